@@ -1,0 +1,68 @@
+"""Checks of what a caller passes in.
+
+A value is checked where it is known. Inside `jit`, `vmap` or `grad` it may be a tracer; then shapes are still
+checked, values are not, and what goes wrong shows up as a status. Every message says which argument, what was
+given and what is allowed.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """The value as a numpy array, or None while it is being traced."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    return np.asarray(value)
+
+
+def as_float(value: Any, dtype: Any = None) -> jax.Array:
+    """`value` as a floating array: its own floating dtype, else the default one (float32 unless x64 is on)."""
+    array = jnp.asarray(value)
+    if dtype is None:
+        dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
+    return array.astype(dtype)
+
+
+def common_dtype(*values: Any) -> Any:
+    """The floating dtype in which a computation over `values` runs; Python numbers do not decide it."""
+    dtypes = [v.dtype for v in jax.tree.leaves(values) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
+    return jnp.result_type(*dtypes) if dtypes else jnp.result_type(float)
+
+
+def shaped(name: str, value: jax.Array, shape: tuple[int | str, ...]) -> None:
+    """`value.shape` must match `shape`; a string stands for any length."""
+    ok = value.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, value.shape, strict=False)
+    )
+    if not ok:
+        wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"{name} has shape {value.shape}; expected {wanted}")
+
+
+def finite(name: str, value: Any) -> None:
+    known = concrete(value)
+    if known is not None and not np.all(np.isfinite(known)):
+        bad = np.argwhere(~np.isfinite(np.atleast_1d(known)))
+        raise ValueError(
+            f"{name} must be finite; found {len(bad)} NaN or infinite value(s), the first at index {tuple(bad[0].tolist())}"
+        )
+
+
+def positive(name: str, value: Any) -> None:
+    known = concrete(value)
+    if known is not None and not np.all(known > 0):
+        raise ValueError(f"{name} must be positive; got {_brief(known)}")
+
+
+def non_negative(name: str, value: Any) -> None:
+    known = concrete(value)
+    if known is not None and not np.all(known >= 0):
+        raise ValueError(f"{name} must not be negative; got {_brief(known)}")
+
+
+def _brief(value: np.ndarray) -> str:
+    return str(value.item()) if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"

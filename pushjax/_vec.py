@@ -1,0 +1,91 @@
+"""Small vectors as pytrees of scalars.
+
+`vmap` over code written with (3,)-arrays leaves an inner axis of length three in every operation, which the
+compiler cannot vectorise. The same arithmetic on separate scalars becomes arithmetic on whole batches, five to
+ten times faster on a CPU. So everything below the public edge is written with `Vec2` and `Vec3`; arrays appear
+where a user sees them (`of`, `array`).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+
+
+class Vec2(NamedTuple):
+    """A point, displacement or force in the plane."""
+
+    x: Scalar
+    y: Scalar
+
+    def __add__(self, other: "Vec2") -> "Vec2":  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Vec2(self.x + other.x, self.y + other.y)
+
+    def __sub__(self, other: "Vec2") -> "Vec2":
+        return Vec2(self.x - other.x, self.y - other.y)
+
+    def __neg__(self) -> "Vec2":
+        return Vec2(-self.x, -self.y)
+
+    def scale(self, factor: Scalar | float) -> "Vec2":
+        return Vec2(factor * self.x, factor * self.y)
+
+    def dot(self, other: "Vec2") -> Scalar:
+        return self.x * other.x + self.y * other.y
+
+    def cross(self, other: "Vec2") -> Scalar:
+        """z component of the cross product: positive where `other` lies counter-clockwise of `self`."""
+        return self.x * other.y - self.y * other.x
+
+    def perp(self) -> "Vec2":
+        """Turned by +90 degrees."""
+        return Vec2(-self.y, self.x)
+
+    def rotate(self, turn: "Vec2") -> "Vec2":
+        """Turned by the angle of the unit vector `turn` = (cos, sin)."""
+        return Vec2(turn.x * self.x - turn.y * self.y, turn.y * self.x + turn.x * self.y)
+
+    def unrotate(self, turn: "Vec2") -> "Vec2":
+        """Turned by minus the angle of the unit vector `turn`."""
+        return Vec2(turn.x * self.x + turn.y * self.y, turn.x * self.y - turn.y * self.x)
+
+    @staticmethod
+    def of(array: Float[Array, "2"]) -> "Vec2":
+        return Vec2(array[0], array[1])
+
+    def array(self) -> Float[Array, "2"]:
+        return jnp.stack(self)
+
+
+class Vec3(NamedTuple):
+    """A twist, wrench or pose: linear part (x, y), angular part z."""
+
+    x: Scalar
+    y: Scalar
+    z: Scalar
+
+    @property
+    def xy(self) -> Vec2:
+        return Vec2(self.x, self.y)
+
+    def scale(self, factor: Scalar | float) -> "Vec3":
+        return Vec3(factor * self.x, factor * self.y, factor * self.z)
+
+    @staticmethod
+    def of(array: Float[Array, "3"]) -> "Vec3":
+        return Vec3(array[0], array[1], array[2])
+
+    def array(self) -> Float[Array, "3"]:
+        return jnp.stack(self)
+
+
+def turn(angle: Scalar) -> Vec2:
+    """The unit vector (cos, sin) of an angle in rad."""
+    return Vec2(jnp.cos(angle), jnp.sin(angle))
+
+
+def select(condition, yes, no):
+    """`where` over two equal pytrees of scalars."""
+    return type(yes)(*(jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True)))

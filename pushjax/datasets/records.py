@@ -1,0 +1,237 @@
+"""The text of a triangle log, taken apart into records; knows the layout, not what the numbers mean.
+
+Layout, one item per line: the number of pushes; then for each push its object pose before and after (7
+numbers each), the number of force samples and those samples (3 numbers each), the number of robot samples and
+those (8 each).
+
+A damaged record must not cost the ones after it. If its counts still fit, the next record starts where they
+say; if not, at the next place that looks like a start: poses and a count are the only lines of 7, 7 and 1
+numbers in a row. Two neighbouring records whose starts are both beyond recognition count as one, and those
+after are numbered one less.
+"""
+
+import gzip
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pushjax.datasets.pushes import Floats, LogError
+
+POSE_COLUMNS, COUNT_COLUMNS, FORCE_COLUMNS, ROBOT_COLUMNS = 7, 1, 3, 8
+# A push takes about 670 force and 220 robot samples; the longest imaginable one stays far below this.
+MOST_SAMPLES = 1_000_000
+# Nothing logged (s, mm, N) comes near; beyond it, squares might overflow later.
+LARGEST_NUMBER = 1e12
+_GZIP_MAGIC = b"\x1f\x8b"
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One push as logged: `poses` (2, 7), `force` (K, 3), `robot` (M, 8); its first pose is on `line`."""
+
+    index: int
+    line: int
+    poses: Floats
+    force: Floats
+    robot: Floats
+
+    @property
+    def force_line(self) -> int:
+        return self.line + 3
+
+    @property
+    def robot_line(self) -> int:
+        return self.force_line + len(self.force) + 1
+
+
+class Fault(Exception):
+    """What is wrong with a record, before it is known which file and push it belongs to."""
+
+    def __init__(self, message: str, line: int, *, at_end: bool = False) -> None:
+        super().__init__(message)
+        self.line = line
+        self.at_end = at_end
+
+
+def read_records(path: Path) -> Iterator[Record | LogError]:
+    """The records of a log in order, each whole one as a Record and each damaged one as a LogError.
+
+    A damaged header or end gives one further LogError. Raises LogError if the file is unreadable or empty.
+    """
+    lines, damage = _read_lines(path)
+    promised, fault = _header(lines)
+    if fault is not None:
+        yield LogError(path, str(fault), line=1)
+    at = 0 if promised is None and _start_score(lines, 0) >= 2 else 1
+    number = 0
+    while at < len(lines):
+        if number == promised:
+            yield LogError(
+                path, f"expected the end of the log after {promised} pushes, found more lines", line=at + 1
+            )
+        if promised is not None and number >= promised and _start_score(lines, at) < 2:
+            return
+        try:
+            record, at = _record(lines, at, number)
+            yield record
+        except Fault as found:
+            ending = _promise(promised) + damage if found.at_end else ""
+            yield LogError(path, str(found) + ending, push=number, line=found.line)
+            if found.at_end:
+                return
+            at = _resume(lines, at, found.line - 1)
+        number += 1
+    if promised is not None and number < promised:
+        message = f"expected {promised} pushes as in the header, found {number}: the log is truncated{damage}"
+        yield LogError(path, message, push=number, line=len(lines))
+    elif damage:
+        yield LogError(path, damage.lstrip("; "), line=len(lines))
+
+
+def _read_lines(path: Path) -> tuple[list[str], str]:
+    """The lines, and how the gzip stream is damaged ("" if it is not); what precedes the damage is good."""
+    damage = ""
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogError(path, f"expected a push log, but cannot read the file: {reason}") from error
+    if text.startswith(_GZIP_MAGIC):
+        try:
+            text = gzip.decompress(text)
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            damage = f"; the gzip stream is damaged: {error}"
+            text = _undamaged(text)
+            # The cut may fall inside a number that still looks like one.
+            text = text[: text.rfind(b"\n") + 1]
+    lines = text.decode("ascii", errors="replace").rstrip().splitlines()
+    if not lines:
+        raise LogError(path, f"expected the number of pushes in the first line, found an empty file{damage}")
+    return lines, damage
+
+
+def _undamaged(zipped: bytes) -> bytes:
+    """What a gzip stream holds before its damage. Byte by byte: a call that fails gives nothing at all."""
+    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    text = bytearray()
+    try:
+        for at in range(len(zipped)):
+            text += stream.decompress(zipped[at : at + 1])
+    except zlib.error:
+        pass
+    return bytes(text)
+
+
+def _header(lines: list[str]) -> tuple[int | None, Fault | None]:
+    try:
+        promised = _count(lines, 0, "pushes")
+    except Fault as fault:
+        return None, fault
+    if promised == 0:
+        return None, Fault("expected the number of pushes, found 0", 1)
+    return promised, None
+
+
+def _promise(promised: int | None) -> str:
+    return "" if promised is None else f" (the header promises {promised} pushes)"
+
+
+def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
+    """The record that starts at line index `at`, and where the next one starts. Raises Fault."""
+    first = _table(lines, at, 1, POSE_COLUMNS, "object pose before the push")
+    last = _table(lines, at + 1, 1, POSE_COLUMNS, "object pose after the push")
+    force_count = _count(lines, at + 2, "force samples")
+    force = _table(lines, at + 3, force_count, FORCE_COLUMNS, "force sample")
+    robot_at = at + 3 + force_count
+    robot_count = _count(lines, robot_at, "robot samples")
+    robot = _table(lines, robot_at + 1, robot_count, ROBOT_COLUMNS, "robot sample")
+    end = robot_at + 1 + robot_count
+    if end < len(lines) and _start_score(lines, end) < 2 and _columns(lines, end) == ROBOT_COLUMNS:
+        raise Fault(
+            f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1
+        )
+    return Record(number, at + 1, np.concatenate([first, last]), force, robot), end
+
+
+def _count(lines: list[str], at: int, what: str) -> int:
+    if at >= len(lines):
+        raise Fault(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
+    try:
+        count = int(lines[at])
+    except ValueError:
+        raise Fault(f"expected the number of {what}, found {_quote(lines[at])}", at + 1) from None
+    if not 0 <= count <= MOST_SAMPLES:
+        raise Fault(f"expected the number of {what} (0 to {MOST_SAMPLES}), found {count}", at + 1)
+    return count
+
+
+def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Floats:
+    """(count, columns) numbers from as many lines."""
+    rows = [line.split() for line in lines[at : at + count]]
+    try:
+        table = np.array(rows, dtype=np.float64).reshape(-1, columns) if rows else np.empty((0, columns))
+        good = len(table) == count and len(rows) == count and bool(np.all(np.abs(table) < LARGEST_NUMBER))
+    except ValueError:
+        good = False
+    if not good or any(len(row) != columns for row in rows):
+        raise _table_fault(lines, at, count, columns, what)
+    return table
+
+
+def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str) -> Fault:
+    """The first thing wrong with the lines of a table that is known to be bad."""
+    for row, line in enumerate(lines[at : at + count]):
+        where = what if count == 1 else f"{what} {row + 1} of {count}"
+        tokens = line.split()
+        if len(tokens) != columns:
+            # The last line of the file with too little on it was cut off while it was written.
+            cut = at + row == len(lines) - 1 and len(tokens) < columns
+            found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {_quote(line)}"
+            return Fault(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
+        for token in tokens:
+            try:
+                value = float(token)
+            except ValueError:
+                return Fault(f"expected a number ({where}), found {_quote(token)}", at + row + 1)
+            if not np.isfinite(value):
+                return Fault(f"expected finite numbers ({where}), found {token}", at + row + 1)
+            if abs(value) >= LARGEST_NUMBER:
+                return Fault(
+                    f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1
+                )
+    have = max(len(lines) - at, 0)
+    return Fault(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
+
+
+def _quote(text: str) -> str:
+    return repr(text if len(text) <= 40 else text[:37] + "...")
+
+
+def _columns(lines: list[str], at: int) -> int:
+    return len(lines[at].split()) if at < len(lines) else -1
+
+
+def _start_score(lines: list[str], at: int) -> int:
+    """How many of the three lines from `at` have the columns of a record's start: 3; 2 if one is damaged."""
+    shape = (POSE_COLUMNS, POSE_COLUMNS, COUNT_COLUMNS)
+    return sum(_columns(lines, at + row) == columns for row, columns in enumerate(shape))
+
+
+def _resume(lines: list[str], at: int, fault_at: int) -> int:
+    """Where to go on after the record that starts at `at`, damaged at `fault_at`; the end if nowhere."""
+    try:
+        robot_at = at + 3 + _count(lines, at + 2, "")
+        end = robot_at + 1 + _count(lines, robot_at, "")
+        if end == len(lines) or _start_score(lines, end) >= 2:
+            return end
+    except Fault:
+        pass
+    # What comes before the fault has been recognised as part of this record.
+    for start in range(max(fault_at, at + 1), len(lines)):
+        if _start_score(lines, start) >= 2:
+            # A damaged line just before a start of three good lines looks like a start of two.
+            return start + 1 if _start_score(lines, start + 1) == 3 else start
+    return len(lines)

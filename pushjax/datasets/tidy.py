@@ -1,0 +1,145 @@
+"""The curated arrays of the same pushes: one `.npz` per log, in SI units and in the frames of `pushes`."""
+
+import zipfile
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pushjax.datasets.pushes import (
+    Floats,
+    LogError,
+    Push,
+    PushLog,
+    contact_onset,
+    continuous_angle,
+    force_filter,
+    wrap_angle,
+)
+
+_PER_PUSH = {"push_index": (), "valid": (), "object_pose_start": (3,), "object_pose_end": (3,)}
+_PER_FILE = (
+    "vertices_body",
+    "rho",
+    "tip_radius",
+    "support_points_body",
+    "support_normal_force",
+    "surface",
+    "arrangement",
+)
+_STREAMS = {"tip_offsets": ("tip_t", "tip_xy", "tip_yaw"), "ft_offsets": ("ft_t", "force_world")}
+
+Arrays = dict[str, NDArray[np.generic]]
+
+
+def load_push_npz(path: str | PathLike[str]) -> PushLog:
+    """Reads a file of the `three_point_push` folder, rows in order; `Push.index` is its `push_index`.
+
+    Rows marked invalid, or holding numbers that are not finite, become problems. Raises LogError if the file
+    is missing, is no such archive, lacks an array or has one of the wrong size, or if no row is usable.
+
+    Source: `three_point_push` in the data folder's README, where every array is described.
+    """
+    file = Path(path)
+    data = _read(file)
+    _check_sizes(file, data)
+    pushes: list[Push] = []
+    problems: list[LogError] = []
+    for row in range(len(data["push_index"])):
+        found = _push(file, data, row)
+        if isinstance(found, Push):
+            pushes.append(found)
+        else:
+            problems.append(found)
+    if not pushes:
+        first = f", the first because: {problems[0].message}" if problems else ""
+        raise LogError(file, f"expected usable pushes, found none among {len(problems)}{first}")
+    return PushLog(
+        pushes=tuple(pushes),
+        problems=tuple(problems),
+        vertices=_floats(data["vertices_body"]),
+        length=float(_floats(data["rho"])),
+        tip_radius=float(_floats(data["tip_radius"])),
+        support_points=_floats(data["support_points_body"]).reshape(-1, 2),
+        support_force=_floats(data["support_normal_force"]).reshape(-1),
+        surface=str(data["surface"]),
+        arrangement=str(data["arrangement"]),
+        source=str(file),
+    )
+
+
+def _read(path: Path) -> Arrays:
+    wanted = [*_PER_PUSH, *_PER_FILE, *_STREAMS, *(name for names in _STREAMS.values() for name in names)]
+    try:
+        # Opened here, because np.load leaves a file open that turns out to be no archive.
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise LogError(path, "expected an .npz archive of pushes, found a single array")
+            missing = [name for name in wanted if name not in archive.files]
+            if missing:
+                raise LogError(path, f"expected the arrays of a push archive, found no {', '.join(missing)}")
+            return {name: archive[name] for name in wanted}
+    except LogError:
+        raise
+    except OSError as error:
+        raise LogError(
+            path, f"expected an .npz archive, but cannot read the file: {error.strerror or error}"
+        ) from error
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise LogError(path, f"expected an .npz archive of pushes, found something else: {error}") from error
+
+
+def _check_sizes(path: Path, data: Arrays) -> None:
+    count = len(data["push_index"]) if data["push_index"].ndim else -1
+    for name, tail in _PER_PUSH.items():
+        if data[name].shape != (count, *tail):
+            raise LogError(
+                path, f"expected {name} of shape (n, *{tail}) for n pushes, found {data[name].shape}"
+            )
+    for offsets_name, names in _STREAMS.items():
+        offsets = data[offsets_name]
+        if offsets.shape != (count + 1,) or offsets[0] != 0 or np.any(np.diff(_floats(offsets)) < 1):
+            raise LogError(
+                path, f"expected {offsets_name} to rise from 0 in {count} steps, found another array"
+            )
+        for name in names:
+            if len(data[name]) != offsets[-1]:
+                raise LogError(path, f"expected {offsets[-1]} rows of {name}, found {len(data[name])}")
+
+
+def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
+    index = int(_floats(data["push_index"])[row])
+    if not data["valid"][row]:
+        return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)
+    streams: dict[str, Floats] = {}
+    for offsets, names in _STREAMS.items():
+        begin, end = (int(at) for at in _floats(data[offsets])[row : row + 2])
+        streams |= {name: _floats(data[name][begin:end]) for name in names}
+    start, end_pose = _floats(data["object_pose_start"])[row], _floats(data["object_pose_end"])[row]
+    for name, values in {**streams, "object_pose_start": start, "object_pose_end": end_pose}.items():
+        if not np.isfinite(values).all():
+            return LogError(path, f"expected finite numbers, found NaN or infinity in {name}", push=index)
+    if not force_filter(streams["force_world"]).any():
+        return LogError(
+            path, "expected the force to last after the first 30 % of the samples, found none", push=index
+        )
+    end_pose[2] = start[2] + wrap_angle(end_pose[2] - start[2])
+    tip_time, tip = streams["tip_t"], streams["tip_xy"]
+    force_time, force = streams["ft_t"], streams["force_world"]
+    return Push(
+        index=index,
+        pose_start=start,
+        pose_end=end_pose,
+        tip_time=tip_time,
+        tip=tip,
+        tip_yaw=continuous_angle(streams["tip_yaw"]),
+        force_time=force_time,
+        force=force,
+        onset=contact_onset(force_time, force, tip_time, tip),
+    )
+
+
+def _floats(array: NDArray[np.generic]) -> Floats:
+    return np.array(array, dtype=np.float64)

@@ -1,0 +1,233 @@
+"""Original text logs of the aluminium triangle pushed by one finger (Zhou et al. 2017, Table 2).
+
+What a record must satisfy to count as a push is in `_check`; what it means is in `_push`. Both follow the
+published toolbox, except that quaternions are normalised here (they have three to six digits) and angles
+never turn the long way.
+"""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pushjax.datasets import arrangement as setup
+from pushjax.datasets.pushes import (
+    Floats,
+    LogError,
+    Push,
+    PushLog,
+    contact_onset,
+    continuous_angle,
+    force_filter,
+    rotation,
+    wrap_angle,
+)
+from pushjax.datasets.records import Fault, Record, read_records
+
+# Logged quaternions are off unit norm by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
+QUATERNION_TOLERANCE = 0.01
+# Broken trials hold one to three samples per push, whole ones some 670 and 220.
+FEWEST_SAMPLES = 4
+# A finger that moves less has no direction; the path is logged with 0.1 mm resolution.
+SHORTEST_TRAVEL = 0.001
+# The motion capture has jumped if the object went further than the finger can have pushed it (deviation
+# |dx| + length |dtheta|), or if it ends where the finger is not: off the line of the edge it pushes on.
+MOST_MOTION = 0.060
+MOST_GAP = 0.003
+
+
+def load_triangle_log(
+    path: str | PathLike[str],
+    *,
+    surface: str | None = None,
+    arrangement: str | None = None,
+    support_points: ArrayLike | None = None,
+    strict: bool = False,
+) -> PushLog:
+    """Reads an original log, plain or gzip-compressed (told from its content, not from its name).
+
+    surface: material the triangle slides on; by default what the file's and folder's names tell.
+    arrangement: "3pts1" ... "3pts4" or "patch", which sets the support points; by default from the names.
+    support_points: (3, 2) or (0, 2) m, body; overrides those of the arrangement.
+    strict: raise the first problem instead of collecting it.
+
+    Damaged pushes become entries of `problems` and the others stay usable, as far as the layout can be
+    followed. Raises LogError if no push is usable, or the file is missing, empty or no such log; ValueError
+    for an unknown `arrangement` or support points that cannot carry the object.
+
+    Source: layout and processing as in the toolbox of Zhou et al. 2017; the rule for jumps is our own.
+    """
+    file = Path(path)
+    name, points = _support(file, arrangement, support_points)
+    normal_force = setup.support_force(points)
+    pushes: list[Push] = []
+    problems: list[LogError] = []
+    for record in read_records(file):
+        problem = record if isinstance(record, LogError) else None
+        if isinstance(record, Record):
+            try:
+                pushes.append(_usable_push(record))
+            except Fault as fault:
+                problem = LogError(file, str(fault), push=record.index, line=fault.line)
+        if problem is not None:
+            if strict:
+                raise problem
+            problems.append(problem)
+    if not pushes:
+        raise _nothing_usable(file, problems)
+    return PushLog(
+        pushes=tuple(pushes),
+        problems=tuple(problems),
+        vertices=setup.VERTICES.copy(),
+        length=setup.LENGTH,
+        tip_radius=setup.TIP_RADIUS,
+        support_points=points,
+        support_force=normal_force,
+        surface=surface if surface is not None else setup.name_surface(file),
+        arrangement=name,
+        source=str(file),
+    )
+
+
+def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
+    name, known = setup.name_support(path) or (setup.UNKNOWN, np.empty((0, 2)))
+    if arrangement is not None:
+        name, known = arrangement, setup.support_points(arrangement)
+    if points is not None:
+        known = np.array(points, dtype=np.float64).reshape(-1, 2)
+        name = arrangement if arrangement is not None else setup.UNKNOWN
+    return name, known
+
+
+def _nothing_usable(path: Path, problems: Sequence[LogError]) -> LogError:
+    if not problems:
+        return LogError(path, "expected at least one push, found none")
+    first = problems[0]
+    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+    return LogError(path, f"no usable push: {first.message}{more}", push=first.push, line=first.line)
+
+
+def _usable_push(record: Record) -> Push:
+    """The push of a record. Raises Fault if it cannot be trusted."""
+    _check(record)
+    push = _push(record)
+    _check_motion(push, record.line + 1)
+    if not force_filter(push.force).any():
+        raise Fault(
+            "expected the force to last after the first 30 % of the samples, found none there",
+            record.force_line,
+        )
+    return push
+
+
+def _check(record: Record) -> None:
+    robot_count_line = record.robot_line - 1
+    for what, table, line in (
+        ("force", record.force, record.line + 2),
+        ("robot", record.robot, robot_count_line),
+    ):
+        if len(table) < FEWEST_SAMPLES:
+            raise Fault(f"expected at least {FEWEST_SAMPLES} {what} samples, found {len(table)}", line)
+    _check_quaternions(record.poses[:, 3:], record.line, "object pose")
+    _check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
+    _check_clock(record.force[:, 0], record.force_line, "force")
+    _check_clock(record.robot[:, 0], record.robot_line, "robot")
+    if record.robot[0, 0] > record.force[-1, 0] or record.robot[-1, 0] < record.force[0, 0]:
+        raise Fault(
+            "expected robot samples from the time of the force samples, found none", record.robot_line
+        )
+
+
+def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
+    norm = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
+    if len(bad):
+        raise Fault(
+            f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0])
+        )
+
+
+def _check_clock(time: Floats, line: int, what: str) -> None:
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        step = time[back[0] + 1] - time[back[0]]
+        message = f"expected time stamps that do not decrease ({what} samples), found a step of {step:.3g} s"
+        raise Fault(message, line + int(back[0]) + 1)
+
+
+def _check_motion(push: Push, line: int) -> None:
+    """`line` is that of the pose after the push, which is where a jump shows."""
+    travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
+    if not travel >= SHORTEST_TRAVEL:
+        raise Fault(
+            f"expected the finger to move at least {SHORTEST_TRAVEL * 1e3:g} mm, found {travel * 1e3:.2g} mm",
+            line,
+        )
+    moved = push.pose_end - push.pose_start
+    deviation = float(np.hypot(moved[0], moved[1]) + setup.LENGTH * abs(moved[2]))
+    gap = _end_gap(push)
+    # Written so that a NaN from absurdly large numbers fails as well.
+    if not (deviation <= MOST_MOTION and abs(gap) <= MOST_GAP):
+        expected = f"less than {MOST_MOTION * 1e3:g} mm and to end within {MOST_GAP * 1e3:g} mm of the finger"
+        found = f"{deviation * 1e3:.4g} mm and {gap * 1e3:.4g} mm"
+        raise Fault(f"the motion capture jumped: expected the object to move {expected}, found {found}", line)
+
+
+def _end_gap(push: Push) -> float:
+    """Distance (m, > 0 outside) of the last finger centre from the line of the edge facing the first one."""
+    start = _edge_distances(push.pose_start, push.tip[0])
+    return float(_edge_distances(push.pose_end, push.tip[-1])[np.argmax(start)])
+
+
+def _edge_distances(pose: Floats, point: Floats) -> Floats:
+    """(3,) signed distances of a world point from the lines of the edges, positive outside."""
+    edge = np.roll(setup.VERTICES, -1, axis=0) - setup.VERTICES
+    # The vertices run clockwise, so the outside is to the left of an edge.
+    outward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    in_body = rotation(pose[2]).T @ (point - pose[:2])
+    return np.sum((in_body - setup.VERTICES) * outward, axis=1)
+
+
+def _push(record: Record) -> Push:
+    start, end = (_body_pose(row) for row in record.poses)
+    end[2] = start[2] + wrap_angle(end[2] - start[2])
+    # Unix seconds use up most of a float64's digits; the clock of the push starts at its first force sample.
+    force_time = record.force[:, 0] - record.force[0, 0]
+    tip_time = record.robot[:, 0] - record.force[0, 0]
+    tip = record.robot[:, 1:3] / 1000
+    yaw = continuous_angle(_yaw(record.robot[:, 4:]))
+    # The finger's frame, in which the sensor reads, turns a little during the push.
+    in_tool = setup.FORCE_SIGN * record.force[:, 1:] @ setup.R_TOOL.T
+    force = np.einsum("kij,kj->ki", rotation(np.interp(force_time, tip_time, yaw)), in_tool - in_tool[0])
+    return Push(
+        index=record.index,
+        pose_start=start,
+        pose_end=end,
+        tip_time=tip_time,
+        tip=tip,
+        tip_yaw=yaw,
+        force_time=force_time,
+        force=force,
+        onset=contact_onset(force_time, force, tip_time, tip),
+    )
+
+
+def _body_pose(row: Floats) -> Floats:
+    """(3,) x, y (m), theta (rad) of the body frame in the world, from a logged pose (7,) of the corner."""
+    w, x, y, z = row[3:] / np.linalg.norm(row[3:])
+    # First two rows of the rotation matrix; the plate's small tilt shortens the way to its centre.
+    matrix = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        ]
+    )
+    position = row[:2] / 1000 + matrix @ setup.CENTRE_OF_MASS
+    return np.append(position, wrap_angle(_yaw(row[None, 3:]))[0])
+
+
+def _yaw(quaternions: Floats) -> Floats:
+    """(m,) rad: rotation about the vertical of quaternions (m, 4), in the order w, x, y, z, of small tilt."""
+    return 2 * np.arctan2(quaternions[:, 3], quaternions[:, 0])

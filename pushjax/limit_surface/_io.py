@@ -1,0 +1,49 @@
+"""Limit surfaces in files."""
+
+import json
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pushjax.limit_surface._base import LimitSurface
+from pushjax.limit_surface.ellipsoid import Ellipsoid
+from pushjax.limit_surface.quartic import Quartic
+
+FORMAT = "pushjax limit surface"
+S = TypeVar("S", bound=LimitSurface)
+
+
+def save_surface(surface: LimitSurface, path: str | Path) -> None:
+    record: dict = {"format": FORMAT, "version": 1, "dtype": str(surface.length.dtype)}
+    # repr of a float64 is exact, and a float32 is a float64
+    record["length"] = float(surface.length)
+    if isinstance(surface, Ellipsoid):
+        record |= {"kind": "ellipsoid", "A": np.asarray(surface.A, np.float64).tolist()}
+    elif isinstance(surface, Quartic):
+        record |= {"kind": "quartic", "coefficients": np.asarray(surface.coefficients, np.float64).tolist()}
+    else:
+        raise TypeError(f"surface: cannot save a {type(surface).__name__}; an Ellipsoid or a Quartic can be saved")
+    Path(path).write_text(json.dumps(record, indent=2) + "\n")
+
+
+def load_surface(path: str | Path, kind: type[S]) -> S:
+    try:
+        record = json.loads(Path(path).read_text())
+        if record["format"] != FORMAT:
+            raise KeyError("format")
+        dtype = jax.dtypes.canonicalize_dtype(record["dtype"])  # float64 needs x64 to be on; else float32
+        length = jnp.asarray(record["length"], dtype)
+        if record["kind"] == "ellipsoid":
+            surface: LimitSurface = Ellipsoid(jnp.asarray(record["A"], dtype), length)
+        elif record["kind"] == "quartic":
+            surface = Quartic(jnp.asarray(record["coefficients"], dtype), length)
+        else:
+            raise KeyError("kind")
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} does not hold a limit surface saved by pushjax: {error!r}") from error
+    if not isinstance(surface, kind):
+        raise ValueError(f"{path} holds a {type(surface).__name__}, not a {kind.__name__}")
+    return surface

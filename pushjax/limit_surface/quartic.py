@@ -1,0 +1,225 @@
+"""Degree four."""
+
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from pushjax._checks import as_float, concrete, finite, shaped
+from pushjax._vec import Scalar, Vec3
+from pushjax.limit_surface._base import (
+    InverseMap,
+    LimitSurface,
+    Symmetric3,
+    angle_between,
+    checked_length,
+)
+from pushjax.status import Status
+
+# Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients.
+MONOMIALS = np.array(
+    [
+        (4, 0, 0), (0, 4, 0), (0, 0, 4), (3, 1, 0), (3, 0, 1), (1, 3, 0), (0, 3, 1), (1, 0, 3), (0, 1, 3),
+        (2, 2, 0), (2, 0, 2), (0, 2, 2), (2, 1, 1), (1, 2, 1), (1, 1, 2),
+    ]
+)  # fmt: skip
+
+# A fitted surface may lie on the border of convexity: how far below zero rounding may put its smallest curvature,
+# relative to the largest. Coefficients stored in float32 are themselves only this exact.
+CONVEXITY_TOLERANCE = 1e-6
+
+MAX_NEWTON_ROUNDS = 100
+
+
+class _QuarticFields(NamedTuple):
+    c: tuple[Scalar, ...]
+    length: Scalar
+
+
+class QuarticForm(_QuarticFields):
+    """H in scalars; `c` are the 15 coefficients."""
+
+    degree: ClassVar[int] = 4
+
+    def value(self, f: Vec3) -> Scalar:
+        g = self.gradient(f)
+        return (f.x * g.x + f.y * g.y + f.z * g.z) / 4
+
+    def gradient(self, f: Vec3) -> Vec3:
+        c, (x, y, z) = self.c, f
+        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+        gx = (
+            x * (4 * c[0] * xx + 3 * (c[3] * xy + c[4] * xz) + 2 * (c[9] * yy + c[10] * zz + c[12] * yz))
+            + yy * (c[5] * y + c[13] * z)
+            + zz * (c[7] * z + c[14] * y)
+        )
+        gy = (
+            y * (4 * c[1] * yy + 3 * (c[5] * xy + c[6] * yz) + 2 * (c[9] * xx + c[11] * zz + c[13] * xz))
+            + xx * (c[3] * x + c[12] * z)
+            + zz * (c[8] * z + c[14] * x)
+        )
+        return Vec3(gx, gy, self.spin(f))
+
+    def spin(self, f: Vec3) -> Scalar:
+        c, (x, y, z) = self.c, f
+        xx, yy, zz = x * x, y * y, z * z
+        return (
+            z * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
+            + xx * (c[4] * x + c[12] * y)
+            + yy * (c[6] * y + c[13] * x)
+        )
+
+    def hessian(self, f: Vec3) -> Symmetric3:
+        c, (x, y, z) = self.c, f
+        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+        return Symmetric3(
+            12 * c[0] * xx + 6 * (c[3] * xy + c[4] * xz) + 2 * (c[9] * yy + c[10] * zz + c[12] * yz),
+            12 * c[1] * yy + 6 * (c[5] * xy + c[6] * yz) + 2 * (c[9] * xx + c[11] * zz + c[13] * xz),
+            12 * c[2] * zz + 6 * (c[7] * xz + c[8] * yz) + 2 * (c[10] * xx + c[11] * yy + c[14] * xy),
+            3 * (c[3] * xx + c[5] * yy) + 4 * c[9] * xy + 2 * (c[12] * xz + c[13] * yz) + c[14] * zz,
+            3 * (c[4] * xx + c[7] * zz) + 4 * c[10] * xz + 2 * (c[12] * xy + c[14] * yz) + c[13] * yy,
+            3 * (c[6] * yy + c[8] * zz) + 4 * c[11] * yz + 2 * (c[13] * xy + c[14] * xz) + c[12] * xx,
+        )
+
+    def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
+        ga, gb, hb = self.gradient(a), self.gradient(b), self.hessian(a).times(b)
+        return (
+            (a.x * ga.x + a.y * ga.y + a.z * ga.z) / 4,
+            b.x * ga.x + b.y * ga.y + b.z * ga.z,
+            (b.x * hb.x + b.y * hb.y + b.z * hb.z) / 2,
+            a.x * gb.x + a.y * gb.y + a.z * gb.z,
+            (b.x * gb.x + b.y * gb.y + b.z * gb.z) / 4,
+        )
+
+
+class Quartic(LimitSurface):
+    """H(F) = sum_k coefficients[k] m_k(F), F = (x, y, z) = (fx, fy, tau / length).
+
+    coefficients: (15,), 1/N^4, of the monomials x⁴ y⁴ z⁴ x³y x³z xy³ y³z xz³ yz³ x²y² x²z² y²z² x²yz xy²z xyz².
+    length: m.
+
+    Raises ValueError for coefficients that are not finite or not convex, or a length that is not positive.
+    """
+
+    coefficients: Float[Array, "15"]
+    length: Float[Array, ""]
+    degree: ClassVar[int] = 4
+
+    def __init__(self, coefficients: ArrayLike, length: ArrayLike):
+        array = as_float(coefficients)
+        shaped("coefficients", array, (15,))
+        finite("coefficients", array)
+        known = concrete(array)
+        if known is not None:
+            curvature = least_curvature(known)
+            if not curvature >= -CONVEXITY_TOLERANCE:
+                raise ValueError(
+                    "coefficients are not those of a convex polynomial: the Hessian's smallest eigenvalue over the "
+                    f"unit sphere is {curvature:.3g} of its largest"
+                )
+        self.coefficients = array
+        self.length = checked_length(length, array.dtype)
+
+    def form(self) -> QuarticForm:
+        return QuarticForm(tuple(self.coefficients[k] for k in range(15)), self.length)
+
+    def is_convex(self) -> bool:
+        return least_curvature(np.asarray(self.coefficients)) >= -CONVEXITY_TOLERANCE
+
+    def inverse(self, twist: ArrayLike) -> InverseMap:
+        """Newton's method on grad H(F) = v, safeguarded: v - grad H is minus the gradient of a convex function."""
+        v, usable = self._normalized_twist(twist)
+        form = self.form()
+        f, rounds = _inverse(form.c, v)
+        h = form.value(f)
+        angle = angle_between(form.gradient(f), v)
+        good = usable & (h > 0) & (angle <= 1e4 * jnp.finfo(angle.dtype).eps)
+        scale = jnp.where(good, jnp.where(good, h, 1.0) ** -0.25, 0.0)
+        wrench = jnp.stack([f.x, f.y, f.z * self.length]) * scale
+        status = jnp.where(good, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
+        return InverseMap(wrench, status, rounds, angle)
+
+
+@jax.custom_jvp
+def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
+    """F with grad H(F) = v, and the Newton rounds it took.
+
+    Each round: the Newton step for the convex H(F) - v . F, the best of its halvings (H along the step is a known
+    polynomial, so they cost nothing), then the best multiple of the result (closed form, by homogeneity), which
+    makes the iteration independent of the scale of H.
+    """
+    form = QuarticForm(c, jnp.ones_like(v.x))
+
+    def rescaled(f: Vec3) -> Vec3:
+        power = jnp.maximum(v.x * f.x + v.y * f.y + v.z * f.z, 0)
+        h = form.value(f)
+        return f.scale(jnp.cbrt(power / jnp.where(h > 0, 4 * h, 1.0)))
+
+    def residual(f: Vec3) -> Vec3:
+        g = form.gradient(f)
+        return Vec3(v.x - g.x, v.y - g.y, v.z - g.z)
+
+    def size(r: Vec3) -> Scalar:
+        return jnp.maximum(jnp.maximum(jnp.abs(r.x), jnp.abs(r.y)), jnp.abs(r.z))
+
+    halvings = 0.5 ** jnp.arange(10, dtype=v.x.dtype)
+
+    def body(state):
+        f, _, rounds = state
+        step = form.hessian(f).solve(residual(f))
+        along = form.restrict(f, step)
+        power = v.x * step.x + v.y * step.y + v.z * step.z
+        cost = sum(a * halvings**k for k, a in enumerate(along[1:], start=1)) - power * halvings
+        t = halvings[jnp.argmin(cost)]
+        new = rescaled(Vec3(f.x + t * step.x, f.y + t * step.y, f.z + t * step.z))
+        return new, size(residual(new)), rounds + 1
+
+    tolerance = 32 * jnp.finfo(v.x.dtype).eps
+    start = rescaled(v)
+    begin = (start, size(residual(start)), jnp.zeros((), jnp.int32))
+    f, _, rounds = jax.lax.while_loop(lambda s: (s[1] > tolerance) & (s[2] < MAX_NEWTON_ROUNDS), body, begin)
+    return f, rounds
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    """hess H dF = dv - d(grad H): one linear solve at the solution."""
+    (c, v), (dc, dv) = primals, tangents
+    f, rounds = _inverse(c, v)
+    one = jnp.ones_like(v.x)
+    g = QuarticForm(dc, one).gradient(f)  # grad H is linear in the coefficients
+    df = QuarticForm(c, one).hessian(f).solve(Vec3(dv.x - g.x, dv.y - g.y, dv.z - g.z))
+    return (f, rounds), (df, np.zeros(rounds.shape, jax.dtypes.float0))
+
+
+def least_curvature(coefficients: np.ndarray) -> float:
+    """Smallest eigenvalue of the Hessian over the unit sphere, relative to the largest found.
+
+    z' hess H(F) z is 12 times a symmetric form T(F, F, z, z), so from the worst of a sweep of directions the search
+    alternates: z the Hessian's lowest eigenvector at F, then F the lowest at z. Each half step can only lower it.
+    """
+    tensor = _curvature_tensor(np.asarray(coefficients, np.float64))
+    k = np.arange(2000) + 0.5
+    height, angle = 1 - k / 2000, np.pi * (1 + 5**0.5) * k  # a half sphere: the form is even
+    ring = np.sqrt(1 - height**2)
+    direction = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+    values, vectors = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, direction, direction))
+    worst = np.argsort(values[:, 0])[:32]
+    lowest, z = values[worst, 0], vectors[worst, :, 0]
+    for _ in range(50):
+        found, vector = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, z, z))
+        lowest, z = np.minimum(lowest, found[:, 0]), vector[:, :, 0]
+    return float(lowest.min() / max(np.abs(values).max(), np.finfo(float).tiny))
+
+
+def _curvature_tensor(coefficients: np.ndarray) -> np.ndarray:
+    """Fully symmetric T with hess H(F)[i, j] = 12 sum_kl T[i, j, k, l] F_k F_l."""
+    tensor = np.zeros((3, 3, 3, 3))
+    for index in np.ndindex(3, 3, 3, 3):
+        exponent = np.bincount(index, minlength=3)
+        k = int(np.argmax((MONOMIALS == exponent).all(axis=1)))
+        ways = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
+        tensor[index] = 12 * coefficients[k] / ways
+    return tensor

@@ -1,0 +1,278 @@
+"""Pushes: one step, and a path of them.
+
+Time does not matter to quasi-static motion, so a step is a displacement of the hand. Within it (body frame, after
+turning the hand's displacement by the slider's angle):
+
+1. the finger travels freely until it meets the slider (exactly, see `contacts`); the rest of the step pushes;
+2. predict: solve the contact where they meet, and move the slider half of that;
+3. correct: solve the contact as seen from halfway, with the halfway angle, and move the slider by that.
+
+This is the midpoint rule: second order within a mode and, because motion is continuous across modes, across
+changes of mode too. The gap of the meeting is part of the contact problem, so an overlap is pushed out within one step
+and what the rule leaves does not add up (the paper's open problem 2: Zhou et al. 2017, section VI).
+
+The slider is moved so that its contact point goes exactly where the contact problem says, in the world, and the
+rest turns about it. Where the finger sticks, slip is then zero to rounding, not to the order of the scheme.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._vec import Scalar, Vec2, Vec3, turn
+from pushjax.contacts import Meeting, meet, touch
+from pushjax.hands import Hand, checked_path
+from pushjax.limit_surface import Form, LimitSurface
+from pushjax.shapes import Outline, Shape
+from pushjax.solve import Contact, ScalarRoot, SingleMotion, StickingSolver, solve_single
+from pushjax.status import ContactMode, Status
+
+
+class Slider(eqx.Module):
+    """What is pushed: its outline and how it slides, both in its body frame."""
+
+    shape: Shape
+    surface: LimitSurface
+
+
+class Step(eqx.Module):
+    """One step of a push.
+
+    pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
+    along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame halfway;
+    zero and SEPARATED where nothing pushes. status: `Status`.
+    """
+
+    pose: Float[Array, "3"]
+    twist: Float[Array, "3"]
+    wrench: Float[Array, "3"]
+    force: Float[Array, "contacts 2"]
+    mode: Int[Array, "contacts"]
+    status: Int[Array, ""]
+
+
+class Trajectory(eqx.Module):
+    """A push, step by step; fields as in `Step`, with a leading axis of steps (pose: steps + 1, the start included)."""
+
+    pose: Float[Array, "steps+1 3"]
+    twist: Float[Array, "steps 3"]
+    wrench: Float[Array, "steps 3"]
+    force: Float[Array, "steps contacts 2"]
+    mode: Int[Array, "steps contacts"]
+    status: Int[Array, "steps"]
+
+    @property
+    def failed(self) -> Bool[Array, "steps"]:
+        """Steps whose status is a failure (`Status.failed`); there the slider was left where it was."""
+        return jnp.isin(self.status, jnp.array([s for s in Status if s.failed], self.status.dtype))
+
+    @property
+    def first_failure(self) -> Int[Array, ""]:
+        """Index of the first failed step, or -1."""
+        return jnp.where(jnp.any(self.failed, axis=-1), jnp.argmax(self.failed, axis=-1), -1)
+
+
+class _Record(NamedTuple):
+    """A step's outcome in scalars: what the scan stacks."""
+
+    pose: Vec3
+    twist: Vec3
+    wrench: Vec3
+    force: Vec2
+    mode: Int[Array, ""]
+    status: Int[Array, ""]
+
+
+def _world(record: _Record, length: Scalar) -> Step:
+    """Arrays of a record; also of a stacked one, whose scalars have an axis of steps."""
+    wrench = (record.wrench.x, record.wrench.y, record.wrench.z * length)
+    return Step(
+        pose=jnp.stack(record.pose, axis=-1),
+        twist=jnp.stack(record.twist, axis=-1),
+        wrench=jnp.stack(wrench, axis=-1),
+        force=jnp.stack(record.force, axis=-1)[..., None, :],
+        mode=record.mode[..., None],
+        status=record.status,
+    )
+
+
+def _moved(pose: Vec3, contact: Vec2, motion: Vec3, angle: Vec2) -> Vec3:
+    """`pose` after the body twist `motion`, its material point `contact` going straight along `angle` times its motion."""
+    straight = (motion.xy + contact.perp().scale(motion.z)).rotate(angle)
+    theta = pose.z + motion.z
+    swing = contact.rotate(turn(theta)) - contact.rotate(turn(pose.z))
+    return Vec3(pose.x + straight.x - swing.x, pose.y + straight.y - swing.y, theta)
+
+
+def _push(
+    form: Form, met: Meeting, seen: tuple[Vec2, Vec2], path: Vec2, friction: Scalar, solver: StickingSolver
+) -> SingleMotion:
+    """Solve the contact `seen` (point, normal) for the part of `path` that pushes."""
+    share = jnp.where(met.reached, 1 - met.start, 0.0)
+    gap = jnp.where(met.reached, met.gap, 1.0)  # out of reach
+    return solve_single(form, Contact(*seen, path.scale(share), friction, gap), solver)
+
+
+def _advance(
+    form: Form,
+    outline: Outline,
+    radius: Scalar,
+    friction: Scalar,
+    solver: StickingSolver,
+    pose: Vec3,
+    before: Vec2,
+    after: Vec2,
+) -> _Record:
+    """One step of one finger from `before` to `after` (world)."""
+    at_start = turn(pose.z)
+    path = after - before
+    local = path.unrotate(at_start)
+    met = meet(outline, (before - pose.xy).unrotate(at_start), local, radius, form.length)
+    first = _push(form, met, (met.point, met.normal), local, friction, solver)
+
+    half = _moved(pose, met.point, first.twist.scale(0.5), at_start)
+    halfway = turn(half.z)
+    center = (before + path.scale((1 + met.start) / 2) - half.xy).unrotate(halfway)
+    seen = touch(outline, center, met)
+    motion = _push(form, met, seen, path.unrotate(halfway), friction, solver)
+
+    moved = _moved(pose, seen[0], motion.twist, halfway)
+    failed = jnp.where(first.status == Status.MOVING, motion.status, jnp.maximum(first.status, motion.status))
+    status = jnp.where(met.overlapping, Status.OVERLAPPING, failed).astype(jnp.int8)
+    # Left where it is, not by way of arithmetic that might turn NaN into a pose
+    still = (status == Status.FREE) | (status >= Status.JAMMED)
+    valid = jnp.isfinite(moved.x + moved.y + moved.z)
+    status = jnp.where(still | valid, status, Status.INVALID).astype(jnp.int8)
+    still = still | ~valid
+
+    def kept(moving, resting):
+        return type(moving)(*(jnp.where(still, b, a) for a, b in zip(moving, resting, strict=True)))
+
+    zero = jnp.zeros_like(pose.x)
+    return _Record(
+        kept(moved, pose),
+        kept(motion.twist, Vec3(zero, zero, zero)),
+        kept(motion.wrench, Vec3(zero, zero, zero)),
+        kept(motion.force, Vec2(zero, zero)),
+        jnp.where(still, ContactMode.SEPARATED, motion.mode).astype(jnp.int8),
+        status,
+    )
+
+
+def _arguments(slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike, *paths: ArrayLike):
+    """Everything in one floating dtype, and checked as far as values are known."""
+    dtype = common_dtype(slider, hand, pose, friction, *paths)
+    start, mu = as_float(pose, dtype), as_float(friction, dtype)
+    shaped("pose", start, (3,))
+    finite("pose", start)
+    fingers = hand.radius.shape[0]
+    if mu.shape not in ((), (fingers,)):
+        raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
+    finite("friction", mu)
+    non_negative("friction", mu)
+    cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
+    return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
+
+
+def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> None:
+    if concrete(pose) is None or concrete(configuration) is None or concrete(hand.radius) is None:
+        return
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(slider)):
+        return
+    (status, depth) = _start(slider, hand, pose, configuration)
+    if bool(status):
+        raise ValueError(
+            f"path starts with the hand inside the slider: a finger's centre is {1e3 * float(depth):.3g} mm deep; "
+            f"at most {1e3 * 0.1 * float(slider.surface.length):.3g} mm (a tenth of the surface's length) is pushed out"
+        )
+
+
+@eqx.filter_jit
+def _start(slider: Slider, hand: Hand, pose: Array, configuration: Array):
+    (center,) = hand.centers(tuple(configuration))
+    local = (center - Vec3.of(pose).xy).unrotate(turn(pose[2]))
+    zero = jnp.zeros_like(pose[0])
+    met = meet(slider.shape.outline(), local, Vec2(zero, zero), hand.radius[0], slider.surface.length)
+    return met.overlapping, -slider.shape.outline().closest(local).distance
+
+
+def step(
+    slider: Slider,
+    hand: Hand,
+    q0: ArrayLike,
+    q1: ArrayLike,
+    *,
+    pose: ArrayLike,
+    friction: ArrayLike,
+    solver: StickingSolver | None = None,
+) -> Step:
+    """Move the hand from configuration `q0` (dof,) to `q1` (dof,), world, m: the one step that `rollout` scans.
+
+    pose: (3,), the slider's, world. friction: mu between fingers and slider, a scalar or (fingers,).
+
+    Raises ValueError for arguments of the wrong shape, not finite, or a negative friction, where they are not traced;
+    where they are, and for a finger that is inside the slider, the step's status says so.
+    """
+    slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, q0, q1)
+    ends = as_float(q0, dtype), as_float(q1, dtype)
+    for name, q in zip(("q0", "q1"), ends, strict=True):
+        shaped(name, q, (hand.dof,))
+        finite(name, q)
+    return _step(slider, hand, *ends, start, mu, ScalarRoot() if solver is None else solver)
+
+
+@eqx.filter_jit
+def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
+    (before,), (after,) = hand.centers(tuple(q0)), hand.centers(tuple(q1))
+    form, outline = slider.surface.form(), slider.shape.outline()
+    record = _advance(form, outline, hand.radius[0], friction[0], solver, Vec3.of(pose), before, after)
+    return _world(record, form.length)
+
+
+def rollout(
+    slider: Slider,
+    hand: Hand,
+    path: ArrayLike,
+    *,
+    pose: ArrayLike,
+    friction: ArrayLike,
+    solver: StickingSolver | None = None,
+) -> Trajectory:
+    """Push the slider along a path of hand configurations.
+
+    path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose: (3,),
+    the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,). There is
+    no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
+
+    Differentiable, forward and reverse, in slider, hand, path, pose and friction. Batches come from `vmap`.
+
+    Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a finger that starts inside
+    the slider, where they are not traced; where they are, `status` says so at every step, and `first_failure` where.
+
+    Source: Zhou et al. 2017, sections III and VI (open problem 2); the scheme is described in this module's header.
+    """
+    slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, path)
+    p = checked_path(path, hand.dof, dtype)
+    _check_start(slider, hand, start, p[0])
+    return _rollout(slider, hand, p, start, mu, ScalarRoot() if solver is None else solver)
+
+
+@eqx.filter_jit
+def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
+    form, outline, radius, mu = slider.surface.form(), slider.shape.outline(), hand.radius[0], friction[0]
+    columns = tuple(path.T)
+
+    def body(pose: Vec3, ends):
+        (before,), (after,) = (hand.centers(q) for q in ends)
+        record = _advance(form, outline, radius, mu, solver, pose, before, after)
+        return record.pose, record
+
+    ends = tuple(c[:-1] for c in columns), tuple(c[1:] for c in columns)
+    _, records = jax.lax.scan(body, Vec3.of(pose), ends)
+    steps = _world(records, form.length)
+    poses = jnp.concatenate([pose[None], steps.pose])
+    return Trajectory(poses, steps.twist, steps.wrench, steps.force, steps.mode, steps.status)

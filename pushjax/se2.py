@@ -1,0 +1,90 @@
+"""Planar rigid motions.
+
+A pose (x, y, theta) places the body frame in the world: the world point of a body point p is (x, y) + R(theta) p.
+A twist (vx, vy, omega) and a wrench (fx, fy, tau) are in the body frame about its origin, linear part first.
+Angles are in rad and never wrapped. All functions take arrays whose last axis has length three (points: two) and
+broadcast over the axes before it.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from pushjax._checks import as_float
+
+Pose = Float[Array, "*batch 3"]
+Twist = Float[Array, "*batch 3"]
+Wrench = Float[Array, "*batch 3"]
+
+
+def _split(value: ArrayLike) -> tuple[Array, Array, Array]:
+    array = as_float(value)
+    return array[..., 0], array[..., 1], array[..., 2]
+
+
+def compose(pose: ArrayLike, relative: ArrayLike) -> Pose:
+    """The pose of a frame that has pose `relative` in the frame `pose`. Shapes (..., 3), m and rad."""
+    x, y, theta = _split(pose)
+    dx, dy, dtheta = _split(relative)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, theta + dtheta], axis=-1)
+
+
+def inverse(pose: ArrayLike) -> Pose:
+    """The pose of the world in the body frame: compose(pose, inverse(pose)) is zero. Shape (..., 3)."""
+    x, y, theta = _split(pose)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
+
+
+def transform(pose: ArrayLike, point: ArrayLike) -> Float[Array, "*batch 2"]:
+    """World coordinates (..., 2) of body points (..., 2), m."""
+    x, y, theta = _split(pose)
+    p = as_float(point)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack([x + c * p[..., 0] - s * p[..., 1], y + s * p[..., 0] + c * p[..., 1]], axis=-1)
+
+
+def _sinc_pair(omega: Array) -> tuple[Array, Array]:
+    """sin(w)/w and (1 - cos(w))/w, smooth through zero in value and derivative."""
+    small = jnp.abs(omega) < 1e-3
+    safe = jnp.where(small, 1.0, omega)  # keeps the unused branch's derivative finite
+    w2 = omega * omega
+    a = jnp.where(small, 1 - w2 / 6 + w2 * w2 / 120, jnp.sin(safe) / safe)
+    # 2 sin(w/2)^2 / w does not cancel where 1 - cos(w) does
+    b = jnp.where(small, omega * (0.5 - w2 / 24), 2 * jnp.sin(safe / 2) ** 2 / safe)
+    return a, b
+
+
+def exp(twist: ArrayLike) -> Pose:
+    """The relative pose reached by a constant body twist (..., 3) in unit time; the angle is not wrapped."""
+    vx, vy, omega = _split(twist)
+    a, b = _sinc_pair(omega)
+    return jnp.stack([a * vx - b * vy, b * vx + a * vy, omega], axis=-1)
+
+
+def log(relative: ArrayLike) -> Twist:
+    """The body twist whose `exp` is `relative`; inverse of `exp` for |theta| < 2 pi (it is singular there)."""
+    x, y, omega = _split(relative)
+    a, b = _sinc_pair(omega)
+    scale = 1.0 / (a * a + b * b)
+    return jnp.stack([scale * (a * x + b * y), scale * (a * y - b * x), omega], axis=-1)
+
+
+def transport_twist(relative: ArrayLike, twist: ArrayLike) -> Twist:
+    """A twist given in frame B, expressed in frame A, where B has pose `relative` in A (the adjoint map)."""
+    x, y, theta = _split(relative)
+    vx, vy, omega = _split(twist)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack([c * vx - s * vy + y * omega, s * vx + c * vy - x * omega, omega], axis=-1)
+
+
+def transport_wrench(relative: ArrayLike, wrench: ArrayLike) -> Wrench:
+    """A wrench given in frame B, expressed in frame A, where B has pose `relative` in A.
+
+    Power is the same in both frames: transport_twist(T, V) . transport_wrench(T, W) = V . W.
+    """
+    x, y, theta = _split(relative)
+    fx, fy, tau = _split(wrench)
+    c, s = jnp.cos(theta), jnp.sin(theta)
+    gx, gy = c * fx - s * fy, s * fx + c * fy
+    return jnp.stack([gx, gy, tau + x * gy - y * gx], axis=-1)

@@ -1,0 +1,89 @@
+"""One contact, seen in its contact plane.
+
+All wrenches one contact can apply are F = J'(f_n n + f_t t), a plane. On it H becomes the binary form
+h(f_n, f_t) = H(J'(f_n n + f_t t)), convex and homogeneous of the same degree d, and the contact point of the slider
+moves, in (n, t), along grad h. So a single contact is a limit curve h = 1 in the plane of contact forces, whatever
+the limit surface: a force f moves the contact along the curve's normal at f.
+
+Along the friction cone put f = (1, s) and h(s) = h(1, s); then the motion is (d h - s h', h'). By convexity its angle
+phi(s) = atan2(h', d h - s h') increases with s, within 90 degrees of the angle of f:
+
+    (d h - s h') h'' - h' (d h - s h')' = d h h'' - (d - 1) h'^2 >= 0.
+
+For a pushing motion v with v_n > 0: beyond phi(mu) the pusher slides left, beyond phi(-mu) right, between them it sticks
+at the s with phi(s) = phi_v. The edge of the motion cone may open beyond 90 degrees from the normal; then no push
+slides past it. Hence the pusher slides left if and only if, at s = mu,
+
+    motion_n > 0  and  cross(motion, v) > 0,
+
+without any arctangent, and mirrored for right (Zhou et al. 2017, section III.A, which tests the cross product only).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from pushjax._vec import Scalar, Vec2, Vec3
+from pushjax.limit_surface import Form
+
+
+class Contact(NamedTuple):
+    """One contact in the body frame, in scalars. Units m and rad; `normal` points into the slider.
+
+    displacement: of the pusher's material point over the step. gap: distance still to close along the normal.
+    """
+
+    point: Vec2
+    normal: Vec2
+    displacement: Vec2
+    friction: Scalar
+    gap: Scalar
+
+    def approach(self) -> Vec2:
+        """What the slider's contact point must do to stay with the pusher, in (n, t)."""
+        normal, tangent = self.normal, self.normal.perp()
+        return Vec2(self.displacement.dot(normal) - self.gap, self.displacement.dot(tangent))
+
+    def wrench(self, force: Vec2, length: Scalar) -> Vec3:
+        """The normalised wrench of a contact force in (n, t)."""
+        f = self.normal.scale(force.x) + self.normal.perp().scale(force.y)
+        return Vec3(f.x, f.y, self.point.cross(f) / length)
+
+
+class LimitCurve(NamedTuple):
+    """h along the friction cone: coefficients of h(s) = sum_k c_k s^k, d + 1 of them."""
+
+    c: tuple[Scalar, ...]
+
+    @staticmethod
+    def of(form: Form, contact: Contact) -> "LimitCurve":
+        one, zero = jnp.ones_like(contact.gap), jnp.zeros_like(contact.gap)
+        along_normal = contact.wrench(Vec2(one, zero), form.length)
+        along_tangent = contact.wrench(Vec2(zero, one), form.length)
+        return LimitCurve(form.restrict(along_normal, along_tangent))
+
+    @property
+    def degree(self) -> int:
+        return len(self.c) - 1
+
+    def motion(self, s: Scalar) -> Vec2:
+        """grad h at (1, s): how the contact point moves, in (n, t). Two polynomials of degree d - 1."""
+        d = self.degree
+        return Vec2(
+            _horner([(d - k) * c for k, c in enumerate(self.c[:-1])], s),
+            _horner([k * c for k, c in enumerate(self.c)][1:], s),
+        )
+
+    def bend(self, s: Scalar) -> Scalar:
+        """h''(s)."""
+        return _horner([k * (k - 1) * c for k, c in enumerate(self.c)][2:], s)
+
+    def value(self, s: Scalar) -> Scalar:
+        return _horner(self.c, s)
+
+
+def _horner(coefficients, s: Scalar) -> Scalar:
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * s + c
+    return total

@@ -1,0 +1,167 @@
+"""The contact problem as a user states it, in arrays."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._vec import Scalar, Vec2, Vec3
+from pushjax.limit_surface import LimitSurface
+from pushjax.solve._contact_plane import Contact, LimitCurve
+from pushjax.solve.single import solve_single
+from pushjax.solve.sticking import ScalarRoot, StickingSolver
+
+UNIT_TOLERANCE = 1e-3  # of a normal's length: measured normals are normalised by their users, in float32
+
+
+class Contacts(eqx.Module):
+    """Contacts between a hand and a slider, in the slider's body frame.
+
+    point, normal, displacement: (contacts, 2), m; `normal` is of unit length and points into the slider; `displacement`
+    is that of the pusher's material point over the step. friction: mu, (contacts,) or one for all. gap: m still to
+    close along the normal, negative in penetration. active: False for a contact that is only padding.
+
+    Raises ValueError for arrays that do not match, are not finite, a normal not of unit length or negative friction.
+    """
+
+    point: Float[Array, "contacts 2"]
+    normal: Float[Array, "contacts 2"]
+    displacement: Float[Array, "contacts 2"]
+    friction: Float[Array, "contacts"]
+    gap: Float[Array, "contacts"]
+    active: Bool[Array, "contacts"]
+
+    def __init__(
+        self,
+        point: ArrayLike,
+        normal: ArrayLike,
+        displacement: ArrayLike,
+        friction: ArrayLike,
+        gap: ArrayLike = 0.0,
+        active: ArrayLike = True,
+    ):
+        dtype = common_dtype(point, normal, displacement, friction, gap)
+        self.point = as_float(point, dtype)
+        shaped("point", self.point, ("contacts", 2))
+        m = self.point.shape[0]
+        self.normal, self.displacement = as_float(normal, dtype), as_float(displacement, dtype)
+        shaped("normal", self.normal, (m, 2))
+        shaped("displacement", self.displacement, (m, 2))
+        self.friction = _each("friction", as_float(friction, dtype), m)
+        self.gap = _each("gap", as_float(gap, dtype), m)
+        self.active = _each("active", jnp.asarray(active, bool), m)
+        for name in ("point", "normal", "displacement", "friction", "gap"):
+            finite(name, getattr(self, name))
+        non_negative("friction", self.friction)
+        known = concrete(self.normal)
+        if known is not None and np.any(np.abs(np.linalg.norm(known, axis=1) - 1) > UNIT_TOLERANCE):
+            raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
+
+
+def _each(name: str, value: Array, contacts: int) -> Array:
+    if value.ndim and value.shape != (contacts,):
+        raise ValueError(f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact")
+    return jnp.broadcast_to(value, (contacts,))
+
+
+class Motion(eqx.Module):
+    """The answer to a contact problem.
+
+    twist: (3,), of the slider over the step (m, m, rad), zero where it does not move. wrench: (3,), N and N m, on
+    H = 1, zero where it does not move. force: (contacts, 2), N, along normal and tangent t = (-n_y, n_x), summing to the
+    wrench. mode: (contacts,) of `ContactMode`. status: `Status`. margin: distance from a jam, infinite for one
+    contact, which cannot jam. unique: False where another twist satisfies every condition too.
+    """
+
+    twist: Float[Array, "3"]
+    wrench: Float[Array, "3"]
+    force: Float[Array, "contacts 2"]
+    mode: Int[Array, "contacts"]
+    status: Int[Array, ""]
+    margin: Float[Array, ""]
+    unique: Bool[Array, ""]
+
+
+def solve_contacts(
+    surface: LimitSurface, contacts: Contacts, *, solver: StickingSolver | None = None
+) -> Motion:
+    """The slider's motion under given pusher displacements: Coulomb friction at the contact, the limit surface below.
+
+    Finds the twist V and force f with V = k grad H(J'f), k > 0, and, with the relative motion w = J V - displacement,
+
+        0 <= f_n  _|_  w_n + gap >= 0,   |f_t| <= mu f_n,   f_t = +mu f_n where w_t < 0,  -mu f_n where w_t > 0.
+
+    Differentiable, forward and reverse, in everything but `active`; while sticking, the derivative by friction is
+    zero. `solver` finds the sticking point: `ScalarRoot()` (default) or `HessianIteration()`.
+
+    Raises ValueError unless there is exactly one contact. Traced values that are not finite, or a negative friction,
+    give `Status.INVALID` and no motion.
+
+    Source: Zhou et al. 2017, section III.A; the gap is that of Stewart & Trinkle 1996.
+    """
+    m = contacts.point.shape[0]
+    if m != 1:
+        raise ValueError(f"contacts: exactly one contact is supported; got {m}")
+    form, contact = surface.form(), _contact(contacts, 0)
+    result = solve_single(form, contact, ScalarRoot() if solver is None else solver)
+    wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
+    return Motion(
+        twist=result.twist.array(),
+        wrench=wrench.array(),
+        force=result.force.array()[None],
+        mode=result.mode[None],
+        status=result.status,
+        margin=jnp.full_like(result.twist.x, jnp.inf),
+        unique=result.unique,
+    )
+
+
+def _contact(contacts: Contacts, i: int) -> Contact:
+    """Contact i in scalars; one that is not active is moved out of reach."""
+    active = contacts.active[i]
+
+    def kept(value: Scalar) -> Scalar:
+        return jnp.where(active, value, 0.0)
+
+    return Contact(
+        Vec2.of(contacts.point[i]),
+        Vec2.of(contacts.normal[i]),
+        Vec2(kept(contacts.displacement[i, 0]), kept(contacts.displacement[i, 1])),
+        contacts.friction[i],
+        jnp.where(active, contacts.gap[i], 1.0),
+    )
+
+
+def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]:
+    """Left and right edge of the friction cone about the inward `normal` (2,): unit force directions, body frame."""
+    dtype = common_dtype(normal, friction)
+    n, mu = as_float(normal, dtype), as_float(friction, dtype)
+    shaped("normal", n, (2,))
+    shaped("friction", mu, ())
+    non_negative("friction", mu)
+    tangent = jnp.stack([-n[1], n[0]])
+    edges = jnp.stack([n + mu * tangent, n - mu * tangent])
+    return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
+
+
+def motion_cone(
+    surface: LimitSurface, point: ArrayLike, normal: ArrayLike, friction: ArrayLike
+) -> Float[Array, "2 2"]:
+    """Left and right edge of the motion cone: unit velocities of the contact point under the friction cone's edges.
+
+    A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The cone
+    may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section III.A.
+    """
+    dtype = common_dtype(surface, point, normal)
+    contacts = Contacts(
+        as_float(point, dtype)[None], as_float(normal, dtype)[None], jnp.zeros((1, 2), dtype), friction
+    )
+    contact = _contact(contacts, 0)
+    curve = LimitCurve.of(surface.form(), contact)
+    edges = []
+    for s in (contact.friction, -contact.friction):
+        g = curve.motion(s)
+        g = g.scale(1 / jnp.sqrt(g.dot(g)))
+        edges.append((contact.normal.scale(g.x) + contact.normal.perp().scale(g.y)).array())
+    return jnp.stack(edges)

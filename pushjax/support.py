@@ -1,0 +1,202 @@
+"""What carries the slider: pressure as weighted points, and the Coulomb friction they give.
+
+A support point at r with friction limit l = mu_s p (pressure times coefficient of friction) resists a sliding
+velocity v(r) with l v/|v|. Summed over the points this is the exact limit surface. A twist whose centre of rotation
+lies on a support point does not slide that point: its friction may then be any vector of length up to l, and the
+wrenches of that twist are a flat facet of the limit surface (Goyal, Ruina & Papadopoulos 1991).
+
+Wrenches are those the hand applies to balance the table, so wrench . twist >= 0.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from pushjax._checks import as_float, concrete, finite, non_negative, positive, shaped
+from pushjax.shapes import Shape
+
+FACET_SHARE = 0.1  # of the wrench-twist pairs
+
+
+class WrenchTwistPairs(NamedTuple):
+    """Pairs on a limit surface, ready to unpack into `fit_limit_surface`.
+
+    wrench: (pairs, 3), N and N m. twist: (pairs, 3), of unit norm as (vx, vy, length * omega). length: m.
+    """
+
+    wrench: Float[Array, "pairs 3"]
+    twist: Float[Array, "pairs 3"]
+    length: Float[Array, ""]
+
+
+class Support(eqx.Module):
+    """Support points in the body frame and the friction limit of each.
+
+    point: (points, 2), m. limit: (points,), N: what friction at that point can bear.
+    """
+
+    point: Float[Array, "points 2"]
+    limit: Float[Array, "points"]
+
+    def __init__(self, point: ArrayLike, limit: ArrayLike):
+        self.point = as_float(point)
+        self.limit = as_float(limit, self.point.dtype)
+        shaped("point", self.point, ("points", 2))
+        shaped("limit", self.limit, (self.point.shape[0],))
+        finite("point", self.point)
+        finite("limit", self.limit)
+        non_negative("limit", self.limit)
+        known = concrete(self.limit)
+        if known is not None and not known.sum() > 0:
+            raise ValueError("limit: at least one support point must carry a load; all are zero")
+
+    @staticmethod
+    def points(point: ArrayLike, weights: ArrayLike | None = None, load: ArrayLike = 1.0) -> "Support":
+        """Given points (points, 2) m that share the friction limit `load` = mu m g (N) by `weights` (default equal)."""
+        array = as_float(point)
+        shaped("point", array, ("points", 2))
+        share = jnp.ones(array.shape[0], array.dtype) if weights is None else as_float(weights, array.dtype)
+        shaped("weights", share, (array.shape[0],))
+        finite("weights", share)
+        non_negative("weights", share)
+        known = concrete(share)
+        if known is not None and not known.sum() > 0:
+            raise ValueError("weights must not all be zero")
+        finite("load", load)
+        positive("load", load)
+        return Support(array, as_float(load, array.dtype) * share / jnp.sum(share))
+
+    @staticmethod
+    def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
+        """Three points (3, 2) m under a weight above `center` (2,) m: statics alone gives each point's share.
+
+        Raises ValueError where the centre lies outside the three points (one would have to pull).
+        """
+        array = as_float(point)
+        shaped("point", array, (3, 2))
+        c = as_float(center, array.dtype)
+        balance = jnp.concatenate([array.T, jnp.ones((1, 3), array.dtype)])
+        share = jnp.linalg.solve(balance, jnp.append(c, jnp.ones((), array.dtype)))
+        known = concrete(share)
+        if known is not None and not np.all(known >= -1e-6):
+            raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
+        return Support.points(array, jnp.maximum(share, 0), load)
+
+    @staticmethod
+    def uniform(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+        """Uniform pressure over `shape`: a square grid of cell centres inside it, as near to `points` as one gets.
+
+        `load` = mu m g in N. A rectangle whose sides are in a ratio of whole numbers gets exactly `points` where the
+        ratio allows (a square with 64: 8 by 8).
+
+        Raises ValueError for fewer than one point; the shape must not be traced.
+        """
+        if points < 1:
+            raise ValueError(f"points must be at least 1; got {points}")
+        corners = concrete(jnp.stack(shape.bounds))
+        if corners is None:
+            raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
+        low, high = corners.astype(np.float64)
+        inside = jax.vmap(lambda outline, x: outline.signed_distance(x), in_axes=(None, 0))
+        best = None
+        # The area fixes the spacing but for the outline's share of cut cells; look around it.
+        base = np.sqrt(float(shape.area) / points)
+        for spacing in base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]:
+            count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
+            cell = (high - low) / count
+            x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
+            grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+            kept = grid[np.asarray(inside(shape, jnp.asarray(grid, corners.dtype))) <= 0]
+            if len(kept) and (best is None or abs(len(kept) - points) < abs(len(best) - points)):
+                best = kept
+            if best is not None and len(best) == points:
+                break
+        if best is None:
+            raise ValueError(f"points={points} is too few for a grid over this shape; give more")
+        return Support.points(jnp.asarray(best, corners.dtype), load=load)
+
+    @staticmethod
+    def rim(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+        """Pressure along the outline only: `points` points equally spaced on it; `load` = mu m g in N."""
+        if points < 1:
+            raise ValueError(f"points must be at least 1; got {points}")
+        return Support.points(shape.boundary(points), load=load)
+
+    @property
+    def load(self) -> Float[Array, ""]:
+        """mu m g, N: the largest force without rotation that the support resists."""
+        return jnp.sum(self.limit)
+
+    @property
+    def center(self) -> Float[Array, "2"]:
+        """Centre of pressure, m."""
+        return jnp.sum(self.limit[:, None] * self.point, axis=0) / self.load
+
+    @property
+    def radius_of_gyration(self) -> Float[Array, ""]:
+        """Root mean square distance of the pressure from its centre, m."""
+        squared = jnp.sum((self.point - self.center) ** 2, axis=1)
+        return jnp.sqrt(jnp.sum(self.limit * squared) / self.load)
+
+    def wrench(self, twist: ArrayLike, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
+        """The wrench (3,) in N, N m with which a hand balances friction while the slider moves with `twist` (3,).
+
+        Only the direction of the twist matters. Where the centre of rotation lies on a support point, the wrench
+        is one of a facet: its middle, or with a `key` a point drawn uniformly from it. A zero twist has no wrench
+        of its own; it gives the middle of all of them, zero.
+        """
+        v = as_float(twist, self.point.dtype)
+        shaped("twist", v, (3,))
+        finite("twist", v)
+        velocity = jnp.stack([v[0] - v[2] * self.point[:, 1], v[1] + v[2] * self.point[:, 0]], axis=1)
+        speed2 = jnp.sum(velocity**2, axis=1)
+        # rounding of the products above: slower than this is not sliding
+        reach = jnp.abs(v[2]) * jnp.max(jnp.abs(self.point)) + jnp.max(jnp.abs(v[:2]))
+        still = speed2 <= (8 * jnp.finfo(speed2.dtype).eps * reach) ** 2
+        force = jnp.where(still[:, None], 0.0, velocity / jnp.sqrt(jnp.where(still, 1.0, speed2))[:, None])
+        if key is not None:
+            moved = jnp.any(v != 0)
+            force = jnp.where((still & moved)[:, None], _in_unit_disc(key, len(self.point), v.dtype), force)
+        f = self.limit[:, None] * force
+        torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
+        return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
+
+    def wrench_twist_pairs(
+        self, key: Key[Array, ""], pairs: int = 400, length: ArrayLike | None = None
+    ) -> WrenchTwistPairs:
+        """Wrench-twist pairs on the exact limit surface, drawn with `key`.
+
+        Twists are uniform on the unit sphere of (vx, vy, length * omega), but for one in ten, whose centre of rotation
+        is a support point drawn by its load; its wrench is drawn from the facet. `length` (m) is the radius of
+        gyration unless given, or where that vanishes (one point), 1 m.
+        """
+        if pairs < 1:
+            raise ValueError(f"pairs must be at least 1; got {pairs}")
+        dtype = self.point.dtype
+        gyration = self.radius_of_gyration
+        rho = jnp.where(gyration > 0, gyration, 1.0) if length is None else as_float(length, dtype)
+        finite("length", rho)
+        positive("length", rho)
+        k_free, k_point, k_side, k_facet = jax.random.split(key, 4)
+        free = jax.random.normal(k_free, (pairs, 3), dtype)
+        about = jax.random.choice(k_point, self.point, (pairs,), p=self.limit / self.load)
+        # a rotation about r moves the origin with (r_y, -r_x) omega
+        spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
+        pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
+        facets = round(FACET_SHARE * pairs)
+        normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
+        normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
+        twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])
+        wrench = jax.vmap(self.wrench)(twist, jax.random.split(k_facet, pairs))
+        return WrenchTwistPairs(wrench, twist, rho)
+
+
+def _in_unit_disc(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
+    k_r, k_angle = jax.random.split(key)
+    radius = jnp.sqrt(jax.random.uniform(k_r, (count, 1), dtype))
+    angle = jax.random.uniform(k_angle, (count, 1), dtype, maxval=2 * jnp.pi)
+    return radius * jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=1)
