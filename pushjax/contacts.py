@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec2, select
+from pushjax._vec import Scalar, Vec2
 from pushjax.shapes import Outline
 
 # How deep, in units of the limit surface's length, a finger's centre may start inside the slider and still be pushed
@@ -19,42 +19,30 @@ DEEPEST_CENTER = 0.1
 
 
 class Meeting(NamedTuple):
-    """One finger and the slider within a step. Body frame, m.
+    """When, within a step, one finger meets the slider. Body frame, m.
 
     start: fraction of the path after which they are in contact. reached: whether they are at all. overlapping: whether
-    the finger's centre is too deep inside for the closest side to mean anything. point, normal (into the slider), gap:
-    the contact at that fraction; the gap is zero but for rounding, or the depth of an overlap, negative.
+    the finger's centre is too deep inside for the closest side to mean anything. gap: the gap then, which is the depth
+    of an overlap (negative) or zero.
     """
 
     start: Scalar
     reached: Bool[Array, ""]
     overlapping: Bool[Array, ""]
-    point: Vec2
-    normal: Vec2
     gap: Scalar
 
 
 def meet(outline: Outline, center: Vec2, path: Vec2, radius: Scalar, length: Scalar) -> Meeting:
-    """The contact of a disc that moves from `center` along `path`, both in the frame of a slider at rest."""
+    """The first contact of a disc that moves from `center` along `path`, both in the frame of a slider at rest."""
     here = outline.closest(center)
     gap = here.distance - radius
     # In contact and pressing on: from the start. Else, also when touching but leaving, whatever is hit first.
     pressing = (gap <= 0) & (-here.normal.dot(path) > gap)
     hit = outline.sweep(center, path, radius)
-    hits = hit <= 1
-    start = jnp.where(pressing, 0.0, jnp.where(hits, hit, 1.0))
-    there = outline.closest(center + path.scale(start))
+    reached = pressing | (hit <= 1)
     return Meeting(
-        start,
-        pressing | hits,
+        jnp.where(pressing, 0.0, jnp.where(reached, hit, 1.0)),
+        reached,
         here.distance < -DEEPEST_CENTER * length,
-        there.point,
-        -there.normal,
-        there.distance - radius,
+        jnp.where(pressing, gap, 0.0),
     )
-
-
-def touch(outline: Outline, center: Vec2, met: Meeting) -> tuple[Vec2, Vec2]:
-    """Contact point and inward normal as seen from a finger at `center`; those of `met` where nothing was reached."""
-    seen = outline.closest(center)
-    return select(met.reached, seen.point, met.point), select(met.reached, -seen.normal, met.normal)

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import Scalar, Vec2, Vec3, turn
-from pushjax.contacts import Meeting, meet, touch
+from pushjax._vec import Scalar, Vec2, Vec3, select, turn
+from pushjax.contacts import meet
 from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Outline, Shape
@@ -108,15 +108,6 @@ def _moved(pose: Vec3, contact: Vec2, motion: Vec3, angle: Vec2) -> Vec3:
     return Vec3(pose.x + straight.x - swing.x, pose.y + straight.y - swing.y, theta)
 
 
-def _push(
-    form: Form, met: Meeting, seen: tuple[Vec2, Vec2], path: Vec2, friction: Scalar, solver: StickingSolver
-) -> SingleMotion:
-    """Solve the contact `seen` (point, normal) for the part of `path` that pushes."""
-    share = jnp.where(met.reached, 1 - met.start, 0.0)
-    gap = jnp.where(met.reached, met.gap, 1.0)  # out of reach
-    return solve_single(form, Contact(*seen, path.scale(share), friction, gap), solver)
-
-
 def _advance(
     form: Form,
     outline: Outline,
@@ -128,37 +119,49 @@ def _advance(
     after: Vec2,
 ) -> _Record:
     """One step of one finger from `before` to `after` (world)."""
-    at_start = turn(pose.z)
     path = after - before
-    local = path.unrotate(at_start)
-    met = meet(outline, (before - pose.xy).unrotate(at_start), local, radius, form.length)
-    first = _push(form, met, (met.point, met.normal), local, friction, solver)
+    angle = turn(pose.z)
+    met = meet(outline, (before - pose.xy).unrotate(angle), path.unrotate(angle), radius, form.length)
+    meeting_point = before + path.scale(met.start)
+    pushed = path.scale(jnp.where(met.reached, 1 - met.start, 0.0))
+    gap = jnp.where(met.reached, met.gap, 1.0)  # else out of reach
 
-    half = _moved(pose, met.point, first.twist.scale(0.5), at_start)
-    halfway = turn(half.z)
-    center = (before + path.scale((1 + met.start) / 2) - half.xy).unrotate(halfway)
-    seen = touch(outline, center, met)
-    motion = _push(form, met, seen, path.unrotate(halfway), friction, solver)
-
-    moved = _moved(pose, seen[0], motion.twist, halfway)
-    failed = jnp.where(first.status == Status.MOVING, motion.status, jnp.maximum(first.status, motion.status))
-    status = jnp.where(met.overlapping, Status.OVERLAPPING, failed).astype(jnp.int8)
-    # Left where it is, not by way of arithmetic that might turn NaN into a pose
-    still = (status == Status.FREE) | (status >= Status.JAMMED)
-    valid = jnp.isfinite(moved.x + moved.y + moved.z)
-    status = jnp.where(still | valid, status, Status.INVALID).astype(jnp.int8)
-    still = still | ~valid
-
-    def kept(moving, resting):
-        return type(moving)(*(jnp.where(still, b, a) for a, b in zip(moving, resting, strict=True)))
+    def stage(carry, share):
+        """Solve the contact as it is when `share` of the last stage's motion is done."""
+        twist, point, angle, status = carry
+        there = _moved(pose, point, twist.scale(share), angle)
+        angle = turn(there.z)
+        seen = outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle))
+        contact = Contact(seen.point, -seen.normal, pushed.unrotate(angle), friction, gap)
+        motion = solve_single(form, contact, solver)
+        # A failed prediction must show, whatever the correction made of it
+        status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
+        return (motion.twist, seen.point, angle, status), motion
 
     zero = jnp.zeros_like(pose.x)
+    start = (Vec3(zero, zero, zero), Vec2(zero, zero), angle, jnp.zeros((), jnp.int8))
+    (twist, point, angle, status), motions = jax.lax.scan(stage, start, jnp.array([0.0, 0.5], zero.dtype))
+    motion: SingleMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
+    moved = _moved(pose, point, twist, angle)
+    status = jnp.where(met.overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
+    return _guarded(motion, moved, pose, status)
+
+
+def _guarded(motion: SingleMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> _Record:
+    """The record of a step; without motion the slider stays, not by way of arithmetic that might turn NaN into a pose."""
+    finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
+    moves = (status == Status.MOVING) & finite_pose
+    status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
+
+    def kept(moving):
+        return type(moving)(*(jnp.where(moves, entry, 0.0) for entry in moving))
+
     return _Record(
-        kept(moved, pose),
-        kept(motion.twist, Vec3(zero, zero, zero)),
-        kept(motion.wrench, Vec3(zero, zero, zero)),
-        kept(motion.force, Vec2(zero, zero)),
-        jnp.where(still, ContactMode.SEPARATED, motion.mode).astype(jnp.int8),
+        select(moves, moved, pose),
+        kept(motion.twist),
+        kept(motion.wrench),
+        kept(motion.force),
+        jnp.where(moves, motion.mode, ContactMode.SEPARATED).astype(jnp.int8),
         status,
     )
 

@@ -111,8 +111,9 @@ class ScalarRoot(StickingSolver):
         rounds = self.rounds
         if rounds is None:
             rounds = 8 if jnp.finfo(friction.dtype).bits <= 32 else 12
-        low, high = -friction, friction
-        for k in range(rounds):
+
+        def body(k, state):
+            s, low, high = state
             g = curve.motion(s)
             r = v.cross(g)
             side = jnp.where(g.x > 0, r, g.y)  # the sign of phi(s) - phi_v
@@ -121,9 +122,11 @@ class ScalarRoot(StickingSolver):
             slope = _slope(curve, v, s, g) - (d - 2) * r * g.y / (g.x + s * g.y)  # Euler: g_n + s g_t = d h
             newton = s - r / jnp.where(slope > 0, slope, 1.0)
             trusted = (slope > 0) & (power > 0) & (newton >= low) & (newton <= high)
-            if k >= 2:
-                trusted &= 3 * r * r < power * power
-            s = jnp.where(trusted, newton, (low + high) / 2)
+            trusted &= (k < 2) | (3 * r * r < power * power)
+            return jnp.where(trusted, newton, (low + high) / 2), low, high
+
+        # a loop, not written out: the compiler would work out each round's bracket anew from all rounds before it
+        s, _, _ = jax.lax.fori_loop(0, rounds, body, (s, -friction, friction))
         return s, jnp.full(jnp.shape(s), rounds, jnp.int32)
 
 
