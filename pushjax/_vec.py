@@ -8,6 +8,7 @@ where a user sees them (`of`, `array`).
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -84,6 +85,29 @@ class Vec3(NamedTuple):
 def turn(angle: Scalar) -> Vec2:
     """The unit vector (cos, sin) of an angle in rad."""
     return Vec2(jnp.cos(angle), jnp.sin(angle))
+
+
+def settle(values, witness: Scalar):
+    """`values`, any pytree of scalars, each worked out exactly once.
+
+    The compiler may fuse a value's arithmetic anew into each of its consumers, and round it differently there (fused
+    multiply-add or not). For a decision at a tie that is fatal: a finger straight out from a corner is equally near to
+    both edges, and fields selected by two copies of one comparison came from different edges; the slider jumped
+    (seen on the CPU with JAX 0.8 to 0.10). It is slow too. An optimization barrier does not stop it there, a
+    division does, because those are never done twice: so divide by a one that is not known to be one.
+
+    witness: any finite scalar that is not a compile-time constant. Where it is not finite, decisions are False.
+    """
+    one = jax.lax.stop_gradient(witness) * 0 + 1
+
+    def settled(value):
+        if jnp.issubdtype(value.dtype, jnp.floating):
+            return value / one
+        if value.dtype != bool:
+            raise TypeError(f"settle takes floats and booleans, not {value.dtype}")
+        return value.astype(one.dtype) / one > 0.5
+
+    return jax.tree.map(settled, values)
 
 
 def select(condition, yes, no):

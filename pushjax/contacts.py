@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec2
+from pushjax._vec import Scalar, Vec2, settle
 from pushjax.shapes import Outline
 
 # How deep, in units of the limit surface's length, a finger's centre may start inside the slider and still be pushed
@@ -37,9 +37,9 @@ def meet(outline: Outline, center: Vec2, path: Vec2, radius: Scalar, length: Sca
     here = outline.closest(center)
     gap = here.distance - radius
     # In contact and pressing on: from the start. Else, also when touching but leaving, whatever is hit first.
-    pressing = (gap <= 0) & (-here.normal.dot(path) > gap)
     hit = outline.sweep(center, path, radius)
-    reached = pressing | (hit <= 1)
+    pressing, hits = settle(((gap <= 0) & (-here.normal.dot(path) > gap), hit <= 1), center.x)
+    reached = pressing | hits
     return Meeting(
         jnp.where(pressing, 0.0, jnp.where(reached, hit, 1.0)),
         reached,

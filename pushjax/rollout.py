@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import Scalar, Vec2, Vec3, select, turn
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
 from pushjax.contacts import meet
 from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface
@@ -150,7 +150,7 @@ def _advance(
 def _guarded(motion: SingleMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> _Record:
     """The record of a step; without motion the slider stays, not by way of arithmetic that might turn NaN into a pose."""
     finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
-    moves = (status == Status.MOVING) & finite_pose
+    moves = settle((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
 
     def kept(moving):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from pushjax._checks import as_float, concrete, finite, positive, shaped
-from pushjax._vec import Scalar, Vec2, select
+from pushjax._vec import Scalar, Vec2, select, settle
 from pushjax.shapes._base import Closest, Outline, Shape, first_hit
 
 # Up to this many edges the search over edges is written out, edge by edge, so that a batch vectorises across its
@@ -66,7 +66,7 @@ class PolygonOutline(Outline):
             if best_squared is None:
                 best_squared = squared
                 continue
-            nearer = squared < best_squared
+            nearer = settle(squared < best_squared, x.x)
             best = select(nearer, edge, best)
             best_squared = jnp.where(nearer, squared, best_squared)
         return best

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._vec import Scalar, Vec2, Vec3, select
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle
 from pushjax.limit_surface import Form
 from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve.sticking import StickingSolver, tolerance
@@ -36,14 +36,15 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     mu, curve = contact.friction, LimitCurve.of(form, contact)
     v = contact.approach()
     valid = jnp.isfinite(v.x + v.y + sum(curve.c)) & (mu >= 0)
-    pushes = valid & (v.x > 0)
+    pushes = settle(valid & (v.x > 0), v.x)
     v = select(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # something to compute on
     mu = jnp.where(valid, mu, 0.0)
     curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
 
     left_edge, right_edge = curve.motion(mu), curve.motion(-mu)
     left = (left_edge.x > 0) & (left_edge.cross(v) > 0)
-    right = ~left & (right_edge.x > 0) & (right_edge.cross(v) < 0)
+    right = (right_edge.x > 0) & (right_edge.cross(v) < 0)
+    left, right = settle((left, right & ~left), v.x)
     slides = left | right
 
     stuck = solver(curve, v, mu)
@@ -60,7 +61,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     linear = normal.scale(follow.x) + normal.perp().scale(follow.y) - contact.point.perp().scale(omega)
     h = curve.value(s)
     solved = (h > 0) & (slides | (stuck.residual <= tolerance(s.dtype))) & jnp.isfinite(omega)
-    moves = pushes & solved
+    moves = settle(pushes & solved, v.x)
     scale = jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)
 
     def where_moving(value):
