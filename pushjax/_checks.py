@@ -29,7 +29,11 @@ def as_float(value: Any, dtype: Any = None) -> jax.Array:
 
 def common_dtype(*values: Any) -> Any:
     """The floating dtype in which a computation over `values` runs; Python numbers do not decide it."""
-    dtypes = [v.dtype for v in jax.tree.leaves(values) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
+    dtypes = [
+        v.dtype
+        for v in jax.tree.leaves(values)
+        if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)
+    ]
     return jnp.result_type(*dtypes) if dtypes else jnp.result_type(float)
 
 

@@ -76,5 +76,7 @@ def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[A
     if known is not None:
         bad = np.flatnonzero(~np.isfinite(known).all(axis=1))
         if bad.size:
-            raise ValueError(f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}")
+            raise ValueError(
+                f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}"
+            )
     return p

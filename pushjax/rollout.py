@@ -9,7 +9,7 @@ turning the hand's displacement by the slider's angle):
 
 This is the midpoint rule: second order within a mode and, because motion is continuous across modes, across
 changes of mode too. The gap of the meeting is part of the contact problem, so an overlap is pushed out within one step
-and what the rule leaves does not add up (the paper's open problem 2: Zhou et al. 2017, section VI).
+and what the rule leaves does not add up (the paper's open problem 2: Zhou et al. 2017, section VII).
 
 The slider is moved so that its contact point goes exactly where the contact problem says, in the world, and the
 rest turns about it. Where the finger sticks, slip is then zero to rounding, not to the order of the scheme.
@@ -131,7 +131,9 @@ def _advance(
         twist, point, angle, status = carry
         there = _moved(pose, point, twist.scale(share), angle)
         angle = turn(there.z)
-        seen = outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle))
+        seen = settle(
+            outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle)), pose.x
+        )
         contact = Contact(seen.point, -seen.normal, pushed.unrotate(angle), friction, gap)
         motion = solve_single(form, contact, solver)
         # A failed prediction must show, whatever the correction made of it
@@ -256,7 +258,7 @@ def rollout(
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a finger that starts inside
     the slider, where they are not traced; where they are, `status` says so at every step, and `first_failure` where.
 
-    Source: Zhou et al. 2017, sections III and VI (open problem 2); the scheme is described in this module's header.
+    Source: Zhou et al. 2017, section IV.A and open problem 2 of section VII; the scheme is described in this module's header.
     """
     slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, path)
     p = checked_path(path, hand.dof, dtype)
@@ -275,6 +277,9 @@ def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
         return record.pose, record
 
     ends = tuple(c[:-1] for c in columns), tuple(c[1:] for c in columns)
+    # Only poses are kept for reverse mode and a step is worked out again there: writing out everything a step
+    # computes, and reading it back, took twice as long as computing it again.
+    body = jax.checkpoint(body, prevent_cse=False)
     _, records = jax.lax.scan(body, Vec3.of(pose), ends)
     steps = _world(records, form.length)
     poses = jnp.concatenate([pose[None], steps.pose])

@@ -12,7 +12,7 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
     Shapes (..., 3) each, `length` in m (the paper uses the object's characteristic length); the result is in m.
     Its gradient at equal positions, where the distance has a corner, is zero.
 
-    Source: Zhou et al. 2017, section V.A.
+    Source: Zhou et al. 2017, section VI.A.
     """
     positive("length", length)
     a, b = as_float(pose_a), as_float(pose_b)

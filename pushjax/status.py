@@ -7,7 +7,7 @@ class ContactMode(IntEnum):
     """How the pusher and the slider move against each other at a contact.
 
     LEFT and RIGHT name the pusher's slip relative to the slider, seen along the inward normal: left is towards
-    the tangent t = (-n_y, n_x), and the friction on the slider is then +mu f_n (Zhou et al. 2017, section III.A).
+    the tangent t = (-n_y, n_x), and the friction on the slider is then +mu f_n (Zhou et al. 2017, section IV.A).
     """
 
     SEPARATED = 0

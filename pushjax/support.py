@@ -83,7 +83,9 @@ class Support(eqx.Module):
         share = jnp.linalg.solve(balance, jnp.append(c, jnp.ones((), array.dtype)))
         known = concrete(share)
         if known is not None and not np.all(known >= -1e-6):
-            raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
+            raise ValueError(
+                f"center must lie inside the three support points; it asks for shares {known.tolist()}"
+            )
         return Support.points(array, jnp.maximum(share, 0), load)
 
     @staticmethod
@@ -105,7 +107,9 @@ class Support(eqx.Module):
         best = None
         # The area fixes the spacing but for the outline's share of cut cells; look around it.
         base = np.sqrt(float(shape.area) / points)
-        for spacing in base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]:
+        for spacing in (
+            base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]
+        ):
             count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
             cell = (high - low) / count
             x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
@@ -186,7 +190,9 @@ class Support(eqx.Module):
         about = jax.random.choice(k_point, self.point, (pairs,), p=self.limit / self.load)
         # a rotation about r moves the origin with (r_y, -r_x) omega
         spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
-        pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
+        pivot = spin[:, None] * jnp.stack(
+            [about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1
+        )
         facets = round(FACET_SHARE * pairs)
         normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
         normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)

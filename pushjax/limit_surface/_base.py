@@ -2,7 +2,7 @@
 
 A limit surface is the level set H(F) = 1 of a convex polynomial, homogeneous of even degree d, over the normalised
 wrench F = (fx, fy, tau / length). While the slider slides, its normalised twist (vx, vy, length * omega) is a positive
-multiple of grad H(F) (Zhou et al. 2016; Zhou et al. 2017, section II.A). Euler's identities, used throughout:
+multiple of grad H(F) (Zhou et al. 2016; Zhou et al. 2017, section III.A). Euler's identities, used throughout:
 F . grad H = d H and hess H F = (d - 1) grad H.
 """
 
@@ -50,7 +50,9 @@ class Symmetric3(NamedTuple):
         return Symmetric3(axx, ayy, azz, axy, axz, ayz).times(v).scale(inverse)
 
     def array(self) -> Float[Array, "3 3"]:
-        return jnp.array([[self.xx, self.xy, self.xz], [self.xy, self.yy, self.yz], [self.xz, self.yz, self.zz]])
+        return jnp.array(
+            [[self.xx, self.xy, self.xz], [self.xy, self.yy, self.yz], [self.xz, self.yz, self.zz]]
+        )
 
 
 class Form(Protocol):
@@ -163,7 +165,9 @@ class LimitSurface(eqx.Module):
         finite("twist", v)
         known = concrete(v)
         if known is not None and not known.any():
-            raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
+            raise ValueError(
+                "twist is zero: every wrench inside the limit surface has it, none is singled out"
+            )
         n = jnp.stack([v[0], v[1], v[2] * self.length])
         size = jnp.max(jnp.abs(n))  # first to order one, so that squares neither under- nor overflow
         usable = jnp.isfinite(size) & (size > 0)

@@ -72,9 +72,7 @@ class Ellipsoid(LimitSurface):
 
     def form(self) -> EllipsoidForm:
         m = self.A
-        return EllipsoidForm(
-            Symmetric3(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]), self.length
-        )
+        return EllipsoidForm(Symmetric3(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]), self.length)
 
     def is_convex(self) -> bool:
         return bool(np.linalg.eigvalsh(np.asarray(self.A, np.float64))[0] > 0)

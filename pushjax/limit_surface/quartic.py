@@ -66,7 +66,8 @@ class QuarticForm(_QuarticFields):
         c, (x, y, z) = self.c, f
         xx, yy, zz = x * x, y * y, z * z
         return (
-            z * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
+            z
+            * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
             + xx * (c[4] * x + c[12] * y)
             + yy * (c[6] * y + c[13] * x)
         )

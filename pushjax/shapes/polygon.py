@@ -221,7 +221,9 @@ def _check_simple(v: np.ndarray) -> None:
     a, b = v, np.roll(v, -1, axis=0)
 
     def side(p, q, r):
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
+            r[..., 0] - p[..., 0]
+        )
 
     p, q, r, s = a[:, None], b[:, None], a[None], b[None]
     crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
@@ -233,7 +235,9 @@ def _check_simple(v: np.ndarray) -> None:
         raise ValueError(f"vertices enclose no area ({abs(_signed_area(v)):.3g} m^2)")
     if bad.any():
         i, j = np.argwhere(bad)[0]
-        raise ValueError(f"vertices: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
+        raise ValueError(
+            f"vertices: the outline crosses or touches itself (edges {i} and {j}, counted from 0)"
+        )
 
 
 def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:

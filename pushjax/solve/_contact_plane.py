@@ -16,7 +16,7 @@ slides past it. Hence the pusher slides left if and only if, at s = mu,
 
     motion_n > 0  and  cross(motion, v) > 0,
 
-without any arctangent, and mirrored for right (Zhou et al. 2017, section III.A, which tests the cross product only).
+without any arctangent, and mirrored for right (Zhou et al. 2017, section IV.A, which tests the cross product only).
 """
 
 from typing import NamedTuple

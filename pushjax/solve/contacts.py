@@ -56,12 +56,16 @@ class Contacts(eqx.Module):
         non_negative("friction", self.friction)
         known = concrete(self.normal)
         if known is not None and np.any(np.abs(np.linalg.norm(known, axis=1) - 1) > UNIT_TOLERANCE):
-            raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
+            raise ValueError(
+                f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}"
+            )
 
 
 def _each(name: str, value: Array, contacts: int) -> Array:
     if value.ndim and value.shape != (contacts,):
-        raise ValueError(f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact")
+        raise ValueError(
+            f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact"
+        )
     return jnp.broadcast_to(value, (contacts,))
 
 
@@ -98,7 +102,7 @@ def solve_contacts(
     Raises ValueError unless there is exactly one contact. Traced values that are not finite, or a negative friction,
     give `Status.INVALID` and no motion.
 
-    Source: Zhou et al. 2017, section III.A; the gap is that of Stewart & Trinkle 1996.
+    Source: Zhou et al. 2017, section IV.A; the gap is that of Stewart & Trinkle 1996.
     """
     m = contacts.point.shape[0]
     if m != 1:
@@ -151,7 +155,7 @@ def motion_cone(
     """Left and right edge of the motion cone: unit velocities of the contact point under the friction cone's edges.
 
     A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The cone
-    may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section III.A.
+    may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section IV.A.
     """
     dtype = common_dtype(surface, point, normal)
     contacts = Contacts(

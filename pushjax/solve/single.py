@@ -24,7 +24,7 @@ class SingleMotion(NamedTuple):
 
 
 def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> SingleMotion:
-    """Map the pusher's displacement at one contact to the slider's twist (Zhou et al. 2017, section III.A).
+    """Map the pusher's displacement at one contact to the slider's twist (Zhou et al. 2017, section IV.A).
 
     The contact point follows the pusher along the normal exactly; along the tangent exactly where it sticks, else
     along the motion cone's edge. That part of the twist is never computed from the surface, so a sticking contact
@@ -33,7 +33,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     The sliding scale v_n / motion_n needs no guard against a small motion_n: sliding left means
     motion_n v_t > motion_t v_n, so it stays below v_t / motion_t.
     """
-    mu, curve = contact.friction, LimitCurve.of(form, contact)
+    mu, curve = contact.friction, settle(LimitCurve.of(form, contact), contact.gap)
     v = contact.approach()
     valid = jnp.isfinite(v.x + v.y + sum(curve.c)) & (mu >= 0)
     pushes = settle(valid & (v.x > 0), v.x)
@@ -67,7 +67,9 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     def where_moving(value):
         return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
 
-    mode = jnp.where(left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING))
+    mode = jnp.where(
+        left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING)
+    )
     status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
     return SingleMotion(
         where_moving(Vec3(linear.x, linear.y, omega)),

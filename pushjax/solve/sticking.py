@@ -142,7 +142,7 @@ class HessianIteration(StickingSolver):
     because near the solution the function's own differences drown in rounding). Each round ends with the best
     multiple of f (closed form by homogeneity), which makes the count independent of the scale of H.
 
-    Source: Zhou et al. 2017, section III.A, corollary 1; deviations: the damping, the line search, the rescaling.
+    Source: Zhou et al. 2017, section IV.A, corollary 1; deviations: the damping, the line search, the rescaling.
     """
 
     max_rounds: int = eqx.field(static=True, default=25)
