@@ -5,16 +5,21 @@ checked, values are not, and what goes wrong shows up as a status. Every message
 given and what is allowed.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike
+
+Numeric = ArrayLike | Sequence[Any]  # what a caller may give for an array: also lists and tuples of numbers
 
 
 def concrete(value: Any) -> np.ndarray | None:
     """The value as a numpy array, or None while it is being traced."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return None
     return np.asarray(value)
 
@@ -29,11 +34,7 @@ def as_float(value: Any, dtype: Any = None) -> jax.Array:
 
 def common_dtype(*values: Any) -> Any:
     """The floating dtype in which a computation over `values` runs; Python numbers do not decide it."""
-    dtypes = [
-        v.dtype
-        for v in jax.tree.leaves(values)
-        if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)
-    ]
+    dtypes = [v.dtype for v in jax.tree.leaves(values) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
     return jnp.result_type(*dtypes) if dtypes else jnp.result_type(float)
 
 
@@ -52,7 +53,8 @@ def finite(name: str, value: Any) -> None:
     if known is not None and not np.all(np.isfinite(known)):
         bad = np.argwhere(~np.isfinite(np.atleast_1d(known)))
         raise ValueError(
-            f"{name} must be finite; found {len(bad)} NaN or infinite value(s), the first at index {tuple(bad[0].tolist())}"
+            f"{name} must be finite; found {len(bad)} NaN or infinite value(s), "
+            f"the first at index {tuple(bad[0].tolist())}"
         )
 
 
@@ -70,3 +72,8 @@ def non_negative(name: str, value: Any) -> None:
 
 def _brief(value: np.ndarray) -> str:
     return str(value.item()) if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
+
+
+def traced(tree: Any) -> bool:
+    """Whether anything in `tree` is being traced."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

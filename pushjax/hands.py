@@ -5,9 +5,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
 from pushjax._vec import Scalar, Vec2
 
 
@@ -21,7 +21,7 @@ class Hand(eqx.Module):
     dof: int = eqx.field(static=True)
 
     @staticmethod
-    def finger(radius: ArrayLike = 0.0) -> "Hand":
+    def finger(radius: Numeric = 0.0) -> "Hand":
         """One round finger of `radius` m that does not turn; its configuration is (x, y) of its centre, world, m."""
         r = as_float(radius)
         shaped("radius", r, ())
@@ -35,7 +35,7 @@ class Hand(eqx.Module):
         return (Vec2(x, y),)
 
 
-def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
+def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
     """A straight path of `steps` equal steps between two configurations (dof,), both included.
 
     Raises ValueError for fewer than one step, or configurations that differ in shape or are not finite.
@@ -52,7 +52,7 @@ def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+
     return a * (1 - t) + b * t  # exact at both ends
 
 
-def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
+def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
     """A recorded path (points, dof) as `steps` steps of equal length along it; its first and last points stay.
 
     Length is measured in the configuration's own units, straight from point to point. A path that does not move
@@ -67,7 +67,7 @@ def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
     return jnp.stack([jnp.interp(at, arc, column) for column in p.T], axis=1)
 
 
-def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:
+def checked_path(path: Numeric, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:
     p = as_float(path, dtype)
     shaped("path", p, ("steps + 1", "dof" if dof is None else dof))
     if p.shape[0] < 2:
@@ -76,7 +76,5 @@ def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[A
     if known is not None:
         bad = np.flatnonzero(~np.isfinite(known).all(axis=1))
         if bad.size:
-            raise ValueError(
-                f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}"
-            )
+            raise ValueError(f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}")
     return p

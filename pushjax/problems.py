@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, QuarticForm
 from pushjax._vec import Vec3
+from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, QuarticForm
 
 
 class ContactProblem(NamedTuple):

@@ -20,11 +20,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped, traced
 from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
-from pushjax.contacts import meet
+from pushjax.contacts import DEEPEST_CENTER, meet
 from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Outline, Shape
@@ -43,8 +43,8 @@ class Step(eqx.Module):
     """One step of a push.
 
     pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
-    along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame halfway;
-    zero and SEPARATED where nothing pushes. status: `Status`.
+    along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
+    halfway; zero and SEPARATED where nothing pushes. status: `Status`.
     """
 
     pose: Float[Array, "3"]
@@ -101,7 +101,7 @@ def _world(record: _Record, length: Scalar) -> Step:
 
 
 def _moved(pose: Vec3, contact: Vec2, motion: Vec3, angle: Vec2) -> Vec3:
-    """`pose` after the body twist `motion`, its material point `contact` going straight along `angle` times its motion."""
+    """`pose` after the body twist `motion`; the point `contact` of the slider goes straight, as seen at `angle`."""
     straight = (motion.xy + contact.perp().scale(motion.z)).rotate(angle)
     theta = pose.z + motion.z
     swing = contact.rotate(turn(theta)) - contact.rotate(turn(pose.z))
@@ -131,9 +131,7 @@ def _advance(
         twist, point, angle, status = carry
         there = _moved(pose, point, twist.scale(share), angle)
         angle = turn(there.z)
-        seen = settle(
-            outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle)), pose.x
-        )
+        seen = settle(outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle)), pose.x)
         contact = Contact(seen.point, -seen.normal, pushed.unrotate(angle), friction, gap)
         motion = solve_single(form, contact, solver)
         # A failed prediction must show, whatever the correction made of it
@@ -150,7 +148,7 @@ def _advance(
 
 
 def _guarded(motion: SingleMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> _Record:
-    """The record of a step; without motion the slider stays, not by way of arithmetic that might turn NaN into a pose."""
+    """The record of a step; without motion the slider stays, untouched by arithmetic that might have failed."""
     finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
     moves = settle((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
@@ -168,7 +166,7 @@ def _guarded(motion: SingleMotion, moved: Vec3, pose: Vec3, status: Int[Array, "
     )
 
 
-def _arguments(slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike, *paths: ArrayLike):
+def _arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *paths: Numeric):
     """Everything in one floating dtype, and checked as far as values are known."""
     dtype = common_dtype(slider, hand, pose, friction, *paths)
     start, mu = as_float(pose, dtype), as_float(friction, dtype)
@@ -184,35 +182,32 @@ def _arguments(slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike,
 
 
 def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> None:
-    if concrete(pose) is None or concrete(configuration) is None or concrete(hand.radius) is None:
+    if traced((slider, hand, pose, configuration)):
         return
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(slider)):
-        return
-    (status, depth) = _start(slider, hand, pose, configuration)
-    if bool(status):
+    depth, allowed = float(_depth(slider, hand, pose, configuration)), DEEPEST_CENTER * float(slider.surface.length)
+    if depth > allowed:
         raise ValueError(
-            f"path starts with the hand inside the slider: a finger's centre is {1e3 * float(depth):.3g} mm deep; "
-            f"at most {1e3 * 0.1 * float(slider.surface.length):.3g} mm (a tenth of the surface's length) is pushed out"
+            f"path starts with the hand inside the slider: a finger's centre is {1e3 * depth:.3g} mm deep; at most "
+            f"{1e3 * allowed:.3g} mm ({DEEPEST_CENTER:g} of the surface's length) is pushed out"
         )
 
 
 @eqx.filter_jit
-def _start(slider: Slider, hand: Hand, pose: Array, configuration: Array):
+def _depth(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> Scalar:
+    """How deep inside the slider the finger's centre is, m."""
     (center,) = hand.centers(tuple(configuration))
     local = (center - Vec3.of(pose).xy).unrotate(turn(pose[2]))
-    zero = jnp.zeros_like(pose[0])
-    met = meet(slider.shape.outline(), local, Vec2(zero, zero), hand.radius[0], slider.surface.length)
-    return met.overlapping, -slider.shape.outline().closest(local).distance
+    return -slider.shape.outline().closest(local).distance
 
 
 def step(
     slider: Slider,
     hand: Hand,
-    q0: ArrayLike,
-    q1: ArrayLike,
+    q0: Numeric,
+    q1: Numeric,
     *,
-    pose: ArrayLike,
-    friction: ArrayLike,
+    pose: Numeric,
+    friction: Numeric,
     solver: StickingSolver | None = None,
 ) -> Step:
     """Move the hand from configuration `q0` (dof,) to `q1` (dof,), world, m: the one step that `rollout` scans.
@@ -241,24 +236,24 @@ def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
 def rollout(
     slider: Slider,
     hand: Hand,
-    path: ArrayLike,
+    path: Numeric,
     *,
-    pose: ArrayLike,
-    friction: ArrayLike,
+    pose: Numeric,
+    friction: Numeric,
     solver: StickingSolver | None = None,
 ) -> Trajectory:
     """Push the slider along a path of hand configurations.
 
-    path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose: (3,),
-    the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,). There is
-    no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
+    path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose:
+    (3,), the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,).
+    There is no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
 
     Differentiable, forward and reverse, in slider, hand, path, pose and friction. Batches come from `vmap`.
 
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a finger that starts inside
     the slider, where they are not traced; where they are, `status` says so at every step, and `first_failure` where.
 
-    Source: Zhou et al. 2017, section IV.A and open problem 2 of section VII; the scheme is described in this module's header.
+    Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; this module's header has the scheme.
     """
     slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, path)
     p = checked_path(path, hand.dof, dtype)

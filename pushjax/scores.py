@@ -1,12 +1,12 @@
 """How far a prediction is from what happened."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, positive
+from pushjax._checks import Numeric, as_float, positive
 
 
-def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[Array, "*batch"]:
+def deviation(pose_a: Numeric, pose_b: Numeric, length: Numeric) -> Float[Array, "*batch"]:
     """The paper's distance of two poses: |difference in position| + length * |smaller angle between them|.
 
     Shapes (..., 3) each, `length` in m (the paper uses the object's characteristic length); the result is in m.
@@ -21,4 +21,4 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
     zero = squared == 0
     distance = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
     angle = jnp.abs(delta[..., 2]) % (2 * jnp.pi)
-    return distance + length * jnp.minimum(angle, 2 * jnp.pi - angle)
+    return distance + as_float(length) * jnp.minimum(angle, 2 * jnp.pi - angle)

@@ -7,21 +7,21 @@ broadcast over the axes before it.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float
+from pushjax._checks import Numeric, as_float
 
 Pose = Float[Array, "*batch 3"]
 Twist = Float[Array, "*batch 3"]
 Wrench = Float[Array, "*batch 3"]
 
 
-def _split(value: ArrayLike) -> tuple[Array, Array, Array]:
+def _split(value: Numeric) -> tuple[Array, Array, Array]:
     array = as_float(value)
     return array[..., 0], array[..., 1], array[..., 2]
 
 
-def compose(pose: ArrayLike, relative: ArrayLike) -> Pose:
+def compose(pose: Numeric, relative: Numeric) -> Pose:
     """The pose of a frame that has pose `relative` in the frame `pose`. Shapes (..., 3), m and rad."""
     x, y, theta = _split(pose)
     dx, dy, dtheta = _split(relative)
@@ -29,14 +29,14 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Pose:
     return jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, theta + dtheta], axis=-1)
 
 
-def inverse(pose: ArrayLike) -> Pose:
+def inverse(pose: Numeric) -> Pose:
     """The pose of the world in the body frame: compose(pose, inverse(pose)) is zero. Shape (..., 3)."""
     x, y, theta = _split(pose)
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
 
 
-def transform(pose: ArrayLike, point: ArrayLike) -> Float[Array, "*batch 2"]:
+def transform(pose: Numeric, point: Numeric) -> Float[Array, "*batch 2"]:
     """World coordinates (..., 2) of body points (..., 2), m."""
     x, y, theta = _split(pose)
     p = as_float(point)
@@ -55,14 +55,14 @@ def _sinc_pair(omega: Array) -> tuple[Array, Array]:
     return a, b
 
 
-def exp(twist: ArrayLike) -> Pose:
+def exp(twist: Numeric) -> Pose:
     """The relative pose reached by a constant body twist (..., 3) in unit time; the angle is not wrapped."""
     vx, vy, omega = _split(twist)
     a, b = _sinc_pair(omega)
     return jnp.stack([a * vx - b * vy, b * vx + a * vy, omega], axis=-1)
 
 
-def log(relative: ArrayLike) -> Twist:
+def log(relative: Numeric) -> Twist:
     """The body twist whose `exp` is `relative`; inverse of `exp` for |theta| < 2 pi (it is singular there)."""
     x, y, omega = _split(relative)
     a, b = _sinc_pair(omega)
@@ -70,7 +70,7 @@ def log(relative: ArrayLike) -> Twist:
     return jnp.stack([scale * (a * x + b * y), scale * (a * y - b * x), omega], axis=-1)
 
 
-def transport_twist(relative: ArrayLike, twist: ArrayLike) -> Twist:
+def transport_twist(relative: Numeric, twist: Numeric) -> Twist:
     """A twist given in frame B, expressed in frame A, where B has pose `relative` in A (the adjoint map)."""
     x, y, theta = _split(relative)
     vx, vy, omega = _split(twist)
@@ -78,7 +78,7 @@ def transport_twist(relative: ArrayLike, twist: ArrayLike) -> Twist:
     return jnp.stack([c * vx - s * vy + y * omega, s * vx + c * vy - x * omega, omega], axis=-1)
 
 
-def transport_wrench(relative: ArrayLike, wrench: ArrayLike) -> Wrench:
+def transport_wrench(relative: Numeric, wrench: Numeric) -> Wrench:
     """A wrench given in frame B, expressed in frame A, where B has pose `relative` in A.
 
     Power is the same in both frames: transport_twist(T, V) . transport_wrench(T, W) = V . W.

@@ -14,9 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, Float, Key
 
-from pushjax._checks import as_float, concrete, finite, non_negative, positive, shaped
+from pushjax._checks import Numeric, as_float, concrete, finite, non_negative, positive, shaped
 from pushjax.shapes import Shape
 
 FACET_SHARE = 0.1  # of the wrench-twist pairs
@@ -42,7 +42,7 @@ class Support(eqx.Module):
     point: Float[Array, "points 2"]
     limit: Float[Array, "points"]
 
-    def __init__(self, point: ArrayLike, limit: ArrayLike):
+    def __init__(self, point: Numeric, limit: Numeric):
         self.point = as_float(point)
         self.limit = as_float(limit, self.point.dtype)
         shaped("point", self.point, ("points", 2))
@@ -55,7 +55,7 @@ class Support(eqx.Module):
             raise ValueError("limit: at least one support point must carry a load; all are zero")
 
     @staticmethod
-    def points(point: ArrayLike, weights: ArrayLike | None = None, load: ArrayLike = 1.0) -> "Support":
+    def points(point: Numeric, weights: Numeric | None = None, load: Numeric = 1.0) -> "Support":
         """Given points (points, 2) m that share the friction limit `load` = mu m g (N) by `weights` (default equal)."""
         array = as_float(point)
         shaped("point", array, ("points", 2))
@@ -71,7 +71,7 @@ class Support(eqx.Module):
         return Support(array, as_float(load, array.dtype) * share / jnp.sum(share))
 
     @staticmethod
-    def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
+    def tripod(point: Numeric, load: Numeric = 1.0, center: Numeric = (0.0, 0.0)) -> "Support":
         """Three points (3, 2) m under a weight above `center` (2,) m: statics alone gives each point's share.
 
         Raises ValueError where the centre lies outside the three points (one would have to pull).
@@ -83,13 +83,11 @@ class Support(eqx.Module):
         share = jnp.linalg.solve(balance, jnp.append(c, jnp.ones((), array.dtype)))
         known = concrete(share)
         if known is not None and not np.all(known >= -1e-6):
-            raise ValueError(
-                f"center must lie inside the three support points; it asks for shares {known.tolist()}"
-            )
+            raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
         return Support.points(array, jnp.maximum(share, 0), load)
 
     @staticmethod
-    def uniform(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+    def uniform(shape: Shape, points: int = 64, load: Numeric = 1.0) -> "Support":
         """Uniform pressure over `shape`: a square grid of cell centres inside it, as near to `points` as one gets.
 
         `load` = mu m g in N. A rectangle whose sides are in a ratio of whole numbers gets exactly `points` where the
@@ -107,9 +105,7 @@ class Support(eqx.Module):
         best = None
         # The area fixes the spacing but for the outline's share of cut cells; look around it.
         base = np.sqrt(float(shape.area) / points)
-        for spacing in (
-            base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]
-        ):
+        for spacing in base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]:
             count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
             cell = (high - low) / count
             x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
@@ -124,7 +120,7 @@ class Support(eqx.Module):
         return Support.points(jnp.asarray(best, corners.dtype), load=load)
 
     @staticmethod
-    def rim(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+    def rim(shape: Shape, points: int = 64, load: Numeric = 1.0) -> "Support":
         """Pressure along the outline only: `points` points equally spaced on it; `load` = mu m g in N."""
         if points < 1:
             raise ValueError(f"points must be at least 1; got {points}")
@@ -146,7 +142,7 @@ class Support(eqx.Module):
         squared = jnp.sum((self.point - self.center) ** 2, axis=1)
         return jnp.sqrt(jnp.sum(self.limit * squared) / self.load)
 
-    def wrench(self, twist: ArrayLike, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
+    def wrench(self, twist: Numeric, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
         """The wrench (3,) in N, N m with which a hand balances friction while the slider moves with `twist` (3,).
 
         Only the direction of the twist matters. Where the centre of rotation lies on a support point, the wrench
@@ -170,7 +166,7 @@ class Support(eqx.Module):
         return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
 
     def wrench_twist_pairs(
-        self, key: Key[Array, ""], pairs: int = 400, length: ArrayLike | None = None
+        self, key: Key[Array, ""], pairs: int = 400, length: Numeric | None = None
     ) -> WrenchTwistPairs:
         """Wrench-twist pairs on the exact limit surface, drawn with `key`.
 
@@ -190,9 +186,7 @@ class Support(eqx.Module):
         about = jax.random.choice(k_point, self.point, (pairs,), p=self.limit / self.load)
         # a rotation about r moves the origin with (r_y, -r_x) omega
         spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
-        pivot = spin[:, None] * jnp.stack(
-            [about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1
-        )
+        pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
         facets = round(FACET_SHARE * pairs)
         normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
         normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)

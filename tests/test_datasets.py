@@ -25,9 +25,7 @@ from pushjax.datasets.records import MOST_SAMPLES
 
 # --- against the curated arrays ---
 
-CONDITIONS = [
-    f"{s}_{a}" for s in ("hardboard", "plywood") for a in ("3pts1", "3pts2", "3pts3", "3pts4", "patch")
-]
+CONDITIONS = [f"{s}_{a}" for s in ("hardboard", "plywood") for a in ("3pts1", "3pts2", "3pts3", "3pts4", "patch")]
 # Logged quaternions are off unit norm by up to 7e-7. The loader normalises them, the curated arrays do not:
 # times the 0.07 m to the centre of mass that is 1e-7 m, and a few 1e-6 rad.
 POSITION_TOLERANCE = 3e-7
@@ -101,9 +99,7 @@ def test_text_log_gives_the_curated_finger_path(both) -> None:
         np.testing.assert_allclose(push.tip, tidy["tip_xy"][rows], rtol=0, atol=TIP_TOLERANCE)
         np.testing.assert_allclose(push.tip_time, tidy["tip_t"][rows], rtol=0, atol=TIME_TOLERANCE)
         assert angle_between(push.tip_yaw, tidy["tip_yaw"][rows].astype(float)).max() < YAW_TOLERANCE
-        np.testing.assert_allclose(
-            raw.commanded_tip_end(push), tidy["tip_end_commanded_xy"][row], rtol=0, atol=EXACT
-        )
+        np.testing.assert_allclose(raw.commanded_tip_end(push), tidy["tip_end_commanded_xy"][row], rtol=0, atol=EXACT)
 
 
 def test_text_log_gives_the_curated_forces_and_filter(both) -> None:
@@ -120,9 +116,7 @@ def test_text_log_gives_the_curated_onset(both) -> None:
     for row, push in enumerate(paired(raw, tidy)):
         assert push.onset is not None
         assert abs(push.onset.time - tidy["contact_onset_t"][row]) < TIME_TOLERANCE
-        np.testing.assert_allclose(
-            push.onset.tip, tidy["contact_onset_tip_xy"][row], rtol=0, atol=TIP_TOLERANCE
-        )
+        np.testing.assert_allclose(push.onset.tip, tidy["contact_onset_tip_xy"][row], rtol=0, atol=TIP_TOLERANCE)
 
 
 def test_text_log_gives_the_curated_pairs(both) -> None:
@@ -459,9 +453,7 @@ DAMAGES: dict[str, tuple[Damage, int, str]] = {
 
 @pytest.mark.parametrize("case", DAMAGES)
 @pytest.mark.parametrize("push", [0, 1, 3])
-def test_damaged_push_is_named_and_the_others_survive(
-    log_file: Path, records: Records, case: str, push: int
-) -> None:
+def test_damaged_push_is_named_and_the_others_survive(log_file: Path, records: Records, case: str, push: int) -> None:
     damage, row, words = DAMAGES[case]
     damage(records[push])
     log = load_triangle_log(write(log_file, records))
@@ -601,11 +593,7 @@ def test_log_cut_anywhere_in_a_push(log_file: Path, records: Records, row: int, 
     problem = only_problem(log)
     assert problem.push == 2
     assert problem.line == len(keep) + cut
-    assert (
-        "the log ends" in problem.message
-        or "end of the log" in problem.message
-        or "truncated" in problem.message
-    )
+    assert "the log ends" in problem.message or "end of the log" in problem.message or "truncated" in problem.message
     assert "50 pushes" in problem.message
     assert indices(log) == [0, 1]
 
@@ -712,17 +700,13 @@ def test_support_points_that_cannot_carry(points: list[list[float]], words: str)
         ("somewhere/log.txt", "unknown", "unknown"),
     ],
 )
-def test_names_tell_the_setup(
-    tmp_path: Path, records: Records, name: str, surface: str, arrangement: str
-) -> None:
+def test_names_tell_the_setup(tmp_path: Path, records: Records, name: str, surface: str, arrangement: str) -> None:
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
     log = load_triangle_log(write(file, records))
     assert (log.surface, log.arrangement) == (surface, arrangement)
     if "20_90" in name:
-        np.testing.assert_allclose(
-            log.support_points, [[-0.03, -0.03], [0.04, -0.03], [-0.03, 0.04]], atol=1e-12
-        )
+        np.testing.assert_allclose(log.support_points, [[-0.03, -0.03], [0.04, -0.03], [-0.03, 0.04]], atol=1e-12)
     if arrangement in ("patch", "unknown") and "20_90" not in name:
         assert log.support_points.shape == (0, 2)
         assert log.support_force.shape == (0,)

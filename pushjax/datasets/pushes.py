@@ -146,9 +146,7 @@ class PushLog:
         travel = push.tip[-1] - push.tip[0]
         distance = np.linalg.norm(travel)
         if not distance > 0:
-            raise ValueError(
-                f"push {push.index}: the finger ends where it starts; its direction is not defined"
-            )
+            raise ValueError(f"push {push.index}: the finger ends where it starts; its direction is not defined")
         return push.tip[0] + COMMANDED_TRAVEL * travel / distance
 
 

@@ -69,9 +69,7 @@ def read_records(path: Path) -> Iterator[Record | LogError]:
     number = 0
     while at < len(lines):
         if number == promised:
-            yield LogError(
-                path, f"expected the end of the log after {promised} pushes, found more lines", line=at + 1
-            )
+            yield LogError(path, f"expected the end of the log after {promised} pushes, found more lines", line=at + 1)
         if promised is not None and number >= promised and _start_score(lines, at) < 2:
             return
         try:
@@ -150,9 +148,7 @@ def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
     robot = _table(lines, robot_at + 1, robot_count, ROBOT_COLUMNS, "robot sample")
     end = robot_at + 1 + robot_count
     if end < len(lines) and _start_score(lines, end) < 2 and _columns(lines, end) == ROBOT_COLUMNS:
-        raise Fault(
-            f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1
-        )
+        raise Fault(f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1)
     return Record(number, at + 1, np.concatenate([first, last]), force, robot), end
 
 
@@ -199,9 +195,7 @@ def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str)
             if not np.isfinite(value):
                 return Fault(f"expected finite numbers ({where}), found {token}", at + row + 1)
             if abs(value) >= LARGEST_NUMBER:
-                return Fault(
-                    f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1
-                )
+                return Fault(f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1)
     have = max(len(lines) - at, 0)
     return Fault(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
 

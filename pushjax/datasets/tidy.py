@@ -95,15 +95,11 @@ def _check_sizes(path: Path, data: Arrays) -> None:
     count = len(data["push_index"]) if data["push_index"].ndim else -1
     for name, tail in _PER_PUSH.items():
         if data[name].shape != (count, *tail):
-            raise LogError(
-                path, f"expected {name} of shape (n, *{tail}) for n pushes, found {data[name].shape}"
-            )
+            raise LogError(path, f"expected {name} of shape (n, *{tail}) for n pushes, found {data[name].shape}")
     for offsets_name, names in _STREAMS.items():
         offsets = data[offsets_name]
         if offsets.shape != (count + 1,) or offsets[0] != 0 or np.any(np.diff(_floats(offsets)) < 1):
-            raise LogError(
-                path, f"expected {offsets_name} to rise from 0 in {count} steps, found another array"
-            )
+            raise LogError(path, f"expected {offsets_name} to rise from 0 in {count} steps, found another array")
         for name in names:
             if len(data[name]) != offsets[-1]:
                 raise LogError(path, f"expected {offsets[-1]} rows of {name}, found {len(data[name])}")
@@ -122,9 +118,7 @@ def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
         if not np.isfinite(values).all():
             return LogError(path, f"expected finite numbers, found NaN or infinity in {name}", push=index)
     if not force_filter(streams["force_world"]).any():
-        return LogError(
-            path, "expected the force to last after the first 30 % of the samples, found none", push=index
-        )
+        return LogError(path, "expected the force to last after the first 30 % of the samples, found none", push=index)
     end_pose[2] = start[2] + wrap_angle(end_pose[2] - start[2])
     tip_time, tip = streams["tip_t"], streams["tip_xy"]
     force_time, force = streams["ft_t"], streams["force_world"]

@@ -135,18 +135,14 @@ def _check(record: Record) -> None:
     _check_clock(record.force[:, 0], record.force_line, "force")
     _check_clock(record.robot[:, 0], record.robot_line, "robot")
     if record.robot[0, 0] > record.force[-1, 0] or record.robot[-1, 0] < record.force[0, 0]:
-        raise Fault(
-            "expected robot samples from the time of the force samples, found none", record.robot_line
-        )
+        raise Fault("expected robot samples from the time of the force samples, found none", record.robot_line)
 
 
 def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
     norm = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
     if len(bad):
-        raise Fault(
-            f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0])
-        )
+        raise Fault(f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0]))
 
 
 def _check_clock(time: Floats, line: int, what: str) -> None:

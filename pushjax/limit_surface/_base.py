@@ -12,9 +12,9 @@ from typing import ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from pushjax._checks import as_float, concrete, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, concrete, finite, positive, shaped
 from pushjax._vec import Scalar, Vec3
 
 
@@ -50,9 +50,7 @@ class Symmetric3(NamedTuple):
         return Symmetric3(axx, ayy, azz, axy, axz, ayz).times(v).scale(inverse)
 
     def array(self) -> Float[Array, "3 3"]:
-        return jnp.array(
-            [[self.xx, self.xy, self.xz], [self.xy, self.yy, self.yz], [self.xz, self.yz, self.zz]]
-        )
+        return jnp.array([[self.xx, self.xy, self.xz], [self.xy, self.yy, self.yz], [self.xz, self.yz, self.zz]])
 
 
 class Form(Protocol):
@@ -109,37 +107,37 @@ class LimitSurface(eqx.Module):
         """Whether H is convex, to rounding. The surface must not be traced."""
 
     @abstractmethod
-    def inverse(self, twist: ArrayLike) -> InverseMap:
+    def inverse(self, twist: Numeric) -> InverseMap:
         """The wrench of a twist (3,), with a status. Differentiable, by the implicit function theorem."""
 
-    def _normalized(self, wrench: ArrayLike) -> Vec3:
+    def _normalized(self, wrench: Numeric) -> Vec3:
         w = as_float(wrench, self.length.dtype)
         shaped("wrench", w, (3,))
         finite("wrench", w)
         return Vec3(w[0], w[1], w[2] / self.length)
 
-    def value(self, wrench: ArrayLike) -> Float[Array, ""]:
+    def value(self, wrench: Numeric) -> Float[Array, ""]:
         """H of a wrench (3,) in N, N m: below one friction holds, at one the slider slides."""
         return self.form().value(self._normalized(wrench))
 
-    def twist(self, wrench: ArrayLike) -> Float[Array, "3"]:
+    def twist(self, wrench: Numeric) -> Float[Array, "3"]:
         """grad H of a wrench (3,): the body twist's direction (its length has no meaning); zero for a zero wrench."""
         g = self.form().gradient(self._normalized(wrench))
         return jnp.stack([g.x, g.y, g.z / self.length])
 
-    def hessian(self, wrench: ArrayLike) -> Float[Array, "3 3"]:
+    def hessian(self, wrench: Numeric) -> Float[Array, "3 3"]:
         """Second derivatives of H by the wrench (3,) in N, N m; positive semi-definite for a convex surface."""
         scale = jnp.stack([jnp.ones_like(self.length), jnp.ones_like(self.length), 1 / self.length])
         return self.form().hessian(self._normalized(wrench)).array() * scale[:, None] * scale
 
-    def wrench(self, twist: ArrayLike) -> Float[Array, "3"]:
+    def wrench(self, twist: Numeric) -> Float[Array, "3"]:
         """The wrench (3,) on H = 1 whose twist has the direction of `twist` (3,); see `inverse` for its status.
 
         Raises ValueError for a zero twist or one that is not finite; where traced, gives zero.
         """
         return self.inverse(twist).wrench
 
-    def on_level_set(self, wrench: ArrayLike) -> Float[Array, "3"]:
+    def on_level_set(self, wrench: Numeric) -> Float[Array, "3"]:
         """The wrench (3,) scaled along its ray to H = 1; a zero wrench stays zero."""
         w = as_float(wrench, self.length.dtype)
         h = self.value(w)
@@ -158,16 +156,14 @@ class LimitSurface(eqx.Module):
 
         return load_surface(path, cls)
 
-    def _normalized_twist(self, twist: ArrayLike) -> tuple[Vec3, Array]:
+    def _normalized_twist(self, twist: Numeric) -> tuple[Vec3, Array]:
         """The unit normalised twist, and whether there is one (else it is +x, to compute on without NaN)."""
         v = as_float(twist, self.length.dtype)
         shaped("twist", v, (3,))
         finite("twist", v)
         known = concrete(v)
         if known is not None and not known.any():
-            raise ValueError(
-                "twist is zero: every wrench inside the limit surface has it, none is singled out"
-            )
+            raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
         n = jnp.stack([v[0], v[1], v[2] * self.length])
         size = jnp.max(jnp.abs(n))  # first to order one, so that squares neither under- nor overflow
         usable = jnp.isfinite(size) & (size > 0)
@@ -175,7 +171,7 @@ class LimitSurface(eqx.Module):
         return Vec3.of(n / jnp.sqrt(jnp.sum(n * n))), usable
 
 
-def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
+def checked_length(length: Numeric, dtype) -> Float[Array, ""]:
     value = as_float(length, dtype)
     shaped("length", value, ())
     finite("length", value)

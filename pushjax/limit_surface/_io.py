@@ -25,9 +25,7 @@ def save_surface(surface: LimitSurface, path: str | Path) -> None:
     elif isinstance(surface, Quartic):
         record |= {"kind": "quartic", "coefficients": np.asarray(surface.coefficients, np.float64).tolist()}
     else:
-        raise TypeError(
-            f"surface: cannot save a {type(surface).__name__}; an Ellipsoid or a Quartic can be saved"
-        )
+        raise TypeError(f"surface: cannot save a {type(surface).__name__}; an Ellipsoid or a Quartic can be saved")
     Path(path).write_text(json.dumps(record, indent=2) + "\n")
 
 

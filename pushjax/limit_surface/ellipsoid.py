@@ -4,9 +4,9 @@ from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, concrete, finite, shaped
+from pushjax._checks import Numeric, as_float, concrete, finite, shaped
 from pushjax._vec import Scalar, Vec3
 from pushjax.limit_surface._base import InverseMap, LimitSurface, Symmetric3, angle_between, checked_length
 from pushjax.status import Status
@@ -56,7 +56,7 @@ class Ellipsoid(LimitSurface):
     length: Float[Array, ""]
     degree: ClassVar[int] = 2
 
-    def __init__(self, A: ArrayLike, length: ArrayLike):
+    def __init__(self, A: Numeric, length: Numeric):
         matrix = as_float(A)
         shaped("A", matrix, (3, 3))
         finite("A", matrix)
@@ -77,7 +77,7 @@ class Ellipsoid(LimitSurface):
     def is_convex(self) -> bool:
         return bool(np.linalg.eigvalsh(np.asarray(self.A, np.float64))[0] > 0)
 
-    def inverse(self, twist: ArrayLike) -> InverseMap:
+    def inverse(self, twist: Numeric) -> InverseMap:
         v, usable = self._normalized_twist(twist)
         form = self.form()
         f = form.a.solve(v)

@@ -1,13 +1,13 @@
 """Degree four."""
 
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from pushjax._checks import as_float, concrete, finite, shaped
+from pushjax._checks import Numeric, as_float, concrete, finite, shaped
 from pushjax._vec import Scalar, Vec3
 from pushjax.limit_surface._base import (
     InverseMap,
@@ -66,8 +66,7 @@ class QuarticForm(_QuarticFields):
         c, (x, y, z) = self.c, f
         xx, yy, zz = x * x, y * y, z * z
         return (
-            z
-            * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
+            z * (4 * c[2] * zz + 3 * z * (c[7] * x + c[8] * y) + 2 * (c[10] * xx + c[11] * yy + c[14] * x * y))
             + xx * (c[4] * x + c[12] * y)
             + yy * (c[6] * y + c[13] * x)
         )
@@ -108,7 +107,7 @@ class Quartic(LimitSurface):
     length: Float[Array, ""]
     degree: ClassVar[int] = 4
 
-    def __init__(self, coefficients: ArrayLike, length: ArrayLike):
+    def __init__(self, coefficients: Numeric, length: Numeric):
         array = as_float(coefficients)
         shaped("coefficients", array, (15,))
         finite("coefficients", array)
@@ -129,7 +128,7 @@ class Quartic(LimitSurface):
     def is_convex(self) -> bool:
         return least_curvature(np.asarray(self.coefficients)) >= -CONVEXITY_TOLERANCE
 
-    def inverse(self, twist: ArrayLike) -> InverseMap:
+    def inverse(self, twist: Numeric) -> InverseMap:
         """Newton's method on grad H(F) = v, safeguarded: v - grad H is minus the gradient of a convex function."""
         v, usable = self._normalized_twist(twist)
         form = self.form()
@@ -185,7 +184,7 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
 
 
 @_inverse.defjvp
-def _inverse_jvp(primals, tangents):
+def _inverse_jvp(primals, tangents) -> Any:
     """hess H dF = dv - d(grad H): one linear solve at the solution."""
     (c, v), (dc, dv) = primals, tangents
     f, rounds = _inverse(c, v)

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, finite, shaped
+from pushjax._checks import Numeric, as_float, finite, shaped
 from pushjax._vec import Scalar, Vec2
 
 
@@ -64,7 +64,7 @@ class Shape(eqx.Module):
     def boundary(self, points: int) -> Float[Array, "points 2"]:
         """`points` points equally spaced along the outline, counter-clockwise, m."""
 
-    def closest(self, point: ArrayLike) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]:
+    def closest(self, point: Numeric) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]:
         """Signed distance (m, negative inside), closest boundary point and outward unit normal of a body point.
 
         `point` has shape (2,); batches come from `vmap`. The distance is differentiable in the point and in the
@@ -79,11 +79,11 @@ class Shape(eqx.Module):
         found = self.outline().closest(Vec2.of(query))
         return found.distance, found.point.array(), found.normal.array()
 
-    def signed_distance(self, point: ArrayLike) -> Float[Array, ""]:
+    def signed_distance(self, point: Numeric) -> Float[Array, ""]:
         """Distance of a body point (2,) to the outline in m, negative inside."""
         return self.closest(point)[0]
 
-    def contains(self, point: ArrayLike) -> Array:
+    def contains(self, point: Numeric) -> Array:
         """Whether a body point (2,) lies inside or on the outline."""
         return self.signed_distance(point) <= 0
 

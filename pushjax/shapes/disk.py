@@ -1,9 +1,9 @@
 """Discs."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select
 from pushjax.shapes._base import Closest, Outline, Shape, first_hit
 
@@ -36,7 +36,7 @@ class Disk(Shape):
     radius: Float[Array, ""]
     center: Float[Array, "2"]
 
-    def __init__(self, radius: ArrayLike, center: ArrayLike = (0.0, 0.0)):
+    def __init__(self, radius: Numeric, center: Numeric = (0.0, 0.0)):
         self.radius = as_float(radius)
         self.center = as_float(center, self.radius.dtype)
         shaped("radius", self.radius, ())

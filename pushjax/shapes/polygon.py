@@ -5,9 +5,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from pushjax._checks import as_float, concrete, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, concrete, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select, settle
 from pushjax.shapes._base import Closest, Outline, Shape, first_hit
 
@@ -81,9 +81,7 @@ class PolygonOutline(Outline):
         edge = self._nearest_edge(x)
         s, clipped, diff = edge.foot(x)
         over_edge = (s >= 0) & (s <= edge.length)
-        bisector = select(
-            s < 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
-        )
+        bisector = select(s < 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
         squared = diff.dot(diff)
         on_vertex = squared <= jnp.finfo(squared.dtype).tiny
         length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
@@ -125,7 +123,7 @@ class Polygon(Shape):
 
     vertices: Float[Array, "vertices 2"]
 
-    def __init__(self, vertices: ArrayLike):
+    def __init__(self, vertices: Numeric):
         array = as_float(vertices)
         shaped("vertices", array, ("vertices", 2))
         if array.shape[0] < 3:
@@ -139,7 +137,7 @@ class Polygon(Shape):
         self.vertices = array
 
     @staticmethod
-    def rectangle(width: ArrayLike, height: ArrayLike) -> "Polygon":
+    def rectangle(width: Numeric, height: Numeric) -> "Polygon":
         """A rectangle about the body origin: `width` along x, `height` along y, m."""
         for name, value in (("width", width), ("height", height)):
             finite(name, value)
@@ -149,7 +147,7 @@ class Polygon(Shape):
         return Polygon(signs * jnp.stack([half_w, half_h]))
 
     @staticmethod
-    def regular(sides: int, circumradius: ArrayLike) -> "Polygon":
+    def regular(sides: int, circumradius: Numeric) -> "Polygon":
         """A regular polygon about the body origin, its first vertex on the +x axis, at `circumradius` m."""
         if sides < 3:
             raise ValueError(f"sides must be at least 3; got {sides}")
@@ -196,7 +194,9 @@ class Polygon(Shape):
         bisector = normal + jnp.roll(normal, 1, axis=0)  # at each edge's start
         bisector = bisector / jnp.sqrt(jnp.sum(bisector**2, axis=1, keepdims=True))
         after = jnp.roll(bisector, -1, axis=0)
-        edges = Edge(*v.T, *along.T, length, *bisector.T, *after.T)
+        edges = Edge(
+            v[:, 0], v[:, 1], along[:, 0], along[:, 1], length, bisector[:, 0], bisector[:, 1], after[:, 0], after[:, 1]
+        )
         if len(v) > UNROLLED_EDGES:
             return PolygonOutline(edges)
         return PolygonOutline(tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(v))))
@@ -221,9 +221,7 @@ def _check_simple(v: np.ndarray) -> None:
     a, b = v, np.roll(v, -1, axis=0)
 
     def side(p, q, r):
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (
-            r[..., 0] - p[..., 0]
-        )
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
 
     p, q, r, s = a[:, None], b[:, None], a[None], b[None]
     crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
@@ -235,9 +233,7 @@ def _check_simple(v: np.ndarray) -> None:
         raise ValueError(f"vertices enclose no area ({abs(_signed_area(v)):.3g} m^2)")
     if bad.any():
         i, j = np.argwhere(bad)[0]
-        raise ValueError(
-            f"vertices: the outline crosses or touches itself (edges {i} and {j}, counted from 0)"
-        )
+        raise ValueError(f"vertices: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
 
 
 def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:

@@ -3,9 +3,9 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._checks import as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
 from pushjax._vec import Scalar, Vec2, Vec3
 from pushjax.limit_surface import LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
@@ -34,12 +34,12 @@ class Contacts(eqx.Module):
 
     def __init__(
         self,
-        point: ArrayLike,
-        normal: ArrayLike,
-        displacement: ArrayLike,
-        friction: ArrayLike,
-        gap: ArrayLike = 0.0,
-        active: ArrayLike = True,
+        point: Numeric,
+        normal: Numeric,
+        displacement: Numeric,
+        friction: Numeric,
+        gap: Numeric = 0.0,
+        active: Numeric = True,
     ):
         dtype = common_dtype(point, normal, displacement, friction, gap)
         self.point = as_float(point, dtype)
@@ -56,16 +56,12 @@ class Contacts(eqx.Module):
         non_negative("friction", self.friction)
         known = concrete(self.normal)
         if known is not None and np.any(np.abs(np.linalg.norm(known, axis=1) - 1) > UNIT_TOLERANCE):
-            raise ValueError(
-                f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}"
-            )
+            raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
 
 
 def _each(name: str, value: Array, contacts: int) -> Array:
     if value.ndim and value.shape != (contacts,):
-        raise ValueError(
-            f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact"
-        )
+        raise ValueError(f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact")
     return jnp.broadcast_to(value, (contacts,))
 
 
@@ -73,8 +69,8 @@ class Motion(eqx.Module):
     """The answer to a contact problem.
 
     twist: (3,), of the slider over the step (m, m, rad), zero where it does not move. wrench: (3,), N and N m, on
-    H = 1, zero where it does not move. force: (contacts, 2), N, along normal and tangent t = (-n_y, n_x), summing to the
-    wrench. mode: (contacts,) of `ContactMode`. status: `Status`. margin: distance from a jam, infinite for one
+    H = 1, zero where it does not move. force: (contacts, 2), N, along normal and tangent t = (-n_y, n_x), summing to
+    the wrench. mode: (contacts,) of `ContactMode`. status: `Status`. margin: distance from a jam, infinite for one
     contact, which cannot jam. unique: False where another twist satisfies every condition too.
     """
 
@@ -87,9 +83,7 @@ class Motion(eqx.Module):
     unique: Bool[Array, ""]
 
 
-def solve_contacts(
-    surface: LimitSurface, contacts: Contacts, *, solver: StickingSolver | None = None
-) -> Motion:
+def solve_contacts(surface: LimitSurface, contacts: Contacts, *, solver: StickingSolver | None = None) -> Motion:
     """The slider's motion under given pusher displacements: Coulomb friction at the contact, the limit surface below.
 
     Finds the twist V and force f with V = k grad H(J'f), k > 0, and, with the relative motion w = J V - displacement,
@@ -137,7 +131,7 @@ def _contact(contacts: Contacts, i: int) -> Contact:
     )
 
 
-def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]:
+def friction_cone(normal: Numeric, friction: Numeric) -> Float[Array, "2 2"]:
     """Left and right edge of the friction cone about the inward `normal` (2,): unit force directions, body frame."""
     dtype = common_dtype(normal, friction)
     n, mu = as_float(normal, dtype), as_float(friction, dtype)
@@ -149,18 +143,14 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
     return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
 
 
-def motion_cone(
-    surface: LimitSurface, point: ArrayLike, normal: ArrayLike, friction: ArrayLike
-) -> Float[Array, "2 2"]:
+def motion_cone(surface: LimitSurface, point: Numeric, normal: Numeric, friction: Numeric) -> Float[Array, "2 2"]:
     """Left and right edge of the motion cone: unit velocities of the contact point under the friction cone's edges.
 
-    A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The cone
-    may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section IV.A.
+    A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The
+    cone may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section IV.A.
     """
     dtype = common_dtype(surface, point, normal)
-    contacts = Contacts(
-        as_float(point, dtype)[None], as_float(normal, dtype)[None], jnp.zeros((1, 2), dtype), friction
-    )
+    contacts = Contacts(as_float(point, dtype)[None], as_float(normal, dtype)[None], jnp.zeros((1, 2), dtype), friction)
     contact = _contact(contacts, 0)
     curve = LimitCurve.of(surface.form(), contact)
     edges = []

@@ -67,9 +67,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     def where_moving(value):
         return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
 
-    mode = jnp.where(
-        left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING)
-    )
+    mode = jnp.where(left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING))
     status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
     return SingleMotion(
         where_moving(Vec3(linear.x, linear.y, omega)),

@@ -1,7 +1,7 @@
 """Where on the limit curve a sticking contact lies: the ratio s = f_t / f_n whose motion is parallel to the push.
 
-Two ways to the same point, each the other's test. `ScalarRoot`, the default, is about five times cheaper: it walks along
-the friction cone. `HessianIteration` is the paper's.
+Two ways to the same point, each the other's test. `ScalarRoot`, the default, is cheaper: it walks along the friction
+cone. `HessianIteration` is the paper's.
 
 Both give exact derivatives through the implicit function theorem: at the solution cross(motion(s), v) = 0, so one
 division gives ds from the changes of h and v; the iterations are never differentiated. While sticking, the solution

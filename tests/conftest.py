@@ -1,0 +1,37 @@
+"""Shared by all tests: float64 is on (float32 is tested by passing float32), and where the data is.
+
+The compiled programs are cached between runs and between pytest's workers where JAX_COMPILATION_CACHE_DIR is set.
+"""
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+from pushjax.datasets import find_data  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def data():
+    """The folder of real data."""
+    folder = find_data()
+    if folder is None:
+        pytest.skip("no real data: set PUSHJAX_DATA to its folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def oracle(data):
+    """The folder of contact problems with known answers, beside the data."""
+    folder = data.parent / "oracle"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded contact problems: {folder} does not exist")
+    return folder
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
