@@ -1,5 +1,8 @@
 """Quasi-static planar pushing in JAX."""
 
+from pushjax.fit import FitReport as FitReport
+from pushjax.fit import fit_limit_surface as fit_limit_surface
+from pushjax.fit import mean_twist_angle as mean_twist_angle
 from pushjax.hands import Hand as Hand
 from pushjax.hands import line as line
 from pushjax.hands import resample as resample

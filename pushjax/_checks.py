@@ -34,8 +34,10 @@ def as_float(value: Any, dtype: Any = None) -> jax.Array:
 
 def common_dtype(*values: Any) -> Any:
     """The floating dtype in which a computation over `values` runs; Python numbers do not decide it."""
-    dtypes = [v.dtype for v in jax.tree.leaves(values) if hasattr(v, "dtype") and jnp.issubdtype(v.dtype, jnp.floating)]
-    return jnp.result_type(*dtypes) if dtypes else jnp.result_type(float)
+    # a numpy float64 counts as the widest float there is: float32, unless x64 is on
+    dtypes = [jax.dtypes.canonicalize_dtype(v.dtype) for v in jax.tree.leaves(values) if hasattr(v, "dtype")]
+    floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
+    return jnp.result_type(*floats) if floats else jnp.result_type(float)
 
 
 def shaped(name: str, value: jax.Array, shape: tuple[int | str, ...]) -> None:

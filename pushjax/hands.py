@@ -49,7 +49,7 @@ def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 do
     finite("start", a)
     finite("end", b)
     t = jnp.arange(steps + 1, dtype=dtype)[:, None] / steps
-    return a * (1 - t) + b * t  # exact at both ends
+    return a[None] * (1 - t) + b[None] * t  # exact at both ends
 
 
 def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:

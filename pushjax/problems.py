@@ -64,12 +64,13 @@ def random_surface(
         # fl: the two ends of the spectrum are drawn, the middle lies between
         middle = jax.random.uniform(k_scale)
         eigenvalues = jnp.stack([jnp.ones_like(worst), worst**-middle, 1 / worst])
-        return Ellipsoid(q * eigenvalues @ q.T, length)
+        return Ellipsoid(q @ jnp.diag(eigenvalues) @ q.T, length)
     if degree != 4:
         raise ValueError(f"degree must be 2 or 4; got {degree}")
     factors = jax.random.normal(k_shape, (5, 3, 3))
     thin = jax.random.bernoulli(k_rank, 0.5, (5,))
-    factors = jnp.where(thin[:, None, None], factors * jnp.array([1.0, 0.0, 0.0]), factors)
+    kept = ~thin[:, None, None] | (jnp.arange(3) == 0)[None, None, :]  # a thin one keeps its first column: rank one
+    factors = jnp.where(kept, factors, 0.0)
     weights = jax.random.exponential(k_scale, (5,))
     c = squared_quadratics(jnp.sqrt(weights)[:, None, None] * factors @ jnp.swapaxes(factors, 1, 2))
     low, high = _spectrum(c)

@@ -29,6 +29,7 @@ from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Outline, Shape
 from pushjax.solve import Contact, ScalarRoot, SingleMotion, StickingSolver, solve_single
+from pushjax.solve.contacts import usable
 from pushjax.status import ContactMode, Status
 
 
@@ -143,8 +144,14 @@ def _advance(
     (twist, point, angle, status), motions = jax.lax.scan(stage, start, jnp.array([0.0, 0.5], zero.dtype))
     motion: SingleMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
     moved = _moved(pose, point, twist, angle)
-    status = jnp.where(met.overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
+    status = jnp.where(met.overlapping & (status != Status.INVALID), Status.OVERLAPPING, status).astype(jnp.int8)
     return _guarded(motion, moved, pose, status)
+
+
+def _ground(slider: Slider, friction: Scalar) -> tuple[Form, Scalar]:
+    """The limit surface in scalars, and the friction; that is NaN, so every contact invalid, if the surface is."""
+    form, known = usable(slider.surface.form())
+    return form, jnp.where(known, friction, jnp.nan)
 
 
 def _guarded(motion: SingleMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> _Record:
@@ -228,8 +235,9 @@ def step(
 @eqx.filter_jit
 def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
     (before,), (after,) = hand.centers(tuple(q0)), hand.centers(tuple(q1))
-    form, outline = slider.surface.form(), slider.shape.outline()
-    record = _advance(form, outline, hand.radius[0], friction[0], solver, Vec3.of(pose), before, after)
+    outline = slider.shape.outline()
+    form, mu = _ground(slider, friction[0])
+    record = _advance(form, outline, hand.radius[0], mu, solver, Vec3.of(pose), before, after)
     return _world(record, form.length)
 
 
@@ -263,7 +271,8 @@ def rollout(
 
 @eqx.filter_jit
 def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
-    form, outline, radius, mu = slider.surface.form(), slider.shape.outline(), hand.radius[0], friction[0]
+    outline, radius = slider.shape.outline(), hand.radius[0]
+    form, mu = _ground(slider, friction[0])
     columns = tuple(path.T)
 
     def body(pose: Vec3, ends):

@@ -14,9 +14,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from pushjax._checks import Numeric, as_float, concrete, finite, non_negative, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, positive, shaped
 from pushjax.shapes import Shape
 
 FACET_SHARE = 0.1  # of the wrench-twist pairs
@@ -43,8 +43,8 @@ class Support(eqx.Module):
     limit: Float[Array, "points"]
 
     def __init__(self, point: Numeric, limit: Numeric):
-        self.point = as_float(point)
-        self.limit = as_float(limit, self.point.dtype)
+        dtype = common_dtype(point, limit)
+        self.point, self.limit = as_float(point, dtype), as_float(limit, dtype)
         shaped("point", self.point, ("points", 2))
         shaped("limit", self.limit, (self.point.shape[0],))
         finite("point", self.point)
@@ -57,30 +57,42 @@ class Support(eqx.Module):
     @staticmethod
     def points(point: Numeric, weights: Numeric | None = None, load: Numeric = 1.0) -> "Support":
         """Given points (points, 2) m that share the friction limit `load` = mu m g (N) by `weights` (default equal)."""
-        array = as_float(point)
+        dtype = common_dtype(point, weights, load)
+        array, total = as_float(point, dtype), as_float(load, dtype)
         shaped("point", array, ("points", 2))
-        share = jnp.ones(array.shape[0], array.dtype) if weights is None else as_float(weights, array.dtype)
+        share = jnp.ones(array.shape[0], dtype) if weights is None else as_float(weights, dtype)
         shaped("weights", share, (array.shape[0],))
         finite("weights", share)
         non_negative("weights", share)
         known = concrete(share)
         if known is not None and not known.sum() > 0:
             raise ValueError("weights must not all be zero")
-        finite("load", load)
-        positive("load", load)
-        return Support(array, as_float(load, array.dtype) * share / jnp.sum(share))
+        shaped("load", total, ())
+        finite("load", total)
+        positive("load", total)
+        return Support(array, total * share / jnp.sum(share))
 
     @staticmethod
     def tripod(point: Numeric, load: Numeric = 1.0, center: Numeric = (0.0, 0.0)) -> "Support":
         """Three points (3, 2) m under a weight above `center` (2,) m: statics alone gives each point's share.
 
-        Raises ValueError where the centre lies outside the three points (one would have to pull).
+        Raises ValueError where the centre lies outside the three points (one would have to pull), or these on a line.
         """
-        array = as_float(point)
+        dtype = common_dtype(point, load, center)
+        array, c = as_float(point, dtype), as_float(center, dtype)
         shaped("point", array, (3, 2))
-        c = as_float(center, array.dtype)
-        balance = jnp.concatenate([array.T, jnp.ones((1, 3), array.dtype)])
-        share = jnp.linalg.solve(balance, jnp.append(c, jnp.ones((), array.dtype)))
+        shaped("center", c, (2,))
+        finite("point", array)
+        finite("center", c)
+        # each point's share is the area of the triangle between the centre and the other two
+        one, two = jnp.roll(array, -1, axis=0) - c[None], jnp.roll(array, -2, axis=0) - c[None]
+        opposite = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+        total = jnp.sum(opposite)
+        known = concrete(total)
+        side = array - jnp.roll(array, 1, axis=0)
+        if known is not None and abs(known) <= 1e-6 * float(jnp.max(jnp.sum(side**2, axis=1))):
+            raise ValueError("point: the three support points lie on a line")
+        share = opposite / total
         known = concrete(share)
         if known is not None and not np.all(known >= -1e-6):
             raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
@@ -101,16 +113,15 @@ class Support(eqx.Module):
         if corners is None:
             raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
         low, high = corners.astype(np.float64)
-        inside = jax.vmap(lambda outline, x: outline.signed_distance(x), in_axes=(None, 0))
+        # The area fixes the spacing but for the outline's share of cut cells; look around it, the nearest first.
+        around = np.linspace(-0.1, 0.1, 21)
+        spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
+        grids = [_cell_centers(low, high, spacing) for spacing in spacings]
+        most = max(len(grid) for grid in grids)  # all padded to one length: one compilation
         best = None
-        # The area fixes the spacing but for the outline's share of cut cells; look around it.
-        base = np.sqrt(float(shape.area) / points)
-        for spacing in base * np.linspace(0.9, 1.1, 21)[np.argsort(np.abs(np.linspace(-1, 1, 21)), kind="stable")]:
-            count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
-            cell = (high - low) / count
-            x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
-            grid = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-            kept = grid[np.asarray(inside(shape, jnp.asarray(grid, corners.dtype))) <= 0]
+        for grid in grids:
+            padded = np.concatenate([grid, np.broadcast_to(low, (most - len(grid), 2))])
+            kept = grid[np.asarray(_inside(shape, jnp.asarray(padded, corners.dtype)))[: len(grid)]]
             if len(kept) and (best is None or abs(len(kept) - points) < abs(len(best) - points)):
                 best = kept
             if best is not None and len(best) == points:
@@ -139,7 +150,7 @@ class Support(eqx.Module):
     @property
     def radius_of_gyration(self) -> Float[Array, ""]:
         """Root mean square distance of the pressure from its centre, m."""
-        squared = jnp.sum((self.point - self.center) ** 2, axis=1)
+        squared = jnp.sum((self.point - self.center[None]) ** 2, axis=1)
         return jnp.sqrt(jnp.sum(self.limit * squared) / self.load)
 
     def wrench(self, twist: Numeric, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
@@ -152,6 +163,8 @@ class Support(eqx.Module):
         v = as_float(twist, self.point.dtype)
         shaped("twist", v, (3,))
         finite("twist", v)
+        moved = jnp.any(v != 0)
+        v = v / jnp.where(moved, jnp.max(jnp.abs(v)), 1.0)  # squares shall neither under- nor overflow
         velocity = jnp.stack([v[0] - v[2] * self.point[:, 1], v[1] + v[2] * self.point[:, 0]], axis=1)
         speed2 = jnp.sum(velocity**2, axis=1)
         # rounding of the products above: slower than this is not sliding
@@ -159,7 +172,6 @@ class Support(eqx.Module):
         still = speed2 <= (8 * jnp.finfo(speed2.dtype).eps * reach) ** 2
         force = jnp.where(still[:, None], 0.0, velocity / jnp.sqrt(jnp.where(still, 1.0, speed2))[:, None])
         if key is not None:
-            moved = jnp.any(v != 0)
             force = jnp.where((still & moved)[:, None], _in_unit_disc(key, len(self.point), v.dtype), force)
         f = self.limit[:, None] * force
         torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
@@ -179,6 +191,7 @@ class Support(eqx.Module):
         dtype = self.point.dtype
         gyration = self.radius_of_gyration
         rho = jnp.where(gyration > 0, gyration, 1.0) if length is None else as_float(length, dtype)
+        shaped("length", rho, ())
         finite("length", rho)
         positive("length", rho)
         k_free, k_point, k_side, k_facet = jax.random.split(key, 4)
@@ -190,9 +203,21 @@ class Support(eqx.Module):
         facets = round(FACET_SHARE * pairs)
         normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
         normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
-        twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])
+        twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
         wrench = jax.vmap(self.wrench)(twist, jax.random.split(k_facet, pairs))
         return WrenchTwistPairs(wrench, twist, rho)
+
+
+def _cell_centers(low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:
+    """Centres (cells, 2) of a grid that fills the box from `low` to `high`, its cells as near to `spacing` as fits."""
+    count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
+    x, y = (low[k] + (np.arange(count[k]) + 0.5) * (high[k] - low[k]) / count[k] for k in range(2))
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+@eqx.filter_jit
+def _inside(shape: Shape, grid: Float[Array, "cells 2"]) -> Bool[Array, "cells"]:
+    return jax.lax.map(shape.contains, grid, batch_size=4096)  # in parts: cells times edges may be many
 
 
 def _in_unit_disc(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple, Protocol, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -128,7 +129,7 @@ class LimitSurface(eqx.Module):
     def hessian(self, wrench: Numeric) -> Float[Array, "3 3"]:
         """Second derivatives of H by the wrench (3,) in N, N m; positive semi-definite for a convex surface."""
         scale = jnp.stack([jnp.ones_like(self.length), jnp.ones_like(self.length), 1 / self.length])
-        return self.form().hessian(self._normalized(wrench)).array() * scale[:, None] * scale
+        return self.form().hessian(self._normalized(wrench)).array() * (scale[:, None] * scale[None])
 
     def wrench(self, twist: Numeric) -> Float[Array, "3"]:
         """The wrench (3,) on H = 1 whose twist has the direction of `twist` (3,); see `inverse` for its status.
@@ -140,6 +141,10 @@ class LimitSurface(eqx.Module):
     def on_level_set(self, wrench: Numeric) -> Float[Array, "3"]:
         """The wrench (3,) scaled along its ray to H = 1; a zero wrench stays zero."""
         w = as_float(wrench, self.length.dtype)
+        shaped("wrench", w, (3,))
+        # To order one first: powers of a small wrench underflow. The result does not depend on it, nor its derivative
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.stack([w[0], w[1], w[2] / self.length]))))
+        w = w / jnp.where(size > 0, size, 1.0)
         h = self.value(w)
         return jnp.where(h > 0, w * jnp.where(h > 0, h, 1.0) ** (-1 / self.degree), 0.0)
 
@@ -183,6 +188,11 @@ def angle_between(a: Vec3, b: Vec3) -> Scalar:
     """Angle of two vectors in rad, accurate also when it is small; zero with a zero vector."""
     cross = Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
     return jnp.arctan2(norm(cross), a.x * b.x + a.y * b.y + a.z * b.z)
+
+
+def angle_tolerance(angle: Scalar) -> float:
+    """The angle in rad up to which an inverse map has converged: some 1e-3 in float32, 1e-12 in float64."""
+    return 1e4 * float(jnp.finfo(angle.dtype).eps)
 
 
 def norm(a: Vec3) -> Scalar:

@@ -13,11 +13,12 @@ from pushjax.limit_surface.ellipsoid import Ellipsoid
 from pushjax.limit_surface.quartic import Quartic
 
 FORMAT = "pushjax limit surface"
+VERSION = 1
 S = TypeVar("S", bound=LimitSurface)
 
 
 def save_surface(surface: LimitSurface, path: str | Path) -> None:
-    record: dict = {"format": FORMAT, "version": 1, "dtype": str(surface.length.dtype)}
+    record: dict = {"format": FORMAT, "version": VERSION, "dtype": str(surface.length.dtype)}
     # repr of a float64 is exact, and a float32 is a float64
     record["length"] = float(surface.length)
     if isinstance(surface, Ellipsoid):
@@ -33,7 +34,9 @@ def load_surface(path: str | Path, kind: type[S]) -> S:
     try:
         record = json.loads(Path(path).read_text())
         if record["format"] != FORMAT:
-            raise KeyError("format")
+            raise ValueError("its format is another")
+        if record["version"] != VERSION:
+            raise ValueError(f"version {record['version']!r} of the format; this program reads {VERSION}")
         dtype = jax.dtypes.canonicalize_dtype(record["dtype"])  # float64 needs x64 to be on; else float32
         length = jnp.asarray(record["length"], dtype)
         if record["kind"] == "ellipsoid":
@@ -41,9 +44,10 @@ def load_surface(path: str | Path, kind: type[S]) -> S:
         elif record["kind"] == "quartic":
             surface = Quartic(jnp.asarray(record["coefficients"], dtype), length)
         else:
-            raise KeyError("kind")
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} does not hold a limit surface saved by pushjax: {error!r}") from error
+            raise ValueError(f"{record['kind']!r} is no kind of surface")
+    except (ValueError, KeyError, TypeError) as error:
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} does not hold a limit surface saved by pushjax: {what}") from error
     if not isinstance(surface, kind):
         raise ValueError(f"{path} holds a {type(surface).__name__}, not a {kind.__name__}")
     return surface

@@ -8,7 +8,14 @@ from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, concrete, finite, shaped
 from pushjax._vec import Scalar, Vec3
-from pushjax.limit_surface._base import InverseMap, LimitSurface, Symmetric3, angle_between, checked_length
+from pushjax.limit_surface._base import (
+    InverseMap,
+    LimitSurface,
+    Symmetric3,
+    angle_between,
+    angle_tolerance,
+    checked_length,
+)
 from pushjax.status import Status
 
 
@@ -78,11 +85,18 @@ class Ellipsoid(LimitSurface):
         return bool(np.linalg.eigvalsh(np.asarray(self.A, np.float64))[0] > 0)
 
     def inverse(self, twist: Numeric) -> InverseMap:
+        """One linear solve, refined: the adjugate alone loses twice the digits that the condition number costs."""
         v, usable = self._normalized_twist(twist)
         form = self.form()
         f = form.a.solve(v)
-        f = f.scale(1 / jnp.sqrt(form.value(f)))
-        solved = usable & jnp.isfinite(f.x + f.y + f.z)
-        wrench = jnp.where(solved, jnp.stack([f.x, f.y, f.z * self.length]), 0.0)
+        for _ in range(2):
+            g = form.a.times(f)
+            more = form.a.solve(Vec3(v.x - g.x, v.y - g.y, v.z - g.z))
+            f = Vec3(f.x + more.x, f.y + more.y, f.z + more.z)
+        h = form.value(f)
+        angle = angle_between(form.gradient(f), v)
+        solved = usable & (h > 0) & (angle <= angle_tolerance(angle))
+        scale = jnp.where(solved, 1 / jnp.sqrt(jnp.where(solved, h, 1.0)), 0.0)
+        wrench = jnp.where(solved, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
         status = jnp.where(solved, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
-        return InverseMap(wrench, status, jnp.ones((), jnp.int32), angle_between(form.gradient(f), v))
+        return InverseMap(wrench, status, jnp.ones((), jnp.int32), angle)

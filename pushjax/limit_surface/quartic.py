@@ -14,6 +14,7 @@ from pushjax.limit_surface._base import (
     LimitSurface,
     Symmetric3,
     angle_between,
+    angle_tolerance,
     checked_length,
 )
 from pushjax.status import Status
@@ -100,7 +101,7 @@ class Quartic(LimitSurface):
     coefficients: (15,), 1/N^4, of the monomials x⁴ y⁴ z⁴ x³y x³z xy³ y³z xz³ yz³ x²y² x²z² y²z² x²yz xy²z xyz².
     length: m.
 
-    Raises ValueError for coefficients that are not finite or not convex, or a length that is not positive.
+    Raises ValueError for coefficients that are not finite, all zero or not convex, or a length that is not positive.
     """
 
     coefficients: Float[Array, "15"]
@@ -113,6 +114,8 @@ class Quartic(LimitSurface):
         finite("coefficients", array)
         known = concrete(array)
         if known is not None:
+            if not known.any():
+                raise ValueError("coefficients are all zero: no wrench would ever make the slider slide")
             curvature = least_curvature(known)
             if not curvature >= -CONVEXITY_TOLERANCE:
                 raise ValueError(
@@ -135,9 +138,9 @@ class Quartic(LimitSurface):
         f, rounds = _inverse(form.c, v)
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
-        good = usable & (h > 0) & (angle <= 1e4 * jnp.finfo(angle.dtype).eps)
+        good = usable & (h > 0) & (angle <= angle_tolerance(angle))
         scale = jnp.where(good, jnp.where(good, h, 1.0) ** -0.25, 0.0)
-        wrench = jnp.stack([f.x, f.y, f.z * self.length]) * scale
+        wrench = jnp.where(good, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
         status = jnp.where(good, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
         return InverseMap(wrench, status, rounds, angle)
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._checks import Numeric, as_float, finite, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, finite, shaped
 from pushjax._vec import Scalar, Vec2
 
 
@@ -32,9 +32,10 @@ class Outline(eqx.Module):
 
     @abstractmethod
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        """The fraction of `path` after which a disc of `radius` that starts at `x`, outside, first touches.
+        """The fraction of `path` after which a disc of `radius` that starts at `x` first touches.
 
-        Infinite where it does not touch within the path. Exact for any length of path, so nothing tunnels.
+        Starts outside, or touching to rounding (then 0, if it approaches). Infinite where it does not touch within
+        the path. Exact for any length of path, so nothing tunnels.
         """
 
 
@@ -73,7 +74,7 @@ class Shape(eqx.Module):
 
         Raises ValueError for a point of another shape, or one that is NaN or infinite.
         """
-        query = as_float(point)
+        query = as_float(point, common_dtype(self, point))
         shaped("point", query, (2,))
         finite("point", query)
         found = self.outline().closest(Vec2.of(query))
@@ -92,13 +93,21 @@ def first_hit(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
     """Fraction of `path` at which a point moving from `x` comes within `reach` of the origin; inf if it does not.
 
     The smaller root of |x + t path|^2 = reach^2, written so that it does not cancel; only for an approaching
-    start outside.
+    start outside, or as little inside as rounding puts it.
     """
     a = path.dot(path)
     b = x.dot(path)
-    c = x.dot(x) - reach * reach
-    disc = b * b - a * c
-    hits = (b < 0) & (c >= 0) & (disc > 0)
+    squared = x.dot(x)
+    c = squared - reach * reach
+    # b^2 - a c, which far away is a small difference of large numbers
+    side = x.cross(path)
+    disc = a * reach * reach - side * side
+    hits = (b < 0) & (c >= -rounding(16 * squared)) & (disc > 0)
     root = jnp.sqrt(jnp.where(hits, disc, 1.0))
-    fraction = c / jnp.where(hits, root - b, 1.0)
+    fraction = jnp.maximum(c / jnp.where(hits, root - b, 1.0), 0)
     return jnp.where(hits & (fraction <= 1), fraction, jnp.inf)
+
+
+def rounding(size: Scalar) -> Scalar:
+    """What a handful of operations on numbers up to `size` may be wrong by."""
+    return 16 * jnp.finfo(size.dtype).eps * size

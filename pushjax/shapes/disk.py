@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._checks import Numeric, as_float, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select
 from pushjax.shapes._base import Closest, Outline, Shape, first_hit
 
@@ -37,8 +37,8 @@ class Disk(Shape):
     center: Float[Array, "2"]
 
     def __init__(self, radius: Numeric, center: Numeric = (0.0, 0.0)):
-        self.radius = as_float(radius)
-        self.center = as_float(center, self.radius.dtype)
+        dtype = common_dtype(radius, center)
+        self.radius, self.center = as_float(radius, dtype), as_float(center, dtype)
         shaped("radius", self.radius, ())
         shaped("center", self.center, (2,))
         for name, value in (("radius", self.radius), ("center", self.center)):
@@ -58,8 +58,8 @@ class Disk(Shape):
         return self.center - self.radius, self.center + self.radius
 
     def boundary(self, points: int) -> Float[Array, "points 2"]:
-        angle = 2 * jnp.pi * (jnp.arange(points) + 0.5) / points
-        return self.center + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        angle = 2 * jnp.pi * (jnp.arange(points, dtype=self.radius.dtype) + 0.5) / points
+        return self.center[None] + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
 
     def outline(self) -> DiskOutline:
         return DiskOutline(Vec2.of(self.center), self.radius)

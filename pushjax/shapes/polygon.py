@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._checks import Numeric, as_float, concrete, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select, settle
-from pushjax.shapes._base import Closest, Outline, Shape, first_hit
+from pushjax.shapes._base import Closest, Outline, Shape, first_hit, rounding
 
 # Up to this many edges the search over edges is written out, edge by edge, so that a batch vectorises across its
 # examples; beyond it, an array over the edges keeps the compiled program small.
@@ -80,8 +80,8 @@ class PolygonOutline(Outline):
         """
         edge = self._nearest_edge(x)
         s, clipped, diff = edge.foot(x)
-        over_edge = (s >= 0) & (s <= edge.length)
-        bisector = select(s < 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
+        over_edge = (s > 0) & (s < edge.length)
+        bisector = select(s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
         squared = diff.dot(diff)
         on_vertex = squared <= jnp.finfo(squared.dtype).tiny
         length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
@@ -99,8 +99,11 @@ class PolygonOutline(Outline):
         gap = edge.normal.dot(rel) - radius
         fraction = gap / jnp.where(approach > 0, approach, 1.0)
         foot = rel.dot(edge.along) + fraction * path.dot(edge.along)
-        hits = (approach > 0) & (gap >= 0) & (fraction <= 1) & (foot >= 0) & (foot <= edge.length)
-        return jnp.minimum(jnp.where(hits, fraction, jnp.inf), first_hit(rel, path, radius))
+        # To rounding a disc may start touching, and a point may aim at a vertex: neither slips through
+        loose = rounding(jnp.abs(rel.x) + jnp.abs(rel.y) + radius + edge.length)
+        on_edge = (foot >= -loose) & (foot <= edge.length + loose)
+        hits = (approach > 0) & (gap >= -loose) & (fraction <= 1) & on_edge
+        return jnp.minimum(jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf), first_hit(rel, path, radius))
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         if isinstance(self.edges, Edge):
@@ -139,35 +142,40 @@ class Polygon(Shape):
     @staticmethod
     def rectangle(width: Numeric, height: Numeric) -> "Polygon":
         """A rectangle about the body origin: `width` along x, `height` along y, m."""
-        for name, value in (("width", width), ("height", height)):
+        dtype = common_dtype(width, height)
+        w, h = as_float(width, dtype), as_float(height, dtype)
+        for name, value in (("width", w), ("height", h)):
+            shaped(name, value, ())
             finite(name, value)
             positive(name, value)
-        half_w, half_h = as_float(width) / 2, as_float(height) / 2
-        signs = jnp.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        return Polygon(signs * jnp.stack([half_w, half_h]))
+        signs = jnp.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype)
+        return Polygon(signs * jnp.stack([w / 2, h / 2])[None])
 
     @staticmethod
     def regular(sides: int, circumradius: Numeric) -> "Polygon":
         """A regular polygon about the body origin, its first vertex on the +x axis, at `circumradius` m."""
         if sides < 3:
             raise ValueError(f"sides must be at least 3; got {sides}")
-        finite("circumradius", circumradius)
-        positive("circumradius", circumradius)
-        angle = 2 * jnp.pi * jnp.arange(sides) / sides
-        return Polygon(as_float(circumradius) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1))
+        radius = as_float(circumradius)
+        shaped("circumradius", radius, ())
+        finite("circumradius", radius)
+        positive("circumradius", radius)
+        angle = 2 * jnp.pi * jnp.arange(sides, dtype=radius.dtype) / sides
+        return Polygon(radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1))
 
     @property
     def area(self) -> Float[Array, ""]:
-        a, b = self.vertices, jnp.roll(self.vertices, -1, axis=0)
+        # relative to the first vertex, so that a polygon far from the origin does not lose its digits
+        a = self.vertices - self.vertices[:1]
+        b = jnp.roll(a, -1, axis=0)
         return jnp.sum(a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]) / 2
 
     @property
     def centroid(self) -> Float[Array, "2"]:
-        # relative to the first vertex, so that a polygon far from the origin does not lose its digits
-        base = self.vertices[0]
-        a, b = self.vertices - base, jnp.roll(self.vertices, -1, axis=0) - base
+        a = self.vertices - self.vertices[:1]  # as for the area
+        b = jnp.roll(a, -1, axis=0)
         twice = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-        return base + jnp.sum((a + b) * twice[:, None], axis=0) / (3 * jnp.sum(twice))
+        return self.vertices[0] + jnp.sum((a + b) * twice[:, None], axis=0) / (3 * jnp.sum(twice))
 
     @property
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
@@ -182,7 +190,7 @@ class Polygon(Shape):
         closed = jnp.concatenate([self.vertices, self.vertices[:1]])
         edge = jnp.diff(closed, axis=0)
         arc = jnp.concatenate([jnp.zeros(1, edge.dtype), jnp.cumsum(jnp.hypot(edge[:, 0], edge[:, 1]))])
-        at = (jnp.arange(points) + 0.5) / points * arc[-1]
+        at = (jnp.arange(points, dtype=edge.dtype) + 0.5) / points * arc[-1]
         return jnp.stack([jnp.interp(at, arc, closed[:, 0]), jnp.interp(at, arc, closed[:, 1])], axis=1)
 
     def outline(self) -> PolygonOutline:

@@ -1,13 +1,16 @@
 """The contact problem as a user states it, in arrays."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
 from pushjax._vec import Scalar, Vec2, Vec3
-from pushjax.limit_surface import LimitSurface
+from pushjax.limit_surface import Form, LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve.single import solve_single
 from pushjax.solve.sticking import ScalarRoot, StickingSolver
@@ -101,7 +104,9 @@ def solve_contacts(surface: LimitSurface, contacts: Contacts, *, solver: Stickin
     m = contacts.point.shape[0]
     if m != 1:
         raise ValueError(f"contacts: exactly one contact is supported; got {m}")
-    form, contact = surface.form(), _contact(contacts, 0)
+    form, known = usable(surface.form())
+    contact = _contact(contacts, 0)
+    contact = contact._replace(friction=jnp.where(known, contact.friction, jnp.nan))
     result = solve_single(form, contact, ScalarRoot() if solver is None else solver)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
@@ -115,31 +120,41 @@ def solve_contacts(surface: LimitSurface, contacts: Contacts, *, solver: Stickin
     )
 
 
-def _contact(contacts: Contacts, i: int) -> Contact:
-    """Contact i in scalars; one that is not active is moved out of reach."""
-    active = contacts.active[i]
+def usable(form: Form) -> tuple[Form, Bool[Array, ""]]:
+    """The form, and whether its numbers can be computed with; one of ones where they cannot, to keep NaN out.
 
-    def kept(value: Scalar) -> Scalar:
-        return jnp.where(active, value, 0.0)
+    An unusable form is for the caller to report: a friction of NaN with it makes the contact invalid.
+    """
+    known = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
+    return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), known
+
+
+def _contact(contacts: Contacts, i: int) -> Contact:
+    """Contact i in scalars; one that is not active is out of reach, whatever its numbers are."""
+    active, normal = contacts.active[i], contacts.normal[i]
+    unit = jnp.abs(jnp.sum(normal**2) - 1) <= 2 * UNIT_TOLERANCE  # where traced, nothing has checked it yet
+
+    def kept(value: Scalar, away: float) -> Scalar:
+        return jnp.where(active, value, away)
 
     return Contact(
-        Vec2.of(contacts.point[i]),
-        Vec2.of(contacts.normal[i]),
-        Vec2(kept(contacts.displacement[i, 0]), kept(contacts.displacement[i, 1])),
-        contacts.friction[i],
-        jnp.where(active, contacts.gap[i], 1.0),
+        Vec2(kept(contacts.point[i, 0], 0.0), kept(contacts.point[i, 1], 0.0)),
+        Vec2(kept(normal[0], 1.0), kept(normal[1], 0.0)),
+        Vec2(kept(contacts.displacement[i, 0], 0.0), kept(contacts.displacement[i, 1], 0.0)),
+        kept(jnp.where(unit, contacts.friction[i], jnp.nan), 0.0),
+        kept(contacts.gap[i], 1.0),
     )
 
 
 def friction_cone(normal: Numeric, friction: Numeric) -> Float[Array, "2 2"]:
-    """Left and right edge of the friction cone about the inward `normal` (2,): unit force directions, body frame."""
+    """Left and right edge of the friction cone about the inward `normal` (2,): unit force directions, body frame.
+
+    Raises ValueError as `Contacts` does.
+    """
     dtype = common_dtype(normal, friction)
-    n, mu = as_float(normal, dtype), as_float(friction, dtype)
-    shaped("normal", n, (2,))
-    shaped("friction", mu, ())
-    non_negative("friction", mu)
-    tangent = jnp.stack([-n[1], n[0]])
-    edges = jnp.stack([n + mu * tangent, n - mu * tangent])
+    contact = _at_rest(jnp.zeros(2, dtype), normal, friction, dtype)
+    n, mu = contact.normal, contact.friction
+    edges = jnp.stack([(n + n.perp().scale(s)).array() for s in (mu, -mu)])
     return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
 
 
@@ -147,11 +162,10 @@ def motion_cone(surface: LimitSurface, point: Numeric, normal: Numeric, friction
     """Left and right edge of the motion cone: unit velocities of the contact point under the friction cone's edges.
 
     A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The
-    cone may open beyond 90 degrees from the normal. Source: Mason 1986; Zhou et al. 2017, section IV.A.
+    cone may open beyond 90 degrees from the normal. Raises ValueError as `Contacts` does. Source: Mason 1986; Zhou et
+    al. 2017, section IV.A.
     """
-    dtype = common_dtype(surface, point, normal)
-    contacts = Contacts(as_float(point, dtype)[None], as_float(normal, dtype)[None], jnp.zeros((1, 2), dtype), friction)
-    contact = _contact(contacts, 0)
+    contact = _at_rest(point, normal, friction, common_dtype(surface, point, normal))
     curve = LimitCurve.of(surface.form(), contact)
     edges = []
     for s in (contact.friction, -contact.friction):
@@ -159,3 +173,12 @@ def motion_cone(surface: LimitSurface, point: Numeric, normal: Numeric, friction
         g = g.scale(1 / jnp.sqrt(g.dot(g)))
         edges.append((contact.normal.scale(g.x) + contact.normal.perp().scale(g.y)).array())
     return jnp.stack(edges)
+
+
+def _at_rest(point: Numeric, normal: Numeric, friction: Numeric, dtype: Any) -> Contact:
+    """One contact, checked, under a pusher that does not move."""
+    p, n, mu = (as_float(value, dtype) for value in (point, normal, friction))
+    shaped("point", p, (2,))
+    shaped("normal", n, (2,))
+    shaped("friction", mu, ())
+    return _contact(Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu), 0)

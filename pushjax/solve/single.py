@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
@@ -33,12 +34,18 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     The sliding scale v_n / motion_n needs no guard against a small motion_n: sliding left means
     motion_n v_t > motion_t v_n, so it stays below v_t / motion_t.
     """
-    mu, curve = contact.friction, settle(LimitCurve.of(form, contact), contact.gap)
+    known, contact = _known(contact)
+    # The motion does not depend on the scale of H, but squares of it over- or underflow in float32: compute with h
+    # divided by its own size, a constant to the derivatives too.
+    curve = LimitCurve.of(form, contact)
+    size = jax.lax.stop_gradient(curve.c[0] + curve.c[-1])
+    size = jnp.where(size > 0, size, 1.0)
+    curve, size = settle((LimitCurve(tuple(c / size for c in curve.c)), size), contact.gap)
+    mu = contact.friction
     v = contact.approach()
-    valid = jnp.isfinite(v.x + v.y + sum(curve.c)) & (mu >= 0)
+    valid = known & jnp.isfinite(sum(curve.c))
     pushes = settle(valid & (v.x > 0), v.x)
     v = select(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # something to compute on
-    mu = jnp.where(valid, mu, 0.0)
     curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
 
     left_edge, right_edge = curve.motion(mu), curve.motion(-mu)
@@ -56,13 +63,13 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
     one = jnp.ones_like(s)
     ray = select(valid, contact.wrench(Vec2(one, s), form.length), Vec3(one, 0 * one, 0 * one))
-    omega = k * form.spin(ray) / form.length
+    omega = k * form.spin(ray) / (size * form.length)
     normal = contact.normal
     linear = normal.scale(follow.x) + normal.perp().scale(follow.y) - contact.point.perp().scale(omega)
     h = curve.value(s)
     solved = (h > 0) & (slides | (stuck.residual <= tolerance(s.dtype))) & jnp.isfinite(omega)
     moves = settle(pushes & solved, v.x)
-    scale = jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)
+    scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
 
     def where_moving(value):
         return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
@@ -77,6 +84,17 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
         jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
         ~(valid & ~pushes & _drags(curve, mu, contact.approach())),
     )
+
+
+def _known(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
+    """Whether every number of a contact is usable; the contact, or else one out of reach.
+
+    Replaced before anything is computed from it: a NaN that is only masked afterwards comes back in the gradient.
+    """
+    known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
+    still = Vec2(0.0, 0.0)
+    away = Contact(still, Vec2(1.0, 0.0), still, 0.0, 1.0)
+    return known, jax.tree.map(lambda entry, other: jnp.where(known, entry, other), contact, away)
 
 
 def _drags(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:

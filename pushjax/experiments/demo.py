@@ -1,0 +1,89 @@
+"""A first push: fit an ellipsoid and a quartic to a square, push it with both, and draw what happened."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.report import envelope
+
+SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
+START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100
+
+
+def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
+    """Fit both surfaces to 64 support points under the square, push 50 mm off centre; pictures into `out`."""
+    key = jax.random.key(seed)
+    block = pj.Polygon.rectangle(SIDE, SIDE)
+    support = pj.Support.uniform(block, points=64)
+    pairs = support.wrench_twist_pairs(key, 400)
+    hand, path, start = pj.Hand.finger(RADIUS), pj.line(START, END, STEPS), jnp.zeros(3)
+
+    rows, surfaces, pushes = [], {}, {}
+    for degree, name in ((2, "ellipsoid"), (4, "quartic")):
+        surface, fit = pj.fit_limit_surface(*pairs, degree=degree, report=True)
+        push = pj.rollout(pj.Slider(block, surface), hand, path, pose=start, friction=FRICTION)
+        surfaces[name], pushes[name] = surface, (push, path)
+        rows.append(
+            {
+                "model": name,
+                "fit_angle_deg": float(np.degrees(fit.angle)),
+                "fit_status": pj.Status(int(fit.status)).name,
+                "pose": push.pose[-1],
+                "modes": _counts(push),
+                "first_failure": int(push.first_failure),
+            }
+        )
+    apart = pj.deviation(pushes["ellipsoid"][0].pose[-1], pushes["quartic"][0].pose[-1], pairs.length)
+    pictures = [] if out is None else _draw(out, key, block, support, pairs, surfaces, pushes)
+    settings = {"seed": seed, "side_m": SIDE, "radius_m": RADIUS, "friction": FRICTION, "steps": STEPS, "pairs": 400}
+    return envelope("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
+
+
+def _counts(push: pj.Trajectory) -> dict[str, int]:
+    values, counts = np.unique(np.asarray(push.mode), return_counts=True)
+    return {pj.ContactMode(int(v)).name: int(c) for v, c in zip(values, counts, strict=True)}
+
+
+def motion_cone_setup(key: jax.Array):
+    """The paper's first figure: 100 grid points, a quartic from 200 pairs, a push to the right of the motion cone."""
+    block = pj.Polygon.rectangle(SIDE, SIDE)
+    support = pj.Support.uniform(block, points=100)
+    surface = pj.fit_limit_surface(*support.wrench_twist_pairs(key, 200), degree=4)
+    point, normal = jnp.array([[-0.02, -SIDE / 2]]), jnp.array([[0.0, 1.0]])
+    right = pj.motion_cone(surface, point[0], normal[0], FRICTION)[1]
+    turn = -np.radians(15)  # clockwise of the cone's right edge
+    push = jnp.stack(
+        [np.cos(turn) * right[0] - np.sin(turn) * right[1], np.sin(turn) * right[0] + np.cos(turn) * right[1]]
+    )
+    contacts = pj.Contacts(point, normal, push[None], FRICTION)
+    return block, support, surface, contacts, pj.solve_contacts(surface, contacts)
+
+
+def _draw(out: Path, key, block, support, pairs, surfaces, pushes) -> list[str]:
+    from pushjax import plot
+
+    drawn = {
+        "limit_surfaces.png": plot.limit_surfaces(surfaces, pairs, float(support.load)),
+        "motion_cone.png": plot.motion_cone_figure(*motion_cone_setup(key)),
+        "push.png": plot.push_figure(block, pushes, RADIUS),
+    }
+    return [str(plot.save(figure, out / name)) for name, figure in drawn.items()]
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    lines = ["A 90 mm square, 64 support points, pushed 18 mm off centre over 50 mm (mu = 0.25):"]
+    for row in record["rows"]:
+        x, y, theta = np.asarray(row["pose"], float)
+        modes = ", ".join(f"{count} {name.lower()}" for name, count in row["modes"].items())
+        lines.append(
+            f"  {row['model']:<10} fit {row['fit_angle_deg']:.1f} deg off   ends at x = {1e3 * x:.2f} mm, "
+            f"y = {1e3 * y:.2f} mm, theta = {np.degrees(theta):.2f} deg   steps: {modes}"
+        )
+    lines.append(f"  the two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration)")
+    lines += [f"  drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

@@ -1,0 +1,184 @@
+"""Pictures. Lengths in mm, angles in degrees on every axis; colours that the colour-blind can tell apart."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pushjax.limit_surface import LimitSurface
+from pushjax.rollout import Trajectory
+from pushjax.shapes import Shape
+from pushjax.solve import Contacts, Motion, friction_cone, motion_cone
+from pushjax.support import Support, WrenchTwistPairs
+
+MM = 1e3
+BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe & Ito
+START, BETWEEN, END = "black", "0.72", "#C1121F"
+
+STYLE = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "savefig.dpi": 160,
+}
+
+
+def save(figure: Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, bbox_inches="tight")
+    plt.close(figure)
+    return path
+
+
+def limit_surfaces(surfaces: Mapping[str, LimitSurface], pairs: WrenchTwistPairs, load: float) -> Figure:
+    """Level sets H = 1 in 3-D, over load and length, and cuts through them, with the wrenches they were fitted to."""
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(4.1 * len(surfaces) + 4.4, 3.9), layout="constrained")
+        grid = figure.add_gridspec(2, len(surfaces) + 1, width_ratios=[1.0] * len(surfaces) + [0.85])
+        wrench = np.asarray(pairs.wrench) / load / np.array([1, 1, float(pairs.length)])
+        colors = dict(zip(surfaces, (ORANGE, BLUE, GREEN), strict=False))
+        for column, (name, surface) in enumerate(surfaces.items()):
+            axes = figure.add_subplot(grid[:, column], projection="3d")
+            u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
+            ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+            x, y, z = np.moveaxis(_on_level_set(surface, ball) / load, -1, 0)
+            axes.plot_surface(x, y, z, color=colors[name], alpha=0.35, linewidth=0.2, edgecolor=colors[name])  # type: ignore[attr-defined]
+            axes.scatter(*wrench.T, s=3, color="0.2", depthshade=False)
+            axes.set(title=name, xlabel="$f_x$ / load", ylabel="$f_y$ / load")
+            axes.set_zlabel(r"$\tau$ / (length · load)")  # type: ignore[attr-defined]
+            axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
+        for row, (title, other, label) in enumerate(
+            (("cut through $f_y = 0$", 2, r"$\tau$ / (length · load)"), ("cut through $\\tau = 0$", 1, "$f_y$ / load"))
+        ):
+            axes = figure.add_subplot(grid[row, -1])
+            angle = np.linspace(0, 2 * np.pi, 241)
+            circle = np.zeros((len(angle), 3))
+            circle[:, 0], circle[:, other] = np.cos(angle), np.sin(angle)
+            for name, surface in surfaces.items():
+                cut = _on_level_set(surface, circle) / load
+                axes.plot(cut[:, 0], cut[:, other], color=colors[name], label=name)
+            near = np.abs(wrench[:, 3 - other]) < 0.06
+            axes.plot(wrench[near, 0], wrench[near, other], ".", color="0.2", ms=3, label="pairs nearby")
+            axes.set(title=title, xlabel="$f_x$ / load", ylabel=label, aspect="equal")
+        figure.axes[-2].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        return figure
+
+
+def _on_level_set(surface: LimitSurface, normalized: np.ndarray) -> np.ndarray:
+    """Normalised wrenches scaled along their rays to H = 1."""
+    flat = normalized.reshape(-1, 3) * np.array([1, 1, float(surface.length)])
+    level = np.array(jax.vmap(surface.on_level_set)(flat.astype(surface.length.dtype)))
+    level[:, 2] /= float(surface.length)
+    return level.reshape(normalized.shape)
+
+
+def motion_cone_figure(
+    shape: Shape, support: Support, surface: LimitSurface, contacts: Contacts, motion: Motion
+) -> Figure:
+    """One contact: support points, friction cone, motion cone, the push, and the centre of rotation with its sign."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
+        _outline(axes, shape, np.zeros(3), START, 1.4)
+        axes.plot(*(MM * np.asarray(support.point)).T, ".", color=BETWEEN, ms=3, label="support points")
+        point, normal = np.asarray(contacts.point[0]), np.asarray(contacts.normal[0])
+        mu = float(contacts.friction[0])
+        reach = 0.45 * float(np.max(np.asarray(shape.bounds[1] - shape.bounds[0])))
+        cones = (
+            ("friction cone", friction_cone(normal, mu), GREEN, "--"),
+            ("motion cone", motion_cone(surface, point, normal, mu), BLUE, "-"),
+        )
+        for name, edges, color, dash in cones:
+            for k, edge in enumerate(np.asarray(edges)):
+                end = point + reach * edge
+                label = name if k == 0 else None
+                axes.plot(*(MM * np.array([point, end])).T, dash, color=color, lw=1.6, label=label)
+            wedge = MM * np.array([point, *(point + reach * np.asarray(edges))])
+            axes.fill(*wedge.T, color=color, alpha=0.10, lw=0)
+        push = np.asarray(contacts.displacement[0])
+        push = 0.5 * reach * push / np.linalg.norm(push)
+        axes.annotate("", MM * point, MM * (point - push), arrowprops={"arrowstyle": "-|>", "color": ORANGE, "lw": 2.2})
+        axes.plot([], [], color=ORANGE, lw=2.2, label="push")
+        _center_of_rotation(axes, np.asarray(motion.twist))
+        tail = MM * (point - 1.1 * push)
+        axes.update_datalim([tail])  # an arrow does not count by itself
+        axes.autoscale_view()
+        axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
+        return figure
+
+
+def _center_of_rotation(axes: Axes, twist: np.ndarray) -> None:
+    vx, vy, omega = twist
+    if omega == 0:
+        return
+    center = MM * np.array([-vy, vx]) / omega
+    axes.plot(*center, "o", mfc="white", mec=PURPLE, ms=13, mew=1.6)
+    axes.annotate("+" if omega > 0 else "\N{MINUS SIGN}", center, ha="center", va="center", color=PURPLE, fontsize=12)
+    axes.plot([], [], "o", mfc="white", mec=PURPLE, label="centre of rotation")
+
+
+def push_figure(
+    shape: Shape, pushes: Mapping[str, tuple[Trajectory, np.ndarray]], radius: float, frames: int = 5
+) -> Figure:
+    """Pushes side by side: outline and finger at the start black, at the end red, between grey; the centre's trace."""
+    with plt.rc_context(STYLE):
+        figure, all_axes = plt.subplots(
+            1,
+            len(pushes),
+            figsize=(4.0 * len(pushes), 4.2),
+            sharex=True,
+            sharey=True,
+            layout="constrained",
+            squeeze=False,
+        )
+        for axes, (name, (push, path)) in zip(all_axes[0], pushes.items(), strict=True):
+            pose, path = np.asarray(push.pose), np.asarray(path)
+            shown = np.unique(np.linspace(0, len(pose) - 1, frames + 2).round().astype(int))
+            for k in [*shown[1:-1], shown[0], shown[-1]]:
+                color = START if k == 0 else END if k == shown[-1] else BETWEEN
+                _outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
+                axes.add_patch(plt.Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
+            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
+            axes.set(title=name, xlabel="x / mm", ylabel="y / mm", aspect="equal")
+        for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
+            all_axes[0, 0].plot([], [], color=color, label=label)
+        handles, labels = all_axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        return figure
+
+
+def _outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float) -> None:
+    points = getattr(shape, "vertices", None)
+    p = np.asarray(shape.boundary(200) if points is None else points)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    p = p @ np.array([[c, s], [-s, c]]) + pose[:2]
+    axes.plot(*(MM * np.vstack([p, p[:1]])).T, color=color, lw=width)
+
+
+def table_figure(cells: list[dict], title: str) -> Figure:
+    """Mean deviation by condition: ours with its interval, and the paper's, one group of bars a condition."""
+    with plt.rc_context(STYLE):
+        conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))
+        figure, axes = plt.subplots(figsize=(8.6, 3.8), layout="constrained")
+        for k, (model, color) in enumerate((("quartic", BLUE), ("ellipsoid", ORANGE))):
+            mine = [cell for cell in cells if cell["model"] == model]
+            x = np.arange(len(conditions)) + (k - 0.5) * 0.36
+            height = [cell["mean_mm"] for cell in mine]
+            error = [cell["ci95_bootstrap_mm"] for cell in mine]
+            axes.bar(x, height, 0.34, yerr=error, color=color, label=f"{model}, this run", capsize=2, ecolor="0.25")
+            paper = [cell["paper_mm"] for cell in mine]
+            axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
+        axes.set_xticks(np.arange(len(conditions)), [f"{surface}\n{name}" for surface, name in conditions])
+        axes.set(ylabel="mean deviation / mm", title=title)
+        axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+        return figure

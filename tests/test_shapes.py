@@ -1,0 +1,634 @@
+"""Outlines against brute force in complex numbers, which shares no code with them: distances, sweeps, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pushjax import Disk, Ellipsoid, Hand, Polygon, Slider, Status, rollout
+from pushjax._vec import Vec2, select, settle
+from pushjax.shapes._base import first_hit
+
+# Closed forms on lengths of order 0.1 m, in units of the dtype's rounding.
+ROUNDINGS = 100
+SIZE = 0.1
+# Central differences of step 1e-6 m: truncation 1e-12 / (1e-3 m)^2 at points no nearer than 1 mm to where the
+# distance has a kink, rounding 1e-17 / 1e-6.
+DIFFERENCE_STEP = 1e-6
+DIFFERENCE_TOLERANCE = 1e-5
+KINK_MARGIN = 1e-3
+# At a grazing contact the fraction of the path is the root of a difference that rounding reaches.
+TOUCH_TOLERANCE = 1e-12
+
+DTYPES = [np.float32, np.float64]
+
+
+def star(vertices: int, seed: int) -> np.ndarray:
+    """Star-shaped about the origin, counter-clockwise, mostly not convex."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * (np.arange(vertices) + rng.uniform(-0.3, 0.3, vertices)) / vertices
+    radius = rng.uniform(0.03, 0.08, vertices)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+POLYGONS = {
+    "triangle": np.array([(-0.03, -0.05), (0.0605, 0.0), (-0.03, 0.05)]),
+    "needle": np.array([(-0.08, -0.001), (0.08, 0.0), (-0.08, 0.001)]),
+    "square": np.array([(-0.045, -0.045), (0.045, -0.045), (0.045, 0.045), (-0.045, 0.045)]),
+    "arrow": np.array([(0.06, 0.0), (-0.05, 0.05), (-0.02, 0.0), (-0.05, -0.05)]),
+    "pentagon": star(5, 1),
+    "L": np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.1), (0, 0.1)]) - 0.04,
+    "almost straight": np.array([(-5, -5), (0, -5 - 1e-7), (5, -5), (2, 0), (5, 5), (-5, 5)]) / 100,
+    "star of 14": star(14, 2),
+    "star of 25": star(25, 3),
+}  # fmt: skip
+CORNERED = ["triangle", "square", "pentagon", "L", "star of 14"]
+
+
+@pytest.fixture(params=POLYGONS.values(), ids=POLYGONS.keys())
+def vertices(request) -> np.ndarray:
+    return request.param
+
+
+# --- brute force ---
+
+
+def complex_of(points: np.ndarray) -> np.ndarray:
+    points = np.asarray(points, np.float64)
+    return points[..., 0] + 1j * points[..., 1]
+
+
+def brute_closest(vertices: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance and closest point (complex): projection on every edge, sign by the winding number."""
+    z, a = complex_of(points)[..., None], complex_of(vertices)
+    edge = np.roll(a, -1) - a
+    foot = a + np.clip(((z - a) / edge).real, 0, 1) * edge
+    gap = np.abs(z - foot)
+    nearest = gap.argmin(axis=-1)[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turns = np.angle((np.roll(a, -1) - z) / (a - z)).sum(axis=-1) / (2 * np.pi)
+    inside = np.abs(np.nan_to_num(turns)) > 0.5
+    distance = np.take_along_axis(gap, nearest, -1)[..., 0]
+    return np.where(inside, -distance, distance), np.take_along_axis(foot, nearest, -1)[..., 0]
+
+
+def runner_up(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How much farther the next boundary feature is, away from the nearest one: zero on the medial axis."""
+    z, a = complex_of(points)[..., None], complex_of(vertices)
+    edge = np.roll(a, -1) - a
+    foot = a + np.clip(((z - a) / edge).real, 0, 1) * edge
+    gap = np.abs(z - foot)
+    nearest = gap.argmin(axis=-1)[..., None]
+    apart = np.abs(foot - np.take_along_axis(foot, nearest, -1)) > 1e-9
+    return np.where(apart, gap - np.take_along_axis(gap, nearest, -1), np.inf).min(axis=-1)
+
+
+def scattered(seed: int, count: int = 400) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-0.12, 0.12, (count, 2))
+
+
+closest = jax.jit(jax.vmap(lambda shape, x: shape.closest(x), (None, 0)))
+
+
+def lengths(dtype) -> float:
+    return ROUNDINGS * SIZE * float(np.finfo(dtype).eps)
+
+
+# --- distance, closest point, normal ---
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("flip", [False, True])
+def test_closest_is_that_of_brute_force(vertices, dtype, flip):
+    polygon = Polygon((vertices[::-1] if flip else vertices).astype(dtype))
+    points = scattered(0).astype(dtype)
+    distance, point, normal = closest(polygon, points)
+    assert {distance.dtype, point.dtype, normal.dtype} == {np.dtype(dtype)}
+    expected, foot = brute_closest(np.asarray(polygon.vertices), points)
+    np.testing.assert_allclose(distance, expected, rtol=0, atol=lengths(dtype))
+    clear = runner_up(vertices, points) > 1e-5
+    np.testing.assert_allclose(complex_of(point)[clear], foot[clear], rtol=0, atol=lengths(dtype))
+    # the foot and the normal lead back to the point
+    back = np.asarray(point) + np.asarray(distance)[:, None] * np.asarray(normal)
+    np.testing.assert_allclose(back, points, rtol=0, atol=lengths(dtype))
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=ROUNDINGS * np.finfo(dtype).eps)
+
+
+star_closest = jax.jit(jax.vmap(lambda vertices, x: Polygon(vertices).closest(x), (None, 0)))
+
+
+@given(st.integers(0, 10**6), st.sampled_from([5, 14]))
+@settings(max_examples=40, derandomize=True, deadline=None)
+def test_closest_of_random_polygons(seed, count):
+    vertices, points = star(count, seed), scattered(seed, 100)
+    distance, *_ = star_closest(vertices, points)
+    np.testing.assert_allclose(distance, brute_closest(vertices, points)[0], rtol=0, atol=lengths(float))
+
+
+def test_edges_written_out_or_in_an_array_agree():
+    """The same square, with 20 vertices along its sides."""
+    square, points = Polygon(POLYGONS["square"]), scattered(1)
+    side = np.linspace(-0.045, 0.045, 6)[:-1]
+    first = np.stack([side, np.full(5, -0.045)], axis=1)
+    quarter = np.array([(0, 1), (-1, 0)])
+    fine = Polygon(np.concatenate([first @ np.linalg.matrix_power(quarter, k) for k in range(4)]))
+    for a, b in zip(closest(square, points), closest(fine, points), strict=True):
+        np.testing.assert_allclose(a, b, atol=lengths(float))
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_on_the_edges(vertices, dtype):
+    v = np.asarray(Polygon(vertices.astype(dtype)).vertices)
+    edge = np.roll(v, -1, axis=0) - v
+    points = v + dtype(0.375) * edge
+    distance, point, normal = closest(Polygon(v), points)
+    np.testing.assert_allclose(distance, 0, atol=lengths(dtype))
+    np.testing.assert_allclose(point, points, atol=lengths(dtype))
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    np.testing.assert_allclose(normal, outward, atol=ROUNDINGS * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_on_the_vertices(vertices, dtype):
+    """Zero distance, the bisector as normal, and a finite gradient."""
+    polygon = Polygon(vertices.astype(dtype))
+    v = np.asarray(polygon.vertices)
+    distance, point, normal = closest(polygon, v)
+    np.testing.assert_allclose(distance, 0, atol=lengths(dtype))
+    np.testing.assert_allclose(point, v, atol=lengths(dtype))
+    edge = np.roll(v, -1, axis=0) - v
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    bisector = outward + np.roll(outward, 1, axis=0)
+    bisector /= np.linalg.norm(bisector, axis=1, keepdims=True)
+    np.testing.assert_allclose(normal, bisector, atol=ROUNDINGS * np.finfo(dtype).eps)
+    slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))(polygon, v)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+
+
+def sector_points(v: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Points that only a convex vertex is nearest to, for counter-clockwise `v`: the vertex, direction, distance."""
+    rng = np.random.default_rng(seed)
+    edge = np.roll(v, -1, axis=0) - v
+    before = np.roll(edge, 1, axis=0)
+    convex = np.flatnonzero(before[:, 0] * edge[:, 1] - before[:, 1] * edge[:, 0] > 0)
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    at = rng.choice(convex, count)
+    share = rng.uniform(0.02, 0.98, (count, 1))
+    direction = (1 - share) * np.roll(normal, 1, axis=0)[at] + share * normal[at]
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return v[at], direction, 10 ** rng.uniform(-4, -2.3, count)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", CORNERED)
+def test_straight_out_from_a_corner(name, dtype):
+    """Both edges at a corner are equally near: compiled, all fields must come from one of them, as uncompiled."""
+    polygon = Polygon(POLYGONS[name].astype(dtype))
+    vertex, direction, height = sector_points(np.asarray(polygon.vertices, np.float64), 2000)
+    clear = brute_closest(np.asarray(polygon.vertices), vertex + direction * height[:, None])[0] > height - 1e-6
+    vertex, direction, height = vertex[clear], direction[clear], height[clear]
+    points = (vertex + direction * height[:, None]).astype(dtype)
+    compiled = closest(polygon, points)
+    with jax.disable_jit():
+        eager = jax.vmap(polygon.closest)(points)
+    tolerance = lengths(dtype)
+    for (distance, point, normal), slack in ((compiled, 1), (eager, 1)):
+        np.testing.assert_allclose(distance, height, rtol=0, atol=slack * tolerance)
+        np.testing.assert_allclose(point, vertex, rtol=0, atol=slack * tolerance)
+        turned = np.linalg.norm(normal - direction, axis=1) * height
+        np.testing.assert_allclose(turned, 0, atol=slack * tolerance)
+
+
+@pytest.mark.parametrize("name", ["triangle", "square"])
+def test_fingers_push_corners_without_a_jump(name):
+    """Fields selected from two edges made the slider jump by centimetres, or the finger end up deep inside it.
+
+    It takes a program as large as a rollout for the compiler to work out one comparison twice: without `settle` in
+    the search for the nearest edge this one fails, in float32, on the CPU.
+    """
+    polygon = Polygon(POLYGONS[name].astype(np.float32))
+    slider = Slider(polygon, Ellipsoid(np.eye(3, dtype=np.float32), 0.03))
+    hand = Hand.finger(radius=np.float32(0.00475))
+    rng = np.random.default_rng(0)
+    corner = np.asarray(polygon.vertices)[rng.integers(len(polygon.vertices), size=1000)]
+    angle = rng.uniform(0, 2 * np.pi, 1000)
+    start = 1.4 * corner + 0.002 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    path = start[:, None] + (0.6 * corner - start)[:, None] * np.linspace(0, 1, 41)[:, None]
+    friction = rng.uniform(0.05, 0.5, 1000).astype(np.float32)
+
+    @jax.jit
+    @jax.vmap
+    def push(path, mu):
+        return rollout(slider, hand, path, pose=jnp.zeros(3, path.dtype), friction=mu)
+
+    found = push(path.astype(np.float32), friction)
+    assert found.pose.dtype == np.float32
+    assert np.isin(found.status, [Status.MOVING, Status.FREE]).all()
+    # a step of the finger moves the slider's origin no more than a few times as far
+    moved = np.linalg.norm(np.diff(found.pose[..., :2], axis=1), axis=-1)
+    assert moved.max() < 3 * np.linalg.norm(np.diff(path, axis=1), axis=-1).max()
+
+
+def test_on_the_medial_axis():
+    """Equally near to several edges: still one of them, with finite derivatives."""
+    square = Polygon(POLYGONS["square"])
+    points = np.array([(0.0, 0.0), (0.01, 0.01), (-0.02, 0.02), (0.03, -0.03)])
+    distance, point, normal = closest(square, points)
+    np.testing.assert_allclose(distance, np.abs(points).max(axis=1) - 0.045, atol=lengths(float))
+    np.testing.assert_allclose(point + -distance[:, None] * normal, 2 * np.asarray(point) - points, atol=lengths(float))
+    slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))(square, points)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+
+
+distance_slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))
+distances = jax.jit(jax.vmap(lambda p, x: p.signed_distance(x), (None, 0)))
+
+
+def test_gradient_of_the_distance_is_the_normal(vertices):
+    polygon = Polygon(vertices)
+    points = scattered(2)
+    _, slope = distance_slope(polygon, points)
+    np.testing.assert_allclose(slope, closest(polygon, points)[2], atol=1e-9)  # 1e-17 m over 1e-7 m to a vertex
+
+
+@pytest.mark.parametrize("name", CORNERED)
+def test_gradient_by_the_vertices(name):
+    polygon = Polygon(POLYGONS[name])
+    points = scattered(3)
+    far = np.abs(brute_closest(polygon.vertices, points)[0]) > KINK_MARGIN
+    points = points[far & (runner_up(np.asarray(polygon.vertices), points) > KINK_MARGIN)]
+    slope, _ = distance_slope(polygon, points)
+
+    @jax.jit
+    @jax.vmap
+    def moved(shift):
+        ends = [jax.vmap(Polygon(polygon.vertices + s * shift).signed_distance)(points) for s in (1, -1)]
+        return (ends[0] - ends[1]) / (2 * DIFFERENCE_STEP)
+
+    count = 2 * len(POLYGONS[name])
+    shifts = DIFFERENCE_STEP * np.eye(count).reshape(count, -1, 2)
+    difference = np.moveaxis(np.asarray(moved(shifts)), 0, 1).reshape(len(points), -1, 2)
+    # second derivatives of the distance change where a point passes from an edge to its end: compare most of them
+    wrong = np.abs(np.asarray(slope.vertices) - difference).max(axis=(1, 2)) > DIFFERENCE_TOLERANCE
+    assert len(points) > 100
+    assert wrong.mean() < 0.01
+
+
+# --- discs ---
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_disk(dtype):
+    center = np.array([0.02, -0.01], dtype)
+    disk = Disk(dtype(0.05), center)
+    points = np.concatenate([scattered(4), [center, center + dtype(1e-12)]]).astype(dtype)
+    distance, point, normal = map(np.asarray, closest(disk, points))
+    assert {distance.dtype, point.dtype, normal.dtype} == {np.dtype(dtype)}
+    np.testing.assert_allclose(distance, np.linalg.norm(points - center, axis=1) - 0.05, atol=lengths(dtype))
+    np.testing.assert_allclose(np.linalg.norm(point - center, axis=1), 0.05, atol=lengths(dtype))
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=ROUNDINGS * np.finfo(dtype).eps)
+    np.testing.assert_allclose(point + distance[:, None] * normal, points, atol=lengths(dtype))
+    by_disk, by_point = distance_slope(disk, points)
+    np.testing.assert_allclose(by_point, normal, atol=ROUNDINGS * np.finfo(dtype).eps)
+    np.testing.assert_array_equal(by_disk.radius, -1)
+    np.testing.assert_allclose(by_disk.center, -normal, atol=ROUNDINGS * np.finfo(dtype).eps)
+
+
+def test_disk_is_the_limit_of_polygons():
+    """A regular 400-gon lies within r (1 - cos(pi / 400)) of its circle."""
+    points = scattered(5)
+    sag = 0.05 * (1 - np.cos(np.pi / 400))
+    off = np.asarray(distances(Polygon.regular(400, 0.05), points) - distances(Disk(0.05), points))
+    assert off.min() >= -lengths(float)
+    assert off.max() <= sag + lengths(float)
+
+
+def test_contains():
+    arrow = Polygon(POLYGONS["arrow"])
+    inside = jax.vmap(arrow.contains)(np.array([(0, 0), (-0.03, 0), (0.06, 0), (0.07, 0)]))
+    assert inside.tolist() == [True, False, True, False]
+
+
+# --- sweep ---
+
+sweeps = jax.jit(
+    jax.vmap(
+        lambda shape, x, path, radius: shape.outline().sweep(Vec2.of(x), Vec2.of(path), radius), (None, 0, 0, None)
+    )
+)
+ALONG = np.linspace(0, 1, 1001)
+
+
+def check_sweep(distance, shape, start, path, radius, dtype=np.float64) -> np.ndarray:
+    """Where it says they touch, they do; before that, or where it says they do not, no sample is nearer."""
+    start, path = start.astype(dtype), path.astype(dtype)
+    outside = distance(start) >= radius + lengths(dtype)
+    start, path = start[outside], path[outside]
+    found = sweeps(shape, start, path, dtype(radius))
+    assert found.dtype == dtype
+    found = np.asarray(found, np.float64)
+    hit = np.isfinite(found)
+    assert (found >= 0).all()
+    assert (found[hit] <= 1).all()
+    length = np.linalg.norm(path, axis=1)
+    # rounding moves a grazing contact along the path by the root of its depth; across it by the depth itself
+    slack = lengths(dtype) * (1 + length / SIZE)
+    at = start + np.where(hit, found, 0)[:, None] * path
+    assert (np.abs(distance(at) - radius) <= slack)[hit].all()
+    free = ALONG[:, None] * np.where(hit, found, 1)
+    clearance = distance(start + free[..., None] * path) - radius
+    assert (clearance.min(axis=0) >= -slack).all()
+    return hit
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [0.0, 0.00475, 0.03])
+@pytest.mark.parametrize("name", ["triangle", "arrow", "L", "star of 14"])
+def test_sweep(name, radius, dtype):
+    polygon = Polygon(POLYGONS[name].astype(dtype))
+    v = np.asarray(polygon.vertices, np.float64)
+    rng = np.random.default_rng(6)
+    start = rng.uniform(-0.2, 0.2, (300, 2))
+    path = rng.normal(size=(300, 2)) * 10 ** rng.uniform(-3, 0.5, (300, 1))  # from 1 mm to 3 m: right through
+    hit = check_sweep(lambda x: brute_closest(v, x)[0], polygon, start, path, radius, dtype)
+    assert hit.any()
+    assert not hit.all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_sweep_of_a_disk(dtype):
+    disk = Disk(dtype(0.05), np.array([0.02, -0.01], dtype))
+    rng = np.random.default_rng(7)
+    start = rng.uniform(-0.2, 0.2, (300, 2))
+    path = rng.normal(size=(300, 2)) * 10 ** rng.uniform(-3, 0.5, (300, 1))
+    center = np.asarray(disk.center, np.float64)
+    hit = check_sweep(lambda x: np.linalg.norm(x - center, axis=-1) - 0.05, disk, start, path, 0.00475, dtype)
+    assert hit.any()
+    assert not hit.all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [0.0, 0.00475])
+@pytest.mark.parametrize("name", CORNERED)
+def test_nothing_slips_through_a_vertex(name, radius, dtype):
+    """Aimed exactly at a vertex from within its sector: between two edges there is no gap, not even of a rounding."""
+    polygon = Polygon(POLYGONS[name].astype(dtype))
+    vertex, direction, _ = sector_points(np.asarray(polygon.vertices, np.float64), 1000, seed=8)
+    start = (vertex + 0.3 * direction).astype(dtype)
+    path = (2 * (vertex - start)).astype(dtype)
+    found = np.asarray(sweeps(polygon, start, path, dtype(radius)))
+    assert np.isfinite(found).all()
+    ahead = brute_closest(np.asarray(polygon.vertices), start + (found - 0.5)[:, None] * 0)[0] > 0
+    alone = (found > 0.5 * (0.3 - radius) / 0.3 - 1e-5) & ahead  # else another part of the outline came first
+    assert alone.mean() > 0.3
+    np.testing.assert_allclose(found[alone], 0.5 * (0.3 - radius) / 0.3, atol=1e-4 if dtype == np.float32 else 1e-9)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("radius", [0.0, 0.00475])
+def test_a_disc_that_starts_touching_does_not_pass(radius, dtype, vertices):
+    """Rounding puts it a little inside or outside: pushed on, it touches at once; pulled away, not at all."""
+    polygon = Polygon(vertices.astype(dtype))
+    v = np.asarray(polygon.vertices, np.float64)
+    edge = np.roll(v, -1, axis=0) - v
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    share = np.random.default_rng(9).uniform(0.1, 0.9, (40, 1, 1))
+    start = (v + share * edge + radius * normal).reshape(-1, 2)
+    outward = np.broadcast_to(normal, (40, *normal.shape)).reshape(-1, 2)
+    free = np.abs(brute_closest(v, start)[0] - radius) < 1e-6  # nothing else in the way
+    start, outward = start[free].astype(dtype), outward[free].astype(dtype)
+    pressed = np.asarray(sweeps(polygon, start, -0.02 * outward, dtype(radius)))
+    assert (pressed <= 1e-4).all()
+    assert (np.asarray(sweeps(polygon, start, dtype(1e-3) * outward, dtype(radius))) > 0.1).all()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_disc_that_starts_touching_a_vertex_does_not_pass(dtype):
+    polygon = Polygon(POLYGONS["pentagon"].astype(dtype))
+    vertex, direction, _ = sector_points(np.asarray(polygon.vertices, np.float64), 500)
+    start = (vertex + 0.00475 * direction).astype(dtype)
+    path = (-0.01 * direction).astype(dtype)
+    assert (np.asarray(sweeps(polygon, start, path, dtype(0.00475))) <= 1e-4).all()
+
+
+def test_grazing():
+    """Past a square's side at a distance a hair above and below the radius, and past a corner."""
+    square, radius = Polygon(POLYGONS["square"]), 0.005
+    hair = 1e-9
+    start = np.array([(-0.2, 0.05 + hair), (-0.2, 0.05 - hair), (-0.2, 0.05 - hair)])
+    path = np.array([(0.4, 0.0), (0.4, 0.0), (0.0, 0.3)])
+    found = np.asarray(sweeps(square, start, path, radius))
+    assert not np.isfinite(found[[0, 2]]).any()
+    # the corner's circle is met where its height is 0.005 - hair
+    reach = 0.155 - np.sqrt(radius**2 - (radius - hair) ** 2)
+    np.testing.assert_allclose(found[1], reach / 0.4, atol=1e-8)
+
+
+def test_first_hit_far_away():
+    """In float32 and from a metre away, a miss and a hit by 0.5 um differ."""
+    x, path = Vec2(jnp.float32(-1), jnp.float32(0)), Vec2(jnp.float32(2), jnp.float32(0))
+    for off, hits in ((0.005 + 5e-7, False), (0.005 - 5e-7, True)):
+        found = jax.jit(first_hit)(x._replace(y=jnp.float32(off)), path, jnp.float32(0.005))
+        assert bool(np.isfinite(found)) == hits
+
+
+def test_no_path_touches_nothing():
+    start = np.array([(0.2, 0.0), (0.045, 0.0), (0.045, 0.045)])
+    for shape in (Polygon(POLYGONS["square"]), Disk(0.045)):
+        assert np.isinf(sweeps(shape, start, np.zeros((3, 2)), 0.0)).all()
+
+
+@pytest.mark.parametrize("shape", [Polygon(POLYGONS["arrow"]), Polygon(POLYGONS["star of 14"]), Disk(0.05)])
+def test_gradient_of_the_sweep(shape):
+    rng = np.random.default_rng(10)
+    start = 0.15 * np.exp(1j * rng.uniform(0, 2 * np.pi, 100))
+    start = np.stack([start.real, start.imag], axis=1)
+    path = -2 * start + rng.normal(size=(100, 2)) * 0.02
+
+    def fraction(shape, x, p, radius):
+        return shape.outline().sweep(Vec2.of(x), Vec2.of(p), radius)
+
+    slope = jax.jit(jax.vmap(jax.grad(fraction, argnums=(0, 1, 2, 3)), (None, 0, 0, None)))(shape, start, path, 0.004)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    shift = DIFFERENCE_STEP * np.eye(2)
+    for k in range(2):
+        ahead, behind = (sweeps(shape, start + s * shift[k], path, 0.004) for s in (1, -1))
+        with np.errstate(invalid="ignore"):
+            difference = (ahead - behind) / (2 * DIFFERENCE_STEP)
+        off = np.abs(slope[1][:, k] - difference) / (1 + np.abs(difference))
+        assert np.nanmean(off < DIFFERENCE_TOLERANCE) > 0.95  # but for those that graze or change edges within the step
+
+
+# --- sizes ---
+
+
+def test_area_and_centroid():
+    area = [float(Polygon(POLYGONS[name]).area) for name in ("triangle", "square", "L")]
+    np.testing.assert_allclose(area, [0.0905 * 0.1 / 2, 0.09**2, 0.1 * 0.03 + 0.07 * 0.03], rtol=1e-12)
+    np.testing.assert_allclose(Polygon(POLYGONS["triangle"]).centroid, [0.0005 / 3, 0], atol=1e-15)
+    x = (0.003 * 0.05 + 0.0021 * 0.015) / 0.0051 - 0.04
+    np.testing.assert_allclose(Polygon(POLYGONS["L"]).centroid, [x, x], atol=1e-14)
+    disk = Disk(0.05, (0.1, 0.2))
+    np.testing.assert_allclose(disk.area, np.pi * 0.0025)
+    np.testing.assert_array_equal(disk.centroid, [0.1, 0.2])
+    np.testing.assert_allclose(disk.bounds, [(0.05, 0.15), (0.15, 0.25)])
+
+
+def test_area_and_centroid_by_sampling(vertices):
+    polygon = Polygon(vertices)
+    rng = np.random.default_rng(11)
+    low, high = map(np.asarray, polygon.bounds)
+    np.testing.assert_array_equal([low, high], [vertices.min(axis=0), vertices.max(axis=0)])
+    points = rng.uniform(low, high, (20_000, 2))
+    inside = brute_closest(vertices, points)[0] <= 0
+    share, box = inside.mean(), np.prod(high - low)
+    error = 4 * np.sqrt(share * (1 - share) / len(points)) + 1e-12  # four standard errors
+    assert abs(share - float(polygon.area) / box) < error
+    error = 4 * points[inside].std(axis=0) / np.sqrt(inside.sum())
+    assert (np.abs(points[inside].mean(axis=0) - polygon.centroid) < error).all()
+
+
+def test_area_and_centroid_far_from_the_origin():
+    away = np.array([100.0, -50.0])
+    polygon = Polygon((POLYGONS["square"] + away).astype(np.float32))
+    # the corners themselves are rounded to 4e-6 m there
+    np.testing.assert_allclose(polygon.area, 0.0081, rtol=2e-4)
+    np.testing.assert_allclose(polygon.centroid, away, rtol=1e-6)
+
+
+def test_perimeter_and_boundary(vertices):
+    polygon = Polygon(vertices)
+    a = complex_of(vertices)
+    perimeter = np.abs(np.roll(a, -1) - a).sum()
+    np.testing.assert_allclose(polygon.perimeter, perimeter, rtol=1e-12)
+    points = polygon.boundary(500)
+    np.testing.assert_allclose(brute_closest(vertices, points)[0], 0, atol=1e-15)
+    gaps = np.abs(np.roll(complex_of(points), -1) - complex_of(points))
+    assert gaps.max() <= perimeter / 500 * (1 + 1e-9)
+    assert np.isclose(gaps, perimeter / 500).sum() >= 500 - len(vertices)  # all but those across a corner
+    about = complex_of(points) - complex_of(polygon.centroid)
+    assert (about.conj() * np.roll(about, -1)).imag.sum() > 0  # counter-clockwise
+
+
+def test_boundary_of_a_disk():
+    disk = Disk(0.05, (0.1, 0.2))
+    points = complex_of(disk.boundary(7)) - (0.1 + 0.2j)
+    np.testing.assert_allclose(np.roll(points, -1) / points, np.exp(2j * np.pi / 7))
+    np.testing.assert_allclose(np.abs(points), 0.05)
+
+
+# --- making them ---
+
+
+def test_stored_counter_clockwise(vertices):
+    kept, flipped = Polygon(vertices), Polygon(vertices[::-1])
+    np.testing.assert_array_equal(kept.vertices, vertices)
+    np.testing.assert_array_equal(flipped.vertices[0], vertices[-1])
+    np.testing.assert_array_equal(flipped.vertices, np.roll(vertices, 1, axis=0))
+    assert float(kept.area) > 0
+    assert float(flipped.area) == pytest.approx(float(kept.area), rel=1e-12)
+
+
+def test_rectangle_and_regular():
+    expected = [(-0.2, -0.1), (0.2, -0.1), (0.2, 0.1), (-0.2, 0.1)]
+    np.testing.assert_array_equal(Polygon.rectangle(0.4, 0.2).vertices, expected)
+    hexagon = complex_of(Polygon.regular(6, 0.3).vertices)
+    np.testing.assert_allclose(hexagon, 0.3 * np.exp(2j * np.pi * np.arange(6) / 6), atol=1e-16)
+
+
+def test_dtype_is_the_input_s():
+    single = np.float32
+
+    def results(shape, point):
+        sizes = shape.area, shape.centroid, shape.bounds, shape.boundary(5)
+        return shape, sizes, shape.closest([0.3, 0.2]), shape.closest(point)  # Python numbers do not widen it
+
+    for shape in (
+        Polygon.rectangle(single(0.1), 0.2),
+        Polygon.rectangle(0.1, single(0.2)),
+        Polygon.regular(5, single(0.1)),
+        Polygon(POLYGONS["star of 14"].astype(single)),
+        Disk(single(0.1)),
+        Disk(0.1, np.zeros(2, single)),
+    ):
+        found = jax.eval_shape(results, shape, np.zeros(2, single))
+        assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {np.dtype(single)}
+        assert jax.eval_shape(results, shape, np.zeros(2))[-1][0].dtype == np.float64
+    assert Polygon.rectangle(1, 2).vertices.dtype == np.float64
+    assert Polygon([(0, 0), (1, 0), (0, 1)]).vertices.dtype == np.float64
+
+
+SQUARE = POLYGONS["square"]
+BAD = {
+    "no area": (lambda: Polygon([(0, 0), (1, 1), (2, 2)]), "vertices"),
+    "bow tie": (lambda: Polygon(SQUARE[[0, 2, 1, 3]]), "vertices"),
+    "crossing": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (1, -1), (0, 3)]), "vertices: the outline crosses"),
+    "touching": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (2, 0), (0, 3)]), "vertices: the outline crosses or touches"),
+    "spike": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (4, 5), (4, 3.5), (0, 3)]), "vertices: the outline"),
+    "repeated": (lambda: Polygon(SQUARE[[0, 1, 1, 2, 3]]), "vertices: 1 and 2 are the same"),
+    "closed": (lambda: Polygon(SQUARE[[0, 1, 2, 3, 0]]), "vertices: 0 and 4 are the same"),
+    "one point": (lambda: Polygon(np.zeros((3, 2))), "vertices"),
+    "two": (lambda: Polygon(SQUARE[:2]), "vertices.*at least three"),
+    "NaN": (lambda: Polygon([(0, 0), (1, 0), (np.nan, 1)]), r"vertices.*NaN.*\(2, 0\)"),
+    "infinite": (lambda: Polygon([(0, 0), (1, 0), (np.inf, 1)]), "vertices"),
+    "three columns": (lambda: Polygon(np.zeros((4, 3))), r"vertices has shape \(4, 3\)"),
+    "flat": (lambda: Polygon(np.zeros(6)), "vertices has shape"),
+    "width": (lambda: Polygon.rectangle(-1, 1), "width"),
+    "height": (lambda: Polygon.rectangle(1, 0), "height"),
+    "height NaN": (lambda: Polygon.rectangle(1, np.nan), "height"),
+    "width array": (lambda: Polygon.rectangle(np.ones(2), 1), "width has shape"),
+    "sides": (lambda: Polygon.regular(2, 1), "sides"),
+    "circumradius": (lambda: Polygon.regular(5, -1), "circumradius"),
+    "circumradius array": (lambda: Polygon.regular(5, np.ones(5)), "circumradius has shape"),
+    "radius": (lambda: Disk(0), "radius"),
+    "radius infinite": (lambda: Disk(np.inf), "radius"),
+    "radius array": (lambda: Disk([1.0, 2.0]), "radius has shape"),
+    "center": (lambda: Disk(1, (0, 0, 0)), "center has shape"),
+    "center NaN": (lambda: Disk(1, (0, np.nan)), "center"),
+    "point": (lambda: Disk(1).closest(np.zeros(3)), "point has shape"),
+    "point NaN": (lambda: Polygon(SQUARE).closest([0, np.nan]), "point"),
+}
+
+
+@pytest.mark.parametrize(("make", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_input_is_named(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_traced_values_do_not_raise():
+    """They cannot be looked at; shapes still are."""
+
+    @jax.jit
+    def area(vertices, radius):
+        return Polygon(vertices).area + Disk(radius).signed_distance(vertices[0]) + Polygon.rectangle(radius, 1.0).area
+
+    assert np.isnan(area(np.full((4, 2), np.nan), -1.0))
+    with pytest.raises(ValueError, match="vertices has shape"):
+        area(np.zeros((4, 3)), 1.0)
+
+
+# --- settling ---
+
+
+def test_settle_returns_its_values():
+    def kept(x, y, flag):
+        return settle((Vec2(x, y), flag, ~flag), x)
+
+    for dtype in DTYPES:
+        (x, y), yes, no = jax.jit(kept)(dtype(0.1), dtype(-3e5), True)
+        assert (x, y, bool(yes), bool(no)) == (dtype(0.1), dtype(-3e5), True, False)
+        assert x.dtype == dtype
+        assert yes.dtype == bool
+    assert not bool(settle(jnp.array(True), jnp.array(np.nan)))
+    assert float(jax.grad(lambda x: settle(x * x, x))(3.0)) == 6
+    with pytest.raises(TypeError, match="int32"):
+        settle(jnp.zeros((), jnp.int32), jnp.ones(()))
+
+
+def test_select():
+    a, b = Vec2(jnp.array(1.0), jnp.array(2.0)), Vec2(jnp.array(3.0), jnp.array(4.0))
+    assert select(jnp.array(True), a, b) == a
+    assert select(jnp.array(False), a, b) == b
