@@ -14,7 +14,7 @@ program) to 0.4 % of the loss at worst, and mostly to all digits, on every set o
 minimisation by gradients, fits batch; the semi-definite program does not.
 """
 
-from typing import NamedTuple, overload
+from typing import Any, Literal, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -79,21 +79,28 @@ class _Pairs(NamedTuple):
 
 
 @overload
-def fit_limit_surface(wrench: Numeric, twist: Numeric, length: Numeric, *, degree: int = 4) -> LimitSurface: ...
-@overload
 def fit_limit_surface(
     wrench: Numeric,
     twist: Numeric,
     length: Numeric,
     *,
-    degree: int = 4,
-    weights: Numeric | None = None,
-    value_weight: Numeric = VALUE_WEIGHT,
-    ridge: Numeric = RIDGE,
-    terms: int = TERMS,
-    report: bool = False,
-): ...
+    degree: Literal[4] = 4,
+    report: Literal[False] = False,
+    **loss: Any,
+) -> Quartic: ...
+@overload
 def fit_limit_surface(
+    wrench: Numeric, twist: Numeric, length: Numeric, *, degree: Literal[2], report: Literal[False] = False, **loss: Any
+) -> Ellipsoid: ...
+@overload
+def fit_limit_surface(
+    wrench: Numeric, twist: Numeric, length: Numeric, *, degree: int, report: Literal[False] = False, **loss: Any
+) -> LimitSurface: ...
+@overload
+def fit_limit_surface(
+    wrench: Numeric, twist: Numeric, length: Numeric, *, degree: int = 4, report: Literal[True], **loss: Any
+) -> tuple[LimitSurface, "FitReport"]: ...
+def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     wrench: Numeric,
     twist: Numeric,
     length: Numeric,
@@ -115,7 +122,8 @@ def fit_limit_surface(
     static) and `vmap`; not under `grad`.
 
     Raises ValueError for fewer pairs than coefficients (6 or 15), arrays of the wrong shape or not finite, a zero
-    twist, wrenches that are all zero, a length that is not positive, negative weights, a degree other than 2 and 4.
+    twist, wrenches that are all zero, a length that is not positive, negative or zero weights, a degree other than 2
+    and 4.
     """
     dtype = common_dtype(wrench, twist, length)
     w, v, rho = as_float(wrench, dtype), as_float(twist, dtype), as_float(length, dtype)
@@ -124,6 +132,9 @@ def fit_limit_surface(
     shaped("weights", share, (w.shape[0],))
     finite("weights", share)
     non_negative("weights", share)
+    known = concrete(share)
+    if known is not None and not known.any():
+        raise ValueError("weights must not all be zero")
     for name, value in (("value_weight", value_weight), ("ridge", ridge)):
         finite(name, value)
         positive(name, value)
@@ -140,7 +151,7 @@ def fit_limit_surface(
 
 
 def mean_twist_angle(surface: LimitSurface, wrench: Numeric, twist: Numeric) -> Float[Array, ""]:
-    """Mean angle, rad, between the surface's twists under wrenches (pairs, 3) and given twists (pairs, 3), normalised."""
+    """Mean angle, rad, between the surface's twists under wrenches (pairs, 3) and given twists (pairs, 3)."""
     w, v = as_float(wrench, surface.length.dtype), as_float(twist, surface.length.dtype)
     shaped("wrench", w, ("pairs", 3))
     shaped("twist", v, (w.shape[0], 3))

@@ -40,8 +40,7 @@ def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 do
 
     Raises ValueError for fewer than one step, or configurations that differ in shape or are not finite.
     """
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1; got {steps}")
+    _check_steps(steps)
     dtype = common_dtype(start, end)
     a, b = as_float(start, dtype), as_float(end, dtype)
     shaped("start", a, ("dof",))
@@ -58,13 +57,21 @@ def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
     Length is measured in the configuration's own units, straight from point to point. A path that does not move
     repeats its first point. Raises ValueError for fewer than two points or one step, or values that are not finite.
     """
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1; got {steps}")
+    _check_steps(steps)
     p = checked_path(path, None)
-    hops = jnp.sqrt(jnp.sum(jnp.diff(p, axis=0) ** 2, axis=1))
+    squared = jnp.sum(jnp.diff(p, axis=0) ** 2, axis=1)
+    moves = squared > 0  # a root's derivative is infinite where a recording pauses
+    hops = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
     arc = jnp.concatenate([jnp.zeros(1, p.dtype), jnp.cumsum(hops)])
     at = jnp.arange(steps + 1, dtype=p.dtype) / steps * arc[-1]
     return jnp.stack([jnp.interp(at, arc, column) for column in p.T], axis=1)
+
+
+def _check_steps(steps: int) -> None:
+    if not isinstance(steps, (int, np.integer)):
+        raise ValueError(f"steps must be a whole number; got {steps!r}")
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1; got {steps}")
 
 
 def checked_path(path: Numeric, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -12,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from pushjax.limit_surface import LimitSurface
 from pushjax.rollout import Trajectory
@@ -23,7 +25,7 @@ MM = 1e3
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"  # Okabe & Ito
 START, BETWEEN, END = "black", "0.72", "#C1121F"
 
-STYLE = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.spines.top": False,
@@ -106,11 +108,12 @@ def motion_cone_figure(
             axes.fill(*wedge.T, color=color, alpha=0.10, lw=0)
         push = np.asarray(contacts.displacement[0])
         push = 0.5 * reach * push / np.linalg.norm(push)
-        axes.annotate("", MM * point, MM * (point - push), arrowprops={"arrowstyle": "-|>", "color": ORANGE, "lw": 2.2})
+        tip, tail = MM * point, MM * (point - push)
+        arrow = {"arrowstyle": "-|>", "color": ORANGE, "lw": 2.2}
+        axes.annotate("", (tip[0], tip[1]), (tail[0], tail[1]), arrowprops=arrow)
         axes.plot([], [], color=ORANGE, lw=2.2, label="push")
         _center_of_rotation(axes, np.asarray(motion.twist))
-        tail = MM * (point - 1.1 * push)
-        axes.update_datalim([tail])  # an arrow does not count by itself
+        axes.update_datalim([1.1 * tail - 0.1 * tip])  # an arrow does not count by itself
         axes.autoscale_view()
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3)
@@ -147,7 +150,7 @@ def push_figure(
             for k in [*shown[1:-1], shown[0], shown[-1]]:
                 color = START if k == 0 else END if k == shown[-1] else BETWEEN
                 _outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
-                axes.add_patch(plt.Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
+                axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
             axes.set(title=name, xlabel="x / mm", ylabel="y / mm", aspect="equal")
         for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):

@@ -101,12 +101,27 @@ def _world(record: _Record, length: Scalar) -> Step:
     )
 
 
-def _moved(pose: Vec3, contact: Vec2, motion: Vec3, angle: Vec2) -> Vec3:
-    """`pose` after the body twist `motion`; the point `contact` of the slider goes straight, as seen at `angle`."""
-    straight = (motion.xy + contact.perp().scale(motion.z)).rotate(angle)
-    theta = pose.z + motion.z
-    swing = contact.rotate(turn(theta)) - contact.rotate(turn(pose.z))
-    return Vec3(pose.x + straight.x - swing.x, pose.y + straight.y - swing.y, theta)
+class _Placed(NamedTuple):
+    """A pose, and the unit vector of its angle: sines cost as much as a contact."""
+
+    pose: Vec3
+    angle: Vec2
+
+    @staticmethod
+    def at(pose: Vec3) -> "_Placed":
+        return _Placed(pose, settle(turn(pose.z), pose.x))
+
+    def local(self, world: Vec2) -> Vec2:
+        """A world point in the body frame."""
+        return (world - self.pose.xy).unrotate(self.angle)
+
+    def moved(self, contact: Vec2, motion: Vec3, seen: Vec2) -> "_Placed":
+        """After the body twist `motion`; the slider's point `contact` goes straight, the twist turned by `seen`."""
+        straight = (motion.xy + contact.perp().scale(motion.z)).rotate(seen)
+        theta = self.pose.z + motion.z
+        angle = settle(turn(theta), self.pose.x)
+        swing = contact.rotate(angle) - contact.rotate(self.angle)
+        return _Placed(Vec3(self.pose.x + straight.x - swing.x, self.pose.y + straight.y - swing.y, theta), angle)
 
 
 def _advance(
@@ -121,8 +136,9 @@ def _advance(
 ) -> _Record:
     """One step of one finger from `before` to `after` (world)."""
     path = after - before
-    angle = turn(pose.z)
-    met = meet(outline, (before - pose.xy).unrotate(angle), path.unrotate(angle), radius, form.length)
+    start = _Placed.at(pose)
+    local = settle((start.local(before), path.unrotate(start.angle)), pose.x)
+    met = meet(outline, local[0], local[1], radius, form.length)
     meeting_point = before + path.scale(met.start)
     pushed = path.scale(jnp.where(met.reached, 1 - met.start, 0.0))
     gap = jnp.where(met.reached, met.gap, 1.0)  # else out of reach
@@ -130,20 +146,19 @@ def _advance(
     def stage(carry, share):
         """Solve the contact as it is when `share` of the last stage's motion is done."""
         twist, point, angle, status = carry
-        there = _moved(pose, point, twist.scale(share), angle)
-        angle = turn(there.z)
-        seen = settle(outline.closest((meeting_point + pushed.scale(share) - there.xy).unrotate(angle)), pose.x)
-        contact = Contact(seen.point, -seen.normal, pushed.unrotate(angle), friction, gap)
+        there = start.moved(point, twist.scale(share), angle)
+        seen = settle(outline.closest(there.local(meeting_point + pushed.scale(share))), pose.x)
+        contact = Contact(seen.point, -seen.normal, pushed.unrotate(there.angle), friction, gap)
         motion = solve_single(form, contact, solver)
         # A failed prediction must show, whatever the correction made of it
         status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
-        return (motion.twist, seen.point, angle, status), motion
+        return (motion.twist, seen.point, there.angle, status), motion
 
     zero = jnp.zeros_like(pose.x)
-    start = (Vec3(zero, zero, zero), Vec2(zero, zero), angle, jnp.zeros((), jnp.int8))
-    (twist, point, angle, status), motions = jax.lax.scan(stage, start, jnp.array([0.0, 0.5], zero.dtype))
+    begin = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
+    (twist, point, angle, status), motions = jax.lax.scan(stage, begin, jnp.array([0.0, 0.5], zero.dtype))
     motion: SingleMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
-    moved = _moved(pose, point, twist, angle)
+    moved = start.moved(point, twist, angle).pose
     status = jnp.where(met.overlapping & (status != Status.INVALID), Status.OVERLAPPING, status).astype(jnp.int8)
     return _guarded(motion, moved, pose, status)
 

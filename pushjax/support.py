@@ -188,24 +188,29 @@ class Support(eqx.Module):
         """
         if pairs < 1:
             raise ValueError(f"pairs must be at least 1; got {pairs}")
-        dtype = self.point.dtype
         gyration = self.radius_of_gyration
-        rho = jnp.where(gyration > 0, gyration, 1.0) if length is None else as_float(length, dtype)
+        rho = jnp.where(gyration > 0, gyration, 1.0) if length is None else as_float(length, gyration.dtype)
         shaped("length", rho, ())
         finite("length", rho)
         positive("length", rho)
-        k_free, k_point, k_side, k_facet = jax.random.split(key, 4)
-        free = jax.random.normal(k_free, (pairs, 3), dtype)
-        about = jax.random.choice(k_point, self.point, (pairs,), p=self.limit / self.load)
-        # a rotation about r moves the origin with (r_y, -r_x) omega
-        spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
-        pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
-        facets = round(FACET_SHARE * pairs)
-        normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
-        normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
-        twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
-        wrench = jax.vmap(self.wrench)(twist, jax.random.split(k_facet, pairs))
-        return WrenchTwistPairs(wrench, twist, rho)
+        return _pairs(self, key, pairs, rho)
+
+
+@eqx.filter_jit
+def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
+    dtype = support.point.dtype
+    k_free, k_point, k_side, k_facet = jax.random.split(key, 4)
+    free = jax.random.normal(k_free, (pairs, 3), dtype)
+    about = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
+    # a rotation about r moves the origin with (r_y, -r_x) omega
+    spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
+    pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
+    facets = round(FACET_SHARE * pairs)
+    normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
+    normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
+    twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
+    wrench = jax.vmap(support.wrench)(twist, jax.random.split(k_facet, pairs))
+    return WrenchTwistPairs(wrench, twist, rho)
 
 
 def _cell_centers(low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:

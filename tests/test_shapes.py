@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.typing import ArrayLike
 
-from pushjax import Disk, Ellipsoid, Hand, Polygon, Slider, Status, rollout
-from pushjax._vec import Vec2, select, settle
+from pushjax import Disk, Polygon
+from pushjax._vec import Vec2, Vec3, select, settle, turn
 from pushjax.shapes._base import first_hit
 
 # Closed forms on lengths of order 0.1 m, in units of the dtype's rounding.
@@ -19,8 +20,6 @@ SIZE = 0.1
 DIFFERENCE_STEP = 1e-6
 DIFFERENCE_TOLERANCE = 1e-5
 KINK_MARGIN = 1e-3
-# At a grazing contact the fraction of the path is the root of a difference that rounding reaches.
-TOUCH_TOLERANCE = 1e-12
 
 DTYPES = [np.float32, np.float64]
 
@@ -42,12 +41,11 @@ POLYGONS = {
     "L": np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.1), (0, 0.1)]) - 0.04,
     "almost straight": np.array([(-5, -5), (0, -5 - 1e-7), (5, -5), (2, 0), (5, 5), (-5, 5)]) / 100,
     "star of 14": star(14, 2),
-    "star of 25": star(25, 3),
 }  # fmt: skip
-CORNERED = ["triangle", "square", "pentagon", "L", "star of 14"]
+CORNERED = ["triangle", "L", "star of 14"]
 
 
-@pytest.fixture(params=POLYGONS.values(), ids=POLYGONS.keys())
+@pytest.fixture(params=POLYGONS.values(), ids=list(POLYGONS))
 def vertices(request) -> np.ndarray:
     return request.param
 
@@ -55,12 +53,12 @@ def vertices(request) -> np.ndarray:
 # --- brute force ---
 
 
-def complex_of(points: np.ndarray) -> np.ndarray:
-    points = np.asarray(points, np.float64)
-    return points[..., 0] + 1j * points[..., 1]
+def complex_of(points: ArrayLike) -> np.ndarray:
+    pairs = np.asarray(points, np.float64)
+    return pairs[..., 0] + 1j * pairs[..., 1]
 
 
-def brute_closest(vertices: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def brute_closest(vertices: ArrayLike, points: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Signed distance and closest point (complex): projection on every edge, sign by the winding number."""
     z, a = complex_of(points)[..., None], complex_of(vertices)
     edge = np.roll(a, -1) - a
@@ -74,7 +72,7 @@ def brute_closest(vertices: np.ndarray, points: np.ndarray) -> tuple[np.ndarray,
     return np.where(inside, -distance, distance), np.take_along_axis(foot, nearest, -1)[..., 0]
 
 
-def runner_up(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+def runner_up(vertices: ArrayLike, points: ArrayLike) -> np.ndarray:
     """How much farther the next boundary feature is, away from the nearest one: zero on the medial axis."""
     z, a = complex_of(points)[..., None], complex_of(vertices)
     edge = np.roll(a, -1) - a
@@ -90,6 +88,8 @@ def scattered(seed: int, count: int = 400) -> np.ndarray:
 
 
 closest = jax.jit(jax.vmap(lambda shape, x: shape.closest(x), (None, 0)))
+distances = jax.jit(jax.vmap(lambda shape, x: shape.signed_distance(x), (None, 0)))
+distance_slope = jax.jit(jax.vmap(jax.grad(lambda shape, x: shape.signed_distance(x), argnums=(0, 1)), (None, 0)))
 
 
 def lengths(dtype) -> float:
@@ -163,7 +163,7 @@ def test_on_the_vertices(vertices, dtype):
     bisector = outward + np.roll(outward, 1, axis=0)
     bisector /= np.linalg.norm(bisector, axis=1, keepdims=True)
     np.testing.assert_allclose(normal, bisector, atol=ROUNDINGS * np.finfo(dtype).eps)
-    slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))(polygon, v)
+    slope = distance_slope(polygon, v)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 
@@ -194,41 +194,45 @@ def test_straight_out_from_a_corner(name, dtype):
     with jax.disable_jit():
         eager = jax.vmap(polygon.closest)(points)
     tolerance = lengths(dtype)
-    for (distance, point, normal), slack in ((compiled, 1), (eager, 1)):
-        np.testing.assert_allclose(distance, height, rtol=0, atol=slack * tolerance)
-        np.testing.assert_allclose(point, vertex, rtol=0, atol=slack * tolerance)
-        turned = np.linalg.norm(normal - direction, axis=1) * height
-        np.testing.assert_allclose(turned, 0, atol=slack * tolerance)
+    for distance, point, normal in (compiled, eager):
+        np.testing.assert_allclose(distance, height, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(point, vertex, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(np.linalg.norm(normal - direction, axis=1) * height, 0, atol=tolerance)
 
 
-@pytest.mark.parametrize("name", ["triangle", "square"])
-def test_fingers_push_corners_without_a_jump(name):
-    """Fields selected from two edges made the slider jump by centimetres, or the finger end up deep inside it.
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_corners_inside_a_larger_program(dtype):
+    """A disc pushes a triangle, without friction, corner first.
 
-    It takes a program as large as a rollout for the compiler to work out one comparison twice: without `settle` in
-    the search for the nearest edge this one fails, in float32, on the CPU.
+    With the outline known to the compiler and the query worked out from a moving pose, the CPU's fused the comparison
+    of two equally near edges once for each field it selects, and rounded it differently: normals were not of unit
+    length, distances those of no edge, and the triangle jumped. Without `settle` in the search this test fails.
     """
-    polygon = Polygon(POLYGONS[name].astype(np.float32))
-    slider = Slider(polygon, Ellipsoid(np.eye(3, dtype=np.float32), 0.03))
-    hand = Hand.finger(radius=np.float32(0.00475))
-    rng = np.random.default_rng(0)
-    corner = np.asarray(polygon.vertices)[rng.integers(len(polygon.vertices), size=1000)]
-    angle = rng.uniform(0, 2 * np.pi, 1000)
-    start = 1.4 * corner + 0.002 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    path = start[:, None] + (0.6 * corner - start)[:, None] * np.linspace(0, 1, 41)[:, None]
-    friction = rng.uniform(0.05, 0.5, 1000).astype(np.float32)
+    polygon, radius, reach2 = Polygon(POLYGONS["triangle"].astype(dtype)), dtype(0.00475), dtype(0.03**2)
+
+    def push(pose: Vec3, finger: Vec2):
+        angle = turn(pose.z)
+        seen = polygon.outline().closest((finger - pose.xy).unrotate(angle))
+        arm = seen.point.cross(seen.normal)
+        share = -jnp.maximum(radius - seen.distance, 0) / (1 + arm * arm / reach2)
+        moved = seen.normal.scale(share).rotate(angle)
+        return Vec3(pose.x + moved.x, pose.y + moved.y, pose.z + share * arm / reach2), seen
 
     @jax.jit
     @jax.vmap
-    def push(path, mu):
-        return rollout(slider, hand, path, pose=jnp.zeros(3, path.dtype), friction=mu)
+    def pushed(path):
+        zero = jnp.zeros((), dtype)
+        return jax.lax.scan(push, Vec3(zero, zero, zero), Vec2(path[:, 0], path[:, 1]))[1]
 
-    found = push(path.astype(np.float32), friction)
-    assert found.pose.dtype == np.float32
-    assert np.isin(found.status, [Status.MOVING, Status.FREE]).all()
-    # a step of the finger moves the slider's origin no more than a few times as far
-    moved = np.linalg.norm(np.diff(found.pose[..., :2], axis=1), axis=-1)
-    assert moved.max() < 3 * np.linalg.norm(np.diff(path, axis=1), axis=-1).max()
+    rng = np.random.default_rng(0)
+    corner = POLYGONS["triangle"][rng.integers(3, size=1000)]
+    angle = rng.uniform(0, 2 * np.pi, 1000)
+    start = 1.4 * corner + 0.002 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    path = start[:, None] + (0.6 * corner - start)[:, None] * np.linspace(0, 1, 41)[:, None]
+    seen = pushed(path[:, :-1].astype(dtype))
+    np.testing.assert_allclose(np.hypot(*seen.normal), 1, atol=ROUNDINGS * np.finfo(dtype).eps)
+    # each step of some 1 mm is undone at once: the disc is never deeper than that
+    assert np.min(seen.distance) > float(radius) - 0.002
 
 
 def test_on_the_medial_axis():
@@ -238,12 +242,8 @@ def test_on_the_medial_axis():
     distance, point, normal = closest(square, points)
     np.testing.assert_allclose(distance, np.abs(points).max(axis=1) - 0.045, atol=lengths(float))
     np.testing.assert_allclose(point + -distance[:, None] * normal, 2 * np.asarray(point) - points, atol=lengths(float))
-    slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))(square, points)
+    slope = distance_slope(square, points)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
-
-
-distance_slope = jax.jit(jax.vmap(jax.grad(lambda p, x: p.signed_distance(x), argnums=(0, 1)), (None, 0)))
-distances = jax.jit(jax.vmap(lambda p, x: p.signed_distance(x), (None, 0)))
 
 
 def test_gradient_of_the_distance_is_the_normal(vertices):
@@ -380,10 +380,10 @@ def test_nothing_slips_through_a_vertex(name, radius, dtype):
     path = (2 * (vertex - start)).astype(dtype)
     found = np.asarray(sweeps(polygon, start, path, dtype(radius)))
     assert np.isfinite(found).all()
-    ahead = brute_closest(np.asarray(polygon.vertices), start + (found - 0.5)[:, None] * 0)[0] > 0
-    alone = (found > 0.5 * (0.3 - radius) / 0.3 - 1e-5) & ahead  # else another part of the outline came first
-    assert alone.mean() > 0.3
-    np.testing.assert_allclose(found[alone], 0.5 * (0.3 - radius) / 0.3, atol=1e-4 if dtype == np.float32 else 1e-9)
+    # the vertex is met with the disc's rim, unless another part of the outline comes first
+    at_vertex, tolerance = 0.5 * (0.3 - radius) / 0.3, 1e-5 if dtype == np.float32 else 1e-9
+    assert found.max() <= at_vertex + tolerance
+    assert (found > at_vertex - tolerance).mean() > 0.3
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -509,7 +509,7 @@ def test_perimeter_and_boundary(vertices):
     assert gaps.max() <= perimeter / 500 * (1 + 1e-9)
     assert np.isclose(gaps, perimeter / 500).sum() >= 500 - len(vertices)  # all but those across a corner
     about = complex_of(points) - complex_of(polygon.centroid)
-    assert (about.conj() * np.roll(about, -1)).imag.sum() > 0  # counter-clockwise
+    assert np.imag(about.conj() * np.roll(about, -1)).sum() > 0  # counter-clockwise
 
 
 def test_boundary_of_a_disk():

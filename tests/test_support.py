@@ -147,7 +147,7 @@ def test_length_of_pairs(support):
     pairs = support.wrench_twist_pairs(jax.random.key(0), 50, length=0.2)
     assert float(pairs.length) == 0.2
     np.testing.assert_allclose(np.linalg.norm(pairs.twist * np.array([[1, 1, 0.2]]), axis=1), 1, rtol=1e-12)
-    alone = Support.points([(0.01, 0.02)]).wrench_twist_pairs(jax.random.key(0), 10)
+    alone = Support.points([(0.01, 0.02)]).wrench_twist_pairs(jax.random.key(0), 50)
     assert float(alone.length) == 1
     assert np.isfinite(alone.wrench).all()
 
@@ -199,8 +199,8 @@ def test_grid_of_a_shape(shape, points):
     assert abs(len(support.point) - points) <= 0.15 * points
     assert np.asarray(jax.vmap(shape.contains)(support.point)).all()
     np.testing.assert_allclose(support.load, 2, rtol=1e-12)
-    # cells cut by the outline: each may be off by half a cell, some root of their number at random
-    np.testing.assert_allclose(support.center, shape.centroid, atol=0.1 / points)
+    # the outline cuts cells, which are kept or left whole: that moves the centre by a fraction of one
+    np.testing.assert_allclose(support.center, shape.centroid, atol=0.2 * float(shape.area / points) ** 0.5)
 
 
 def test_rim():

@@ -188,8 +188,6 @@ def summary(record: dict[str, Any]) -> str:
             f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}), "
             f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
         )
-    lines.append(
-        "The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON."
-    )
+    lines.append("The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON.")
     lines += [f"drew {path}" for path in record["pictures"]]
     return "\n".join(lines)

@@ -81,7 +81,9 @@ class PolygonOutline(Outline):
         edge = self._nearest_edge(x)
         s, clipped, diff = edge.foot(x)
         over_edge = (s > 0) & (s < edge.length)
-        bisector = select(s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
+        bisector = select(
+            s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
+        )
         squared = diff.dot(diff)
         on_vertex = squared <= jnp.finfo(squared.dtype).tiny
         length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))

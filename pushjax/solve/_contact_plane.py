@@ -11,8 +11,8 @@ phi(s) = atan2(h', d h - s h') increases with s, within 90 degrees of the angle 
     (d h - s h') h'' - h' (d h - s h')' = d h h'' - (d - 1) h'^2 >= 0.
 
 For a pushing motion v with v_n > 0: beyond phi(mu) the pusher slides left, beyond phi(-mu) right, between them it
-sticks at the s with phi(s) = phi_v. The edge of the motion cone may open beyond 90 degrees from the normal; then no push
-slides past it. Hence the pusher slides left if and only if, at s = mu,
+sticks at the s with phi(s) = phi_v. The edge of the motion cone may open beyond 90 degrees from the normal; then no
+push slides past it. Hence the pusher slides left if and only if, at s = mu,
 
     motion_n > 0  and  cross(motion, v) > 0,
 

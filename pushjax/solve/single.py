@@ -92,8 +92,9 @@ def _known(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
     Replaced before anything is computed from it: a NaN that is only masked afterwards comes back in the gradient.
     """
     known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
-    still = Vec2(0.0, 0.0)
-    away = Contact(still, Vec2(1.0, 0.0), still, 0.0, 1.0)
+    zero, one = jnp.zeros_like(contact.gap), jnp.ones_like(contact.gap)
+    still = Vec2(zero, zero)
+    away = Contact(still, Vec2(one, zero), still, zero, one)
     return known, jax.tree.map(lambda entry, other: jnp.where(known, entry, other), contact, away)
 
 

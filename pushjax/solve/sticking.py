@@ -32,7 +32,7 @@ def finest(dtype) -> float:
 
 
 class Sticking(NamedTuple):
-    """The ratio f_t / f_n, the sine of the angle still between motion and push, and the rounds it took."""
+    """The ratio f_t / f_n, the sine of the angle still between motion and push beyond rounding, and the rounds."""
 
     ratio: Scalar
     residual: Scalar
@@ -50,7 +50,11 @@ class StickingSolver(eqx.Module):
         ratio, rounds = _solve(self, curve, v, friction)
         g = curve.motion(ratio)
         size = jnp.sqrt(g.dot(g) * v.dot(v))
-        residual = jnp.abs(g.cross(v)) / jnp.where(size > 0, size, 1.0)
+        # What the rounding of the terms of g leaves is no fault of the iteration: where h is ill-conditioned (the
+        # square of a thin ellipsoid), g is a small difference of large terms.
+        terms = LimitCurve(tuple(jnp.abs(c) for c in curve.c)).motion(jnp.abs(ratio))
+        rounding = 4 * jnp.finfo(size.dtype).eps * (terms.x * jnp.abs(v.y) + terms.y * jnp.abs(v.x))
+        residual = jnp.maximum(jnp.abs(g.cross(v)) - rounding, 0) / jnp.where(size > 0, size, 1.0)
         return Sticking(ratio, jax.lax.stop_gradient(residual), rounds)
 
 
