@@ -1,5 +1,6 @@
 """Quasi-static planar pushing in JAX."""
 
+from pushjax import se2 as se2
 from pushjax.fit import FitReport as FitReport
 from pushjax.fit import fit_limit_surface as fit_limit_surface
 from pushjax.fit import mean_twist_angle as mean_twist_angle

@@ -80,6 +80,9 @@ def main(arguments: list[str] | None = None) -> None:
         prog="pushjax",
         description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes.",
     )
+    import matplotlib
+
+    matplotlib.use("Agg")  # draws to files; there may be no screen
     try:
         record, text = _table2(command) if isinstance(command, Reproduce) else _demo(command)
         print(text)

@@ -13,16 +13,16 @@ from jaxtyping import Array, Bool
 from pushjax._vec import Scalar, Vec2, settle
 from pushjax.shapes import Outline
 
-# How deep, in units of the limit surface's length, a finger's centre may start inside the slider and still be pushed
-# out: a few roundings or a tracker's error for a point finger, not a finger on the wrong side.
-DEEPEST_CENTER = 0.1
+# How far, in units of the limit surface's length, a finger may overlap the slider and still be pushed out: a tracker's
+# error, not a finger on the wrong side.
+DEEPEST_OVERLAP = 0.2
 
 
 class Meeting(NamedTuple):
     """When, within a step, one finger meets the slider. Body frame, m.
 
     start: fraction of the path after which they are in contact. reached: whether they are at all. overlapping: whether
-    the finger's centre is too deep inside for the closest side to mean anything. gap: the gap then, which is the depth
+    the finger is too deep inside for the closest side to mean anything. gap: the gap then, which is the depth
     of an overlap (negative) or zero.
     """
 
@@ -43,6 +43,6 @@ def meet(outline: Outline, center: Vec2, path: Vec2, radius: Scalar, length: Sca
     return Meeting(
         jnp.where(pressing, 0.0, jnp.where(reached, hit, 1.0)),
         reached,
-        here.distance < -DEEPEST_CENTER * length,
+        gap < -DEEPEST_OVERLAP * length,
         jnp.where(pressing, gap, 0.0),
     )

@@ -14,6 +14,7 @@ program) to 0.4 % of the loss at worst, and mostly to all digits, on every set o
 minimisation by gradients, fits batch; the semi-definite program does not.
 """
 
+import warnings
 from typing import Any, Literal, NamedTuple, overload
 
 import equinox as eqx
@@ -116,9 +117,11 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
 
     wrench: (pairs, 3), N and N m, applied by the hand. twist: (pairs, 3), m and rad; only directions matter. length: m,
     as `Support.wrench_twist_pairs` gives with its pairs: the radius of gyration is a good one. weights: (pairs,), how
-    much each pair counts. value_weight, ridge: of the loss in this module's header. terms: for degree 4.
+    much each pair counts, in the mean norm too; pairs with zero are left out. value_weight, ridge: of the loss in this
+    module's header. terms: for degree 4.
 
-    Returns the surface; with `report=True` the surface and a `FitReport`. Works under `jit` (degree, terms and report
+    Returns the surface, with a RuntimeWarning if the fit did not converge; with `report=True` the surface and a
+    `FitReport`. Works under `jit` (degree, terms and report
     static) and `vmap`; not under `grad`.
 
     Raises ValueError for fewer pairs than coefficients (6 or 15), arrays of the wrong shape or not finite, a zero
@@ -127,7 +130,7 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     """
     dtype = common_dtype(wrench, twist, length)
     w, v, rho = as_float(wrench, dtype), as_float(twist, dtype), as_float(length, dtype)
-    _check(w, v, rho, degree)
+    shaped("wrench", w, ("pairs", 3))
     share = jnp.ones(w.shape[0], dtype) if weights is None else as_float(weights, dtype)
     shaped("weights", share, (w.shape[0],))
     finite("weights", share)
@@ -135,6 +138,7 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     known = concrete(share)
     if known is not None and not known.any():
         raise ValueError("weights must not all be zero")
+    _check(w, v, rho, share, degree)
     for name, value in (("value_weight", value_weight), ("ridge", ridge)):
         finite(name, value)
         positive(name, value)
@@ -142,6 +146,8 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
         raise ValueError(f"terms must be at least 1; got {terms}")
     factors = as_float(value_weight, dtype), as_float(ridge, dtype)
     coefficients, found = _fit(w, v, rho, share, *factors, degree=degree, terms=terms if degree == 4 else 1)
+    if not report and concrete(found.status) == Status.NOT_CONVERGED:
+        warnings.warn("fit_limit_surface did not converge; see its report", RuntimeWarning, stacklevel=2)
     surface: LimitSurface
     if degree == 2:
         surface = Ellipsoid(_symmetric(coefficients), rho)
@@ -163,10 +169,9 @@ def mean_twist_angle(surface: LimitSurface, wrench: Numeric, twist: Numeric) -> 
     return jnp.mean(jax.vmap(angle)(w, v))
 
 
-def _check(wrench: Array, twist: Array, length: Array, degree: int) -> None:
+def _check(wrench: Array, twist: Array, length: Array, weights: Array, degree: int) -> None:
     if degree not in (2, 4):
         raise ValueError(f"degree must be 2 or 4; got {degree}")
-    shaped("wrench", wrench, ("pairs", 3))
     shaped("twist", twist, (wrench.shape[0], 3))
     shaped("length", length, ())
     needed = 6 if degree == 2 else 15
@@ -175,21 +180,26 @@ def _check(wrench: Array, twist: Array, length: Array, degree: int) -> None:
     for name, value in (("wrench", wrench), ("twist", twist), ("length", length)):
         finite(name, value)
     positive("length", length)
-    known = concrete(twist)
-    if known is not None and not known.any(axis=1).all():
-        raise ValueError(f"twist must not be zero; it is for pair {int(np.argmin(known.any(axis=1)))}")
+    known, counts = concrete(twist), concrete(weights)
+    if known is not None and counts is not None:
+        zero = ~known.any(axis=1) & (counts > 0)
+        if zero.any():
+            raise ValueError(f"twist must not be zero; it is for pair {int(np.argmax(zero))}")
     known = concrete(wrench)
-    if known is not None and not known.any():
+    if known is not None and counts is not None and not known[counts > 0].any():
         raise ValueError("wrench: all pairs are zero")
 
 
 @eqx.filter_jit
 def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, terms: int):
     """Coefficients in wrench units, and the report."""
+    share = weights / jnp.sum(weights)
+    counts = share > 0  # what has no weight has no say, whatever it is: it may be padding
     f, v = wrench.at[:, 2].divide(length), twist.at[:, 2].multiply(length)
+    f, v = (jnp.where(counts[:, None], each, jnp.array([[1.0, 0.0, 0.0]], each.dtype)) for each in (f, v))
     v = v / jnp.linalg.norm(v, axis=1, keepdims=True)
-    scale = jnp.mean(jnp.linalg.norm(f, axis=1))
-    pairs = _in_monomials(f / scale, v, weights / jnp.sum(weights), degree)
+    scale = share @ jnp.linalg.norm(f, axis=1)
+    pairs = _in_monomials(f / scale, v, share, degree)
     start = _start(pairs, value_weight, ridge, degree, terms)
 
     def again(state):
@@ -199,7 +209,7 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
     def solve(state):
         parameters, along, steps, _, rounds = state
         parameters, taken, solved = _minimise(_loss(pairs, along, value_weight, ridge), parameters, degree)
-        after = pairs.along @ _coefficients(parameters, degree) > 0
+        after = (pairs.along @ _coefficients(parameters, degree) > 0) | ~counts
         return parameters, after, steps + taken, solved & jnp.all(after == along), rounds + 1
 
     zero = jnp.zeros((), jnp.int32)
@@ -208,7 +218,7 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
     a = _coefficients(parameters, degree)
     angles = angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist))
     report = FitReport(
-        angle=jnp.mean(angles),
+        angle=share @ angles,
         loss=_loss(pairs, along, value_weight, ridge).value(a),
         clipped=jnp.sum(~along),
         status=jnp.where(good, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8),

@@ -20,6 +20,10 @@ class Hand(eqx.Module):
     radius: Float[Array, "fingers"]
     dof: int = eqx.field(static=True)
 
+    def __check_init__(self):
+        if self.radius.shape != (1,) or self.dof != 2:
+            raise ValueError(f"a hand has one finger of two degrees of freedom; got {self.radius.shape}, {self.dof}")
+
     @staticmethod
     def finger(radius: Numeric = 0.0) -> "Hand":
         """One round finger of `radius` m that does not turn; its configuration is (x, y) of its centre, world, m."""

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key
 
 from pushjax._vec import Vec3
-from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, QuarticForm
+from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic, QuarticForm
+from pushjax.limit_surface.sums import squared_quadratics
 
 
 class ContactProblem(NamedTuple):
@@ -80,27 +80,6 @@ def random_surface(
     ball = squared_quadratics(jnp.eye(3)[None])
     c = c + round_part * ball
     return Quartic(c / _spectrum(c)[1], length)
-
-
-def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
-    """Coefficients of sum_k (F' P_k F)^2, in `Quartic`'s order."""
-    return sum_products(p[..., None, None] * p[:, None, None]).reshape(15)
-
-
-def sum_products(tensor: Float[Array, "terms 3 3 3 3"]) -> Float[Array, "15"]:
-    """Coefficients of sum_k T_k(F, F, F, F): entries with equal exponents add up."""
-    return jnp.asarray(_GATHER, tensor.dtype) @ jnp.sum(tensor, axis=0).reshape(81)
-
-
-def _gather() -> np.ndarray:
-    table = np.zeros((15, 81))
-    for flat, index in enumerate(np.ndindex(3, 3, 3, 3)):
-        exponent = np.bincount(index, minlength=3)
-        table[int(np.argmax((MONOMIALS == exponent).all(axis=1))), flat] = 1
-    return table
-
-
-_GATHER = _gather()
 
 
 def _spectrum(c: Float[Array, "15"]) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped, traced
 from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
-from pushjax.contacts import DEEPEST_CENTER, meet
+from pushjax.contacts import DEEPEST_OVERLAP, meet
 from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Outline, Shape
@@ -45,7 +45,8 @@ class Step(eqx.Module):
 
     pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
     along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
-    halfway; zero and SEPARATED where nothing pushes. status: `Status`.
+    halfway; zero and SEPARATED where nothing pushes. The pose after is that before moved by the twist to the second
+    order (the contact point goes straight), not its exponential. status: `Status`.
     """
 
     pose: Float[Array, "3"]
@@ -206,20 +207,23 @@ def _arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *pa
 def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> None:
     if traced((slider, hand, pose, configuration)):
         return
-    depth, allowed = float(_depth(slider, hand, pose, configuration)), DEEPEST_CENTER * float(slider.surface.length)
-    if depth > allowed:
+    overlap, allowed = (
+        float(_overlap(slider, hand, pose, configuration)),
+        DEEPEST_OVERLAP * float(slider.surface.length),
+    )
+    if overlap > allowed:
         raise ValueError(
-            f"path starts with the hand inside the slider: a finger's centre is {1e3 * depth:.3g} mm deep; at most "
-            f"{1e3 * allowed:.3g} mm ({DEEPEST_CENTER:g} of the surface's length) is pushed out"
+            f"path starts with the hand inside the slider: a finger overlaps it by {1e3 * overlap:.3g} mm; at most "
+            f"{1e3 * allowed:.3g} mm ({DEEPEST_OVERLAP:g} of the surface's length) is pushed out"
         )
 
 
 @eqx.filter_jit
-def _depth(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> Scalar:
-    """How deep inside the slider the finger's centre is, m."""
+def _overlap(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> Scalar:
+    """By how much the finger overlaps the slider, m."""
     (center,) = hand.centers(tuple(configuration))
     local = (center - Vec3.of(pose).xy).unrotate(turn(pose[2]))
-    return -slider.shape.outline().closest(local).distance
+    return hand.radius[0] - slider.shape.outline().closest(local).distance
 
 
 def step(
@@ -274,7 +278,8 @@ def rollout(
     Differentiable, forward and reverse, in slider, hand, path, pose and friction. Batches come from `vmap`.
 
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a finger that starts inside
-    the slider, where they are not traced; where they are, `status` says so at every step, and `first_failure` where.
+    the slider by more than a fifth of the surface's length (less is pushed out in the first step), where they are not
+    traced; where they are, `status` says so at every step, and `first_failure` where.
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; this module's header has the scheme.
     """

@@ -55,12 +55,13 @@ def transform(pose: Numeric, point: Numeric) -> Float[Array, "*batch 2"]:
 
 def _sinc_pair(omega: Array) -> tuple[Array, Array]:
     """sin(w)/w and (1 - cos(w))/w, smooth through zero in value and derivative."""
-    small = jnp.abs(omega) < 1e-3
+    # Below this the series' next term is beyond rounding; above it, so is what the derivative of sin(w)/w cancels
+    small = jnp.abs(omega) < (0.25 if jnp.finfo(omega.dtype).bits <= 32 else 0.03)
     safe = jnp.where(small, 1.0, omega)  # keeps the unused branch's derivative finite
     w2 = omega * omega
-    a = jnp.where(small, 1 - w2 / 6 + w2 * w2 / 120, jnp.sin(safe) / safe)
+    a = jnp.where(small, 1 - w2 / 6 * (1 - w2 / 20 * (1 - w2 / 42 * (1 - w2 / 72))), jnp.sin(safe) / safe)
     # 2 sin(w/2)^2 / w does not cancel where 1 - cos(w) does
-    b = jnp.where(small, omega * (0.5 - w2 / 24 + w2 * w2 / 720), 2 * jnp.sin(safe / 2) ** 2 / safe)
+    b = jnp.where(small, omega / 2 * (1 - w2 / 12 * (1 - w2 / 30 * (1 - w2 / 56))), 2 * jnp.sin(safe / 2) ** 2 / safe)
     return a, b
 
 

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Float, Key
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, positive, shaped
 from pushjax.shapes import Shape
@@ -100,10 +100,11 @@ class Support(eqx.Module):
 
     @staticmethod
     def uniform(shape: Shape, points: int = 64, load: Numeric = 1.0) -> "Support":
-        """Uniform pressure over `shape`: a square grid of cell centres inside it, as near to `points` as one gets.
+        """Uniform pressure over `shape`: a point for each cell of a grid over it, as near to `points` as one gets.
 
-        `load` = mu m g in N. A rectangle whose sides are in a ratio of whole numbers gets exactly `points` where the
-        ratio allows (a square with 64: 8 by 8).
+        `load` = mu m g in N. The cells are nearly square. A cell the outline cuts bears its share of the load, at the
+        middle of what lies inside. A rectangle whose sides are in a ratio of whole numbers gets exactly `points` where
+        the ratio allows (a square with 64: 8 by 8).
 
         Raises ValueError for fewer than one point; the shape must not be traced.
         """
@@ -113,22 +114,22 @@ class Support(eqx.Module):
         if corners is None:
             raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
         low, high = corners.astype(np.float64)
-        # The area fixes the spacing but for the outline's share of cut cells; look around it, the nearest first.
-        around = np.linspace(-0.1, 0.1, 21)
+        # The area fixes the spacing but for the cut cells, which make it coarser; look around it, the nearest first.
+        around = np.linspace(-0.1, 0.4, 26)
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
-        grids = [_cell_centers(low, high, spacing) for spacing in spacings]
-        most = max(len(grid) for grid in grids)  # all padded to one length: one compilation
-        best = None
-        for grid in grids:
-            padded = np.concatenate([grid, np.broadcast_to(low, (most - len(grid), 2))])
-            kept = grid[np.asarray(_inside(shape, jnp.asarray(padded, corners.dtype)))[: len(grid)]]
-            if len(kept) and (best is None or abs(len(kept) - points) < abs(len(best) - points)):
-                best = kept
-            if best is not None and len(best) == points:
+        grids = [_cells(low, high, spacing) for spacing in spacings]
+        most = max(len(samples) for samples, _ in grids)  # all padded to one length: one compilation
+        best: tuple[np.ndarray, np.ndarray] | None = None
+        for samples, middles in grids:
+            padded = np.concatenate([samples, np.broadcast_to(low, (most - len(samples), 2))])
+            inside = np.asarray(_inside(shape, jnp.asarray(padded, corners.dtype)))[: len(samples)]
+            found = _covered(samples, middles, inside)
+            if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
+                best = found
+            if len(best[0]) == points:
                 break
-        if best is None:
-            raise ValueError(f"points={points} is too few for a grid over this shape; give more")
-        return Support.points(jnp.asarray(best, corners.dtype), load=load)
+        assert best is not None
+        return Support.points(jnp.asarray(best[0], corners.dtype), best[1].astype(corners.dtype), load)
 
     @staticmethod
     def rim(shape: Shape, points: int = 64, load: Numeric = 1.0) -> "Support":
@@ -183,13 +184,16 @@ class Support(eqx.Module):
         """Wrench-twist pairs on the exact limit surface, drawn with `key`.
 
         Twists are uniform on the unit sphere of (vx, vy, length * omega), but for one in ten, whose centre of rotation
-        is a support point drawn by its load; its wrench is drawn from the facet. `length` (m) is the radius of
-        gyration unless given, or where that vanishes (one point), 1 m.
+        is a support point drawn by its load; its wrench is drawn from the facet. They come in random order. `length`
+        (m) is the radius of gyration unless given, or where that vanishes (one point), 1 m.
+
+        Raises ValueError for fewer than one pair, or a length that is not positive.
         """
         if pairs < 1:
             raise ValueError(f"pairs must be at least 1; got {pairs}")
         gyration = self.radius_of_gyration
-        rho = jnp.where(gyration > 0, gyration, 1.0) if length is None else as_float(length, gyration.dtype)
+        rounding = 16 * jnp.finfo(gyration.dtype).eps * jnp.max(jnp.abs(self.point))
+        rho = jnp.where(gyration > rounding, gyration, 1.0) if length is None else as_float(length, gyration.dtype)
         shaped("length", rho, ())
         finite("length", rho)
         positive("length", rho)
@@ -199,30 +203,58 @@ class Support(eqx.Module):
 @eqx.filter_jit
 def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
     dtype = support.point.dtype
-    k_free, k_point, k_side, k_facet = jax.random.split(key, 4)
+    k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
     free = jax.random.normal(k_free, (pairs, 3), dtype)
     about = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
     # a rotation about r moves the origin with (r_y, -r_x) omega
     spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
     pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
     facets = round(FACET_SHARE * pairs)
-    normalized = jnp.where((jnp.arange(pairs) < facets)[:, None], pivot, free)
+    on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facets)
+    normalized = jnp.where(on_facet[:, None], pivot, free)
     normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
     twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
     wrench = jax.vmap(support.wrench)(twist, jax.random.split(k_facet, pairs))
     return WrenchTwistPairs(wrench, twist, rho)
 
 
-def _cell_centers(low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:
-    """Centres (cells, 2) of a grid that fills the box from `low` to `high`, its cells as near to `spacing` as fits."""
+SAMPLES = 8  # of each cell along x and along y, to find its share
+
+
+def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """A grid that fills a box, its cells as near to `spacing` as fits: samples (cells * SAMPLES^2, 2), and middles."""
     count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
-    x, y = (low[k] + (np.arange(count[k]) + 0.5) * (high[k] - low[k]) / count[k] for k in range(2))
-    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    cell = (high - low) / count
+    x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
+    middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+    offsets = np.stack(np.meshgrid(offset * cell[0], offset * cell[1], indexing="ij"), axis=-1).reshape(-1, 2)
+    return (middles[:, None] + offsets[None]).reshape(-1, 2), middles
+
+
+def _covered(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each cell that has a sample inside: the mean of those, and their share of the cell."""
+    inside = inside.reshape(len(middles), -1)
+    share = inside.mean(axis=1)
+    mean = (
+        np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
+        / np.maximum(inside.sum(axis=1), 0.5)[:, None]
+    )
+    mean = np.where((share == 1)[:, None], middles, mean)
+    return mean[share > 0], share[share > 0]
 
 
 @eqx.filter_jit
-def _inside(shape: Shape, grid: Float[Array, "cells 2"]) -> Bool[Array, "cells"]:
-    return jax.lax.map(shape.contains, grid, batch_size=4096)  # in parts: cells times edges may be many
+def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
+    """1 inside, 0 outside, and one half on the outline, where rounding would decide."""
+    low, high = shape.bounds
+    border = 64 * jnp.finfo(points.dtype).eps * jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)))
+
+    def share(point):
+        distance = shape.signed_distance(point)
+        return jnp.where(distance < -border, 1.0, jnp.where(distance <= border, 0.5, 0.0))
+
+    return jax.lax.map(share, points, batch_size=4096)  # in parts: points times edges may be many
 
 
 def _in_unit_disc(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:

@@ -3,6 +3,9 @@
 The compiled programs are cached between runs and between pytest's workers where JAX_COMPILATION_CACHE_DIR is set.
 """
 
+import os
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
@@ -12,6 +15,10 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 from pushjax.datasets import find_data  # noqa: E402
+
+BESIDE = Path(__file__).parents[2] / "shared" / "data"
+if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
+    os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,7 @@ def supports() -> dict[str, pj.Support]:
 
 def pairs_of(name: str, count: int = 400) -> list[np.ndarray]:
     pairs = supports()[name].wrench_twist_pairs(jax.random.key(1), count)
-    return [np.asarray(part) for part in pairs]
+    return [np.array(part) for part in pairs]
 
 
 def real_pairs(data, name: str) -> list[np.ndarray]:
@@ -108,11 +108,27 @@ def test_quartic_reaches_the_semidefinite_optimum_on_real_pairs(data, name):
 
 
 def test_every_real_fit_converges_and_is_convex(data):
-    for file in sorted((data / "mit_push").glob("*.npz")):
-        for degree in (2, 4):
-            surface, report = pj.fit_limit_surface(*real_pairs(data, file.stem), degree=degree, report=True)
-            assert surface.is_convex(), (file.stem, degree)
-            assert report.status == pj.Status.MOVING, (file.stem, degree)
+    """All 22 in one batch, padded to one length with pairs of no weight."""
+    sets = [real_pairs(data, file.stem) for file in sorted((data / "mit_push").glob("*.npz"))]
+    most = max(len(wrench) for wrench, _, _ in sets)
+
+    def padded(array):
+        return np.concatenate([array, np.zeros((most - len(array), *array.shape[1:]))])
+
+    wrench, twist = (jnp.stack([padded(each[k]) for each in sets]) for k in range(2))
+    weights = jnp.stack([padded(np.ones(len(each[0]))) for each in sets])
+    length = jnp.array([each[2] for each in sets])
+    for degree in (2, 4):
+        fit = jax.jit(
+            jax.vmap(lambda w, v, l, g, d=degree: pj.fit_limit_surface(w, v, l, degree=d, weights=g, report=True))
+        )
+        surfaces, reports = fit(wrench, twist, length, weights)
+        assert (reports.status == pj.Status.MOVING).all()
+        for k in range(len(sets)):
+            surface = jax.tree.map(lambda leaf, k=k: leaf[k], surfaces)
+            assert surface.is_convex(), (degree, k)
+            angle = pj.mean_twist_angle(surface, *sets[k][:2])
+            assert reports.angle[k] == pytest.approx(float(angle), rel=1e-9)
 
 
 @pytest.mark.parametrize("degree", [2, 4])
@@ -154,17 +170,28 @@ def test_scale_of_wrenches_and_twists_does_not_matter():
     assert np.allclose(other.coefficients, np.asarray(one.coefficients) / 7.0**4, rtol=1e-6, atol=1e-9)
 
 
-def test_weights_leave_pairs_out():
+@pytest.mark.parametrize("degree", [2, 4])
+def test_pairs_without_weight_have_no_say(degree):
     wrench, twist, length = pairs_of("uniform", 200)
-    spoiled = twist.copy()
-    spoiled[:50] *= -1
+    kept, report = pj.fit_limit_surface(wrench[50:], twist[50:], length, degree=degree, report=True)
+    wrench[:50] *= 30
+    twist[:25] *= -1
+    twist[25:50] = 0  # padding
     weights = np.r_[np.zeros(50), np.ones(150)]
-    kept = pj.fit_limit_surface(wrench[50:], twist[50:], length)
-    # the scale of the wrenches is the mean over all pairs, so the ridge differs a little
-    weighted = pj.fit_limit_surface(wrench, spoiled, length, weights=weights)
-    assert np.allclose(kept.coefficients, weighted.coefficients, rtol=5e-3, atol=5e-3)
-    _, report = pj.fit_limit_surface(wrench, spoiled, length, report=True)
-    assert report.clipped > 0
+    weighted, same = pj.fit_limit_surface(wrench, twist, length, degree=degree, weights=weights, report=True)
+    field = "A" if degree == 2 else "coefficients"
+    assert np.allclose(getattr(kept, field), getattr(weighted, field), rtol=1e-5, atol=1e-6)
+    assert same.angle == pytest.approx(float(report.angle), rel=1e-4)
+    assert same.clipped == report.clipped
+
+
+def test_opposed_twists_are_clipped_not_fitted():
+    wrench, twist, length = pairs_of("uniform", 200)
+    twist[:20] *= -1
+    surface, report = pj.fit_limit_surface(wrench, twist, length, report=True)
+    assert 10 <= report.clipped <= 20
+    angle = pj.mean_twist_angle(surface, wrench[20:], twist[20:])
+    assert angle < 0.15
 
 
 def test_batches_equal_single_fits():

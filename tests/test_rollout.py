@@ -575,7 +575,10 @@ BAD = [
     ({"friction": -0.1}, "friction must not be negative"),
     ({"friction": np.nan}, "friction must be finite"),
     ({"friction": [0.1, 0.2]}, "friction has shape"),
-    ({"path": [[0.0, 0.0], [0.1, 0.0]]}, "path starts with the hand inside the slider.*45 mm deep; at most 3 mm"),
+    (
+        {"path": [[0.0, 0.0], [0.1, 0.0]]},
+        "path starts with the hand inside the slider.*overlaps it by .* mm; at most 6 mm",
+    ),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Where the benchmark data lies on this machine; none of it is part of the package."""
+"""Where recorded pushes lie on this machine; none of them is part of the package."""
 
 import os
 from pathlib import Path
@@ -7,20 +7,9 @@ ENVIRONMENT_VARIABLE = "PUSHJAX_DATA"
 
 
 def find_data(name: str | None = None) -> Path | None:
-    """The data folder, or the file or folder `name` inside it; None where there is none.
-
-    The environment variable PUSHJAX_DATA decides when it is set, even to a folder that does not exist (the
-    answer is then None: quietly reading other data than what was asked for would be worse). Without it,
-    `../shared/data` beside the repository is tried, then beside the current folder.
-    """
+    """The folder that the environment variable PUSHJAX_DATA names, or `name` inside it; None where there is none."""
     given = os.environ.get(ENVIRONMENT_VARIABLE)
-    if given:
-        roots = [Path(given)]
-    else:
-        repository = Path(__file__).resolve().parents[2]
-        roots = [folder.parent / "shared" / "data" for folder in (repository, Path.cwd())]
-    for root in roots:
-        found = root if name is None else root / name
-        if root.is_dir() and found.exists():
-            return found
-    return None
+    if not given:
+        return None
+    found = Path(given) if name is None else Path(given) / name
+    return found if found.exists() else None

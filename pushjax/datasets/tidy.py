@@ -39,7 +39,7 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
     Rows marked invalid, or holding numbers that are not finite, become problems. Raises LogError if the file
     is missing, is no such archive, lacks an array or has one of the wrong size, or if no row is usable.
 
-    Source: `three_point_push` in the data folder's README, where every array is described.
+    The arrays it reads, and their shapes, are named in `_read` and below it.
     """
     file = Path(path)
     data = _read(file)

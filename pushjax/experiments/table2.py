@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets import PushLog, load_push_npz
+from pushjax.datasets import PushLog, load_push_npz, load_triangle_log
 from pushjax.report import envelope
 
 SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4")
@@ -65,7 +65,7 @@ def run(
     cells, done = [], 0
     conditions = [(surface, name) for surface in SURFACES for name in OBJECTS]
     for index, (surface, name) in enumerate(conditions):
-        log = load_push_npz(folder / "three_point_push" / f"{surface}_{name}.npz")
+        log = load(folder / "three_point_push", surface, name)
         for model in MODELS:
             errors, statuses = predict(log, model, jax.random.key(seed + index), GEOMETRIES[geometry], steps)
             cell = _cell(log, errors, np.random.default_rng(seed + index))
@@ -80,6 +80,15 @@ def run(
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
     settings |= GEOMETRIES[geometry]._asdict()
     return envelope("table2", settings, cells=cells, means=means, pictures=pictures)
+
+
+def load(folder: Path, surface: str, name: str) -> PushLog:
+    """A condition's pushes: its tidy archive, or else an original log whose name begins with the condition."""
+    archive = folder / f"{surface}_{name}.npz"
+    originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
+    if archive.exists() or not originals:
+        return load_push_npz(archive)
+    return load_triangle_log(originals[0], surface=surface, arrangement=name)
 
 
 def predict(log: PushLog, model: str, key: jax.Array, geometry: Geometry, steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -188,6 +197,9 @@ def summary(record: dict[str, Any]) -> str:
             f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}), "
             f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
         )
+    failed = sum(cell["failed_steps"] for cell in record["cells"])
+    if failed:
+        lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
     lines.append("The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON.")
     lines += [f"drew {path}" for path in record["pictures"]]
     return "\n".join(lines)

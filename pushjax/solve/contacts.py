@@ -15,7 +15,7 @@ from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve.single import solve_single
 from pushjax.solve.sticking import ScalarRoot, StickingSolver
 
-UNIT_TOLERANCE = 1e-3  # of a normal's length: measured normals are normalised by their users, in float32
+UNIT_TOLERANCE = 1e-5  # of a normal's length: a hundred roundings of float32
 
 
 class Contacts(eqx.Module):
@@ -170,6 +170,7 @@ def motion_cone(surface: LimitSurface, point: Numeric, normal: Numeric, friction
     edges = []
     for s in (contact.friction, -contact.friction):
         g = curve.motion(s)
+        g = g.scale(1 / jnp.maximum(jnp.abs(g.x), jnp.abs(g.y)))  # squares of it may underflow
         g = g.scale(1 / jnp.sqrt(g.dot(g)))
         edges.append((contact.normal.scale(g.x) + contact.normal.perp().scale(g.y)).array())
     return jnp.stack(edges)
