@@ -113,7 +113,7 @@ def solve(tables, rho, point, n, path, mu, gap):
         trusted &= (i < 2) | (3 * r * r < power * power)
         return jnp.where(trusted, newton, (low + high) / 2), low, high
 
-    s, _, _ = jax.lax.fori_loop(0, 8, body, (s, -mu, mu))
+    s, _, _ = jax.lax.fori_loop(0, 12, body, (s, -mu, mu))
     s = jnp.where(is_left, mu, jnp.where(is_right, -mu, s))
     g = motion(s)
     slides = is_left | is_right
