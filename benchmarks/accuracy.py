@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy.py
 
-221 pushes of 50 mm: every 5 mm across a side of a 90 mm square, every 10 degrees up to 60 from its normal, mu 0.25; some
-slide off a corner. float64; the reference has 6400 steps.
+221 pushes of 50 mm: every 5 mm across a side of a 90 mm square, every 10 degrees up to 60 from its normal, mu 0.25;
+some slide off a corner. float64; the reference has 6400 steps.
 """
 
 import jax
