@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, concrete, finite, shaped
-from pushjax._vec import Scalar, Vec3
+from pushjax._vec import Scalar, Vec3, settle
 from pushjax.limit_surface._base import (
     InverseMap,
     LimitSurface,
@@ -88,11 +88,13 @@ class Ellipsoid(LimitSurface):
         """One linear solve, refined: the adjugate alone loses twice the digits that the condition number costs."""
         v, usable = self._normalized_twist(twist)
         form = self.form()
-        f = form.a.solve(v)
+        f = settle(form.a.solve(v), v.x)
         for _ in range(2):
             g = form.a.times(f)
             more = form.a.solve(Vec3(v.x - g.x, v.y - g.y, v.z - g.z))
-            f = Vec3(f.x + more.x, f.y + more.y, f.z + more.z)
+            f = settle(
+                Vec3(f.x + more.x, f.y + more.y, f.z + more.z), v.x
+            )  # one rounding of it: refined, judged, given
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
         solved = usable & (h > 0) & (angle <= angle_tolerance(angle))

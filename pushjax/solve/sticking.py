@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from pushjax._vec import Scalar, Vec2
+from pushjax._vec import Scalar, Vec2, settle
 from pushjax.solve._contact_plane import LimitCurve
 
 
@@ -169,7 +169,7 @@ class HessianIteration(StickingSolver):
 
         def body(state):
             f, _, rounds = state
-            new = hessian_round(curve, unit, f)
+            new = settle(hessian_round(curve, unit, f), unit.x)  # the error is to be that of what is kept
             return new, error(new), rounds + 1
 
         start = _rescaled(curve, unit, unit)
@@ -188,14 +188,14 @@ def hessian_round(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
     det = hnn * htt - hnt * hnt
     singular = det <= 0
     inverse = jnp.where(singular, 0.0, 1.0 / jnp.where(singular, 1.0, det))
-    step = Vec2(htt * r.x - hnt * r.y, hnn * r.y - hnt * r.x).scale(inverse)
+    step = settle(Vec2(htt * r.x - hnt * r.y, hnn * r.y - hnt * r.x).scale(inverse), v.x)
     halvings = [0.5**k for k in range(10)]
     slopes = [jnp.abs((_gradient(curve, f + step.scale(t)) - v).dot(step)) for t in halvings]
     best, lowest = halvings[0] * jnp.ones_like(det), slopes[0]
     for t, slope in zip(halvings[1:], slopes[1:], strict=True):
         best = jnp.where(slope < lowest, t, best)
         lowest = jnp.minimum(lowest, slope)
-    return _rescaled(curve, v, f + step.scale(best))
+    return _rescaled(curve, v, settle(f + step.scale(best), v.x))
 
 
 def _rescaled(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
