@@ -72,6 +72,18 @@ def non_negative(name: str, value: Any) -> None:
         raise ValueError(f"{name} must not be negative; got {_brief(known)}")
 
 
+def weights_of(weights: Any, count: int, dtype: Any) -> jax.Array:
+    """The argument `weights` as (count,) numbers, none negative and not all zero; ones for None."""
+    value = jnp.ones(count, dtype) if weights is None else as_float(weights, dtype)
+    shaped("weights", value, (count,))
+    finite("weights", value)
+    non_negative("weights", value)
+    known = concrete(value)
+    if known is not None and not known.any():
+        raise ValueError("weights must not all be zero")
+    return value
+
+
 def _brief(value: np.ndarray) -> str:
     return str(value.item()) if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
 

@@ -24,7 +24,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped, weights_of
 from pushjax._vec import Vec3
 from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, angle_between
 from pushjax.limit_surface.sums import squared_quadratics
@@ -131,13 +131,7 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     dtype = common_dtype(wrench, twist, length)
     w, v, rho = as_float(wrench, dtype), as_float(twist, dtype), as_float(length, dtype)
     shaped("wrench", w, ("pairs", 3))
-    share = jnp.ones(w.shape[0], dtype) if weights is None else as_float(weights, dtype)
-    shaped("weights", share, (w.shape[0],))
-    finite("weights", share)
-    non_negative("weights", share)
-    known = concrete(share)
-    if known is not None and not known.any():
-        raise ValueError("weights must not all be zero")
+    share = weights_of(weights, w.shape[0], dtype)
     _check(w, v, rho, share, degree)
     for name, value in (("value_weight", value_weight), ("ridge", ridge)):
         finite(name, value)
@@ -200,7 +194,7 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
     v = v / jnp.linalg.norm(v, axis=1, keepdims=True)
     scale = share @ jnp.linalg.norm(f, axis=1)
     pairs = _in_monomials(f / scale, v, share, degree)
-    start = _start(pairs, value_weight, ridge, degree, terms)
+    start = _start(degree, terms, pairs.value.dtype)
 
     def again(state):
         _, _, _, good, rounds = state
@@ -270,7 +264,7 @@ def _symmetric(a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([a[0], xy, xz]), jnp.stack([xy, a[1], yz]), jnp.stack([xz, yz, a[2]])])
 
 
-def _start(pairs: _Pairs, value_weight: Array, ridge: Array, degree: int, terms: int) -> Float[Array, "terms 6"]:
+def _start(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 6"]:
     """Near the ball; the terms differ, each a ball stretched along its own direction, or they would never part."""
     k = np.arange(terms) + 0.5
     height, angle = 1 - k / terms, np.pi * (1 + 5**0.5) * k
@@ -279,7 +273,7 @@ def _start(pairs: _Pairs, value_weight: Array, ridge: Array, degree: int, terms:
     spread = 0.5 if terms > 1 else 0.0
     lower = np.linalg.cholesky(np.eye(3) + spread * (3 * u[:, :, None] * u[:, None] - np.eye(3)))
     size = terms ** (-1 / degree)
-    return jnp.asarray(size * lower[:, *_LOWER], pairs.value.dtype)
+    return jnp.asarray(size * lower[:, *_LOWER], dtype)
 
 
 def _minimise(loss: _Quadratic, parameters: Array, degree: int) -> tuple[Array, Array, Array]:

@@ -207,10 +207,8 @@ def _arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *pa
 def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> None:
     if traced((slider, hand, pose, configuration)):
         return
-    overlap, allowed = (
-        float(_overlap(slider, hand, pose, configuration)),
-        DEEPEST_OVERLAP * float(slider.surface.length),
-    )
+    overlap = float(_overlap(slider, hand, pose, configuration))
+    allowed = DEEPEST_OVERLAP * float(slider.surface.length)
     if overlap > allowed:
         raise ValueError(
             f"path starts with the hand inside the slider: a finger overlaps it by {1e3 * overlap:.3g} mm; at most "
@@ -222,7 +220,7 @@ def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) 
 def _overlap(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> Scalar:
     """By how much the finger overlaps the slider, m."""
     (center,) = hand.centers(tuple(configuration))
-    local = (center - Vec3.of(pose).xy).unrotate(turn(pose[2]))
+    local = _Placed.at(Vec3.of(pose)).local(center)
     return hand.radius[0] - slider.shape.outline().closest(local).distance
 
 

@@ -16,7 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, positive, shaped
+from pushjax._checks import (
+    Numeric,
+    as_float,
+    common_dtype,
+    concrete,
+    finite,
+    non_negative,
+    positive,
+    shaped,
+    weights_of,
+)
 from pushjax.shapes import Shape
 
 FACET_SHARE = 0.1  # of the wrench-twist pairs
@@ -60,13 +70,7 @@ class Support(eqx.Module):
         dtype = common_dtype(point, weights, load)
         array, total = as_float(point, dtype), as_float(load, dtype)
         shaped("point", array, ("points", 2))
-        share = jnp.ones(array.shape[0], dtype) if weights is None else as_float(weights, dtype)
-        shaped("weights", share, (array.shape[0],))
-        finite("weights", share)
-        non_negative("weights", share)
-        known = concrete(share)
-        if known is not None and not known.sum() > 0:
-            raise ValueError("weights must not all be zero")
+        share = weights_of(weights, array.shape[0], dtype)
         shaped("load", total, ())
         finite("load", total)
         positive("load", total)

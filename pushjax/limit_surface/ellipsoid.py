@@ -92,9 +92,8 @@ class Ellipsoid(LimitSurface):
         for _ in range(2):
             g = form.a.times(f)
             more = form.a.solve(Vec3(v.x - g.x, v.y - g.y, v.z - g.z))
-            f = settle(
-                Vec3(f.x + more.x, f.y + more.y, f.z + more.z), v.x
-            )  # one rounding of it: refined, judged, given
+            # one rounding of it: refined, judged and given
+            f = settle(Vec3(f.x + more.x, f.y + more.y, f.z + more.z), v.x)
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
         solved = usable & (h > 0) & (angle <= angle_tolerance(angle))

@@ -58,7 +58,8 @@ class PolygonOutline(Outline):
     def _nearest_edge(self, x: Vec2) -> Edge:
         if isinstance(self.edges, Edge):
             *_, diff = self.edges.foot(x)
-            return jax.tree.map(lambda field: field[jnp.argmin(diff.dot(diff))], self.edges)
+            nearest = jnp.argmin(diff.dot(diff))
+            return jax.tree.map(lambda field: field[nearest], self.edges)
         best, best_squared = self.edges[0], None
         for edge in self.edges:
             *_, diff = edge.foot(x)
