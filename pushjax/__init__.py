@@ -7,6 +7,7 @@ from pushjax.fit import mean_twist_angle as mean_twist_angle
 from pushjax.hands import Hand as Hand
 from pushjax.hands import line as line
 from pushjax.hands import resample as resample
+from pushjax.hands import through as through
 from pushjax.limit_surface import Ellipsoid as Ellipsoid
 from pushjax.limit_surface import InverseMap as InverseMap
 from pushjax.limit_surface import LimitSurface as LimitSurface
@@ -17,12 +18,17 @@ from pushjax.rollout import Trajectory as Trajectory
 from pushjax.rollout import rollout as rollout
 from pushjax.rollout import step as step
 from pushjax.scores import deviation as deviation
+from pushjax.shapes import Curve as Curve
 from pushjax.shapes import Disk as Disk
+from pushjax.shapes import Ellipse as Ellipse
 from pushjax.shapes import Polygon as Polygon
 from pushjax.shapes import Shape as Shape
 from pushjax.solve import Contacts as Contacts
+from pushjax.solve import ContactSolver as ContactSolver
+from pushjax.solve import Exhaustive as Exhaustive
 from pushjax.solve import HessianIteration as HessianIteration
 from pushjax.solve import Motion as Motion
+from pushjax.solve import Projected as Projected
 from pushjax.solve import ScalarRoot as ScalarRoot
 from pushjax.solve import friction_cone as friction_cone
 from pushjax.solve import motion_cone as motion_cone

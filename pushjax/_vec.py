@@ -67,12 +67,33 @@ class Vec3(NamedTuple):
     y: Scalar
     z: Scalar
 
+    def __add__(self, other: "Vec3") -> "Vec3":  # pyright: ignore[reportIncompatibleMethodOverride]
+        return Vec3(self.x + other.x, self.y + other.y, self.z + other.z)
+
+    def __sub__(self, other: "Vec3") -> "Vec3":
+        return Vec3(self.x - other.x, self.y - other.y, self.z - other.z)
+
     @property
     def xy(self) -> Vec2:
         return Vec2(self.x, self.y)
 
     def scale(self, factor: Scalar | float) -> "Vec3":
         return Vec3(factor * self.x, factor * self.y, factor * self.z)
+
+    def dot(self, other: "Vec3") -> Scalar:
+        return self.x * other.x + self.y * other.y + self.z * other.z
+
+    def cross(self, other: "Vec3") -> "Vec3":
+        return Vec3(
+            self.y * other.z - self.z * other.y,
+            self.z * other.x - self.x * other.z,
+            self.x * other.y - self.y * other.x,
+        )
+
+    def unit(self) -> "Vec3":
+        """Of length one; zero stays zero."""
+        squared = self.dot(self)
+        return self.scale(jnp.where(squared > 0, jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0)), 0.0))
 
     @staticmethod
     def of(array: Float[Array, "3"]) -> "Vec3":
@@ -112,4 +133,4 @@ def settle(values, witness: Scalar):
 
 def select(condition, yes, no):
     """`where` over two equal pytrees of scalars."""
-    return type(yes)(*(jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True)))
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -1,6 +1,7 @@
-"""The command line: `pushjax demo`, `pushjax reproduce NAME`."""
+"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax bench CASE`."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,44 +33,88 @@ class Reproduce(Common):
     """Reproduce an experiment of the paper beside the paper's own figures.
 
     table2: a triangle on three support points, pushed by a robot; predicted against measured final poses.
+    squeeze: a parallel jaw closes on a rectangle from four start poses. jam: two fingers that jam, and from what
+    friction. two-finger: the triangle pushed by two fingers, predicted against measured. three-finger: the original
+    authors' simulated grasps, run again.
     """
 
-    experiment: Annotated[Literal["table2"], tyro.conf.Positional] = tyro.MISSING
+    experiment: Annotated[Literal["table2", "squeeze", "jam", "two-finger", "three-finger"], tyro.conf.Positional] = (
+        tyro.MISSING
+    )
     """Which."""
     data: Path | None = None
     """Folder of the recorded pushes. Default: the environment variable PUSHJAX_DATA."""
     geometry: Literal["nominal", "measured"] = "nominal"
-    """nominal: as in the paper. measured: contact and the push's end as force sensor and robot command tell."""
-    steps: int = 100
-    """Steps of each push."""
+    """table2: nominal, as in the paper; or measured, contact and the push's end as force sensor and robot command
+    tell."""
+    steps: int | None = None
+    """Steps of each push or grasp. Default: the experiment's own."""
 
 
-Command = Annotated[Demo, tyro.conf.subcommand("demo")] | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+@dataclass
+class Bench(Common):
+    """Measure: how exact, how fast.
+
+    contacts: random problems of one to eight contacts, every answer checked by an independent solver.
+    """
+
+    case: Annotated[Literal["contacts"], tyro.conf.Positional] = "contacts"
+    """Which."""
+    dtype: Literal["float32", "float64"] = "float64"
+    """Floating type."""
+    scale: float = 1.0
+    """How many problems, of 100 000 for up to four contacts and 10 000 for more."""
+    starts: int = 50
+    """Starts of the independent solver on every problem that was called jammed."""
 
 
-def _demo(command: Demo) -> tuple[dict[str, Any], str]:
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
+)
+Progress = Callable[[int, int], None]
+Result = tuple[dict[str, Any], str]
+
+
+def _demo(command: Demo, progress: Progress) -> Result:
     from pushjax.experiments import demo
 
     record = demo.run(command.seed, command.out)
     return record, demo.summary(record)
 
 
-def _table2(command: Reproduce) -> tuple[dict[str, Any], str]:
-    from rich.progress import Progress
+def _reproduce(command: Reproduce, progress: Progress) -> Result:
+    from pushjax.experiments import jam, squeeze, table2, three_finger, two_finger
 
-    from pushjax.experiments import table2
-
+    own: Any = {} if command.steps is None else {"steps": command.steps}
+    if command.experiment == "jam":
+        record = jam.run(command.seed, command.out)
+        return record, jam.summary(record)
+    if command.experiment == "squeeze":
+        record = squeeze.run(command.seed, command.out, **own)
+        return record, squeeze.summary(record)
     folder = command.data or find_data()
     if folder is None:
         raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
-    with Progress(transient=True) as bar:
-        task = bar.add_task("cells", total=None)
+    if command.experiment == "table2":
+        record = table2.run(folder, command.seed, command.out, command.geometry, progress=progress, **own)
+        return record, table2.summary(record)
+    if command.experiment == "two-finger":
+        record = two_finger.run(folder, command.seed, command.out, progress=progress, **own)
+        return record, two_finger.summary(record)
+    record = three_finger.run(folder, command.seed, command.out, progress=progress, **own)
+    return record, three_finger.summary(record)
 
-        def progress(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
 
-        record = table2.run(folder, command.seed, command.out, command.geometry, command.steps, progress)
-    return record, table2.summary(record)
+def _bench(command: Bench, progress: Progress) -> Result:
+    import jax
+
+    from pushjax.experiments import bench_contacts
+
+    jax.config.update("jax_enable_x64", command.dtype == "float64")  # of this process, which is the command's own
+    record = bench_contacts.run(command.seed, command.out, command.scale, command.starts, progress=progress)
+    return record, bench_contacts.summary(record)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -78,13 +123,26 @@ def main(arguments: list[str] | None = None) -> None:
         Command,  # pyright: ignore[reportArgumentType]
         args=arguments,
         prog="pushjax",
-        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes.",
+        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.",
     )
     import matplotlib
 
     matplotlib.use("Agg")  # draws to files; there may be no screen
+    from rich.progress import Progress as Bar
+
     try:
-        record, text = _table2(command) if isinstance(command, Reproduce) else _demo(command)
+        with Bar(transient=True) as bar:
+            task = bar.add_task("working", total=None, visible=not isinstance(command, Demo))
+
+            def progress(done: int, total: int) -> None:
+                bar.update(task, completed=done, total=total)
+
+            if isinstance(command, Reproduce):
+                record, text = _reproduce(command, progress)
+            elif isinstance(command, Bench):
+                record, text = _bench(command, progress)
+            else:
+                record, text = _demo(command, progress)
         print(text)
         if command.json is not None:
             from pushjax.report import write_json

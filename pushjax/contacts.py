@@ -1,48 +1,218 @@
-"""Contact detection: where a finger meets the slider during a step, and with what normal and gap.
+"""Contact detection: where fingers meet the slider during a step, and with what normals and gaps.
 
-Everything is exact for a straight relative path of any length, so a finger can neither tunnel through the slider nor
-meet the extension of an edge past its corner: first the time of impact with the slider at rest, then the boundary
-as seen from where the finger then is.
+How long the hand moves freely is exact for straight relative paths of any length, so a finger can neither tunnel
+through the slider nor meet the extension of an edge past its corner. From there every place where a finger and the
+slider may touch is a contact with its own gap, closed or not: contacts that are made within the step are the contact
+problem's to find.
+
+A round finger has one such place, or two on an outline that is not convex. A pad against a polygon has two: of all
+corners of either, seen from the other's outline, the two nearest in different places (an edge flat on an edge rests
+on the two ends of what they share). All are chosen anew in each step, and stay the same within it.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
-from pushjax._vec import Scalar, Vec2, settle
-from pushjax.shapes import Outline
+from pushjax._vec import Scalar, Vec2, select, settle
+from pushjax.hands import Finger, RoundFinger
+from pushjax.shapes import DiskOutline, Outline, PolygonOutline
+from pushjax.shapes.polygon import Edge
 
 # How far, in units of the limit surface's length, a finger may overlap the slider and still be pushed out: a tracker's
 # error, not a finger on the wrong side.
 DEEPEST_OVERLAP = 0.2
+# A corner may touch what lies in a direction if neither of its edges leads there; so much (sine) an edge may, so that
+# both ends of an edge almost flat on another are contacts, and neither sinks in when it comes down.
+BLUNT = 0.3
+LOOSE = 1e-6  # of an edge's length: how far past its end a corner still lies beside it
+FAR = 1e3  # m, out of any reach
+# Two places nearer to each other than this, in the same unit, are one.
+SAME_PLACE = 1e-3
+
+
+class Placement(NamedTuple):
+    """Where a finger is: its centre, and its angle as a unit vector (None: it never turns)."""
+
+    center: Vec2
+    angle: Vec2 | None
+
+
+class Touch(NamedTuple):
+    """A place where a finger and the slider may touch, in the slider's frame, m: signed distance (negative in
+    penetration), the slider's point, the inward unit normal."""
+
+    distance: Scalar
+    point: Vec2
+    normal: Vec2
+
+
+def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> tuple[Touch, ...]:
+    """Every place where a finger and the slider may touch."""
+    if isinstance(finger, RoundFinger):
+        seen = outline.touches(at.center)
+        return tuple(Touch(s.distance - finger.radius, s.point, -s.normal) for s in seen)
+    pad, angle = finger.shape.outline(), _angle(at)
+    if isinstance(outline, DiskOutline):
+        seen = pad.closest((outline.center - at.center).unrotate(angle))
+        normal = seen.normal.rotate(angle)
+        return (Touch(seen.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
+    touches = []
+    for corner in corners(pad):
+        touches.append(_beside(outline, corner.turned(angle, at.center), length))
+    away = Vec2(angle.x, -angle.y)
+    for corner in corners(outline):
+        seen = _beside(pad, corner.turned(away, (-at.center).unrotate(angle)), length)
+        touches.append(Touch(seen.distance, corner.point, -seen.normal.rotate(angle)))
+    return tuple(touches)
+
+
+class Corner(NamedTuple):
+    """A polygon's corner, and the unit directions in which its two edges leave it."""
+
+    point: Vec2
+    onward: Vec2
+    back: Vec2
+
+    def turned(self, angle: Vec2, shift: Vec2) -> "Corner":
+        return Corner(shift + self.point.rotate(angle), self.onward.rotate(angle), self.back.rotate(angle))
+
+
+def _beside(outline: Outline, corner: Corner, length: Scalar) -> Touch:
+    """A corner against the edge of a polygon that it lies beside and points to; far off if there is none.
+
+    Not the closest point: a corner that is a little inside, next to the other's corner, may be closest to the wrong
+    edge, and one that is past an edge's end touches nothing, though it is near.
+    """
+    found: Touch | None = None
+    for edge in edges(outline):
+        rel = corner.point - edge.start
+        along, height = rel.dot(edge.along), edge.normal.dot(rel)
+        loose = LOOSE * edge.length
+        points = (corner.onward.dot(edge.normal) >= -BLUNT) & (corner.back.dot(edge.normal) >= -BLUNT)
+        # deeper than this it is on the far side of another edge
+        beside = points & (along >= -loose) & (along <= edge.length + loose) & (height > -2 * DEEPEST_OVERLAP * length)
+        touch = Touch(jnp.where(beside, height, FAR), corner.point - edge.normal.scale(height), -edge.normal)
+        if found is None:
+            found = touch
+            continue
+        nearer = settle(jnp.abs(touch.distance) < jnp.abs(found.distance), corner.point.x)
+        found = select(nearer, touch, found)
+    assert found is not None
+    return found
+
+
+def count(finger: Finger, outline: Outline) -> int:
+    """How many contacts a finger takes part in: known before anything is."""
+    zero = jnp.zeros(())
+    return min(
+        2, len(jax.eval_shape(lambda: places(finger, outline, Placement(Vec2(zero, zero), Vec2(zero, zero)), zero)))
+    )
+
+
+def choose(touches: tuple[Touch, ...], length: Scalar) -> tuple[Int[Array, ""] | int, ...]:
+    """Which places are contacts: all, if there are no more than two; else the nearest, and the nearest elsewhere."""
+    if len(touches) <= 2:
+        return tuple(range(len(touches)))
+    first, nearest = jnp.zeros((), jnp.int32), touches[0]
+    for k, touch in enumerate(touches[1:], start=1):
+        nearer = settle(touch.distance < nearest.distance, length)
+        first, nearest = jnp.where(nearer, k, first), select(nearer, touch, nearest)
+    far = nearest.distance + 1e3 * length
+    second, best = first, far
+    for k, touch in enumerate(touches):
+        apart = touch.point - nearest.point
+        elsewhere = (k != first) & (apart.dot(apart) > (SAME_PLACE * length) ** 2)
+        nearer = settle(elsewhere & (touch.distance < best), length)
+        second, best = jnp.where(nearer, k, second), jnp.where(nearer, touch.distance, best)
+    return first, second
+
+
+def taken(touches: tuple[Touch, ...], chosen: tuple[Any, ...]) -> tuple[Touch, ...]:
+    """The chosen places; the second, where there is none but the first, is out of reach."""
+    if len(touches) <= 2:
+        return touches
+    picked = []
+    for index in chosen:
+        touch = touches[0]
+        for k, other in enumerate(touches[1:], start=1):
+            touch = select(index == k, other, touch)
+        picked.append(touch)
+    alone = chosen[0] == chosen[1]
+    picked[1] = picked[1]._replace(distance=picked[1].distance + jnp.where(alone, 1.0, 0.0))
+    return tuple(picked)
 
 
 class Meeting(NamedTuple):
-    """When, within a step, one finger meets the slider. Body frame, m.
-
-    start: fraction of the path after which they are in contact. reached: whether they are at all. overlapping: whether
-    the finger is too deep inside for the closest side to mean anything. gap: the gap then, which is the depth
-    of an overlap (negative) or zero.
-    """
+    """When, within a step, one finger meets the slider. start: the fraction of the path after which they are in
+    contact, one if they never are. overlapping: whether the finger is too deep inside for the closest side to mean
+    anything."""
 
     start: Scalar
-    reached: Bool[Array, ""]
     overlapping: Bool[Array, ""]
-    gap: Scalar
 
 
-def meet(outline: Outline, center: Vec2, path: Vec2, radius: Scalar, length: Scalar) -> Meeting:
-    """The first contact of a disc that moves from `center` along `path`, both in the frame of a slider at rest."""
-    here = outline.closest(center)
-    gap = here.distance - radius
-    # In contact and pressing on: from the start. Else, also when touching but leaving, whatever is hit first.
-    hit = outline.sweep(center, path, radius)
-    pressing, hits = settle(((gap <= 0) & (-here.normal.dot(path) > gap), hit <= 1), center.x)
-    reached = pressing | hits
-    return Meeting(
-        jnp.where(pressing, 0.0, jnp.where(reached, hit, 1.0)),
-        reached,
-        gap < -DEEPEST_OVERLAP * length,
-        jnp.where(pressing, gap, 0.0),
-    )
+def meet(finger: Finger, outline: Outline, at: Placement, path: Vec2, length: Scalar) -> Meeting:
+    """The first contact of a finger that moves along `path`, in the frame of a slider at rest, without turning."""
+    pressing = jnp.zeros((), bool)
+    for touch in places(finger, outline, at, length):
+        # In contact and pressing on: from the start
+        pressing |= (touch.distance <= 0) & (touch.normal.dot(path) > touch.distance)
+    # Else, also when touching but leaving, whatever is hit first
+    hit = _sweep(finger, outline, at, path)
+    pressing, hits = settle((pressing, hit <= 1), at.center.x)
+    start = jnp.where(pressing, 0.0, jnp.where(hits, hit, 1.0))
+    return Meeting(start, overlap(finger, outline, at) > DEEPEST_OVERLAP * length)
+
+
+def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
+    """How deep a finger is inside the slider, or a corner of either in the other, m; negative where they are apart."""
+    if isinstance(finger, RoundFinger):
+        return finger.radius - outline.closest(at.center).distance
+    pad, angle = finger.shape.outline(), _angle(at)
+    if isinstance(outline, DiskOutline):
+        return outline.radius - pad.closest((outline.center - at.center).unrotate(angle)).distance
+    deepest = jnp.full_like(at.center.x, -jnp.inf)
+    for corner in corners(pad):
+        deepest = jnp.maximum(deepest, -outline.closest(at.center + corner.point.rotate(angle)).distance)
+    for corner in corners(outline):
+        deepest = jnp.maximum(deepest, -pad.closest((corner.point - at.center).unrotate(angle)).distance)
+    return deepest
+
+
+def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scalar:
+    if isinstance(finger, RoundFinger):
+        return outline.sweep(at.center, path, finger.radius)
+    pad, angle, zero = finger.shape.outline(), _angle(at), jnp.zeros_like(path.x)
+    back = (-path).unrotate(angle)
+    if isinstance(outline, DiskOutline):
+        return pad.sweep((outline.center - at.center).unrotate(angle), back, outline.radius)
+    fraction = jnp.full_like(path.x, jnp.inf)
+    for corner in corners(pad):
+        fraction = jnp.minimum(fraction, outline.sweep(at.center + corner.point.rotate(angle), path, zero))
+    for corner in corners(outline):
+        fraction = jnp.minimum(fraction, pad.sweep((corner.point - at.center).unrotate(angle), back, zero))
+    return fraction
+
+
+def edges(outline: Outline) -> tuple[Edge, ...]:
+    """Of a polygon with few of them, as pads and what they touch must be."""
+    if not isinstance(outline, PolygonOutline):
+        raise ValueError("hand: pads can touch a Polygon or a Disk; other shapes need round fingers")
+    if isinstance(outline.edges, Edge):
+        many = outline.edges.start_x.shape[0]
+        raise ValueError(f"hand: pads can touch a Polygon of up to twelve vertices; got {many}")
+    return outline.edges
+
+
+def corners(outline: Outline) -> tuple[Corner, ...]:
+    sides = edges(outline)
+    return tuple(Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides))
+
+
+def _angle(at: Placement) -> Vec2:
+    if at.angle is None:
+        raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centres")
+    return at.angle

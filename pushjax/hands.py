@@ -1,42 +1,142 @@
 """Hands: the fingers, and where a configuration puts them; paths through configurations."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import Scalar, Vec2
+from pushjax.shapes import Polygon
+
+Kinematics = Callable[[Array], Array]
 
 
-class Hand(eqx.Module):
-    """A position-controlled hand: round fingers, and a map from configurations to their centres in the world.
+class RoundFinger(eqx.Module):
+    """A disc of `radius` m; zero is a point."""
 
-    radius: (fingers,), m; zero is a point. dof: numbers in a configuration.
-    """
+    radius: Float[Array, ""]
 
-    radius: Float[Array, "fingers"]
-    dof: int = eqx.field(static=True)
-
-    def __check_init__(self):
-        if self.radius.shape != (1,) or self.dof != 2:
-            raise ValueError(f"a hand has one finger of two degrees of freedom; got {self.radius.shape}, {self.dof}")
-
-    @staticmethod
-    def finger(radius: Numeric = 0.0) -> "Hand":
-        """One round finger of `radius` m that does not turn; its configuration is (x, y) of its centre, world, m."""
+    def __init__(self, radius: Numeric):
         r = as_float(radius)
         shaped("radius", r, ())
         finite("radius", r)
         non_negative("radius", r)
-        return Hand(r[None], 2)
+        self.radius = r
 
-    def centers(self, configuration: tuple[Scalar, ...]) -> tuple[Vec2, ...]:
-        """World position of each finger's centre."""
-        x, y = configuration
-        return (Vec2(x, y),)
+
+class Pad(eqx.Module):
+    """A convex polygon, in the finger's own frame."""
+
+    shape: Polygon
+
+    def __init__(self, shape: Polygon):
+        if not shape.convex:
+            raise ValueError("shape: a pad must be a convex polygon whose vertices are known")
+        self.shape = shape
+
+
+Finger = RoundFinger | Pad
+
+
+class Hand(eqx.Module):
+    """A position-controlled hand: its fingers, and a map from configurations to where they are in the world.
+
+    fingers: numbers (radii of discs, m), `Polygon`s (convex pads, in the finger's own frame), `RoundFinger`s or `Pad`s.
+    kinematics: a function from a configuration (dof,) to the fingers' poses (fingers, 3), world, m and rad; or to their
+    centres (fingers, 2), of a hand that never turns (not with pads). It is traced. least: what a configuration's last
+    number, the opening, must not fall short of, if anything.
+
+    Raises ValueError for no finger, or kinematics that do not give one pose a finger.
+    """
+
+    fingers: tuple[Finger, ...]
+    kinematics: Kinematics = eqx.field(static=True)
+    dof: int = eqx.field(static=True)
+    least: Float[Array, ""] | None
+
+    def __init__(self, fingers: Sequence[Any], kinematics: Kinematics, dof: int, least: Numeric | None = None):
+        if not fingers:
+            raise ValueError("fingers: a hand needs at least one; got none")
+        self.fingers = tuple(_finger(finger) for finger in fingers)
+        self.kinematics, self.dof = kinematics, dof
+        self.least = None if least is None else as_float(least)
+        shape = jax.eval_shape(kinematics, jax.ShapeDtypeStruct((dof,), jnp.result_type(float))).shape
+        widths = (3,) if any(isinstance(f, Pad) for f in self.fingers) else (2, 3)
+        if len(shape) != 2 or shape[0] != len(self.fingers) or shape[1] not in widths:
+            wanted = " or ".join(f"({len(self.fingers)}, {width})" for width in widths)
+            raise ValueError(f"kinematics gives shape {shape} for a configuration of {dof} numbers; expected {wanted}")
+
+    @property
+    def radius(self) -> Float[Array, "fingers"]:
+        """m, of a hand with round fingers only."""
+        return jnp.stack([finger.radius for finger in self.fingers])  # pyright: ignore[reportAttributeAccessIssue]
+
+    @staticmethod
+    def finger(radius: Numeric = 0.0) -> "Hand":
+        """One round finger of `radius` m that does not turn; its configuration is (x, y) of its centre, world, m."""
+        return Hand((radius,), _one, 2)
+
+    @staticmethod
+    def two_fingers(radius: Numeric = 0.0) -> "Hand":
+        """Two round fingers of `radius` m at (0, d/2) and (0, -d/2) of the hand; configuration (x, y, theta, d)."""
+        return Hand((radius, radius), _two, 4, least=2 * as_float(radius))
+
+    @staticmethod
+    def three_fingers(radius: Numeric = 0.0) -> "Hand":
+        """Three round fingers of `radius` m at distance d from the hand's origin, the first on its +y axis, the others
+        120 degrees apart; configuration (x, y, theta, d)."""
+        return Hand((radius, radius, radius), _three, 4, least=2 / 3**0.5 * as_float(radius))
+
+    @staticmethod
+    def parallel_jaw(width: Numeric, thickness: Numeric) -> "Hand":
+        """Two rectangular pads that face each other along the hand's y axis: faces of `width` m along x, `thickness` m
+        behind them; configuration (x, y, theta, d), d the opening between the faces."""
+        pad = Polygon.rectangle(width, thickness)
+        half = float(as_float(thickness)) / 2
+        return Hand((pad, pad), _Jaw(half), 4, least=0.0)
+
+    def poses(self, path: Float[Array, "*steps dof"]) -> Float[Array, "*steps fingers width"]:
+        """World poses (3) or centres (2) of the fingers along a path."""
+        return jax.vmap(self.kinematics)(path) if path.ndim > 1 else self.kinematics(path)
+
+
+def _finger(finger: Any) -> Finger:
+    if isinstance(finger, RoundFinger | Pad):
+        return finger
+    return Pad(finger) if isinstance(finger, Polygon) else RoundFinger(finger)
+
+
+def _one(q: Array) -> Array:
+    return q[None]
+
+
+def _placed(q: Array, offsets: list[tuple[Any, Any]]) -> Array:
+    """Poses of fingers that turn with the hand, at offsets in its frame."""
+    c, s = jnp.cos(q[2]), jnp.sin(q[2])
+    return jnp.stack([jnp.stack([q[0] + c * x - s * y, q[1] + s * x + c * y, q[2]]) for x, y in offsets])
+
+
+def _two(q: Array) -> Array:
+    return _placed(q, [(0.0, q[3] / 2), (0.0, -q[3] / 2)])
+
+
+def _three(q: Array) -> Array:
+    side = 3**0.5 / 2 * q[3]
+    return _placed(q, [(0.0, q[3]), (side, -q[3] / 2), (-side, -q[3] / 2)])
+
+
+@dataclass(frozen=True)
+class _Jaw:
+    half: float  # of the pads' thickness
+
+    def __call__(self, q: Array) -> Array:
+        away = q[3] / 2 + self.half
+        return _placed(q, [(0.0, away), (0.0, -away)])
 
 
 def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
@@ -53,6 +153,20 @@ def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 do
     finite("end", b)
     t = jnp.arange(steps + 1, dtype=dtype)[:, None] / steps
     return a[None] * (1 - t) + b[None] * t  # exact at both ends
+
+
+def through(configurations: Numeric, steps: int | Sequence[int]) -> Float[Array, "points dof"]:
+    """A path straight from each way point to the next, all of which it meets exactly.
+
+    configurations: the way points (points, dof). steps: equal steps on each stretch, one number for all or one each.
+    Raises ValueError for fewer than two way points or one step on a stretch, or values that are not finite.
+    """
+    p = checked_path(configurations, None)
+    stretches = p.shape[0] - 1
+    each: list[Any] = np.broadcast_to(steps, stretches).tolist() if np.ndim(steps) == 0 else np.ravel(steps).tolist()
+    if len(each) != stretches:
+        raise ValueError(f"steps must be one number, or one for each of {stretches} stretches; got {len(each)}")
+    return jnp.concatenate([p[:1], *(line(p[k], p[k + 1], n)[1:] for k, n in enumerate(each))])
 
 
 def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:

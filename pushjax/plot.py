@@ -11,10 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
+from pushjax.hands import Finger, Hand, Pad
 from pushjax.limit_surface import LimitSurface
 from pushjax.rollout import Trajectory
 from pushjax.shapes import Shape
 from pushjax.solve import Contacts, Motion, friction_cone, motion_cone
+from pushjax.status import Status
 from pushjax.support import Support, WrenchTwistPairs
 
 MM = 1e3
@@ -153,6 +155,102 @@ def push_figure(
             all_axes[0, 0].plot([], [], color=color, label=label)
         handles, labels = all_axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        return figure
+
+
+def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], frames: int = 4) -> Figure:
+    """Grasps side by side: slider and fingers at the start black, at the end red, between grey; the centre's trace."""
+    with plt.rc_context(STYLE):
+        figure, all_axes = plt.subplots(
+            1,
+            len(grasps),
+            figsize=(3.1 * len(grasps), 3.9),
+            sharex=True,
+            sharey=True,
+            layout="constrained",
+            squeeze=False,
+        )
+        for axes, (name, grasp) in zip(all_axes[0], grasps.items(), strict=True):
+            pose = np.asarray(grasp.pose)
+            fingers = np.asarray(hand.poses(grasp.configuration))
+            # only where the slider moves is there something to see
+            moves = np.flatnonzero(np.any(np.diff(pose, axis=0) != 0, axis=1))
+            last = len(pose) - 1 if moves.size == 0 else min(moves[-1] + 1, len(pose) - 1)
+            first = 0 if moves.size == 0 else moves[0]
+            between = np.linspace(first, last, frames + 2).round().astype(int)[1:-1]
+            for k, color in [*((k, BETWEEN) for k in between), (0, START), (last, END)]:
+                width = 0.8 if color == BETWEEN else 1.4
+                _outline(axes, shape, pose[k], color, width)
+                for finger, where in zip(hand.fingers, fingers[k], strict=True):
+                    _finger(axes, finger, where, color, width)
+            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
+            axes.set(title=name.replace(": ", ":\n"), xlabel="x / mm", aspect="equal")
+        all_axes[0, 0].set_ylabel("y / mm")
+        for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
+            all_axes[0, 0].plot([], [], color=color, label=label)
+        handles, labels = all_axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        return figure
+
+
+def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
+    if isinstance(finger, Pad):
+        _outline(axes, finger.shape, pose, color, width)
+    else:
+        axes.add_patch(Circle(tuple(MM * pose[:2]), MM * float(finger.radius), color=color, fill=False, lw=width))
+
+
+def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
+    """Two closing contacts, labelled: where a centre of rotation keeps both fingers out, and what their forces can do.
+
+    Each panel: friction cones; the contact normals and the region between or beyond them where a counter-clockwise (+)
+    or clockwise (-) centre of rotation moves both contacts away from their fingers; the line through the contacts,
+    along which they press on each other if it lies in both cones; the verdict, with the centre of rotation.
+    """
+    with plt.rc_context(STYLE):
+        figure, all_axes = plt.subplots(
+            1, len(panels), figsize=(5.0 * len(panels), 4.6), layout="constrained", squeeze=False
+        )
+        low, high = (MM * np.asarray(b) for b in shape.bounds)
+        reach = 0.55 * (high - low).max()
+        box = low - 0.4 * reach, high + 0.4 * reach
+        for axes, (contacts, motion) in zip(all_axes[0], panels, strict=True):
+            point, normal = MM * np.asarray(contacts.point), np.asarray(contacts.normal)
+            mu = np.asarray(contacts.friction)
+            grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(*box, strict=True))), axis=-1)
+            arm = point[:, None, None] - grid[None]
+            # a counter-clockwise turn about c moves p along perp(p - c)
+            away = -normal[:, None, None, 0] * arm[..., 1] + normal[:, None, None, 1] * arm[..., 0]
+            for sign, color in ((1, ORANGE), (-1, PURPLE)):
+                region = np.all(sign * away > 0, axis=0)
+                if region.any():
+                    axes.contourf(grid[..., 0], grid[..., 1], region, levels=[0.5, 1.5], colors=[color], alpha=0.16)
+                    label = "centre of rotation allowed, " + ("+" if sign > 0 else "\N{MINUS SIGN}")
+                    axes.fill([], [], color=color, alpha=0.16, label=label)
+            _outline(axes, shape, np.zeros(3), START, 1.4)
+            for name, p, n, m in zip("AC", point, normal, mu, strict=False):
+                axes.plot(*np.array([p - 2 * reach * n, p + 2 * reach * n]).T, "--", color=BLUE, lw=0.9)
+                tangent = np.array([-n[1], n[0]])
+                for side in (1, -1):
+                    edge = (n + side * m * tangent) / np.hypot(1, m)
+                    axes.plot(*np.array([p, p + 0.9 * reach * edge]).T, color=GREEN, lw=1.6)
+                axes.annotate(
+                    "",
+                    tuple(p),
+                    tuple(p - 0.4 * reach * n),
+                    arrowprops={"arrowstyle": "-|>", "color": "0.3", "lw": 1.8},
+                )
+                axes.annotate(name, tuple(p - 0.5 * reach * n), ha="center", va="center")
+            axes.plot(*point.T, ":", color="0.2", lw=1.3)
+            status = Status(int(motion.status)).name
+            _center_of_rotation(axes, np.asarray(motion.twist))
+            axes.plot([], [], color=GREEN, label="friction cone")
+            axes.plot([], [], "--", color=BLUE, lw=0.9, label="contact normal")
+            axes.plot([], [], ":", color="0.2", label="line through both contacts")
+            axes.set(title=f"$\\mu$ = {mu[0]:.2f}: {status}", xlabel="x / mm", ylabel="y / mm", aspect="equal")
+            axes.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))
+        handles, labels = all_axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
         return figure
 
 

@@ -84,6 +84,30 @@ def test_table2_no_push_fails_or_blows_up(table):
         assert 0 < cell["ci95_mm"] < cell["mean_mm"]
 
 
+def test_jam(tmp_path, capsys):
+    cli.main(["reproduce", "jam", "--out", str(tmp_path), "--json", str(tmp_path / "jam.json")])
+    record = json.loads((tmp_path / "jam.json").read_text())
+    assert record["verdicts"] == {"0.25": "MOVING", "0.55": "JAMMED"}
+    for row in record["rows"]:
+        assert row["last_moving"] < row["threshold"] <= row["jams_from"] + 1e-6
+    assert (tmp_path / "jam.png").stat().st_size > 10_000
+    assert "jams from 0.400" in capsys.readouterr().out
+
+
+def test_bench_contacts(tmp_path):
+    """Two thousand problems of two contacts, judged by the independent solver."""
+    from pushjax.experiments import bench_contacts
+
+    record = bench_contacts.run(scale=0.0, contacts=(2,), starts=20)
+    for row in record["rows"]:
+        assert row["problems"] == 2000
+        assert row["wrong"] == row["not_converged"] == 0
+        assert row["solved"] + row["jammed"] == 2000
+        assert row["jammed"] > 100
+        assert row["worst_violation"] < 1e-8
+    assert "wrong" in bench_contacts.summary(record)
+
+
 def test_table2_wants_data(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PUSHJAX_DATA", str(tmp_path / "nowhere"))
     with pytest.raises(SystemExit) as stop:

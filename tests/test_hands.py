@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pushjax import Hand, line, resample
+from pushjax import Hand, line, resample, through
 
 ROUNDING = 1e-15  # of numbers of order 0.1
 
@@ -50,6 +50,32 @@ def test_line_is_batched_and_differentiable():
 def test_line_refuses_bad_input(arguments, message):
     with pytest.raises(ValueError, match=message):
         line(*arguments)
+
+
+def test_through_meets_every_way_point():
+    points = jnp.array([[0.0, 0.0, 0.1], [1.0, 0.0, 0.1], [1.0, 2.0, 0.0]])
+    path = through(points, 4)
+    assert path.shape == (9, 3)
+    np.testing.assert_array_equal(path[::4], points)
+    uneven = through(points, [1, 3])
+    np.testing.assert_array_equal(uneven[jnp.array([0, 1, 4])], points)
+    np.testing.assert_array_equal(uneven[1:], line(points[1], points[2], 3))
+    gradient = jax.grad(lambda p: jnp.sum(through(p, 2)))(points)
+    np.testing.assert_allclose(gradient.sum(), path[::2].size)
+
+
+@pytest.mark.parametrize(
+    ("points", "steps", "message"),
+    [
+        ([[0.0, 0.0]], 3, "at least one step, two configurations"),
+        ([[0.0, 0.0], [1.0, 0.0]], [2, 2], "one for each of 1 stretches; got 2"),
+        ([[0.0, 0.0], [1.0, 0.0]], 0, "steps must be at least 1; got 0"),
+        ([[0.0, 0.0], [np.nan, 0.0]], 1, "path must be finite"),
+    ],
+)
+def test_through_refuses_bad_input(points, steps, message):
+    with pytest.raises(ValueError, match=message):
+        through(points, steps)
 
 
 @pytest.mark.parametrize("steps", [2.5, "3"])
@@ -111,8 +137,7 @@ def test_finger():
     hand = Hand.finger(0.005)
     assert hand.dof == 2
     np.testing.assert_array_equal(hand.radius, [0.005])
-    (center,) = hand.centers((jnp.asarray(0.1), jnp.asarray(-0.2)))
-    np.testing.assert_array_equal(center.array(), [0.1, -0.2])
+    np.testing.assert_array_equal(hand.poses(jnp.array([0.1, -0.2])), [[0.1, -0.2]])
     np.testing.assert_array_equal(Hand.finger().radius, [0.0])
 
 

@@ -42,8 +42,8 @@ UNITS = Inputs(*(np.asarray(u) for u in (1.0, SURFACE.max(), np.array([0.03, 0.0
 
 
 def push(inputs: Inputs):
-    slider = Slider(Polygon(inputs.vertices), Quartic(inputs.surface, LENGTH))
-    return rollout(slider, Hand(inputs.radius[None], 2), inputs.path, pose=inputs.pose, friction=inputs.friction)
+    slider = Slider(Polygon(inputs.vertices, convex=True), Quartic(inputs.surface, LENGTH))
+    return rollout(slider, Hand.finger(inputs.radius), inputs.path, pose=inputs.pose, friction=inputs.friction)
 
 
 def final(inputs: Inputs) -> jax.Array:

@@ -276,6 +276,135 @@ def test_gradient_by_the_vertices(name):
     assert wrong.mean() < 0.01
 
 
+# --- all places where a finger touches ---
+
+touches = jax.jit(jax.vmap(lambda shape, x: shape.outline().touches(Vec2.of(x)), (None, 0)))
+REFLEX = ["arrow", "L", "star of 14"]
+
+
+def reflex_corners(v: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of counter-clockwise `v`: the reflex vertices, and the outward normals of the edges before and after each."""
+    edge = np.roll(v, -1, axis=0) - v
+    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    before = np.roll(edge, 1, axis=0)
+    reflex = np.flatnonzero(before[:, 0] * edge[:, 1] - before[:, 1] * edge[:, 0] < 0)
+    return v[reflex], np.roll(normal, 1, axis=0)[reflex], normal[reflex]
+
+
+def against(vertex: np.ndarray, one: np.ndarray, other: np.ndarray, heights: tuple[float, float]) -> np.ndarray:
+    """The point at these heights over the two walls of each corner."""
+    walls = np.stack([one, other], axis=1)
+    return vertex + np.linalg.solve(walls, np.broadcast_to(heights, (len(vertex), 2))[..., None])[..., 0]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", REFLEX)
+@pytest.mark.parametrize("heights", [(0.002, 0.002), (0.002, 0.0021), (0.0021, 0.002), (0.0, 0.0)])
+def test_both_walls_of_a_reflex_corner_are_touched(name, heights, dtype):
+    polygon = Polygon(POLYGONS[name].astype(dtype))
+    vertex, *walls = reflex_corners(np.asarray(polygon.vertices, np.float64))
+    points = against(vertex, *walls, heights)
+    first, second = touches(polygon, points.astype(dtype))
+    alone = closest(polygon, points.astype(dtype))
+    same = (alone[0], *alone[1].T, *alone[2].T) if heights[0] != heights[1] else alone[:1]  # either, if equally near
+    for a, b in zip(jax.tree.leaves(first), same, strict=False):
+        np.testing.assert_allclose(a, b, rtol=0, atol=max(lengths(dtype), 4 * np.finfo(dtype).eps))
+    found, expected = np.sort([first.distance, second.distance], axis=0), np.sort(heights)[:, None]
+    np.testing.assert_allclose(found - expected, 0, atol=lengths(dtype))
+    normals = np.stack([np.stack(first.normal, axis=1), np.stack(second.normal, axis=1)])
+    if heights[1] == 0:  # in the vertex itself the first is its bisector
+        off = np.min([np.abs(normals[1] - wall).max(axis=1) for wall in walls], axis=0)
+    else:
+        straight, crossed = (np.abs(normals - np.stack(order)).max(axis=(0, 2)) for order in (walls, walls[::-1]))
+        off = np.minimum(straight, crossed)
+    np.testing.assert_allclose(off, 0, atol=ROUNDINGS * np.finfo(dtype).eps)
+    foot = np.stack(second.point, axis=1) + np.asarray(second.distance)[:, None] * normals[1]
+    np.testing.assert_allclose(foot, points, rtol=0, atol=lengths(dtype))
+
+
+@pytest.mark.parametrize("name", REFLEX)
+@pytest.mark.parametrize("heights", [(-1e-5, 2e-3), (2e-3, -1e-5), (-1e-5, -2e-5), (-2e-5, -1e-5), (-1e-5, 1e-7)])
+def test_a_point_pressed_into_a_reflex_corner_is_stopped_by_the_other_wall(name, heights):
+    polygon = Polygon(POLYGONS[name])
+    vertex, *walls = reflex_corners(np.asarray(polygon.vertices, np.float64))
+    points = against(vertex, *walls, heights)
+    first, second = touches(polygon, points)
+    assert (first.distance < 0).all()
+    normal = np.stack(second.normal, axis=1)
+    at = np.argmin([np.abs(normal - wall).max(axis=1) for wall in walls], axis=0)
+    np.testing.assert_allclose(normal, np.stack(walls)[at, np.arange(len(at))], atol=1e-12)
+    np.testing.assert_allclose(second.distance, np.array(heights)[at], atol=lengths(float))
+    if heights[0] * heights[1] < 0:  # the first is then the wall it is in, the second the other
+        assert (np.asarray(second.distance) > 0).all()
+
+
+def test_the_second_touch_is_the_next_local_minimum(vertices):
+    """By brute force: the distance along the outline, at many points, falls and rises again on the outer side."""
+    polygon, points = Polygon(vertices, convex=False), scattered(12, 150)
+    outline = complex_of(polygon.boundary(4000))
+    perimeter = float(polygon.perimeter)
+    first, second = touches(polygon, points)
+    found = np.asarray(second.distance) < np.asarray(first.distance) + 0.99 * perimeter
+    np.testing.assert_allclose(second.distance[~found], first.distance[~found] + perimeter, rtol=1e-12)
+    for k in np.flatnonzero(brute_closest(vertices, points)[0] > 0):
+        rel = complex_of(points[k]) - outline
+        tangent = np.roll(outline, -1) - np.roll(outline, 1)
+        gap = np.abs(rel)
+        least = (gap < np.roll(gap, 1)) & (gap <= np.roll(gap, -1)) & ((tangent.conj() * rel).imag < 0)
+        far = np.abs(outline - (first.point.x[k] + 1j * first.point.y[k])) > 2 * perimeter / 4000
+        next_one = gap[least & far].min(initial=np.inf)
+        assert np.isfinite(next_one) == found[k]
+        if found[k]:
+            np.testing.assert_allclose(second.distance[k], next_one, atol=perimeter / 8000)  # samples miss a vertex
+
+
+@pytest.mark.parametrize("name", ["triangle", "square", "needle"])
+def test_convex_outlines_are_touched_once(name):
+    shape = Polygon(POLYGONS[name])
+    (only,) = touches(shape, scattered(13))
+    np.testing.assert_array_equal(only.distance, distances(shape, scattered(13)))
+    # also asked for two, there is no second: not at a vertex, where two edges share the foot, and not through material
+    vertex, direction, height = sector_points(POLYGONS[name], 200)
+    inside = 0.4 * vertex
+    for points in (scattered(13), vertex + direction * height[:, None], vertex, inside):
+        first, second = touches(Polygon(POLYGONS[name], convex=False), points)
+        np.testing.assert_allclose(second.distance - first.distance, shape.perimeter, rtol=1e-9)
+        np.testing.assert_allclose(np.hypot(*second.normal), 1, rtol=1e-9)
+    assert len(touches(Disk(0.05), scattered(13))) == 1
+
+
+@pytest.mark.parametrize("name", ["L", "star of 14"])
+def test_gradients_of_the_second_touch_are_finite(name):
+    polygon = Polygon(POLYGONS[name])
+    points = np.concatenate([scattered(14, 100), np.asarray(polygon.vertices), [polygon.centroid]])
+
+    def second(shape, x):
+        return jnp.stack(jax.tree.leaves(shape.outline().touches(Vec2.of(x))[1]))
+
+    slope = jax.jit(jax.vmap(jax.jacfwd(second, argnums=(0, 1)), (None, 0)))(polygon, points)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+    seen = touches(polygon, points)
+    own = np.asarray(seen[1].distance) < np.asarray(seen[0].distance) + 0.99 * float(polygon.perimeter)
+    np.testing.assert_allclose(slope[1][own, 0], np.stack(seen[1].normal, axis=1)[own], atol=1e-9)
+
+
+def test_convexity_is_found_out():
+    convex = {name: Polygon(v).convex for name, v in POLYGONS.items()}
+    assert [name for name, flag in convex.items() if flag] == ["triangle", "needle", "square", "pentagon"]
+    assert Polygon(POLYGONS["square"][::-1]).convex
+    rounded = Polygon.regular(400, np.float32(0.05))
+    assert Polygon(rounded.vertices).convex  # its vertices are rounded, and the angles almost straight
+    assert not Polygon(POLYGONS["square"], convex=False).convex
+
+    @jax.jit
+    def flags(v):
+        kinds = Polygon(v), Polygon(v, convex=True), Polygon.rectangle(v[0, 0], 1.0), Polygon.regular(5, v[0, 0])
+        assert [kind.convex for kind in kinds] == [False, True, True, True]
+        return kinds
+
+    flags(POLYGONS["square"])
+
+
 # --- discs ---
 
 
@@ -575,6 +704,7 @@ BAD = {
     "infinite": (lambda: Polygon([(0, 0), (1, 0), (np.inf, 1)]), "vertices"),
     "three columns": (lambda: Polygon(np.zeros((4, 3))), r"vertices has shape \(4, 3\)"),
     "flat": (lambda: Polygon(np.zeros(6)), "vertices has shape"),
+    "not convex": (lambda: Polygon(POLYGONS["L"], convex=True), "convex is True.*vertex 3"),
     "width": (lambda: Polygon.rectangle(-1, 1), "width"),
     "height": (lambda: Polygon.rectangle(1, 0), "height"),
     "height NaN": (lambda: Polygon.rectangle(1, np.nan), "height"),

@@ -495,13 +495,6 @@ def test_shapes_are_refused_while_traced_too():
         jax.jit(lambda n: Contacts(**(GOOD | {"normal": n})).gap)(jnp.ones(2))
 
 
-@pytest.mark.parametrize("count", [0, 2])
-def test_other_than_one_contact_is_refused(count):
-    contacts = Contacts(np.zeros((count, 2)), np.tile([1.0, 0.0], (count, 1)), np.zeros((count, 2)), 0.3)
-    with pytest.raises(ValueError, match=f"exactly one contact is supported; got {count}"):
-        solve_contacts(Ellipsoid(jnp.eye(3), 0.03), contacts)
-
-
 # --- cones ---
 
 

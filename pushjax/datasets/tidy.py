@@ -1,12 +1,11 @@
 """The curated arrays of the same pushes: one `.npz` per log, in SI units and in the frames of `pushes`."""
 
-import zipfile
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pushjax.datasets._archive import Arrays, floats, read_archive, row_count
 from pushjax.datasets.pushes import (
     Floats,
     LogError,
@@ -30,8 +29,6 @@ _PER_FILE = (
 )
 _STREAMS = {"tip_offsets": ("tip_t", "tip_xy", "tip_yaw"), "ft_offsets": ("ft_t", "force_world")}
 
-Arrays = dict[str, NDArray[np.generic]]
-
 
 def load_push_npz(path: str | PathLike[str]) -> PushLog:
     """Reads a file of the `three_point_push` folder, rows in order; `Push.index` is its `push_index`.
@@ -39,10 +36,11 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
     Rows marked invalid, or holding numbers that are not finite, become problems. Raises LogError if the file
     is missing, is no such archive, lacks an array or has one of the wrong size, or if no row is usable.
 
-    The arrays it reads, and their shapes, are named in `_read` and below it.
+    The arrays it reads, and their shapes, are named at the head of this file.
     """
     file = Path(path)
-    data = _read(file)
+    wanted = [*_PER_PUSH, *_PER_FILE, *_STREAMS, *(name for names in _STREAMS.values() for name in names)]
+    data = read_archive(file, wanted, "pushes")
     _check_sizes(file, data)
     pushes: list[Push] = []
     problems: list[LogError] = []
@@ -58,47 +56,22 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
     return PushLog(
         pushes=tuple(pushes),
         problems=tuple(problems),
-        vertices=_floats(data["vertices_body"]),
-        length=float(_floats(data["rho"])),
-        tip_radius=float(_floats(data["tip_radius"])),
-        support_points=_floats(data["support_points_body"]).reshape(-1, 2),
-        support_force=_floats(data["support_normal_force"]).reshape(-1),
+        vertices=floats(data["vertices_body"]),
+        length=float(floats(data["rho"])),
+        tip_radius=float(floats(data["tip_radius"])),
+        support_points=floats(data["support_points_body"]).reshape(-1, 2),
+        support_force=floats(data["support_normal_force"]).reshape(-1),
         surface=str(data["surface"]),
         arrangement=str(data["arrangement"]),
         source=str(file),
     )
 
 
-def _read(path: Path) -> Arrays:
-    wanted = [*_PER_PUSH, *_PER_FILE, *_STREAMS, *(name for names in _STREAMS.values() for name in names)]
-    try:
-        # Opened here, because np.load leaves a file open that turns out to be no archive.
-        with path.open("rb") as file:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise LogError(path, "expected an .npz archive of pushes, found a single array")
-            missing = [name for name in wanted if name not in archive.files]
-            if missing:
-                raise LogError(path, f"expected the arrays of a push archive, found no {', '.join(missing)}")
-            return {name: archive[name] for name in wanted}
-    except LogError:
-        raise
-    except OSError as error:
-        raise LogError(
-            path, f"expected an .npz archive, but cannot read the file: {error.strerror or error}"
-        ) from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise LogError(path, f"expected an .npz archive of pushes, found something else: {error}") from error
-
-
 def _check_sizes(path: Path, data: Arrays) -> None:
-    count = len(data["push_index"]) if data["push_index"].ndim else -1
-    for name, tail in _PER_PUSH.items():
-        if data[name].shape != (count, *tail):
-            raise LogError(path, f"expected {name} of shape (n, *{tail}) for n pushes, found {data[name].shape}")
+    count = row_count(path, data, _PER_PUSH)
     for offsets_name, names in _STREAMS.items():
         offsets = data[offsets_name]
-        if offsets.shape != (count + 1,) or offsets[0] != 0 or np.any(np.diff(_floats(offsets)) < 1):
+        if offsets.shape != (count + 1,) or offsets[0] != 0 or np.any(np.diff(floats(offsets)) < 1):
             raise LogError(path, f"expected {offsets_name} to rise from 0 in {count} steps, found another array")
         for name in names:
             if len(data[name]) != offsets[-1]:
@@ -106,14 +79,14 @@ def _check_sizes(path: Path, data: Arrays) -> None:
 
 
 def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
-    index = int(_floats(data["push_index"])[row])
+    index = int(floats(data["push_index"])[row])
     if not data["valid"][row]:
         return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)
     streams: dict[str, Floats] = {}
     for offsets, names in _STREAMS.items():
-        begin, end = (int(at) for at in _floats(data[offsets])[row : row + 2])
-        streams |= {name: _floats(data[name][begin:end]) for name in names}
-    start, end_pose = _floats(data["object_pose_start"])[row], _floats(data["object_pose_end"])[row]
+        begin, end = (int(at) for at in floats(data[offsets])[row : row + 2])
+        streams |= {name: floats(data[name][begin:end]) for name in names}
+    start, end_pose = floats(data["object_pose_start"])[row], floats(data["object_pose_end"])[row]
     for name, values in {**streams, "object_pose_start": start, "object_pose_end": end_pose}.items():
         if not np.isfinite(values).all():
             return LogError(path, f"expected finite numbers, found NaN or infinity in {name}", push=index)
@@ -133,7 +106,3 @@ def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
         force=force,
         onset=contact_onset(force_time, force, tip_time, tip),
     )
-
-
-def _floats(array: NDArray[np.generic]) -> Floats:
-    return np.array(array, dtype=np.float64)

@@ -3,6 +3,7 @@
 from pushjax.limit_surface._base import Form as Form
 from pushjax.limit_surface._base import InverseMap as InverseMap
 from pushjax.limit_surface._base import LimitSurface as LimitSurface
+from pushjax.limit_surface._base import Symmetric3 as Symmetric3
 from pushjax.limit_surface._base import angle_between as angle_between
 from pushjax.limit_surface.ellipsoid import Ellipsoid as Ellipsoid
 from pushjax.limit_surface.ellipsoid import EllipsoidForm as EllipsoidForm

@@ -29,6 +29,9 @@ class EllipsoidForm(_EllipsoidFields):
 
     degree: ClassVar[int] = 2
 
+    def scaled(self, factor: Scalar) -> "EllipsoidForm":
+        return EllipsoidForm(Symmetric3(*(factor * entry for entry in self.a)), self.length)
+
     def gradient(self, f: Vec3) -> Vec3:
         return self.a.times(f).scale(2.0)
 

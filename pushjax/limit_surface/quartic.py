@@ -44,6 +44,9 @@ class QuarticForm(_QuarticFields):
 
     degree: ClassVar[int] = 4
 
+    def scaled(self, factor: Scalar) -> "QuarticForm":
+        return QuarticForm(tuple(factor * c for c in self.c), self.length)
+
     def value(self, f: Vec3) -> Scalar:
         g = self.gradient(f)
         return (f.x * g.x + f.y * g.y + f.z * g.z) / 4

@@ -1,10 +1,12 @@
 """What a shape must be able to answer."""
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, shaped
@@ -29,6 +31,16 @@ class Outline(eqx.Module):
     @abstractmethod
     def closest(self, x: Vec2) -> Closest:
         """The boundary as seen from the body point `x`."""
+
+    def touches(self, x: Vec2) -> tuple[Closest, ...]:
+        """All places where a round finger about the body point `x` may rest at once; how many there are is static.
+
+        The first is `closest(x)`. Outlines that may not be convex have a second: the next nearest local minimum of the
+        distance that faces `x`, as of a finger wedged in a concave corner. Its sign is that of its own side: negative
+        where `x` is behind it. Where there is none, its distance is the first's plus the perimeter, out of any
+        finger's reach, and its point and normal are the first's.
+        """
+        return (self.closest(x),)
 
     @abstractmethod
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
@@ -111,3 +123,82 @@ def first_hit(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
 def rounding(size: Scalar) -> Scalar:
     """What a handful of operations on numbers up to `size` may be wrong by."""
     return 16 * jnp.finfo(size.dtype).eps * size
+
+
+def equally_spaced(
+    speed: Callable[[Array], Array], nodes: Float[Array, "nodes"], points: int
+) -> tuple[Float[Array, "points"], Float[Array, ""]]:
+    """Parameters of `points` points equally spaced in arc length along a closed smooth outline, and its length.
+
+    speed: arc length per parameter, of an array of parameters; nodes: increasing parameters from start to end, so
+    dense that the speed is smooth between two. The first point is half a spacing from the start.
+    """
+    at, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
+    at = at + 0.5
+
+    def along(start, width):
+        """Arc length from each start over its width."""
+        return width * jnp.sum(weights[None] * speed(start[:, None] + width[:, None] * at[None]), axis=1)
+
+    width = jnp.diff(nodes)
+    arc = jnp.concatenate([jnp.zeros(1, nodes.dtype), jnp.cumsum(along(nodes[:-1], width))])
+    wanted = (jnp.arange(points, dtype=nodes.dtype) + 0.5) / points * arc[-1]
+    node = jnp.clip(jnp.searchsorted(arc, wanted, side="right") - 1, 0, width.size - 1)
+    start, rest, most = nodes[node], wanted - arc[node], width[node]
+    offset = most * rest / (arc[node + 1] - arc[node])
+    for _ in range(4):  # Newton; the speed hardly changes between two nodes
+        offset = jnp.clip(offset + (rest - along(start, offset)) / speed(start + offset), 0, most)
+    return start + offset, arc[-1]
+
+
+def signed_area(v: np.ndarray) -> float:
+    rel = v - v[0]
+    after = np.roll(rel, -1, axis=0)
+    return float(np.sum(rel[:, 0] * after[:, 1] - after[:, 0] * rel[:, 1]) / 2)
+
+
+def check_simple(name: str, v: np.ndarray) -> None:
+    """Raise unless the closed polyline `v`, the argument `name`, encloses an area without touching itself."""
+    n, size = len(v), float(np.max(np.ptp(v, axis=0)))
+    gap = np.linalg.norm(v[:, None] - v[None], axis=-1) + size * np.eye(n)
+    if size == 0 or gap.min() <= 1e-9 * size:
+        i, j = np.unravel_index(np.argmin(gap), gap.shape)
+        raise ValueError(
+            f"{name}: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
+            "first is not repeated at the end"
+        )
+    if abs(signed_area(v)) <= 1e-12 * size**2:
+        raise ValueError(f"{name} enclose no area ({abs(signed_area(v)):.3g} m^2)")
+    crossed = crossing(v, 1e-9 * size)
+    if crossed is not None:
+        i, j = crossed
+        raise ValueError(f"{name}: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
+
+
+def crossing(v: np.ndarray, tolerance: float) -> tuple[int, int] | None:
+    """Two edges of a closed polyline that cross or touch, other than at the vertex they share; None if there are none.
+
+    tolerance: the distance, m, within which a vertex touches an edge.
+    """
+    n = len(v)
+    a, b = v, np.roll(v, -1, axis=0)
+
+    def side(p, q, r):
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+
+    p, q, r, s = a[:, None], b[:, None], a[None], b[None]
+    crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
+    on_edge = _touches(p, q, r, tolerance)  # a vertex lying on an edge that is not its own
+    index = np.arange(n)
+    own = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
+    bad = crossing | (on_edge & ~own)
+    if not bad.any():
+        return None
+    i, j = np.argwhere(bad)[0]
+    return int(i), int(j)
+
+
+def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
+    edge = q - p
+    s = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
+    return np.linalg.norm(r - p - s[..., None] * edge, axis=-1) <= tolerance

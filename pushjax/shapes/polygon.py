@@ -2,14 +2,15 @@
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select, settle
-from pushjax.shapes._base import Closest, Outline, Shape, first_hit, rounding
+from pushjax.shapes._base import Closest, Outline, Shape, check_simple, first_hit, rounding, signed_area
 
 # Up to this many edges the search over edges is written out, edge by edge, so that a batch vectorises across its
 # examples; beyond it, an array over the edges keeps the compiled program small.
@@ -17,7 +18,8 @@ UNROLLED_EDGES = 12
 
 
 class Edge(NamedTuple):
-    """One edge, or an array of them: start, unit direction, length, and the bisecting normals at both ends."""
+    """One edge, or an array of them: start, unit direction, length, and for both ends the bisecting normal and the
+    turn of the outline there, as its sine (negative at a reflex corner)."""
 
     start_x: Scalar
     start_y: Scalar
@@ -28,6 +30,8 @@ class Edge(NamedTuple):
     bisector_a_y: Scalar
     bisector_b_x: Scalar
     bisector_b_y: Scalar
+    turn_a: Scalar
+    turn_b: Scalar
 
     @property
     def start(self) -> Vec2:
@@ -54,47 +58,67 @@ class PolygonOutline(Outline):
     """Edges of a polygon: a tuple of them (written out), or one `Edge` of arrays (many edges)."""
 
     edges: tuple[Edge, ...] | Edge
+    convex: bool = eqx.field(static=True, default=False)
 
-    def _nearest_edge(self, x: Vec2) -> Edge:
+    def _nearest_edge(self, x: Vec2) -> tuple[Edge, "Marks"]:
+        """The nearest edge, and for each edge whether it is that one."""
         if isinstance(self.edges, Edge):
             *_, diff = self.edges.foot(x)
             nearest = jnp.argmin(diff.dot(diff))
-            return jax.tree.map(lambda field: field[nearest], self.edges)
-        best, best_squared = self.edges[0], None
+            return jax.tree.map(lambda field: field[nearest], self.edges), jnp.arange(diff.x.size) == nearest
+        best, best_squared, marks = self.edges[0], None, []
         for edge in self.edges:
             *_, diff = edge.foot(x)
             squared = diff.dot(diff)
             if best_squared is None:
                 best_squared = squared
+                marks = [jnp.ones_like(squared, bool)]
                 continue
             nearer = settle(squared < best_squared, x.x)
             best = select(nearer, edge, best)
             best_squared = jnp.where(nearer, squared, best_squared)
-        return best
+            marks = [mark & ~nearer for mark in marks] + [nearer]
+        return best, marks
 
     def closest(self, x: Vec2) -> Closest:
-        """The search only chooses the edge; distance and normal then come from that edge alone.
+        return _seen_over(self._nearest_edge(x)[0], x)
 
-        Over an edge's interior the signed distance is linear and its sign is right inside and outside. At a
-        vertex the sign follows the bisector (outside a convex vertex, inside a reflex one), which stays right
-        for vertices that are almost straight.
-        """
-        edge = self._nearest_edge(x)
-        s, clipped, diff = edge.foot(x)
-        over_edge = (s > 0) & (s < edge.length)
-        bisector = select(
-            s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
-        )
-        squared = diff.dot(diff)
-        on_vertex = squared <= jnp.finfo(squared.dtype).tiny
-        length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
-        sign = jnp.where(bisector.dot(diff) >= 0, 1.0, -1.0)
-        radial = select(on_vertex, bisector, diff.scale(sign / length))
-        # on the vertex itself the distance is zero and, as gradient, gets the bisector
-        vertex_distance = jnp.where(on_vertex, bisector.dot(diff), sign * length)
-        normal = select(over_edge, edge.normal, radial)
-        distance = jnp.where(over_edge, edge.normal.dot(x - edge.start), vertex_distance)
-        return Closest(distance, edge.start + edge.along.scale(clipped), normal)
+    def touches(self, x: Vec2) -> tuple[Closest, ...]:
+        if self.convex:
+            return (self.closest(x),)
+        edge, marks = self._nearest_edge(x)
+        first = _seen_over(edge, x)
+        other, wall, found = self._next_edge(x, marks, first.distance)
+        # over a wall, also past its end, the distance is that to its line; a corner is seen as any corner
+        at_corner = _seen_over(other, x)
+        _, clipped, _ = other.foot(x)
+        height = other.normal.dot(x - other.start)
+        perimeter = jnp.sum(self.edges.length) if isinstance(self.edges, Edge) else sum(e.length for e in self.edges)
+        distance = jnp.where(found, jnp.where(wall, height, at_corner.distance), first.distance + perimeter)
+        point = select(found, other.start + other.along.scale(clipped), first.point)
+        normal = select(found, select(wall, other.normal, at_corner.normal), first.normal)
+        return first, Closest(distance, point, normal)
+
+    def _next_edge(self, x: Vec2, marks: "Marks", gap: Scalar) -> tuple[Edge, Bool[Array, ""], Bool[Array, ""]]:
+        """The edge of the second touch, whether over the edge or at its start, and whether there is one at all."""
+        if isinstance(self.edges, Edge):
+            marks = jnp.asarray(marks)
+            before = jax.tree.map(lambda field: jnp.roll(field, 1), self.edges)
+            near = (jnp.roll(marks, 1), marks, jnp.roll(marks, -1))
+            wall, corner, squared = _second_touch(self.edges, before, x, near, gap)
+            chosen = jnp.argmin(jnp.where(wall | corner, squared, jnp.inf))
+            return jax.tree.map(lambda field: field[chosen], (self.edges, wall, wall | corner))
+        count = len(self.edges)
+        best, best_squared = self.edges[0], jnp.full_like(gap, jnp.inf)
+        over, found = jnp.zeros_like(gap, bool), jnp.zeros_like(gap, bool)
+        for k, edge in enumerate(self.edges):
+            near = (marks[k - 1], marks[k], marks[(k + 1) % count])
+            wall, corner, squared = _second_touch(edge, self.edges[k - 1], x, near, gap)
+            wall, nearer = settle((wall, (wall | corner) & (squared < best_squared)), x.x)
+            best = select(nearer, edge, best)
+            over, best_squared = jnp.where(nearer, wall, over), jnp.where(nearer, squared, best_squared)
+            found = found | nearer
+        return best, over, found
 
     def _sweep_edge(self, edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         rel = x - edge.start
@@ -117,6 +141,55 @@ class PolygonOutline(Outline):
         return fraction
 
 
+Marks = list[Bool[Array, ""]] | Bool[Array, "vertices"]  # one per edge, as the edges themselves
+
+
+def _seen_over(edge: Edge, x: Vec2) -> Closest:
+    """The boundary as seen from `x`, which `edge` is nearest to; distance and normal come from that edge alone.
+
+    Over an edge's interior the signed distance is linear and its sign is right inside and outside. At a vertex the
+    sign follows the bisector (outside a convex vertex, inside a reflex one), which stays right for vertices that are
+    almost straight.
+    """
+    s, clipped, diff = edge.foot(x)
+    over_edge = (s > 0) & (s < edge.length)
+    bisector = select(s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
+    squared = diff.dot(diff)
+    on_vertex = squared <= jnp.finfo(squared.dtype).tiny
+    length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
+    sign = jnp.where(bisector.dot(diff) >= 0, 1.0, -1.0)
+    radial = select(on_vertex, bisector, diff.scale(sign / length))
+    # on the vertex itself the distance is zero and, as gradient, gets the bisector
+    vertex_distance = jnp.where(on_vertex, bisector.dot(diff), sign * length)
+    normal = select(over_edge, edge.normal, radial)
+    distance = jnp.where(over_edge, edge.normal.dot(x - edge.start), vertex_distance)
+    return Closest(distance, edge.start + edge.along.scale(clipped), normal)
+
+
+def _second_touch(edge: Edge, before: Edge, x: Vec2, first: tuple, gap: Scalar):
+    """Whether an edge, or its start vertex, is another local minimum of the distance; and its squared distance.
+
+    first: whether the nearest is the edge before, this one, the edge after; gap: the signed distance to it.
+
+    A wall counts if `x` is over it and in front of it; one seen through the material is no place to rest at. A
+    neighbour of the nearest edge meets it at a convex vertex, where they share the foot and there is but one
+    minimum, or at a reflex one. In there, once `x` is on the outline or behind it, the neighbour counts also past its
+    end: a point pressed a little into one wall is still stopped by the other.
+    """
+    s, _, diff = edge.foot(x)
+    rel = x - edge.start
+    loose = rounding(jnp.abs(rel.x) + jnp.abs(rel.y) + edge.length)
+    straight = rounding(jnp.ones_like(gap))
+    reflex_a, reflex_b = edge.turn_a < -straight, edge.turn_b < -straight
+    is_before, is_this, is_after = first
+    shares = (is_before & ~reflex_a) | (is_after & ~reflex_b)
+    wedged = ((is_before & reflex_a) | (is_after & reflex_b)) & (gap <= loose)
+    over = (s >= -loose) & (s <= edge.length + loose) & (edge.normal.dot(rel) >= -loose)
+    wall = ~is_this & ~shares & (over | wedged)
+    sector = (s <= 0) & (rel.dot(before.along) >= 0) & ~reflex_a
+    return wall, sector & ~is_this & ~is_before & ~wall, diff.dot(diff)
+
+
 class Polygon(Shape):
     """A simple polygon, convex or not, in the body frame.
 
@@ -124,12 +197,17 @@ class Polygon(Shape):
     counter-clockwise; the first vertex stays first. While the vertices are traced (under `jit`, `grad` or
     `vmap`) they are taken as they are and must be counter-clockwise already.
 
-    Raises ValueError for fewer than three vertices, NaN, repeated vertices, crossing edges or no area.
+    `convex`: whether a finger touches it in one place only. None: determined from the vertices; where they are
+    traced, not assumed. False for a convex polygon costs time and changes nothing.
+
+    Raises ValueError for fewer than three vertices, NaN, repeated vertices, crossing edges, no area, or known vertices
+    that are not convex, as `convex` says they are.
     """
 
     vertices: Float[Array, "vertices 2"]
+    convex: bool = eqx.field(static=True)
 
-    def __init__(self, vertices: Numeric):
+    def __init__(self, vertices: Numeric, *, convex: bool | None = None):
         array = as_float(vertices)
         shaped("vertices", array, ("vertices", 2))
         if array.shape[0] < 3:
@@ -137,10 +215,11 @@ class Polygon(Shape):
         finite("vertices", array)
         known = concrete(array)
         if known is not None:
-            _check_simple(known.astype(np.float64))
-            if _signed_area(known.astype(np.float64)) < 0:
+            check_simple("vertices", known.astype(np.float64))
+            if signed_area(known.astype(np.float64)) < 0:
                 array = jnp.roll(array[::-1], 1, axis=0)
         self.vertices = array
+        self.convex = _is_convex(array, convex)
 
     @staticmethod
     def rectangle(width: Numeric, height: Numeric) -> "Polygon":
@@ -152,7 +231,7 @@ class Polygon(Shape):
             finite(name, value)
             positive(name, value)
         signs = jnp.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype)
-        return Polygon(signs * jnp.stack([w / 2, h / 2])[None])
+        return Polygon(signs * jnp.stack([w / 2, h / 2])[None], convex=True)
 
     @staticmethod
     def regular(sides: int, circumradius: Numeric) -> "Polygon":
@@ -164,7 +243,7 @@ class Polygon(Shape):
         finite("circumradius", radius)
         positive("circumradius", radius)
         angle = 2 * jnp.pi * jnp.arange(sides, dtype=radius.dtype) / sides
-        return Polygon(radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1))
+        return Polygon(radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1), convex=True)
 
     @property
     def area(self) -> Float[Array, ""]:
@@ -204,50 +283,31 @@ class Polygon(Shape):
         normal = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
         bisector = normal + jnp.roll(normal, 1, axis=0)  # at each edge's start
         bisector = bisector / jnp.sqrt(jnp.sum(bisector**2, axis=1, keepdims=True))
-        after = jnp.roll(bisector, -1, axis=0)
-        edges = Edge(
-            v[:, 0], v[:, 1], along[:, 0], along[:, 1], length, bisector[:, 0], bisector[:, 1], after[:, 0], after[:, 1]
-        )
+        back = jnp.roll(along, 1, axis=0)
+        turn = back[:, 0] * along[:, 1] - back[:, 1] * along[:, 0]
+        starts = (bisector[:, 0], bisector[:, 1]), turn
+        (a_x, a_y), turn_a = starts
+        (b_x, b_y), turn_b = jax.tree.map(lambda field: jnp.roll(field, -1), starts)
+        edges = Edge(v[:, 0], v[:, 1], along[:, 0], along[:, 1], length, a_x, a_y, b_x, b_y, turn_a, turn_b)
         if len(v) > UNROLLED_EDGES:
-            return PolygonOutline(edges)
-        return PolygonOutline(tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(v))))
+            return PolygonOutline(edges, self.convex)
+        each = tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(v)))
+        return PolygonOutline(each, self.convex)
 
 
-def _signed_area(v: np.ndarray) -> float:
-    rel = v - v[0]
-    after = np.roll(rel, -1, axis=0)
-    return float(np.sum(rel[:, 0] * after[:, 1] - after[:, 0] * rel[:, 1]) / 2)
-
-
-def _check_simple(v: np.ndarray) -> None:
-    """Raise unless the closed polyline `v` encloses an area without touching itself."""
-    n, size = len(v), float(np.max(np.ptp(v, axis=0)))
-    gap = np.linalg.norm(v[:, None] - v[None], axis=-1) + size * np.eye(n)
-    if size == 0 or gap.min() <= 1e-9 * size:
-        i, j = np.unravel_index(np.argmin(gap), gap.shape)
-        raise ValueError(
-            f"vertices: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
-            "first is not repeated at the end"
-        )
-    a, b = v, np.roll(v, -1, axis=0)
-
-    def side(p, q, r):
-        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
-
-    p, q, r, s = a[:, None], b[:, None], a[None], b[None]
-    crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
-    on_edge = _touches(p, q, r, 1e-9 * size)  # a vertex lying on an edge that is not its own
-    index = np.arange(n)
-    own = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
-    bad = crossing | (on_edge & ~own)
-    if abs(_signed_area(v)) <= 1e-12 * size**2:
-        raise ValueError(f"vertices enclose no area ({abs(_signed_area(v)):.3g} m^2)")
-    if bad.any():
-        i, j = np.argwhere(bad)[0]
-        raise ValueError(f"vertices: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
-
-
-def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
-    edge = q - p
-    s = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
-    return np.linalg.norm(r - p - s[..., None] * edge, axis=-1) <= tolerance
+def _is_convex(vertices: Array, claimed: bool | None) -> bool:
+    """Whether no vertex lies more than a rounding inside the line between its neighbours; as claimed, if traced."""
+    known = concrete(vertices)
+    if known is None:
+        return bool(claimed)
+    v = known.astype(np.float64)
+    chord = np.roll(v, -1, axis=0) - np.roll(v, 1, axis=0)
+    arm = v - np.roll(v, 1, axis=0)
+    # how far each vertex lies outside that line; where there is none, the outline turns back on itself
+    length = np.maximum(np.linalg.norm(chord, axis=1), np.finfo(np.float64).tiny)
+    bulge = (arm[:, 0] * chord[:, 1] - arm[:, 1] * chord[:, 0]) / length
+    inner = int(np.argmin(bulge))
+    convex = bool(bulge[inner] >= -16 * float(jnp.finfo(vertices.dtype).eps) * np.max(np.abs(v)))
+    if claimed and not convex:
+        raise ValueError(f"convex is True, but the vertices are not: vertex {inner} is a reflex corner")
+    return convex if claimed is None else bool(claimed)

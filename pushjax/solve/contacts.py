@@ -12,9 +12,12 @@ from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, n
 from pushjax._vec import Scalar, Vec2, Vec3
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
+from pushjax.solve._several import ContactSolver, SeveralMotion, assemble
+from pushjax.solve.exhaustive import Exhaustive
 from pushjax.solve.single import solve_single
 from pushjax.solve.sticking import ScalarRoot, StickingSolver
 
+MAX_CONTACTS = 8
 UNIT_TOLERANCE = 1e-5  # of a normal's length: a hundred roundings of float32
 
 
@@ -23,7 +26,8 @@ class Contacts(eqx.Module):
 
     point, normal, displacement: (contacts, 2), m; `normal` is of unit length and points into the slider; `displacement`
     is that of the pusher's material point over the step. friction: mu, (contacts,) or one for all. gap: m still to
-    close along the normal, negative in penetration. active: False for a contact that is only padding.
+    close along the normal, negative in penetration. active: False for a contact that is only padding, whose other
+    entries may be anything.
 
     Raises ValueError for arrays that do not match, are not finite, a normal not of unit length or negative friction.
     """
@@ -54,11 +58,14 @@ class Contacts(eqx.Module):
         self.friction = _each("friction", as_float(friction, dtype), m)
         self.gap = _each("gap", as_float(gap, dtype), m)
         self.active = _each("active", jnp.asarray(active, bool), m)
+        counts = concrete(self.active)
+        # padding may hold anything; where it is not known which contacts are, all are checked
+        used = slice(None) if counts is None or counts.all() else np.flatnonzero(counts)
         for name in ("point", "normal", "displacement", "friction", "gap"):
-            finite(name, getattr(self, name))
-        non_negative("friction", self.friction)
+            finite(name, getattr(self, name)[used])
+        non_negative("friction", self.friction[used])
         known = concrete(self.normal)
-        if known is not None and np.any(np.abs(np.linalg.norm(known, axis=1) - 1) > UNIT_TOLERANCE):
+        if known is not None and np.any(np.abs(np.linalg.norm(known[used], axis=1) - 1) > UNIT_TOLERANCE):
             raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
 
 
@@ -73,8 +80,19 @@ class Motion(eqx.Module):
 
     twist: (3,), of the slider over the step (m, m, rad), zero where it does not move. wrench: (3,), N and N m, on
     H = 1, zero where it does not move. force: (contacts, 2), N, along normal and tangent t = (-n_y, n_x), summing to
-    the wrench. mode: (contacts,) of `ContactMode`. status: `Status`. margin: distance from a jam, infinite for one
-    contact, which cannot jam. unique: False where another twist satisfies every condition too.
+    the wrench; where several distributions do, the one of evenly soft fingers (`pushjax.solve.share`). mode:
+    (contacts,) of `ContactMode`; a contact that touches has the mode of its slip, also where its force is zero.
+
+    status: `Status`. MOVING: every condition holds to 1e-9 of the fastest pusher and the
+    forces' sum (1e-4 in float32).
+    FREE: nothing would be violated if the slider stayed. JAMMED: no twist satisfies every contact. NOT_CONVERGED: none
+    was found, which proves nothing.
+
+    margin: m, minus the hand's squeeze power: the most work, per unit of normal force, that the fingers do in a step on
+    forces that cancel through the slider. A positive margin guarantees a motion, and is how far the fingers may still
+    close on each other; where JAMMED it is negative, and its size is how far they would have to open. Infinite where
+    no forces can cancel, as with one contact. Seldom is it negative where there is a motion: a jam is possible too.
+    unique: False where another twist satisfies every condition too.
     """
 
     twist: Float[Array, "3"]
@@ -86,38 +104,72 @@ class Motion(eqx.Module):
     unique: Bool[Array, ""]
 
 
-def solve_contacts(surface: LimitSurface, contacts: Contacts, *, solver: StickingSolver | None = None) -> Motion:
-    """The slider's motion under given pusher displacements: Coulomb friction at the contact, the limit surface below.
+def solve_contacts(
+    surface: LimitSurface, contacts: Contacts, *, solver: ContactSolver | StickingSolver | None = None
+) -> Motion:
+    """The slider's motion under given pusher displacements: Coulomb friction at each contact, the limit surface below.
 
-    Finds the twist V and force f with V = k grad H(J'f), k > 0, and, with the relative motion w = J V - displacement,
+    Finds the twist V and forces f with V = k grad H(sum J'f), k > 0, and, with the relative motion w = J V -
+    displacement at each contact,
 
         0 <= f_n  _|_  w_n + gap >= 0,   |f_t| <= mu f_n,   f_t = +mu f_n where w_t < 0,  -mu f_n where w_t > 0.
 
-    Differentiable, forward and reverse, in everything but `active`; while sticking, the derivative by friction is
-    zero. `solver` finds the sticking point: `ScalarRoot()` (default) or `HessianIteration()`.
+    Of several solutions, the one with the largest power on H = 1, then with the smallest twist in the length metric;
+    but where the slider may stay, it does. None of it depends on the order of the contacts, the frame or a mirror.
 
-    Raises ValueError unless there is exactly one contact. Traced values that are not finite, or a negative friction,
-    give `Status.INVALID` and no motion.
+    Differentiable, forward and reverse, in everything but `active`, within the contact modes of the solution; while a
+    contact sticks, the derivative of the motion by its friction is zero. Where forces are indeterminate their
+    derivatives are those of changes that keep them so: by one of two frictions of a flat push, say, there is none. The
+    margin is a maximum, with kinks.
 
-    Source: Zhou et al. 2017, section IV.A; the gap is that of Stewart & Trinkle 1996.
+    solver: default `ScalarRoot()` for one contact (also for one: `HessianIteration()`), `Exhaustive()` for more.
+
+    Raises ValueError for no contact, more than eight, or more than one for a solver of one. Traced values that are not
+    finite, or a negative friction, give `Status.INVALID` and no motion.
+
+    Source: Zhou et al. 2017, sections IV.A and IV.B; the gap is that of Stewart & Trinkle 1996.
     """
     m = contacts.point.shape[0]
-    if m != 1:
-        raise ValueError(f"contacts: exactly one contact is supported; got {m}")
+    if not 1 <= m <= MAX_CONTACTS:
+        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {m}")
+    return _solved(surface, contacts, solver)
+
+
+@eqx.filter_jit
+def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
+    m = contacts.point.shape[0]
     form, known = usable(surface.form())
-    contact = _contact(contacts, 0)
-    contact = contact._replace(friction=jnp.where(known, contact.friction, jnp.nan))
-    result = solve_single(form, contact, ScalarRoot() if solver is None else solver)
+    each = tuple(_contact(contacts, i) for i in range(m))
+    each = tuple(c._replace(friction=jnp.where(known, c.friction, jnp.nan)) for c in each)
+    result = motion_under(form, each, tuple(contacts.active[i] for i in range(m)), solver)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
         twist=result.twist.array(),
         wrench=wrench.array(),
-        force=result.force.array()[None],
-        mode=result.mode[None],
+        force=jnp.stack([f.array() for f in result.force]),
+        mode=jnp.stack(result.mode),
         status=result.status,
-        margin=jnp.full_like(result.twist.x, jnp.inf),
+        margin=result.margin,
         unique=result.unique,
     )
+
+
+def motion_under(
+    form: Form,
+    contacts: tuple[Contact, ...],
+    active: tuple[Bool[Array, ""], ...],
+    solver: ContactSolver | StickingSolver | None,
+) -> SeveralMotion:
+    """`solve_contacts` in scalars. One that is not active must be out of reach (`_contact`)."""
+    if solver is None:
+        solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
+    if not isinstance(solver, StickingSolver):
+        return solver.solve(assemble(form, contacts, active))
+    if len(contacts) != 1:
+        raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {len(contacts)}")
+    one = solve_single(form, contacts[0], solver)
+    margin = jnp.full_like(one.twist.x, jnp.inf)
+    return SeveralMotion(one.twist, one.wrench, (one.force,), (one.mode,), one.status, margin, one.unique)
 
 
 def usable(form: Form) -> tuple[Form, Bool[Array, ""]]:

@@ -40,7 +40,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     curve = LimitCurve.of(form, contact)
     size = jax.lax.stop_gradient(curve.c[0] + curve.c[-1])
     size = jnp.where(size > 0, size, 1.0)
-    curve, size = settle((LimitCurve(tuple(c / size for c in curve.c)), size), contact.gap)
+    curve, size = settle((LimitCurve(tuple(c / size for c in curve.c)), size), contact.approach().x)
     mu = contact.friction
     v = contact.approach()
     valid = known & jnp.isfinite(sum(curve.c))

@@ -1,0 +1,119 @@
+"""Contact problems by the thousand: is any answer wrong, is any missing, and what does one cost.
+
+Random problems of `pushjax.problems` (rigid hands, closing and independent fingers, with and without gaps, flat faces,
+opposite pairs, well and badly conditioned surfaces). MOVING and FREE are checked against every condition by
+`pushjax.verify`, which shares no code with the solvers; JAMMED needs a positive squeeze power, by its own linear
+program, and no clean answer from many starts of a different solver.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.problems import random_contacts_problem
+from pushjax.report import envelope
+from pushjax.verify import ProblemBatch, search, squeeze_power, squeeze_power_enumerated, violations
+
+# Largest violation of an answer, relative
+ALLOWED = {"float64": 1e-8, "float32": 1e-4}
+COUNTS = {m: 100_000 if m <= 4 else 10_000 for m in range(1, 9)}
+CHUNK = 2000
+PROGRAMMED = 50  # jams of each row whose squeeze power is confirmed by the linear program proper
+MODELS = {"quartic": 4, "ellipsoid": 2}
+
+
+def run(
+    seed: int = 0,
+    out: Path | None = None,
+    scale: float = 1.0,
+    starts: int = 50,
+    contacts: tuple[int, ...] = tuple(COUNTS),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """A row for each count, model and floating type the process allows. scale: of the number of problems."""
+    dtype = str(jnp.zeros(()).dtype)
+    cases = [(m, model) for m in contacts for model in MODELS]
+    rows = []
+    for done, (m, model) in enumerate(cases):
+        rows.append(_row(m, model, dtype, max(CHUNK, int(scale * COUNTS[m])), starts, seed))
+        progress(done + 1, len(cases))
+    settings = {"seed": seed, "scale": scale, "starts": starts, "allowed": ALLOWED[dtype], "chunk": CHUNK}
+    return envelope("contacts", settings, rows=rows)
+
+
+def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) -> dict[str, Any]:
+    draw = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=m, degree=MODELS[model])))
+    solve = jax.jit(jax.vmap(lambda p: pj.solve_contacts(p.surface, p.contacts)))
+    names = ("solved", "jammed", "wrong", "not_converged", "nonunique")
+    counts: dict[str, int] = dict.fromkeys(names, 0)
+    worst, elapsed, rounds = 0.0, [], -(-problems // CHUNK)
+    key = jax.random.fold_in(jax.random.key(seed), 10 * m + MODELS[model])
+    for chunk in range(rounds):
+        problem = draw(jax.random.split(jax.random.fold_in(key, chunk), CHUNK))
+        if not chunk:
+            jax.block_until_ready(solve(problem))  # compiles
+        begin = time.perf_counter()
+        motion = jax.block_until_ready(solve(problem))
+        elapsed.append(time.perf_counter() - begin)
+        found, violated = judge(ProblemBatch.of(problem.surface, problem.contacts), motion, dtype, starts, seed + chunk)
+        worst = max(worst, violated)
+        for name, number in found.items():
+            counts[name] += number
+    return {
+        "contacts": m,
+        "model": model,
+        "dtype": dtype,
+        "problems": rounds * CHUNK,
+        **counts,
+        "worst_violation": worst,
+        "us_per_problem": 1e6 * float(np.median(elapsed)) / CHUNK,
+    }
+
+
+def judge(
+    batch: ProblemBatch, motion: pj.Motion, dtype: str, starts: int, seed: int = 0
+) -> tuple[dict[str, int], float]:
+    """Counts of every outcome, and the largest violation by a MOVING or FREE answer."""
+    status = np.asarray(motion.status)
+    answered = (status == pj.Status.MOVING) | (status == pj.Status.FREE)
+    twist, force, wrench = (np.asarray(part) for part in (motion.twist, motion.force, motion.wrench))
+    worst = violations(batch, twist, force, wrench).worst()
+    wrong = answered & (worst > ALLOWED[dtype])
+    jams = np.flatnonzero(status == pj.Status.JAMMED)
+    if jams.size:
+        jammed = batch.take(jams)
+        loose = squeeze_power_enumerated(jammed) <= 0
+        few = min(PROGRAMMED, jams.size)
+        loose[:few] |= squeeze_power(jammed.take(slice(few))) <= 0
+        # float32's inputs are solved as they are, but its verdict near the border is float32's
+        clean = search(jammed, starts=starts, seed=seed).found if dtype == "float64" else np.zeros(jams.size, bool)
+        wrong[jams] |= loose | clean
+    counts = {
+        "solved": int(answered.sum()),
+        "jammed": int(jams.size),
+        "wrong": int(wrong.sum()),
+        "not_converged": int(np.sum(status == pj.Status.NOT_CONVERGED)),
+        "nonunique": int(np.sum(~np.asarray(motion.unique))),
+    }
+    return counts, float(worst[answered].max(initial=0.0))
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    lines = [
+        f"{'contacts':>8} {'model':10} {'dtype':8} {'problems':>8} {'solved':>8} {'jammed':>7} {'wrong':>6} "
+        f"{'not conv.':>9} {'nonunique':>9} {'worst':>9} {'us each':>8}"
+    ]
+    for row in record["rows"]:
+        lines.append(
+            f"{row['contacts']:8} {row['model']:10} {row['dtype']:8} {row['problems']:8} {row['solved']:8} "
+            f"{row['jammed']:7} {row['wrong']:6} {row['not_converged']:9} {row['nonunique']:9} "
+            f"{row['worst_violation']:9.1e} {row['us_per_problem']:8.2f}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,301 @@
+"""Hands of several fingers: recorded grasps, laws, jams, gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.experiments import jam, squeeze
+from pushjax.limit_surface.sums import squared_quadratics
+from pushjax.rollout import _overlap
+from pushjax.verify import ProblemBatch, violations
+
+DISTANCE, ANGLE = 1e-4, np.radians(0.1)  # of a final pose from a recorded one
+STEPS = 3000  # a jam is found to a step: 15 to 40 um of closing, some 0.05 degrees for these small sliders
+# Their solver had not converged: the recorded slider drifts along the fingers where the contact conditions, which have
+# one solution there, turn it about its middle (see test_recorded_drift_violates_the_conditions).
+DRIFTED = {1, 11}
+recorded = pytest.mark.xdist_group("recorded grasps")  # one worker runs them all again, once
+
+
+def six(vertices: np.ndarray) -> np.ndarray:
+    """The same outline with six vertices, some of them in the middle of an edge: one program for all."""
+    points = list(vertices)
+    k = 0
+    while len(points) < 6:
+        points.insert(k + 1, (points[k] + points[(k + 1) % len(points)]) / 2)
+        k += 2
+    return np.array(points)
+
+
+def quartic_of(record: dict, i: int) -> np.ndarray:
+    """Coefficients; an ellipsoid's square has the same level set and the same twists."""
+    if record["ls_type"][i]:
+        return record["coeffs"][i]
+    return np.asarray(squared_quadratics(jnp.asarray(record["A"][i])[None]))
+
+
+@pytest.fixture(scope="module")
+def grasps(oracle):
+    """Every recorded grasp run again, by number of fingers."""
+    record = dict(np.load(oracle / "rollouts_grasp.npz"))
+    results = {}
+    for fingers, make in ((2, pj.Hand.two_fingers), (3, pj.Hand.three_fingers)):
+        rows = np.flatnonzero(record["n_fingers"] == fingers)
+        hand = make(record["finger_radius"][rows[0]])
+        vertices = np.stack([six(record["vertices"][i][: record["n_vertices"][i]]) for i in rows])
+        surface = np.stack([quartic_of(record, i) for i in rows])
+
+        def run(v, c, length, q0, q1, pose, mu, hand=hand):
+            slider = pj.Slider(pj.Polygon(v, convex=True), pj.Quartic(c, length))
+            t = jnp.linspace(0, 1, STEPS + 1)[:, None]
+            path = q0[None] * (1 - t) + q1[None] * t
+            return pj.rollout(slider, hand, path, pose=pose, friction=mu)
+
+        inputs = (vertices, surface, *(record[k][rows] for k in ("rho", "hand_q0", "hand_q1", "obj_pose0", "mu")))
+        results[fingers] = rows, jax.jit(jax.vmap(run))(*inputs)
+    return record, results
+
+
+@recorded
+@pytest.mark.parametrize("fingers", [2, 3])
+def test_recorded_grasps(grasps, fingers):
+    record, results = grasps
+    rows, runs = results[fingers]
+    checked = 0
+    for k, i in enumerate(rows):
+        if not record["ode_completed_ref_tight"][i] or i in DRIFTED:
+            continue
+        status = pj.Status(int(runs.status[k, -1])).name
+        moved = bool(np.any(np.asarray(runs.status[k]) == pj.Status.MOVING))
+        expected = {
+            "grasped": ["GRASPED"],
+            "jammed": ["JAMMED"],
+            "pushed": ["MOVING", "FREE"],
+            "free": ["FREE"],
+        }[str(record["final_status_ref_tight"][i])]
+        assert status in expected, i
+        assert moved == (str(record["final_status_ref_tight"][i]) != "free")
+        off = np.asarray(runs.pose[k, -1]) - record["final_pose_ref_tight"][i]
+        assert np.hypot(off[0], off[1]) < DISTANCE, i
+        assert abs(off[2]) < ANGLE, i
+        checked += 1
+    assert checked >= len(rows) - 3
+
+
+@recorded
+@pytest.mark.parametrize("fingers", [2, 3])
+def test_frozen_and_finite_after_a_jam(grasps, fingers):
+    _, results = grasps
+    rows, runs = results[fingers]
+    for k in range(len(rows)):
+        stop = int(runs.stopped[k])
+        if stop < 0:
+            continue
+        assert stop > 0
+        np.testing.assert_array_equal(runs.pose[k, stop:], np.tile(runs.pose[k, stop], (STEPS + 1 - stop, 1)))
+        np.testing.assert_array_equal(
+            runs.configuration[k, stop:], np.tile(runs.configuration[k, stop], (STEPS + 1 - stop, 1))
+        )
+        assert len(np.unique(np.asarray(runs.status[k, stop:]))) == 1
+        assert not np.any(np.asarray(runs.force[k, stop:]))
+    for leaf in jax.tree.leaves(runs):
+        assert np.all(np.isfinite(leaf))
+    # no step fails, friction only takes energy away
+    assert not np.any(runs.failed)
+    assert np.min(np.sum(np.asarray(runs.twist) * np.asarray(runs.wrench), axis=-1)) >= -1e-15
+
+
+@recorded
+def test_recorded_drift_violates_the_conditions(grasps):
+    """In two recorded runs the slider moves at the end as no solution does; ours there is clean and the only one."""
+    record, _ = grasps
+    for i in sorted(DRIFTED):
+        sample = 13
+        pose, t = record["obj_ref_tight"][i][sample], record["t"][sample]
+        q0, q1 = record["hand_q0"][i], record["hand_q1"][i]
+        hand = pj.Hand.two_fingers(record["finger_radius"][i])
+        slider = pj.Slider(
+            pj.Polygon(record["vertices"][i][: record["n_vertices"][i]]),
+            pj.Quartic(quartic_of(record, i), record["rho"][i]),
+        )
+        stop = record["t_freeze_ref_tight"][i]
+        path = pj.line(q0 + t * (q1 - q0), q0 + (stop - 1e-4) * (q1 - q0), 400)
+        ours = pj.rollout(slider, hand, path, pose=pose, friction=record["mu"][i])
+        theirs = record["final_pose_ref_tight"][i] - pose
+        drift = np.hypot(*(np.asarray(ours.pose[-1]) - pose - theirs)[:2])
+        assert drift > 10 * DISTANCE
+        # a step on the way, with both fingers in contact, judged by itself
+        step = int(np.flatnonzero(np.all(np.asarray(ours.mode) > 0, axis=1))[0]) + 5
+        where, q, after = np.asarray(ours.pose[step]), path[step], path[step + 1]
+        turn = np.array([[np.cos(where[2]), -np.sin(where[2])], [np.sin(where[2]), np.cos(where[2])]])
+        begin, end = (np.asarray(hand.poses(c))[:, :2] for c in (q, after))
+        seen = [slider.shape.closest(c) for c in (begin - where[:2]) @ turn]
+        contacts = pj.Contacts(
+            jnp.stack([s[1] for s in seen]), -jnp.stack([s[2] for s in seen]), (end - begin) @ turn, record["mu"][i]
+        )
+        motion = pj.solve_contacts(slider.surface, contacts)
+        one = jax.tree.map(lambda a: jnp.asarray(a)[None], (slider.surface, contacts, motion))
+        batch = ProblemBatch.of(one[0], one[1])
+        assert violations(batch, one[2].twist, one[2].force, one[2].wrench).worst()[0] < 1e-8
+        assert bool(motion.unique)
+        body = np.array([*(theirs[:2] @ turn), theirs[2]])
+        size = np.array([1, 1, record["rho"][i]])
+        cosine = np.dot(body * size, np.asarray(motion.twist) * size)
+        cosine /= np.linalg.norm(body * size) * np.linalg.norm(np.asarray(motion.twist) * size)
+        assert cosine < 0.95
+
+
+def test_two_fingers_centre_a_disc():
+    disc = pj.Disk(0.03)
+    pairs = pj.Support.uniform(disc, points=64).wrench_twist_pairs(jax.random.key(0), 300)
+    slider = pj.Slider(disc, pj.fit_limit_surface(*pairs, degree=2))
+    hand = pj.Hand.two_fingers(0.005)
+    path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), 800)
+    grasp = pj.rollout(slider, hand, path, pose=jnp.array([0.0, 0.012, 0.3]), friction=0.3)
+    assert pj.Status(int(grasp.status[-1])) == pj.Status.GRASPED
+    np.testing.assert_allclose(grasp.pose[-1, :2], 0, atol=1e-4)
+    # the second finger arrives within a step: first order there
+    assert grasp.pose[-1, 2] == pytest.approx(0.3, abs=1e-3)
+    assert float(grasp.configuration[-1, 3]) == pytest.approx(0.07, abs=2e-4)
+
+
+def test_wide_flat_push_sticks_with_no_slip():
+    block = pj.Polygon.rectangle(0.09, 0.09)
+    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 300)
+    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    wide = pj.Hand([pj.Polygon.rectangle(0.01, 0.05)], lambda q: q[None], 3)
+    path = pj.line((-0.06, 0.004, 0.0), (0.0, 0.01, 0.0), 60)
+    push = pj.rollout(slider, wide, path, pose=jnp.zeros(3), friction=0.5)
+    moving = np.asarray(push.status) == pj.Status.MOVING
+    assert moving[15:].all()
+    assert (np.asarray(push.mode)[15:] == pj.ContactMode.STICKING).all()
+    relative = np.asarray(push.pose[15:, :2] - path[15:, :2])
+    np.testing.assert_allclose(relative - relative[0], 0, atol=1e-15)
+    np.testing.assert_allclose(push.pose[:, 2], 0, atol=1e-15)
+
+
+def test_squeeze_ends_as_the_paper_says():
+    record = squeeze.run(steps=750)
+    assert [row["outcome"] for row in record["rows"]] == ["grasped", "jammed", "grasped", "slipped out"]
+    assert [row["status"] for row in record["rows"]] == ["GRASPED", "GRASPED", "GRASPED", "FREE"]
+    assert [row["failed_steps"] for row in record["rows"]] == [0, 0, 0, 0]
+    one, _, other, _ = (np.asarray(row["pose"]) for row in record["rows"])
+    assert one[0] > 0.01
+    assert other[0] < -0.01
+
+
+@pytest.mark.parametrize("model", ["ellipsoid", "quartic"])
+def test_jam_threshold(model):
+    surface = jam.surfaces(0)[1][model]
+    statuses = jax.vmap(lambda mu: pj.solve_contacts(surface, jam.contacts(mu)).status)
+    edge = jam.threshold()
+    assert edge == pytest.approx(0.4)
+    below, above = (
+        statuses(edge * (1 - jnp.array([1e-3, 0.1, 0.9]))),
+        statuses(edge * (1 + jnp.array([1e-3, 0.1, 2.0]))),
+    )
+    assert (below == pj.Status.MOVING).all()
+    assert (above == pj.Status.JAMMED).all()
+
+
+def test_gradients_through_two_contacts():
+    """Two fingers push a square, both in contact: by friction, pose and path."""
+    block = pj.Polygon.rectangle(0.09, 0.09)
+    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 300)
+    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    hand = pj.Hand.two_fingers(0.005)
+
+    def final(x):
+        path = pj.line(jnp.concatenate([jnp.array([-0.055, 0.0, 0.0]), x[3:4]]), x[:4], 20)
+        end = pj.rollout(slider, hand, path, pose=x[4:7], friction=x[7]).pose[-1]
+        return end * jnp.array([1.0, 1.0, 0.05])
+
+    value, reverse = jax.jit(jax.vmap(final)), jax.jit(jax.jacrev(final))
+    h = 1e-6
+    x = jnp.array([-0.029, 0.012, 0.303, 0.034, 0.005, 0.007, 0.006, 0.207])
+    steps = h * jnp.eye(8)
+    central = (value(x[None] + steps) - value(x[None] - steps)) / (2 * h)
+    np.testing.assert_allclose(reverse(x).T, central, rtol=0, atol=1e-5)
+
+
+def test_gradients_are_finite_at_and_after_a_jam():
+    """Nothing of the closing that did not happen counts."""
+    disc = pj.Slider(pj.Disk(0.03), pj.Ellipsoid(np.eye(3), 0.02))
+    hand = pj.Hand.two_fingers(0.005)
+
+    def final(x):
+        still, end = jnp.zeros(3), jnp.array([0.0, 0.0, 0.0, 0.06])
+        closing = pj.line(jnp.array([0.0, 0.0, 0.0, 0.12]), end, 20)
+        path = jnp.concatenate([closing, pj.line(end, jnp.concatenate([still, x[:1]]), 20)[1:]])
+        grasp = pj.rollout(disc, hand, path, pose=x[1:4], friction=x[4])
+        return jnp.sum(grasp.pose[-1]), grasp.status[-1]
+
+    (_, status), gradient = jax.jit(jax.value_and_grad(final, has_aux=True))(jnp.array([0.05, 0.0, 0.003, 0.0, 0.3]))
+    assert pj.Status(int(status)) == pj.Status.GRASPED
+    assert np.all(np.isfinite(gradient))
+    assert np.any(gradient[1:4] != 0)
+    assert gradient[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("hand", "opening"),
+    [
+        (pj.Hand.two_fingers(0.003), 0.09),
+        (pj.Hand.three_fingers(0.003), 0.05),
+        (pj.Hand.parallel_jaw(0.027, 0.01), 0.08),
+    ],
+    ids=["two fingers", "three fingers", "jaw"],
+)
+def test_laws_of_a_grasp(hand, opening):
+    """Friction only takes energy; nothing penetrates; moved or mirrored as a whole, the grasp is the same."""
+    slider = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), pj.Ellipsoid(np.eye(3), 0.017))
+    shift, mirror = np.array([0.3, -0.2, 0.7]), np.array([-1.0, 1.0, -1.0])  # x -> -x: rectangle and hands keep
+    path = np.array(pj.line((0.0, 0.0, 0.0, opening), (0.0, 0.0, 0.1, 0.3 * opening), 100))
+    pose = np.array([0.004, 0.002, 0.4])
+    paths = np.stack([path, path, path * np.array([*mirror, 1.0])])
+    paths[1, :, :3] = pj.se2.compose(shift, path[:, :3])
+    poses = np.stack([pose, pj.se2.compose(shift, pose), pose * mirror])
+    run = jax.jit(jax.vmap(lambda path, pose: pj.rollout(slider, hand, path, pose=pose, friction=0.2)))
+    runs = run(paths, poses)
+    base, moved, mirrored = (jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), runs) for k in range(3))
+    assert np.any(base.status == pj.Status.MOVING)
+    assert base.status[-1] in (pj.Status.GRASPED, pj.Status.JAMMED)
+    np.testing.assert_array_equal(base.status, moved.status)
+    np.testing.assert_array_equal(base.status, mirrored.status)
+    np.testing.assert_allclose(pj.se2.compose(shift, base.pose), moved.pose, atol=1e-9)
+    np.testing.assert_allclose(base.pose * mirror, mirrored.pose, atol=1e-9)
+    assert np.min(np.sum(base.twist * base.wrench, axis=-1)) >= -1e-15
+    # once in contact
+    depth = jax.vmap(lambda p, q: _overlap(slider, hand, p, q))(base.pose, base.configuration)
+    assert np.max(depth) < 2e-5
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: pj.Hand([], lambda q: q[None], 2), "fingers: a hand needs at least one"),
+        (lambda: pj.Hand([0.01], lambda q: q, 2), r"kinematics gives shape \(2,\)"),
+        (lambda: pj.Hand([pj.Polygon.rectangle(1, 1)], lambda q: q[None], 2), r"kinematics gives shape \(1, 2\)"),
+        (lambda: pj.Hand.two_fingers(-0.001), "radius must not be negative"),
+        (lambda: pj.Hand.parallel_jaw(0.0, 0.01), "width must be positive"),
+    ],
+)
+def test_hands_refuse_bad_input(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_grasps_refuse_bad_input():
+    slider = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), pj.Ellipsoid(np.eye(3), 0.017))
+    jaw, still = pj.Hand.parallel_jaw(0.027, 0.01), {"pose": jnp.zeros(3), "friction": 0.2}
+    with pytest.raises(ValueError, match=r"path closes the hand on itself: d is -0\.01"):
+        pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.05), (0, 0, 0, -0.01), 5), **still)
+    with pytest.raises(ValueError, match="the hand inside the slider"):
+        pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.02), (0, 0, 0, 0.01), 5), **still)
+    with pytest.raises(ValueError, match=r"friction has shape \(3,\); expected a scalar or \(2,\)"):
+        pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.05), (0, 0, 0, 0.04), 5), pose=jnp.zeros(3), friction=jnp.ones(3))
+    ellipse = pj.Slider(pj.Ellipse(0.03, 0.02), slider.surface)
+    with pytest.raises(ValueError, match="pads can touch a Polygon or a Disk"):
+        pj.rollout(ellipse, jaw, pj.line((0, 0, 0, 0.07), (0, 0, 0, 0.06), 5), **still)
