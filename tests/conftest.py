@@ -21,6 +21,17 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs_end_with_their_module():
+    """Compiled programs live no longer than the module that runs them.
+
+    Each keeps several memory maps; a worker that holds those of the whole suite comes to the kernel's limit (65 530
+    maps by default) and dies in the compiler.
+    """
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data():
     """The folder of real data."""
