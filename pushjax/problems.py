@@ -3,6 +3,7 @@
 Everything is drawn from a key; batches come from `vmap` over split keys.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -118,52 +119,67 @@ def random_contacts_problem(
     contacts: how many count. degree, condition: of the surface, see `random_surface`. padding: how many more are
     inactive, anywhere among them, with numbers of their own. Each choice below is drawn for each problem.
 
-    - Where they touch, a quarter each: on an ellipse, anywhere about it; anywhere with any normals; two or more on one
+    - Where they touch, a fifth each: on an ellipse, anywhere about it; anywhere with any normals; two or more on one
       straight edge and the others on the ellipse; the flat faces of two parallel jaws, in turn, half of these exactly
-      opposite.
-    - How the pushers move, a third each: as one rigid hand, half of these without rotation; towards the slider's
+      opposite; two as a wedge at the border of holding itself, each one's cone missing the other or containing it by
+      1e-1 to 1e-5 rad, and the others on the ellipse.
+    - How the pushers move, a quarter each: as one rigid hand, half of these without rotation; towards the slider's
       middle, half of these equally fast and exactly, the others unevenly and with some drift; independently, three
-      quarters of them into the slider. Sizes are log-uniform from 0.1 to 10 mm.
+      quarters of them into the slider; such that one of them slides along the slider and so moves it by itself, often
+      while it recedes, and the others stay behind or only just touch. Sizes are log-uniform from 0.1 to 10 mm.
     - friction: in half of the problems one mu for all. A tenth of them zero, a tenth up to four times `friction`, the
       others uniform up to it.
     - gaps: the share of problems with gaps: there, two fifths of the contacts touch, two fifths are up to 3 mm apart,
       a fifth overlap by up to 0.5 mm. In the others all touch.
     """
-    k_surface, k_length, k_where, k_how, k_size, k_mu, k_gap, k_order = jax.random.split(key, 8)
+    k_surface, k_uniform, k_normal = jax.random.split(key, 3)
     m = contacts + padding
-    length = jax.random.uniform(k_length, minval=0.02, maxval=0.1)
+    # one call draws all the numbers of a kind: each call costs a quarter of a second of compilation
+    uniform = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * m,)))
+    gauss = _Numbers(jax.random.normal(k_normal, (3 + 2 * m,)))
+    length = 0.02 + 0.08 * uniform.take()
     surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
-    point, normal, middle = _random_places(k_where, contacts, m)
-    size = 10 ** jax.random.uniform(k_size, minval=-4.0, maxval=-2.0)
-    order = jax.random.permutation(k_order, m)
-    problem = Contacts(
-        point[order],
-        normal[order],
-        size * _random_pushes(k_how, point, normal, middle)[order],
-        _random_friction(k_mu, m, friction)[order],
-        _random_gaps(k_gap, m, gaps)[order],
-        (jnp.arange(m) < contacts)[order],
-    )
-    return ContactsProblem(surface, problem)
+    mu = _random_friction(uniform, m, friction)
+    point, normal, middle = _random_places(uniform, mu, contacts)
+    size = 10 ** (2 * uniform.take() - 4)
+    gap = _random_gaps(uniform, m, gaps)
+    push, dragged = _random_pushes(uniform, gauss, surface, mu, point, normal, middle)
+    push = size * push + jnp.where(dragged, gap, 0.0)[:, None] * normal
+    order = jnp.argsort(uniform.take(m))
+    active = jnp.arange(m) < contacts
+    return ContactsProblem(surface, Contacts(*(a[order] for a in (point, normal, push, mu, gap, active))))
+
+
+class _Numbers:
+    """Random numbers, handed out in turn."""
+
+    def __init__(self, values: Array):
+        self.values, self.taken = values, 0
+
+    def take(self, *shape: int) -> Array:
+        begin, self.taken = self.taken, self.taken + math.prod(shape)
+        assert self.taken <= self.values.size
+        return self.values[begin : self.taken].reshape(shape)
 
 
 def _unit(angle: Array) -> Array:
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-# Below, one call draws all the numbers of a kind: each call costs a quarter of a second of compilation.
+def _aside(v: Array) -> Array:
+    """Turned by +90 degrees."""
+    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
-def _random_places(key: Key[Array, ""], contacts: int, m: int) -> tuple[Array, Array, Array]:
+def _random_places(uniform: _Numbers, mu: Array, contacts: int) -> tuple[Array, Array, Array]:
     """Points and inward normals (m, 2) of the kinds of `random_contacts_problem`, and the slider's middle (1, 2)."""
-    k_all, k_each = jax.random.split(key)
-    all_ = jax.random.uniform(k_all, (8,))
-    phase, x, y, angle, along = jax.random.uniform(k_each, (5, m))
+    m = mu.size
+    all_ = uniform.take(12)
+    phase, x, y, angle, along = uniform.take(5, m)
     middle = 0.04 * all_[None, :2] - 0.02
     axes = 0.02 + 0.06 * all_[None, 2:4]
     ahead = _unit(2 * jnp.pi * all_[4:5])
-    aside = jnp.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
-    turned = jnp.concatenate([ahead, aside])  # (a, b) @ turned: a along the one, b along the other
+    turned = jnp.concatenate([ahead, _aside(ahead)])  # (a, b) @ turned: a along the one, b along the other
 
     on_circle = _unit(2 * jnp.pi * phase)
     on_ellipse = middle + (on_circle * axes) @ turned
@@ -180,41 +196,74 @@ def _random_places(key: Key[Array, ""], contacts: int, m: int) -> tuple[Array, A
     place = jnp.where(all_[6] < 0.5, along[2 * (index[:, 0] // 2)], along)
     jaw_point = middle + jnp.concatenate([-axes[0, 0] * side, axes[0, 1] * place], axis=1) @ turned
 
-    which = jnp.floor(4 * all_[7]).astype(int)
-    points = jnp.stack([on_ellipse, anywhere, jnp.where(on_edge, edge_point, on_ellipse), jaw_point])
-    normals = jnp.stack([inward, _unit(2 * jnp.pi * angle), jnp.where(on_edge, ahead, inward), side * ahead])
+    in_wedge = index < 2
+    miss = jnp.where(all_[8] < 0.5, 1.0, -1.0) * 10 ** (-1 - 4 * all_[9])
+    lean = jnp.where(all_[10:12] < 0.5, 1.0, -1.0)[jnp.minimum(index[:, 0], 1)] * (jnp.arctan(mu) + miss)
+    wedge_normal = side * _unit(lean) @ turned
+    wedge_point = middle - axes[0, 0] * side * ahead
+
+    which = jnp.floor(5 * all_[7]).astype(int)
+    points = jnp.stack(
+        [
+            on_ellipse,
+            anywhere,
+            jnp.where(on_edge, edge_point, on_ellipse),
+            jaw_point,
+            jnp.where(in_wedge, wedge_point, on_ellipse),
+        ]
+    )
+    normals = jnp.stack(
+        [
+            inward,
+            _unit(2 * jnp.pi * angle),
+            jnp.where(on_edge, ahead, inward),
+            side * ahead,
+            jnp.where(in_wedge, wedge_normal, inward),
+        ]
+    )
     return points[which], normals[which], jnp.where(which == 1, 0.0, middle)
 
 
-def _random_pushes(key: Key[Array, ""], point: Array, normal: Array, middle: Array) -> Array:
-    """Displacements (m, 2) of the kinds of `random_contacts_problem`; the fastest has length one."""
+def _random_pushes(
+    uniform: _Numbers, gauss: _Numbers, surface: LimitSurface, mu: Array, point: Array, normal: Array, middle: Array
+) -> tuple[Array, Array]:
+    """Displacements (m, 2) of the kinds of `random_contacts_problem`, the fastest of length about one; and whether
+    they are of the last kind, to which gaps are to be added."""
     m = point.shape[0]
-    k_uniform, k_normal = jax.random.split(key)
-    uniform, gauss = jax.random.uniform(k_uniform, (4 + 2 * m,)), jax.random.normal(k_normal, (3 + 2 * m,))
-    fast, into = uniform[4:].reshape(2, m, 1)
+    all_, (fast, into) = uniform.take(6), uniform.take(2, m, 1)
+    spin_, drift, free = gauss.take(), gauss.take(1, 2), gauss.take(m, 2)
     # a rotation moves contacts some 0.05 m away about as far as the translation does
-    spin = jnp.where(uniform[0] < 0.5, 20 * gauss[0], 0.0)
-    rigid = _unit(2 * jnp.pi * uniform[1:2]) + spin * jnp.stack([-point[:, 1], point[:, 0]], axis=1)
+    spin = jnp.where(all_[0] < 0.5, 20 * spin_, 0.0)
+    rigid = _unit(2 * jnp.pi * all_[1:2]) + spin * _aside(point)
     to_middle = middle - point
     to_middle /= jnp.maximum(jnp.linalg.norm(to_middle, axis=1, keepdims=True), 1e-3)
-    uneven = (0.3 + 0.7 * fast) * to_middle + 0.5 * gauss[None, 1:3]
-    close = jnp.where(uniform[2] < 0.5, to_middle, uneven)
-    independent = gauss[3:].reshape(m, 2)
-    leaving = jnp.sum(independent * normal, axis=1, keepdims=True) < 0
-    independent = jnp.where(leaving & (into < 0.5), -independent, independent)
-    push = jnp.stack([rigid, close, independent])[jnp.floor(3 * uniform[3]).astype(int)]
-    return push / jnp.max(jnp.linalg.norm(push, axis=1))
+    uneven = (0.3 + 0.7 * fast) * to_middle + 0.5 * drift
+    close = jnp.where(all_[2] < 0.5, to_middle, uneven)
+    leaving = jnp.sum(free * normal, axis=1, keepdims=True) < 0
+    independent = jnp.where(leaving & (into < 0.5), -free, free)
+
+    # the first one's force is on its cone's edge, and the slider moves as that force makes it
+    side, mover = jnp.where(all_[4] < 0.5, 1.0, -1.0), jnp.arange(m)[:, None] == 0
+    force = normal[0] + side * mu[0] * _aside(normal[0])
+    torque = point[0, 0] * force[1] - point[0, 1] * force[0]
+    twist = surface.form().gradient(Vec3(force[0], force[1], torque / surface.length))
+    moved = jnp.stack([twist.x, twist.y])[None] + twist.z / surface.length * _aside(point)
+    moved /= jnp.max(jnp.linalg.norm(moved, axis=1))
+    behind = jnp.where(into < 0.3, 0.0, into)
+    drag = moved + jnp.where(mover, side * 2 * all_[5] * _aside(normal), free[:, :1] * _aside(normal) - behind * normal)
+
+    kind = jnp.floor(4 * all_[3]).astype(int)
+    push = jnp.stack([rigid, close, independent, drag])[kind]
+    return push / jnp.max(jnp.linalg.norm(push, axis=1)), kind == 3
 
 
-def _random_friction(key: Key[Array, ""], m: int, most: float) -> Array:
-    uniform = jax.random.uniform(key, (2 * m + 1,))
-    mu, kind = uniform[1:].reshape(2, m)
+def _random_friction(uniform: _Numbers, m: int, most: float) -> Array:
+    same, (mu, kind) = uniform.take(), uniform.take(2, m)
     mu = most * jnp.where(kind < 0.1, 0.0, jnp.where(kind < 0.2, 4 * mu, mu))
-    return jnp.where(uniform[0] < 0.5, mu[0], mu)
+    return jnp.where(same < 0.5, mu[0], mu)
 
 
-def _random_gaps(key: Key[Array, ""], m: int, share: float) -> Array:
-    uniform = jax.random.uniform(key, (2 * m + 1,))
-    kind, size = uniform[1:].reshape(2, m)
+def _random_gaps(uniform: _Numbers, m: int, share: float) -> Array:
+    some, (kind, size) = uniform.take(), uniform.take(2, m)
     gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
-    return jnp.where(uniform[0] < share, gap, 0.0)
+    return jnp.where(some < share, gap, 0.0)

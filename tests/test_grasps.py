@@ -16,7 +16,6 @@ STEPS = 3000  # a jam is found to a step: 15 to 40 um of closing, some 0.05 degr
 # Their solver had not converged: the recorded slider drifts along the fingers where the contact conditions, which have
 # one solution there, turn it about its middle (see test_recorded_drift_violates_the_conditions).
 DRIFTED = {1, 11}
-recorded = pytest.mark.xdist_group("recorded grasps")  # one worker runs them all again, once
 
 
 def six(vertices: np.ndarray) -> np.ndarray:
@@ -58,7 +57,6 @@ def grasps(oracle):
     return record, results
 
 
-@recorded
 @pytest.mark.parametrize("fingers", [2, 3])
 def test_recorded_grasps(grasps, fingers):
     record, results = grasps
@@ -84,7 +82,6 @@ def test_recorded_grasps(grasps, fingers):
     assert checked >= len(rows) - 3
 
 
-@recorded
 @pytest.mark.parametrize("fingers", [2, 3])
 def test_frozen_and_finite_after_a_jam(grasps, fingers):
     _, results = grasps
@@ -107,7 +104,6 @@ def test_frozen_and_finite_after_a_jam(grasps, fingers):
     assert np.min(np.sum(np.asarray(runs.twist) * np.asarray(runs.wrench), axis=-1)) >= -1e-15
 
 
-@recorded
 def test_recorded_drift_violates_the_conditions(grasps):
     """In two recorded runs the slider moves at the end as no solution does; ours there is clean and the only one."""
     record, _ = grasps

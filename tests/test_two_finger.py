@@ -172,9 +172,6 @@ def test_repeats_of_an_action_stay_on_one_side_of_a_split(tmp_path):
     assert np.all(per_push[seen] < 1)
 
 
-experiment = pytest.mark.xdist_group("two-finger experiment")  # run once, on one worker
-
-
 @pytest.fixture(scope="module")
 def record(data, tmp_path_factory):
     if not (data / "two_finger_push").is_dir():
@@ -188,7 +185,6 @@ def record(data, tmp_path_factory):
     return json.loads((folder / "record.json").read_text())
 
 
-@experiment
 def test_predicts_the_real_pushes(record):
     assert [cell["object"] for cell in record["cells"]] == list(OBJECTS)
     for cell in record["cells"]:
@@ -203,7 +199,6 @@ def test_predicts_the_real_pushes(record):
         assert cell["pushes"] == {"3pts1": 95, "3pts3": 298, "patch": 138}[cell["object"]]
 
 
-@experiment
 def test_repeats_bound_what_can_be_predicted(record):
     for cell in record["cells"]:
         repeats = cell["repeats"]
@@ -212,7 +207,6 @@ def test_repeats_bound_what_can_be_predicted(record):
         assert 0.8 < repeats["floor_agreement"] <= 1
 
 
-@experiment
 def test_draws_and_sums_up(record):
     (picture,) = record["pictures"]
     image = matplotlib.image.imread(picture)

@@ -78,16 +78,27 @@ def roots(
             new.append((jnp.where(inside, newton, (low + high) / 2), low, high))
         return tuple(new)
 
+    def start(low, high, p_low, p_high, rising):
+        """As far from a point where the cubic is small as its derivatives there let the root be, to a factor of two:
+        roots may lie a millionth of the interval from a turning point or from u = 0, where the cubic has its scale."""
+        between = (low < 0) & (high > 0)
+        p_zero = jnp.where(between, c[0], jnp.inf)
+        at_low = jnp.abs(p_low) < jnp.abs(p_high)
+        place, p = jnp.where(at_low, low, high), jnp.where(at_low, p_low, p_high)
+        at_zero = jnp.abs(p_zero) < jnp.abs(p)
+        place, p = jnp.where(at_zero, 0.0, place), jnp.where(at_zero, p_zero, p)
+        first = (3 * c[3] * place + 2 * c[2]) * place + c[1]
+        second = 3 * c[3] * place + c[2]
+        ratios = [jnp.abs(p) / jnp.where(d != 0, jnp.abs(d), jnp.finfo(p.dtype).tiny) for d in (first, second, c[3])]
+        reach = jnp.minimum(jnp.minimum(ratios[0], jnp.sqrt(ratios[1])), jnp.cbrt(ratios[2]))
+        onward = (p > 0) != rising
+        return jnp.clip(place + jnp.where(onward, reach, -reach), low, high)
+
     state, rise, has = [], [], []
     for k in range(3):
         low, high, p_low, p_high = marks[k], marks[k + 1], levels[k], levels[k + 1]
-        span = p_high - p_low
-        secant = low - p_low * (high - low) / jnp.where(span != 0, span, 1.0)
-        has.append((p_low * p_high <= 0) & (high > low) & (span != 0))
-        rise.append(span > 0)
-        # u = 0, where the polynomial has its own scale, is the best start if it is on this piece: far from it the cubic
-        # term rules, and Newton only comes back by thirds
-        inside = (low < 0) & (high > 0)
-        state.append((jnp.where(inside, 0.0, jnp.clip(secant, low, high)), low, high))
+        has.append((p_low * p_high <= 0) & (high > low) & (p_low != p_high))
+        rise.append(p_high > p_low)
+        state.append((start(low, high, p_low, p_high, rise[k]), low, high))
     state = jax.lax.fori_loop(0, rounds, body, tuple(state))
     return tuple(settle((s, root), witness) for (s, _, _), root in zip(state, has, strict=True))

@@ -150,7 +150,9 @@ def _consider(found: Found, passes, edges: tuple, weight: Vec3, twist: Vec3, key
     apart = twist - found.twist
     several = passes & found.found & (apart.dot(apart) > same_twist(key.dtype) ** 2 * (size + size_before))
     tie = jnp.abs(key - found.key) <= 4 * clean(key.dtype) * found.key
-    better = passes & (~found.found | jnp.where(tie, size < size_before, key > found.key))
+    # what differs by rounding is the same motion: the one of fewer edges, which was found first, is better conditioned
+    smaller = size < (1 - 8 * clean(key.dtype)) * size_before
+    better = passes & (~found.found | jnp.where(tie, smaller, key > found.key))
     better, several = settle((better, found.several | several), key)
     edges = tuple(
         jnp.where(better, jnp.asarray(new, jnp.int32), old) for new, old in zip(edges, found.edges, strict=True)

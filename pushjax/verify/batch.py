@@ -79,6 +79,14 @@ class ProblemBatch:
         """The problems at `index`: integers, a slice or a mask over N."""
         return ProblemBatch(self.degree, *(getattr(self, f.name)[index] for f in fields(self)[1:]))
 
+    def gathered(self) -> tuple["ProblemBatch", np.ndarray]:
+        """Active contacts first, and as many columns as the most there are; and which (N, fewer) contacts they are."""
+        most = max(int(self.active.sum(axis=1).max(initial=0)), 1)
+        order = np.argsort(~self.active, axis=1, kind="stable")[:, :most]
+        row = np.arange(len(self))[:, None]
+        parts = {f.name: getattr(self, f.name)[row, order] for f in fields(self)[3:]}
+        return ProblemBatch(self.degree, self.coefficients, self.length, **parts), order
+
     def speed(self) -> np.ndarray:
         """(N,), m: the unit of displacement, max |displacement| + |gap| over the active contacts.
 

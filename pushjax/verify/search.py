@@ -42,9 +42,10 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     more the more starts there were. Different batches or portions draw different starts from one seed.
     """
     n, m = batch.friction.shape
+    batch, order = batch.gathered()  # time goes with the square of the number of contacts, padding or not
     rng = np.random.default_rng(seed)
-    still = violations(batch, np.zeros((n, 3)), np.zeros((n, m, 2))).worst() <= CLEAN
-    twist, force, wrench = np.zeros((n, 3)), np.zeros((n, m, 2)), np.zeros((n, 3))
+    twist, force, wrench = np.zeros((n, 3)), np.zeros((*order.shape, 2)), np.zeros((n, 3))
+    still = violations(batch, twist, force).worst() <= CLEAN
     result = Found(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
     done = 0
     for portion in (*portions, starts):
@@ -58,7 +59,9 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
                 answers = _follow(batch.take(where), portion, rng)
             for field, values in zip(result, answers, strict=True):
                 field[where] += values
-    return result
+    every = np.zeros((n, m, 2))
+    every[np.arange(n)[:, None], order] = result.force
+    return result._replace(force=every)
 
 
 def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Found:
@@ -277,8 +280,11 @@ def _interleave(normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
 
 def _damped_step(value: np.ndarray, by_y: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """(J'J + damping)^-1 J' value for each of the last axis, by elimination."""
-    a, r = np.einsum("kib,kjb->ijb", by_y, by_y), np.einsum("kib,kb->ib", by_y, value)
-    n = len(r)
+    r = np.einsum("kib,kb->ib", by_y, value)
+    n, a = len(r), np.empty_like(by_y)
+    for i in range(n):
+        a[i, i:] = np.einsum("kb,kjb->jb", by_y[:, i], by_y[:, i:])
+        a[i:, i] = a[i, i:]
     a[np.arange(n), np.arange(n)] += damping
     for k in range(n):
         inverse = 1 / a[k, k]
