@@ -42,14 +42,19 @@ class Placement(NamedTuple):
 
 class Touch(NamedTuple):
     """A place where a finger and the slider may touch, in the slider's frame, m: signed distance (negative in
-    penetration), the slider's point, the inward unit normal."""
+    penetration), the slider's point, the inward unit normal. Or an array of such places."""
 
     distance: Scalar
     point: Vec2
     normal: Vec2
 
 
-def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> tuple[Touch, ...]:
+# One by one; or, of a pad, an array of them: written out, corner by corner, a jaw's program took four times as long to
+# compile.
+Touches = tuple[Touch, ...] | Touch
+
+
+def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> Touches:
     """Every place where a finger and the slider may touch."""
     if isinstance(finger, RoundFinger):
         seen = outline.touches(at.center)
@@ -59,18 +64,15 @@ def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> t
         seen = pad.closest((outline.center - at.center).unrotate(angle))
         normal = seen.normal.rotate(angle)
         return (Touch(seen.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
-    touches = []
-    for corner in corners(pad):
-        touches.append(_beside(outline, corner.turned(angle, at.center), length))
-    away = Vec2(angle.x, -angle.y)
-    for corner in corners(outline):
-        seen = _beside(pad, corner.turned(away, (-at.center).unrotate(angle)), length)
-        touches.append(Touch(seen.distance, corner.point, -seen.normal.rotate(angle)))
-    return tuple(touches)
+    mine = _beside(outline, corners(pad).turned(angle, at.center), length)
+    away, own = Vec2(angle.x, -angle.y), corners(outline)
+    seen = _beside(pad, own.turned(away, (-at.center).unrotate(angle)), length)
+    theirs = Touch(seen.distance, own.point, -seen.normal.rotate(angle))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), mine, theirs)
 
 
 class Corner(NamedTuple):
-    """A polygon's corner, and the unit directions in which its two edges leave it."""
+    """A polygon's corners, as arrays, and the unit directions in which the two edges of each leave it."""
 
     point: Vec2
     onward: Vec2
@@ -81,7 +83,7 @@ class Corner(NamedTuple):
 
 
 def _beside(outline: Outline, corner: Corner, length: Scalar) -> Touch:
-    """A corner against the edge of a polygon that it lies beside and points to; far off if there is none.
+    """Corners, each against the edge of a polygon that it lies beside and points to; far off if there is none.
 
     Not the closest point: a corner that is a little inside, next to the other's corner, may be closest to the wrong
     edge, and one that is past an edge's end touches nothing, though it is near.
@@ -107,42 +109,38 @@ def _beside(outline: Outline, corner: Corner, length: Scalar) -> Touch:
 def count(finger: Finger, outline: Outline) -> int:
     """How many contacts a finger takes part in: known before anything is."""
     zero = jnp.zeros(())
-    return min(
-        2, len(jax.eval_shape(lambda: places(finger, outline, Placement(Vec2(zero, zero), Vec2(zero, zero)), zero)))
-    )
+    found = jax.eval_shape(lambda: places(finger, outline, Placement(Vec2(zero, zero), Vec2(zero, zero)), zero))
+    return 2 if isinstance(found, Touch) else len(found)
 
 
-def choose(touches: tuple[Touch, ...], length: Scalar) -> tuple[Int[Array, ""] | int, ...]:
-    """Which places are contacts: all, if there are no more than two; else the nearest, and the nearest elsewhere."""
-    if len(touches) <= 2:
+def choose(touches: Touches, length: Scalar) -> tuple[Int[Array, ""] | int, ...]:
+    """Which places are contacts: of an array the nearest and the nearest elsewhere, the same one twice if there is
+    none; else all."""
+    if not isinstance(touches, Touch):
         return tuple(range(len(touches)))
-    first, nearest = jnp.zeros((), jnp.int32), touches[0]
-    for k, touch in enumerate(touches[1:], start=1):
-        nearer = settle(touch.distance < nearest.distance, length)
-        first, nearest = jnp.where(nearer, k, first), select(nearer, touch, nearest)
-    far = nearest.distance + 1e3 * length
-    second, best = first, far
-    for k, touch in enumerate(touches):
-        apart = touch.point - nearest.point
-        elsewhere = (k != first) & (apart.dot(apart) > (SAME_PLACE * length) ** 2)
-        nearer = settle(elsewhere & (touch.distance < best), length)
-        second, best = jnp.where(nearer, k, second), jnp.where(nearer, touch.distance, best)
-    return first, second
+    distance = jax.lax.stop_gradient(touches.distance)
+    first = jnp.argmin(distance)
+    nearest = _at(touches, first)
+    apart = touches.point - nearest.point
+    elsewhere = apart.dot(apart) > (SAME_PLACE * length) ** 2
+    elsewhere = settle(elsewhere & (distance < nearest.distance + 1e3 * length), length)
+    second = jnp.where(jnp.any(elsewhere), jnp.argmin(jnp.where(elsewhere, distance, jnp.inf)), first)
+    return first.astype(jnp.int32), second.astype(jnp.int32)
 
 
-def taken(touches: tuple[Touch, ...], chosen: tuple[Any, ...]) -> tuple[Touch, ...]:
+def taken(touches: Touches, chosen: tuple[Any, ...]) -> tuple[Touch, ...]:
     """The chosen places; the second, where there is none but the first, is out of reach."""
-    if len(touches) <= 2:
+    if not isinstance(touches, Touch):
         return touches
-    picked = []
-    for index in chosen:
-        touch = touches[0]
-        for k, other in enumerate(touches[1:], start=1):
-            touch = select(index == k, other, touch)
-        picked.append(touch)
+    first, second = (_at(touches, index) for index in chosen)
     alone = chosen[0] == chosen[1]
-    picked[1] = picked[1]._replace(distance=picked[1].distance + jnp.where(alone, 1.0, 0.0))
-    return tuple(picked)
+    return first, second._replace(distance=second.distance + jnp.where(alone, 1.0, 0.0))
+
+
+def _at(touches: Touch, index: Int[Array, ""]) -> Touch:
+    """touches[index], by selection, which a batch does in its stride."""
+    mark = jnp.arange(touches.distance.size) == index
+    return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), touches)
 
 
 class Meeting(NamedTuple):
@@ -156,10 +154,10 @@ class Meeting(NamedTuple):
 
 def meet(finger: Finger, outline: Outline, at: Placement, path: Vec2, length: Scalar) -> Meeting:
     """The first contact of a finger that moves along `path`, in the frame of a slider at rest, without turning."""
-    pressing = jnp.zeros((), bool)
-    for touch in places(finger, outline, at, length):
+    pressing, touches = jnp.zeros((), bool), places(finger, outline, at, length)
+    for touch in (touches,) if isinstance(touches, Touch) else touches:
         # In contact and pressing on: from the start
-        pressing |= (touch.distance <= 0) & (touch.normal.dot(path) > touch.distance)
+        pressing |= jnp.any((touch.distance <= 0) & (touch.normal.dot(path) > touch.distance))
     # Else, also when touching but leaving, whatever is hit first
     hit = _sweep(finger, outline, at, path)
     pressing, hits = settle((pressing, hit <= 1), at.center.x)
@@ -174,12 +172,9 @@ def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
     pad, angle = finger.shape.outline(), _angle(at)
     if isinstance(outline, DiskOutline):
         return outline.radius - pad.closest((outline.center - at.center).unrotate(angle)).distance
-    deepest = jnp.full_like(at.center.x, -jnp.inf)
-    for corner in corners(pad):
-        deepest = jnp.maximum(deepest, -outline.closest(at.center + corner.point.rotate(angle)).distance)
-    for corner in corners(outline):
-        deepest = jnp.maximum(deepest, -pad.closest((corner.point - at.center).unrotate(angle)).distance)
-    return deepest
+    mine = outline.closest(at.center + corners(pad).point.rotate(angle)).distance
+    theirs = pad.closest((corners(outline).point - at.center).unrotate(angle)).distance
+    return jnp.maximum(jnp.max(-mine), jnp.max(-theirs))
 
 
 def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scalar:
@@ -189,12 +184,9 @@ def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scala
     back = (-path).unrotate(angle)
     if isinstance(outline, DiskOutline):
         return pad.sweep((outline.center - at.center).unrotate(angle), back, outline.radius)
-    fraction = jnp.full_like(path.x, jnp.inf)
-    for corner in corners(pad):
-        fraction = jnp.minimum(fraction, outline.sweep(at.center + corner.point.rotate(angle), path, zero))
-    for corner in corners(outline):
-        fraction = jnp.minimum(fraction, pad.sweep((corner.point - at.center).unrotate(angle), back, zero))
-    return fraction
+    mine = outline.sweep(at.center + corners(pad).point.rotate(angle), path, zero)
+    theirs = pad.sweep((corners(outline).point - at.center).unrotate(angle), back, zero)
+    return jnp.minimum(jnp.min(mine), jnp.min(theirs))
 
 
 def edges(outline: Outline) -> tuple[Edge, ...]:
@@ -207,9 +199,10 @@ def edges(outline: Outline) -> tuple[Edge, ...]:
     return outline.edges
 
 
-def corners(outline: Outline) -> tuple[Corner, ...]:
+def corners(outline: Outline) -> Corner:
     sides = edges(outline)
-    return tuple(Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides))
+    each = [Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides)]
+    return jax.tree.map(lambda *entries: jnp.stack(entries), *each)
 
 
 def _angle(at: Placement) -> Vec2:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from pushjax._vec import Vec3
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic, QuarticForm
@@ -51,7 +51,7 @@ def random_contact_problem(
 
 
 def random_surface(
-    key: Key[Array, ""], *, degree: int = 4, condition: float = 1e3, length: float | Array = 0.05
+    key: Key[Array, ""], *, degree: int = 4, condition: float | Array = 1e3, length: float | Array = 0.05
 ) -> LimitSurface:
     """A random limit surface whose Hessian's condition number is log-uniform up to about `condition`.
 
@@ -107,17 +107,19 @@ class ContactsProblem(NamedTuple):
 def random_contacts_problem(
     key: Key[Array, ""],
     *,
-    contacts: int,
+    contacts: int | Int[Array, ""],
     degree: int = 4,
-    condition: float = 1e3,
-    friction: float = 1.5,
-    gaps: float = 0.5,
-    padding: int = 0,
+    condition: float | Float[Array, ""] = 1e3,
+    friction: float | Float[Array, ""] = 1.5,
+    gaps: float | Float[Array, ""] = 0.5,
+    slots: int | None = None,
 ) -> ContactsProblem:
     """Several contacts on a slider of some 0.1 m, in the mix that a solver must survive.
 
-    contacts: how many count. degree, condition: of the surface, see `random_surface`. padding: how many more are
-    inactive, anywhere among them, with numbers of their own. Each choice below is drawn for each problem.
+    contacts: how many count. degree, condition: of the surface, see `random_surface`. slots: how many contacts the
+    arrays hold, if not just those; the others are inactive, anywhere among them, with numbers of their own. All but
+    degree and slots may be traced, and then one compiled program draws them all. Each choice below is drawn for each
+    problem.
 
     - Where they touch, a fifth each: on an ellipse, anywhere about it; anywhere with any normals; two or more on one
       straight edge and the others on the ellipse; the flat faces of two parallel jaws, in turn, half of these exactly
@@ -133,7 +135,7 @@ def random_contacts_problem(
       a fifth overlap by up to 0.5 mm. In the others all touch.
     """
     k_surface, k_uniform, k_normal = jax.random.split(key, 3)
-    m = contacts + padding
+    m = int(contacts) if slots is None else slots
     # one call draws all the numbers of a kind: each call costs a quarter of a second of compilation
     uniform = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * m,)))
     gauss = _Numbers(jax.random.normal(k_normal, (3 + 2 * m,)))
@@ -171,7 +173,7 @@ def _aside(v: Array) -> Array:
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
-def _random_places(uniform: _Numbers, mu: Array, contacts: int) -> tuple[Array, Array, Array]:
+def _random_places(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple[Array, Array, Array]:
     """Points and inward normals (m, 2) of the kinds of `random_contacts_problem`, and the slider's middle (1, 2)."""
     m = mu.size
     all_ = uniform.take(12)
@@ -189,7 +191,7 @@ def _random_places(uniform: _Numbers, mu: Array, contacts: int) -> tuple[Array, 
     anywhere = 0.2 * jnp.stack([x, y], axis=1) - 0.1
 
     index, along = jnp.arange(m)[:, None], 2 * along[:, None] - 1
-    on_edge = index < 2 + jnp.floor(all_[5] * (max(contacts, 2) - 1))
+    on_edge = index < 2 + jnp.floor(all_[5] * (jnp.maximum(contacts, 2) - 1))
     edge_point = middle + jnp.concatenate([jnp.full_like(along, -axes[0, 0]), axes[0, 1] * along], axis=1) @ turned
 
     side = jnp.where(index % 2 == 0, 1.0, -1.0)
@@ -257,13 +259,13 @@ def _random_pushes(
     return push / jnp.max(jnp.linalg.norm(push, axis=1)), kind == 3
 
 
-def _random_friction(uniform: _Numbers, m: int, most: float) -> Array:
+def _random_friction(uniform: _Numbers, m: int, most: float | Array) -> Array:
     same, (mu, kind) = uniform.take(), uniform.take(2, m)
     mu = most * jnp.where(kind < 0.1, 0.0, jnp.where(kind < 0.2, 4 * mu, mu))
     return jnp.where(same < 0.5, mu[0], mu)
 
 
-def _random_gaps(uniform: _Numbers, m: int, share: float) -> Array:
+def _random_gaps(uniform: _Numbers, m: int, share: float | Array) -> Array:
     some, (kind, size) = uniform.take(), uniform.take(2, m)
     gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
     return jnp.where(some < share, gap, 0.0)

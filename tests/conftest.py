@@ -3,6 +3,7 @@
 The compiled programs are cached between runs and between pytest's workers where JAX_COMPILATION_CACHE_DIR is set.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -16,9 +17,21 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 from pushjax.datasets import find_data  # noqa: E402
 
+# Tracing makes objects by the million that die young: a fifth of the time went into looking at the old ones again.
+gc.freeze()
+gc.set_threshold(100_000, 50, 100)
+
+# Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
+LONG = ("random_contacts", "grasps", "several_contacts", "smooth_shapes", "commands", "rollout_gradients")
+
 BESIDE = Path(__file__).parents[2] / "shared" / "data"
 if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
+
+
+def pytest_collection_modifyitems(items):
+    order = {f"test_{name}": place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 @pytest.fixture(scope="module", autouse=True)

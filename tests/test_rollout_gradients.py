@@ -46,11 +46,17 @@ def push(inputs: Inputs):
     return rollout(slider, Hand.finger(inputs.radius), inputs.path, pose=inputs.pose, friction=inputs.friction)
 
 
+def end(inputs: Inputs) -> tuple[jax.Array, jax.Array]:
+    """The final pose and all modes."""
+    run = push(inputs)
+    return run.pose[-1] / jnp.asarray([LENGTH, LENGTH, 1.0], inputs.pose.dtype), run.mode[:, 0]
+
+
 def final(inputs: Inputs) -> jax.Array:
-    return push(inputs).pose[-1] / jnp.asarray([LENGTH, LENGTH, 1.0], inputs.pose.dtype)
+    return end(inputs)[0]
 
 
-ends = jax.jit(jax.vmap(lambda inputs: (final(inputs), push(inputs).mode[:, 0])))
+ends = jax.jit(jax.vmap(end))
 forward = jax.jit(jax.vmap(lambda inputs, along: jax.jvp(final, (inputs,), (along,))[1]))
 reverse = jax.jit(jax.vmap(jax.jacrev(final)))
 

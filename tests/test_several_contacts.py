@@ -1,172 +1,18 @@
-"""Several contacts: recorded answers, laws, degenerate sets, derivatives."""
-
-import functools
+"""Several contacts: single cases, degenerate sets, derivatives."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contact_batches import BATCH, first, problems
 
 import pushjax as pj
-from pushjax.experiments import bench_contacts
-from pushjax.problems import random_contacts_problem
 from pushjax.verify import ProblemBatch, violations
 
-# Of a clean answer, relative: conditions, and the twist against the recorded one
-CONDITIONS, RECORDED = 1e-8, 1e-6
-# The same problem in another order, frame or unit: rounding, times the conditioning of a set that is kept
-EQUIVALENT = 1e-8
+CONDITIONS = 1e-8  # of a clean answer, relative
 DIFFERENCE = 1e-5  # gradient against central differences
 
-
-# Compiling a program takes longer than any of them runs: so one size of batch everywhere, and one program for each
-# number of contacts and degree.
-BATCH = 2000
-
 solve = pj.solve_contacts
-solve_all = jax.jit(jax.vmap(solve))
-solve_one_as_several = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Exhaustive())))
-
-
-@functools.cache
-def problems(contacts: int, degree: int = 4, seed: int = 0, **options):
-    return draw(contacts, degree, tuple(options.items()))(jax.random.split(jax.random.key(seed), BATCH))
-
-
-@functools.cache
-def draw(contacts: int, degree: int, options: tuple):
-    return jax.jit(jax.vmap(lambda k: random_contacts_problem(k, contacts=contacts, degree=degree, **dict(options))))
-
-
-def first(tree, count: int):
-    return jax.tree.map(lambda leaf: leaf[:count], tree)
-
-
-@pytest.mark.parametrize("kind", [0, 1], ids=["ellipsoid", "quartic"])
-@pytest.mark.parametrize("count", [2, 3, 4])
-def test_recorded_problems(oracle, kind, count):
-    record = np.load(oracle / "multi_contact.npz")
-    rows = np.resize(np.flatnonzero((record["ls_type"] == kind) & (record["K"] == count)), BATCH)
-    length, mu = jnp.asarray(record["rho"][rows]), jnp.asarray(record["mu"][rows])
-    if kind:
-        surface = jax.vmap(pj.Quartic)(jnp.asarray(record["coeffs"][rows]), length)
-    else:
-        surface = jax.vmap(pj.Ellipsoid)(jnp.asarray(record["A"][rows]), length)
-    places = [record[name][rows][:, :count] for name in ("points", "normals", "vels")]
-    contacts = jax.vmap(pj.Contacts)(places[0], -places[1], places[2], mu)
-    motion = solve_all(surface, contacts)
-
-    expected = np.array([{"moving": 0, "receding": 1, "jam": 2}[s] for s in record["status_true"][rows]])
-    clear = ~record["ambiguous"][rows]
-    status = np.asarray(motion.status)
-    np.testing.assert_array_equal(status[clear], expected[clear])
-    twist = np.array(motion.twist)
-    worst = violations(ProblemBatch.of(surface, contacts), twist, motion.force, motion.wrench).worst()
-    assert worst[status == pj.Status.MOVING].max() < CONDITIONS
-    twist[:, 2] *= record["rho"][rows]
-    error = np.linalg.norm(twist - record["V_true"][rows], axis=1) / record["max_speed"][rows]
-    other = error > RECORDED
-    assert not np.any(other & (expected == 0) & clear & np.asarray(motion.unique))
-    # the margin is the recorded certificate
-    squeeze = -np.asarray(motion.margin) / record["max_speed"][rows]
-    np.testing.assert_allclose(squeeze, record["squeeze_power"][rows], atol=1e-9)
-
-
-@pytest.mark.parametrize("degree", [2, 4])
-@pytest.mark.parametrize("count", range(1, 9))
-def test_random_problems(count, degree):
-    """Every motion satisfies every condition; every jam has squeeze power, and 50 starts of another solver find no
-    motion; nothing stays open."""
-    padding = 8 - count if count > 4 else 0  # one program for all of these
-    surface, contacts = problems(count, degree, seed=count, padding=padding)
-    motion = (solve_one_as_several if count == 1 else solve_all)(surface, contacts)
-    counts, worst = bench_contacts.judge(ProblemBatch.of(surface, contacts), motion, "float64", starts=50)
-    assert counts["wrong"] == counts["not_converged"] == 0, worst
-    assert counts["solved"] + counts["jammed"] == BATCH
-    assert (counts["jammed"] > 0) == (count > 1)
-    status = np.asarray(motion.status)
-    assert np.all(np.asarray(motion.margin)[status == pj.Status.JAMMED] < 0)
-    still = status != pj.Status.MOVING
-    assert not np.any(np.asarray(motion.force)[still])
-    assert not np.any(np.asarray(motion.twist)[still])
-
-
-@pytest.mark.parametrize("degree", [2, 4])
-def test_one_contact_has_the_same_answer(degree):
-    surface, contacts = problems(1, degree)
-    one = solve_all(surface, contacts)
-    same = solve_one_as_several(surface, contacts)
-    np.testing.assert_array_equal(one.status, same.status)
-    scale = np.linalg.norm(contacts.displacement, axis=(1, 2))
-    size = np.stack([np.ones(BATCH), np.ones(BATCH), surface.length], axis=1)
-    # ill-conditioned forms: two algorithms differ by rounding times condition
-    assert np.max(np.linalg.norm((one.twist - same.twist) * size, axis=1) / scale) < RECORDED
-    agree = np.mean(np.asarray(one.mode == same.mode))
-    assert agree > 0.999, "modes differ beyond the edges of motion cones"
-    np.testing.assert_allclose(one.wrench, same.wrench, rtol=1e-6, atol=1e-6)
-    moving = np.asarray(same.status) == pj.Status.MOVING
-    worst = violations(ProblemBatch.of(surface, contacts), same.twist, same.force, same.wrench).worst()
-    assert worst[moving].max() < CONDITIONS
-
-
-def test_order_frame_mirror_and_padding_do_not_matter():
-    surface, contacts = problems(3, seed=3)
-    base = solve_all(surface, contacts)
-    order = jnp.array([2, 0, 1])
-    swapped = solve_all(surface, jax.tree.map(lambda a: a[:, order], contacts))
-    compare(base, swapped, order=order)
-
-    # padding: five contacts that are not there, with numbers of their own
-    def padded(c):
-        def grown(a, fill):
-            return jnp.concatenate([a, jnp.broadcast_to(fill, (5, *a.shape[1:]))])
-
-        unit = jnp.array([0.0, 1.0])
-        return pj.Contacts(
-            grown(c.point, 0.01),
-            grown(c.normal, unit),
-            grown(c.displacement, 0.3),
-            grown(c.friction, 0.5),
-            grown(c.gap, -0.01),
-            grown(c.active, False),
-        )
-
-    more = solve_all(surface, jax.vmap(padded)(contacts))
-    compare(base, jax.tree.map(lambda a: a[:, :3] if a.ndim > 1 and a.shape[1] == 8 else a, more))
-
-    # an ellipsoid turned and mirrored with everything else
-    surface, contacts = problems(3, 2, seed=4)
-    base = solve_all(surface, contacts)
-    c, s = np.cos(0.7), np.sin(0.7)
-    for linear in (np.array([[c, -s], [s, c]]), np.array([[1.0, 0.0], [0.0, -1.0]])):
-        full = np.eye(3)
-        full[:2, :2], full[2, 2] = linear, np.linalg.det(linear)
-        turned = jax.vmap(pj.Ellipsoid)(full @ surface.A @ full.T, surface.length)
-        moved = jax.vmap(pj.Contacts)(
-            *(a @ linear.T for a in (contacts.point, contacts.normal, contacts.displacement)),
-            contacts.friction,
-            contacts.gap,
-        )
-        other = solve_all(turned, moved)
-        np.testing.assert_array_equal(base.status, other.status)
-        keep = np.asarray(base.unique)
-        close(base.twist @ full.T, other.twist, keep)
-        assert np.array_equal(base.unique, other.unique)
-
-
-def close(a, b, where):
-    a, b = np.asarray(a)[where], np.asarray(b)[where]
-    scale = np.abs(a).max(axis=tuple(range(1, a.ndim)), keepdims=True) + 1e-12
-    assert np.max(np.abs(a - b) / scale) < 1e-6
-
-
-def compare(a, b, order=slice(None)):
-    np.testing.assert_array_equal(a.status, b.status)
-    np.testing.assert_array_equal(a.unique, b.unique)
-    close(a.twist, b.twist, slice(None))
-    close(a.force[:, order], b.force, slice(None))
-    # what counts as no friction at all is some 1e-7, and cancels to so much
-    np.testing.assert_allclose(a.margin, b.margin, rtol=1e-7, atol=1e-10)
 
 
 def flat_push(mu=0.5, displacement=((0.001, 0.0), (0.001, 0.0)), tilt=0.0):
@@ -177,15 +23,27 @@ def flat_push(mu=0.5, displacement=((0.001, 0.0), (0.001, 0.0)), tilt=0.0):
     return pj.Contacts(point, jnp.array([[1.0, 0.0], [1.0, 0.0]]), d, mu)
 
 
-@pytest.fixture(scope="module", params=[2, 4], ids=["ellipsoid", "quartic"])
-def square(request):
+@pytest.fixture(scope="module")
+def squares():
     support = pj.Support.uniform(pj.Polygon.rectangle(0.09, 0.09), points=64)
-    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(1), 300), degree=request.param)
+    pairs = support.wrench_twist_pairs(jax.random.key(1), 300)
+    return {degree: pj.fit_limit_surface(*pairs, degree=degree) for degree in (2, 4)}
 
 
-def test_flat_push_sticks_without_slip_and_shares_the_force(square):
+@pytest.fixture
+def square(squares):
+    """Of uniform pressure, as a quartic."""
+    return squares[4]
+
+
+@pytest.fixture(params=[2, 4], ids=["ellipsoid", "quartic"])
+def either_square(squares, request):
+    return squares[request.param]
+
+
+def test_flat_push_sticks_without_slip_and_shares_the_force(either_square):
     contacts = flat_push()
-    motion = solve(square, contacts)
+    motion = solve(either_square, contacts)
     assert motion.status == pj.Status.MOVING
     np.testing.assert_array_equal(motion.mode, [pj.ContactMode.STICKING] * 2)
     v = np.asarray(motion.twist)
@@ -198,7 +56,7 @@ def test_flat_push_sticks_without_slip_and_shares_the_force(square):
     np.testing.assert_allclose(f.sum(axis=0), np.asarray(motion.wrench)[:2], rtol=1e-12, atol=1e-12)
 
 
-def test_pinched_disc_moves_to_the_middle(square):
+def test_pinched_disc_moves_to_the_middle():
     """Two opposite fingers, one faster: the slider goes with the difference; at equal speed it is jammed."""
     disc = pj.Ellipsoid(np.eye(3), 0.02)
     point, normal = jnp.array([[-0.03, 0.0], [0.03, 0.0]]), jnp.array([[1.0, 0.0], [-1.0, 0.0]])
@@ -211,48 +69,59 @@ def test_pinched_disc_moves_to_the_middle(square):
     assert gap.mode[1] == pj.ContactMode.SEPARATED
 
 
+def moved(c: pj.Contacts, t) -> pj.Contacts:
+    """Along a line through the inputs."""
+    direction = jnp.arange(1.0, c.point.shape[0] + 1)
+    angle = 0.3 * t * direction
+    turn = jnp.stack([jnp.cos(angle), -jnp.sin(angle), jnp.sin(angle), jnp.cos(angle)], -1).reshape(-1, 2, 2)
+    return pj.Contacts(
+        c.point + t * 1e-2 * direction[:, None],
+        jnp.einsum("mij,mj->mi", turn, c.normal),
+        c.displacement * (1 + t * direction[:, None]),
+        c.friction * (1 + t * direction),
+        c.gap + t * 1e-3,
+        c.active,
+    )
+
+
+def outcome(t, s, c):
+    """A weighted sum of everything, and the modes it is within."""
+    m = solve(s, moved(c, t))
+    total = jnp.sum(m.twist * jnp.array([100.0, 50.0, 1.0])) + jnp.sum(m.wrench) + m.twist[0] * m.twist[2] * 1e3
+    return total, (jnp.append(m.mode, m.status), m.unique)
+
+
+forward = jax.jit(jax.vmap(lambda t, s, c: jax.jvp(lambda t: outcome(t, s, c), (t,), (1.0,), has_aux=True)))
+reverse = jax.jit(jax.vmap(jax.value_and_grad(outcome, has_aux=True)))
+
+
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("degree", [2, 4])
 def test_derivatives_are_those_of_the_solution(count, degree):
-    surface, contacts = first(problems(count, degree, seed=11, condition=30.0, gaps=0.3), 60)
-
-    def moved(c, t):
-        """Along a line through the inputs."""
-        direction = jnp.arange(1.0, c.point.shape[0] + 1)
-        angle = 0.3 * t * direction
-        turn = jnp.stack([jnp.cos(angle), -jnp.sin(angle), jnp.sin(angle), jnp.cos(angle)], -1).reshape(-1, 2, 2)
-        return pj.Contacts(
-            c.point + t * 1e-2 * direction[:, None],
-            jnp.einsum("mij,mj->mi", turn, c.normal),
-            c.displacement * (1 + t * direction[:, None]),
-            c.friction * (1 + t * direction),
-            c.gap + t * 1e-3,
-        )
-
-    def outcome(t, s, c):
-        """A weighted sum of everything, and the modes it is within."""
-        m = solve(s, moved(c, t))
-        total = jnp.sum(m.twist * jnp.array([100.0, 50.0, 1.0])) + jnp.sum(m.wrench) + m.twist[0] * m.twist[2] * 1e3
-        return total, (jnp.append(m.mode, m.status), m.unique)
-
-    forward = jax.jit(jax.vmap(lambda t, s, c: jax.jvp(lambda t: outcome(t, s, c), (t,), (1.0,), has_aux=True)))
-    reverse = jax.jit(jax.vmap(jax.value_and_grad(outcome, has_aux=True)))
-    h, zero = 1e-5, jnp.zeros(60)
+    surface, contacts = first(problems(count, degree, seed=11, slots=3, condition=30.0, gaps=0.3), 200)
+    zero = jnp.zeros(200)
     value, d1, (modes, unique) = forward(zero, surface, contacts)
-    (above, _, (modes_above, _)), (below, _, (modes_below, _)) = (forward(zero + t, surface, contacts) for t in (h, -h))
     d2 = reverse(zero, surface, contacts)[1]
-    central = (above - below) / (2 * h)
-    same = np.all((modes_above == modes_below) & (modes_above == modes), axis=1) & np.asarray(unique)
-    assert same.sum() > 40
     assert np.all(np.isfinite(d1))
     assert np.all(np.isfinite(d2))
-    scale = np.abs(central) + np.abs(value) + 1.0
+
+    def central(h):
+        (above, _, (modes_above, _)), (below, _, (modes_below, _)) = (
+            forward(zero + t, surface, contacts) for t in (h, -h)
+        )
+        return (above - below) / (2 * h), np.all((modes_above == modes_below) & (modes_above == modes), axis=1)
+
+    (wide, same), (narrow, _) = central(1e-5), central(2.5e-6)
+    scale = np.abs(narrow) + np.abs(value) + 1.0
     np.testing.assert_allclose(d1 / scale, d2 / scale, atol=1e-9)
-    assert np.quantile(np.abs(d1 - central)[same] / scale[same], 0.9) < DIFFERENCE
-    assert np.max(np.abs(d1 - central)[same] / scale[same]) < 1e-3  # curvature near a change of mode
+    # near a jam the motion changes within a step of the differences, which then mean nothing
+    judged = same & np.asarray(unique) & (np.abs(wide - narrow) < 1e-4 * scale)
+    assert judged.sum() > 100
+    assert np.quantile(np.abs(d1 - narrow)[judged] / scale[judged], 0.9) < DIFFERENCE
+    assert np.max(np.abs(d1 - narrow)[judged] / scale[judged]) < 1e-4
 
 
-def test_nothing_is_nan_in_degenerate_problems(square):
+def test_nothing_is_nan_in_degenerate_problems(either_square):
     point = jnp.array([[-0.045, 0.0], [0.045, 0.0], [0.0, 0.045]])
     normal = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0.0, -1.0]])
     still, push = jnp.zeros((3, 2)), 1e-3 * normal
@@ -268,7 +137,7 @@ def test_nothing_is_nan_in_degenerate_problems(square):
     }
 
     def total(p, n, d, mu):
-        m = solve(square, pj.Contacts(p, n, d, mu))
+        m = solve(either_square, pj.Contacts(p, n, d, mu))
         margin = jnp.where(jnp.isfinite(m.margin), m.margin, 0)
         return jnp.sum(m.twist) + jnp.sum(m.wrench) + jnp.sum(m.force) + margin, m
 
@@ -389,23 +258,6 @@ def test_traced_values_that_are_no_numbers_are_invalid(square):
     assert run(contacts.displacement, jnp.array(-0.3)).status == pj.Status.INVALID
 
 
-def test_float32():
-    surface, contacts = problems(3, seed=5, condition=100.0)
-    as32 = jax.tree.map(
-        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, (surface, contacts)
-    )
-    exact, rough = solve_all(surface, contacts), solve_all(*as32)
-    assert rough.twist.dtype == jnp.float32
-    status = np.asarray(rough.status)
-    # ill-conditioned sets lose float32's digits; they say so
-    assert np.mean(status == pj.Status.NOT_CONVERGED) < 0.01
-    settled = (status != pj.Status.NOT_CONVERGED) & (np.asarray(exact.margin / np.abs(exact.margin)) != 0)
-    assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.99
-    batch = ProblemBatch.of(*as32)
-    worst = violations(batch, rough.twist, rough.force, rough.wrench)._replace(flow=np.zeros(BATCH)).worst()
-    assert worst[status == pj.Status.MOVING].max() < 1e-4
-
-
 @pytest.mark.parametrize("count", [0, 9])
 def test_number_of_contacts(square, count):
     with pytest.raises(ValueError, match=f"from one to 8 are supported; got {count}"):
@@ -418,19 +270,3 @@ def test_number_of_contacts(square, count):
 def test_a_solver_of_one_contact_refuses_two(square):
     with pytest.raises(ValueError, match="ScalarRoot solves one contact; got 2"):
         solve(square, flat_push(), solver=pj.ScalarRoot())
-
-
-def test_projected_is_right_where_it_answers():
-    surface, contacts = problems(3, seed=9, condition=100.0)
-    exact = solve_all(surface, contacts)
-    found = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Projected())))(surface, contacts)
-    status = np.asarray(found.status)
-    assert set(np.unique(status)) <= {pj.Status.MOVING, pj.Status.FREE, pj.Status.NOT_CONVERGED}
-    moving = status == pj.Status.MOVING
-    worst = violations(ProblemBatch.of(surface, contacts), found.twist, found.force, found.wrench).worst()
-    assert worst[moving].max() < CONDITIONS
-    could = np.asarray(exact.status) == pj.Status.MOVING
-    assert not np.any(moving & ~could)
-    assert np.mean(moving[could]) > 0.85
-    same = moving & np.asarray(exact.unique)
-    close(found.twist, exact.twist, same)
