@@ -1,0 +1,180 @@
+"""Random and recorded contact problems by the thousand: no answer is wrong, and none is missing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from contact_batches import BATCH, MOST, problems
+
+import pushjax as pj
+from pushjax.experiments import bench_contacts
+from pushjax.verify import ProblemBatch, violations
+
+# Of a clean answer, relative: conditions, and the twist against the recorded one
+CONDITIONS, RECORDED = 1e-8, 1e-6
+# The same problem in another order, frame or unit: rounding, times the conditioning of a set that is kept
+EQUIVALENT = 1e-6
+
+solve = pj.solve_contacts
+solve_all = jax.jit(jax.vmap(solve))
+solve_one_as_several = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Exhaustive())))
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["ellipsoid", "quartic"])
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_recorded_problems(oracle, kind, count):
+    record = np.load(oracle / "multi_contact.npz")
+    rows = np.resize(np.flatnonzero((record["ls_type"] == kind) & (record["K"] == count)), BATCH)
+    length, mu = jnp.asarray(record["rho"][rows]), jnp.asarray(record["mu"][rows])
+    if kind:
+        surface = jax.vmap(pj.Quartic)(jnp.asarray(record["coeffs"][rows]), length)
+    else:
+        surface = jax.vmap(pj.Ellipsoid)(jnp.asarray(record["A"][rows]), length)
+    places = [record[name][rows][:, :count] for name in ("points", "normals", "vels")]
+    contacts = jax.vmap(pj.Contacts)(places[0], -places[1], places[2], mu)
+    motion = solve_all(surface, contacts)
+
+    expected = np.array([{"moving": 0, "receding": 1, "jam": 2}[s] for s in record["status_true"][rows]])
+    clear = ~record["ambiguous"][rows]
+    status = np.asarray(motion.status)
+    np.testing.assert_array_equal(status[clear], expected[clear])
+    twist = np.array(motion.twist)
+    worst = violations(ProblemBatch.of(surface, contacts), twist, motion.force, motion.wrench).worst()
+    assert worst[status == pj.Status.MOVING].max() < CONDITIONS
+    twist[:, 2] *= record["rho"][rows]
+    error = np.linalg.norm(twist - record["V_true"][rows], axis=1) / record["max_speed"][rows]
+    other = error > RECORDED
+    assert not np.any(other & (expected == 0) & clear & np.asarray(motion.unique))
+    # the margin is the recorded certificate
+    squeeze = -np.asarray(motion.margin) / record["max_speed"][rows]
+    np.testing.assert_allclose(squeeze, record["squeeze_power"][rows], atol=1e-9)
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("count", range(1, 9))
+def test_random_problems(count, degree):
+    """Every motion satisfies every condition; every jam has squeeze power, and 50 starts of another solver find no
+    motion; nothing stays open."""
+    slots = MOST if count > 4 else count  # one program for all of these
+    surface, contacts = problems(count, degree, seed=count, slots=slots)
+    motion = (solve_one_as_several if count == 1 else solve_all)(surface, contacts)
+    counts, worst = bench_contacts.judge(ProblemBatch.of(surface, contacts), motion, "float64", starts=50)
+    assert counts["wrong"] == counts["not_converged"] == 0, worst
+    assert counts["solved"] + counts["jammed"] == BATCH
+    assert (counts["jammed"] > 0) == (count > 1)
+    status = np.asarray(motion.status)
+    assert np.all(np.asarray(motion.margin)[status == pj.Status.JAMMED] < 0)
+    still = status != pj.Status.MOVING
+    assert not np.any(np.asarray(motion.force)[still])
+    assert not np.any(np.asarray(motion.twist)[still])
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_one_contact_has_the_same_answer(degree):
+    surface, contacts = problems(1, degree)
+    one = solve_all(surface, contacts)
+    same = solve_one_as_several(surface, contacts)
+    np.testing.assert_array_equal(one.status, same.status)
+    scale = np.linalg.norm(contacts.displacement, axis=(1, 2))
+    size = np.stack([np.ones(BATCH), np.ones(BATCH), surface.length], axis=1)
+    # ill-conditioned forms: two algorithms differ by rounding times condition
+    assert np.max(np.linalg.norm((one.twist - same.twist) * size, axis=1) / scale) < RECORDED
+    agree = np.mean(np.asarray(one.mode == same.mode))
+    assert agree > 0.999, "modes differ beyond the edges of motion cones"
+    np.testing.assert_allclose(one.wrench, same.wrench, rtol=1e-6, atol=1e-6)
+    moving = np.asarray(same.status) == pj.Status.MOVING
+    worst = violations(ProblemBatch.of(surface, contacts), same.twist, same.force, same.wrench).worst()
+    assert worst[moving].max() < CONDITIONS
+
+
+def test_order_frame_mirror_and_padding_do_not_matter():
+    surface, contacts = problems(3, seed=3)
+    base = solve_all(surface, contacts)
+    order = jnp.array([2, 0, 1])
+    swapped = solve_all(surface, jax.tree.map(lambda a: a[:, order], contacts))
+    compare(base, swapped, order=order)
+
+    # padding: five contacts that are not there, with numbers of their own
+    def padded(c):
+        def grown(a, fill):
+            return jnp.concatenate([a, jnp.broadcast_to(fill, (5, *a.shape[1:]))])
+
+        unit = jnp.array([0.0, 1.0])
+        return pj.Contacts(
+            grown(c.point, 0.01),
+            grown(c.normal, unit),
+            grown(c.displacement, 0.3),
+            grown(c.friction, 0.5),
+            grown(c.gap, -0.01),
+            grown(c.active, False),
+        )
+
+    more = solve_all(surface, jax.vmap(padded)(contacts))
+    compare(base, jax.tree.map(lambda a: a[:, :3] if a.ndim > 1 and a.shape[1] == 8 else a, more))
+
+    # an ellipsoid turned and mirrored with everything else
+    surface, contacts = problems(3, 2, seed=4)
+    base = solve_all(surface, contacts)
+    c, s = np.cos(0.7), np.sin(0.7)
+    for linear in (np.array([[c, -s], [s, c]]), np.array([[1.0, 0.0], [0.0, -1.0]])):
+        full = np.eye(3)
+        full[:2, :2], full[2, 2] = linear, np.linalg.det(linear)
+        turned = jax.vmap(pj.Ellipsoid)(full @ surface.A @ full.T, surface.length)
+        moved = jax.vmap(pj.Contacts)(
+            *(a @ linear.T for a in (contacts.point, contacts.normal, contacts.displacement)),
+            contacts.friction,
+            contacts.gap,
+        )
+        other = solve_all(turned, moved)
+        np.testing.assert_array_equal(base.status, other.status)
+        keep = np.asarray(base.unique)
+        close(base.twist @ full.T, other.twist, keep)
+        assert np.array_equal(base.unique, other.unique)
+
+
+def close(a, b, where):
+    a, b = np.asarray(a)[where], np.asarray(b)[where]
+    scale = np.abs(a).max(axis=tuple(range(1, a.ndim)), keepdims=True) + 1e-12
+    assert np.max(np.abs(a - b) / scale) < EQUIVALENT
+
+
+def compare(a, b, order=slice(None)):
+    np.testing.assert_array_equal(a.status, b.status)
+    np.testing.assert_array_equal(a.unique, b.unique)
+    close(a.twist, b.twist, slice(None))
+    close(a.force[:, order], b.force, slice(None))
+    # what counts as no friction at all is some 1e-7, and cancels to so much
+    np.testing.assert_allclose(a.margin, b.margin, rtol=1e-7, atol=1e-10)
+
+
+def test_float32():
+    surface, contacts = problems(3, seed=5, condition=100.0)
+    as32 = jax.tree.map(
+        lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, (surface, contacts)
+    )
+    exact, rough = solve_all(surface, contacts), solve_all(*as32)
+    assert rough.twist.dtype == jnp.float32
+    status = np.asarray(rough.status)
+    # ill-conditioned sets lose float32's digits; they say so
+    assert np.mean(status == pj.Status.NOT_CONVERGED) < 0.01
+    settled = (status != pj.Status.NOT_CONVERGED) & (np.asarray(exact.margin / np.abs(exact.margin)) != 0)
+    assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.99
+    batch = ProblemBatch.of(*as32)
+    worst = violations(batch, rough.twist, rough.force, rough.wrench)._replace(flow=np.zeros(BATCH)).worst()
+    assert worst[status == pj.Status.MOVING].max() < 1e-4
+
+
+def test_projected_is_right_where_it_answers():
+    surface, contacts = problems(3, seed=9, condition=100.0)
+    exact = solve_all(surface, contacts)
+    found = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Projected())))(surface, contacts)
+    status = np.asarray(found.status)
+    assert set(np.unique(status)) <= {pj.Status.MOVING, pj.Status.FREE, pj.Status.NOT_CONVERGED}
+    moving = status == pj.Status.MOVING
+    worst = violations(ProblemBatch.of(surface, contacts), found.twist, found.force, found.wrench).worst()
+    assert worst[moving].max() < CONDITIONS
+    could = np.asarray(exact.status) == pj.Status.MOVING
+    assert not np.any(moving & ~could)
+    assert np.mean(moving[could]) > 0.85
+    same = moving & np.asarray(exact.unique)
+    close(found.twist, exact.twist, same)
