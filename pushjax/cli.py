@@ -66,6 +66,8 @@ class Bench(Common):
     """How many problems, of 100 000 for up to four contacts and 10 000 for more."""
     starts: int = 50
     """Starts of the independent solver on every problem that was called jammed."""
+    contacts: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
+    """Of how many contacts."""
 
 
 Command = (
@@ -111,9 +113,16 @@ def _bench(command: Bench, progress: Progress) -> Result:
     import jax
 
     from pushjax.experiments import bench_contacts
+    from pushjax.report import write_json
 
     jax.config.update("jax_enable_x64", command.dtype == "float64")  # of this process, which is the command's own
-    record = bench_contacts.run(command.seed, command.out, command.scale, command.starts, progress=progress)
+
+    def keep(so_far: dict[str, Any]) -> None:
+        if command.json is not None:
+            write_json(so_far, command.json)
+
+    scale, starts, contacts = command.scale, command.starts, command.contacts
+    record = bench_contacts.run(command.seed, scale, starts, contacts, progress, keep)
     return record, bench_contacts.summary(record)
 
 

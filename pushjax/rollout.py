@@ -35,7 +35,7 @@ from pushjax.hands import Finger, Hand, Pad, checked_path
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Outline, Shape
 from pushjax.solve import Contact, ContactSolver, SeveralMotion, StickingSolver
-from pushjax.solve.contacts import motion_under, usable
+from pushjax.solve.contacts import ground, motion_under
 from pushjax.status import ContactMode, Status
 
 # A finger holds a jammed slider if it is nearer than this, in units of the length, or than the hand goes in four steps:
@@ -262,12 +262,6 @@ def _grips(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[_G
     return tuple(grips)
 
 
-def _ground(slider: Slider, friction: Array) -> tuple[Form, Array]:
-    """The limit surface in scalars, and the friction; that is NaN, so every contact invalid, if the surface is."""
-    form, known = usable(slider.surface.form())
-    return form, jnp.where(known, friction, jnp.nan)
-
-
 def _guarded(motion: SeveralMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> _Record:
     """The record of a step; without motion the slider stays, untouched by arithmetic that might have failed."""
     finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
@@ -372,7 +366,7 @@ def step(
 @eqx.filter_jit
 def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
     outline = slider.shape.outline()
-    form, mu = _ground(slider, friction)
+    form, mu = ground(slider.surface, friction)
     grips = _grips(hand, mu, _columns(hand.poses(q0)), _columns(hand.poses(q1)))
     return _world(_advance(form, outline, grips, solver, Vec3.of(pose)), form.length)
 
@@ -410,7 +404,7 @@ def rollout(
 @eqx.filter_jit
 def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
     outline = slider.shape.outline()
-    form, mu = _ground(slider, friction)
+    form, mu = ground(slider.surface, friction)
     columns = _columns(hand.poses(path))
     one = sum(count(finger, outline) for finger in hand.fingers) == 1  # which cannot jam
 

@@ -99,8 +99,11 @@ def test_bench_contacts(monkeypatch):
     from pushjax.experiments import bench_contacts
 
     monkeypatch.setattr(bench_contacts, "MODELS", {"quartic": 4})
-    record = bench_contacts.run(scale=0.0, contacts=(2,), starts=20)
-    assert len(record["rows"]) == 1
+    kept = []
+    record = bench_contacts.run(
+        scale=0.0, contacts=(2,), starts=20, keep=lambda so_far: kept.append(len(so_far["rows"]))
+    )
+    assert kept == [len(record["rows"])] == [1]
     for row in record["rows"]:
         assert row["problems"] == 2000
         assert row["wrong"] == row["not_converged"] == 0
@@ -108,6 +111,13 @@ def test_bench_contacts(monkeypatch):
         assert row["jammed"] > 100
         assert row["worst_violation"] < 1e-8
     assert "wrong" in bench_contacts.summary(record)
+
+
+def test_bench_of_too_many_contacts(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["bench", "contacts", "--contacts", "2", "9"])
+    assert stop.value.code == 1
+    assert "contacts must be from 1 to 8; got 9" in capsys.readouterr().err
 
 
 def test_table2_wants_data(tmp_path, monkeypatch, capsys):

@@ -7,6 +7,7 @@ import pytest
 from contact_batches import BATCH, first, problems
 
 import pushjax as pj
+from pushjax.solve._edge_line import roots
 from pushjax.verify import ProblemBatch, violations
 
 CONDITIONS = 1e-8  # of a clean answer, relative
@@ -67,6 +68,27 @@ def test_pinched_disc_moves_to_the_middle():
     assert gap.status == pj.Status.MOVING
     np.testing.assert_allclose(gap.twist, [0.001, 0, 0], atol=1e-15)
     assert gap.mode[1] == pj.ContactMode.SEPARATED
+
+
+def test_roots_of_very_different_sizes_are_found(rng):
+    """Of cubics on an interval of length one with zero in it: three real roots, or one, from 1e-6 to 1."""
+    n = 20_000
+    root = 10 ** rng.uniform(-6, 0, (3, n)) * rng.choice([-1, 1], (3, n))
+    single = rng.random(n) < 0.4  # then the first two are a complex pair's two parts
+    a, b = np.where(single, -2 * root[0], -root[0] - root[1]), root[0] * root[1]
+    b = np.where(single, root[0] ** 2 + root[1] ** 2, b)
+    cubic = [-b * root[2], b - a * root[2], a - root[2], np.ones(n)]
+    low = -rng.uniform(0, 1, n)
+    places = jax.jit(jax.vmap(lambda c, low: roots(c, low, low + 1)))(tuple(map(jnp.asarray, cubic)), jnp.asarray(low))
+    found = np.stack([np.where(is_root, place, np.inf) for place, is_root in places])
+    for k in range(3):
+        apart = np.min([np.abs(root[k] - root[j]) for j in range(3) if j != k], axis=0)
+        wanted = (root[k] > low) & (root[k] < low + 1) & ((apart > 1e-2 * np.abs(root[k])) | (single & (k == 2)))
+        wanted &= ~single | (k == 2)
+        assert wanted.sum() > 3000
+        off = np.abs(found - root[k]).min(axis=0) / np.abs(root[k])
+        assert np.mean(off[wanted] < 1e-8) > 0.999  # but for those with a larger pair nearby, which rounding may part
+        assert np.max(off[wanted]) < 1e-3
 
 
 def moved(c: pj.Contacts, t) -> pj.Contacts:

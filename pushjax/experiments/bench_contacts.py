@@ -1,14 +1,13 @@
 """Contact problems by the thousand: is any answer wrong, is any missing, and what does one cost.
 
 Random problems of `pushjax.problems` (rigid hands, closing and independent fingers, with and without gaps, flat faces,
-opposite pairs, well and badly conditioned surfaces). MOVING and FREE are checked against every condition by
+opposite pairs, wedges at the border of a jam, pushers that drag the slider along, well and badly conditioned surfaces). MOVING and FREE are checked against every condition by
 `pushjax.verify`, which shares no code with the solvers; JAMMED needs a positive squeeze power, by its own linear
 program, and no clean answer from many starts of a different solver.
 """
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -30,21 +29,31 @@ MODELS = {"quartic": 4, "ellipsoid": 2}
 
 def run(
     seed: int = 0,
-    out: Path | None = None,
     scale: float = 1.0,
     starts: int = 50,
     contacts: tuple[int, ...] = tuple(COUNTS),
     progress: Callable[[int, int], None] = lambda done, total: None,
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
-    """A row for each count, model and floating type the process allows. scale: of the number of problems."""
+    """A row for each count and model, in the floating type the process allows.
+
+    scale: of the number of problems. keep: called with the record so far after every row; all of them take an hour.
+
+    Raises ValueError for a number of contacts that is not from one to eight.
+    """
+    wrong = [m for m in contacts if m not in COUNTS]
+    if wrong:
+        raise ValueError(f"contacts must be from 1 to {max(COUNTS)}; got {wrong[0]}")
     dtype = str(jnp.zeros(()).dtype)
     cases = [(m, model) for m in contacts for model in MODELS]
-    rows = []
+    rows: list[dict[str, Any]] = []
+    settings = {"seed": seed, "scale": scale, "starts": starts, "allowed": ALLOWED[dtype], "chunk": CHUNK}
+    record = envelope("contacts", settings, rows=rows)
     for done, (m, model) in enumerate(cases):
         rows.append(_row(m, model, dtype, max(CHUNK, int(scale * COUNTS[m])), starts, seed))
+        keep(record)
         progress(done + 1, len(cases))
-    settings = {"seed": seed, "scale": scale, "starts": starts, "allowed": ALLOWED[dtype], "chunk": CHUNK}
-    return envelope("contacts", settings, rows=rows)
+    return record
 
 
 def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) -> dict[str, Any]:

@@ -22,8 +22,9 @@ without any arctangent, and mirrored for right (Zhou et al. 2017, section IV.A, 
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec2, Vec3
+from pushjax._vec import Scalar, Vec2, Vec3, select
 from pushjax.limit_surface import Form
 
 
@@ -38,6 +39,16 @@ class Contact(NamedTuple):
     displacement: Vec2
     friction: Scalar
     gap: Scalar
+
+    def where(self, condition: Bool[Array, ""]) -> "Contact":
+        """This contact, or, where the condition does not hold, one out of reach, whatever the numbers of this one are.
+
+        To be called before anything is computed from them: a NaN that is only masked afterwards comes back in the
+        gradient.
+        """
+        zero, one = jnp.zeros_like(self.gap), jnp.ones_like(self.gap)
+        still = Vec2(zero, zero)
+        return select(condition, self, Contact(still, Vec2(one, zero), still, zero, one))
 
     def approach(self) -> Vec2:
         """What the slider's contact point must do to stay with the pusher, in (n, t)."""

@@ -88,11 +88,9 @@ def assemble(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array
         known &= (contact.friction >= 0) | ~counts
     zero, one = jnp.zeros_like(contacts[0].gap), jnp.ones_like(contacts[0].gap)
     still = Vec2(zero, zero)
-    away = Contact(still, Vec2(one, zero), still, zero, one)
     witness = form.length + sum((c.point.x + c.displacement.x for c in contacts), zero)  # variable, if anything is
     counts = tuple(settle(known & a, witness) for a in active)
-    # Replaced before anything is computed: a NaN that is only masked afterwards comes back in the gradient
-    contacts = tuple(select(a, contact, away) for a, contact in zip(counts, contacts, strict=True))
+    contacts = tuple(contact.where(a) for a, contact in zip(counts, contacts, strict=True))
 
     # units, no variables: the answer does not depend on them
     pushers = [select(a, c.displacement, still) for a, c in zip(counts, contacts, strict=True)]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import Scalar, Vec2, Vec3
+from pushjax._vec import Vec2, Vec3
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve._several import ContactSolver, SeveralMotion, assemble
@@ -138,9 +138,8 @@ def solve_contacts(
 @eqx.filter_jit
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     m = contacts.point.shape[0]
-    form, known = usable(surface.form())
-    each = tuple(_contact(contacts, i) for i in range(m))
-    each = tuple(c._replace(friction=jnp.where(known, c.friction, jnp.nan)) for c in each)
+    form, friction = ground(surface, contacts.friction)
+    each = tuple(_contact(contacts, friction, i) for i in range(m))
     result = motion_under(form, each, tuple(contacts.active[i] for i in range(m)), solver)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
@@ -172,30 +171,21 @@ def motion_under(
     return SeveralMotion(one.twist, one.wrench, (one.force,), (one.mode,), one.status, margin, one.unique)
 
 
-def usable(form: Form) -> tuple[Form, Bool[Array, ""]]:
-    """The form, and whether its numbers can be computed with; one of ones where they cannot, to keep NaN out.
-
-    An unusable form is for the caller to report: a friction of NaN with it makes the contact invalid.
-    """
+def ground(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
+    """The surface in scalars, and the contacts' friction. A surface whose numbers cannot be computed with is replaced
+    by one of ones, which keeps NaN out, and the friction by NaN, which makes every contact invalid."""
+    form = surface.form()
     known = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
-    return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), known
+    return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), jnp.where(known, friction, jnp.nan)
 
 
-def _contact(contacts: Contacts, i: int) -> Contact:
+def _contact(contacts: Contacts, friction: Array, i: int) -> Contact:
     """Contact i in scalars; one that is not active is out of reach, whatever its numbers are."""
-    active, normal = contacts.active[i], contacts.normal[i]
+    normal = contacts.normal[i]
     unit = jnp.abs(jnp.sum(normal**2) - 1) <= 2 * UNIT_TOLERANCE  # where traced, nothing has checked it yet
-
-    def kept(value: Scalar, away: float) -> Scalar:
-        return jnp.where(active, value, away)
-
-    return Contact(
-        Vec2(kept(contacts.point[i, 0], 0.0), kept(contacts.point[i, 1], 0.0)),
-        Vec2(kept(normal[0], 1.0), kept(normal[1], 0.0)),
-        Vec2(kept(contacts.displacement[i, 0], 0.0), kept(contacts.displacement[i, 1], 0.0)),
-        kept(jnp.where(unit, contacts.friction[i], jnp.nan), 0.0),
-        kept(contacts.gap[i], 1.0),
-    )
+    point, displacement = Vec2.of(contacts.point[i]), Vec2.of(contacts.displacement[i])
+    mu = jnp.where(unit, friction[i], jnp.nan)
+    return Contact(point, Vec2.of(normal), displacement, mu, contacts.gap[i]).where(contacts.active[i])
 
 
 def friction_cone(normal: Numeric, friction: Numeric) -> Float[Array, "2 2"]:
@@ -234,4 +224,5 @@ def _at_rest(point: Numeric, normal: Numeric, friction: Numeric, dtype: Any) -> 
     shaped("point", p, (2,))
     shaped("normal", n, (2,))
     shaped("friction", mu, ())
-    return _contact(Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu), 0)
+    contacts = Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu)
+    return _contact(contacts, contacts.friction, 0)

@@ -87,15 +87,9 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
 
 def _known(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
-    """Whether every number of a contact is usable; the contact, or else one out of reach.
-
-    Replaced before anything is computed from it: a NaN that is only masked afterwards comes back in the gradient.
-    """
+    """Whether every number of a contact is usable; the contact, or else one out of reach."""
     known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
-    zero, one = jnp.zeros_like(contact.gap), jnp.ones_like(contact.gap)
-    still = Vec2(zero, zero)
-    away = Contact(still, Vec2(one, zero), still, zero, one)
-    return known, jax.tree.map(lambda entry, other: jnp.where(known, entry, other), contact, away)
+    return known, contact.where(known)
 
 
 def _drags(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
