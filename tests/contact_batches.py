@@ -1,4 +1,4 @@
-"""Batches of random contact problems, drawn by one compiled program for each degree, whatever their options."""
+"""Contact problems: random batches, drawn by one compiled program for each degree, and a square."""
 
 import functools
 
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import pushjax as pj
 from pushjax.problems import ContactsProblem, random_contacts_problem
 
 # Compiling a program takes longer than any of them runs: so one size of batch everywhere.
@@ -40,3 +41,18 @@ def _program(degree: int):
 
 def first(tree, count: int):
     return jax.tree.map(lambda leaf: leaf[:count], tree)
+
+
+def flat_push(mu=0.5, displacement=((0.001, 0.0), (0.001, 0.0)), tilt=0.0) -> pj.Contacts:
+    """Two points flat against the left side of a square, 40 mm apart."""
+    c, s = np.cos(tilt), np.sin(tilt)
+    d = jnp.asarray(displacement) @ jnp.array([[c, s], [-s, c]])
+    point = jnp.array([[-0.045, 0.02], [-0.045, -0.02]])
+    return pj.Contacts(point, jnp.array([[1.0, 0.0], [1.0, 0.0]]), d, mu)
+
+
+@functools.cache
+def square(degree: int) -> pj.LimitSurface:
+    """That square's, under uniform pressure."""
+    support = pj.Support.uniform(pj.Polygon.rectangle(0.09, 0.09), points=64)
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(1), 300), degree=degree)

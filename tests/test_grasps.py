@@ -1,5 +1,8 @@
 """Hands of several fingers: recorded grasps, laws, jams, gradients."""
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,32 +38,53 @@ def quartic_of(record: dict, i: int) -> np.ndarray:
     return np.asarray(squared_quadratics(jnp.asarray(record["A"][i])[None]))
 
 
+class Grasps(NamedTuple):
+    """The recorded grasps with one number of fingers: their rows of the record, and the program that runs them all."""
+
+    record: dict
+    rows: np.ndarray
+    hand: pj.Hand
+    run: Callable[..., pj.Trajectory]
+
+    def again(self, **changes: np.ndarray) -> pj.Trajectory:
+        """All of them; changes: of the record, (rows, …)."""
+        names = ("hand_q0", "hand_q1", "obj_pose0")
+        given = {name: self.record[name][self.rows] for name in names} | changes
+        vertices = np.stack([six(self.record["vertices"][i][: self.record["n_vertices"][i]]) for i in self.rows])
+        surface = np.stack([quartic_of(self.record, i) for i in self.rows])
+        return self.run(vertices, surface, self.record["rho"][self.rows], *given.values(), self.record["mu"][self.rows])
+
+
+def path_of(q0, q1):
+    t = jnp.linspace(0, 1, STEPS + 1)[:, None]
+    return q0[None] * (1 - t) + q1[None] * t
+
+
 @pytest.fixture(scope="module")
-def grasps(oracle):
-    """Every recorded grasp run again, by number of fingers."""
+def grasps(oracle) -> dict[int, Grasps]:
+    """By number of fingers."""
     record = dict(np.load(oracle / "rollouts_grasp.npz"))
-    results = {}
+    found = {}
     for fingers, make in ((2, pj.Hand.two_fingers), (3, pj.Hand.three_fingers)):
         rows = np.flatnonzero(record["n_fingers"] == fingers)
         hand = make(record["finger_radius"][rows[0]])
-        vertices = np.stack([six(record["vertices"][i][: record["n_vertices"][i]]) for i in rows])
-        surface = np.stack([quartic_of(record, i) for i in rows])
 
         def run(v, c, length, q0, q1, pose, mu, hand=hand):
             slider = pj.Slider(pj.Polygon(v, convex=True), pj.Quartic(c, length))
-            t = jnp.linspace(0, 1, STEPS + 1)[:, None]
-            path = q0[None] * (1 - t) + q1[None] * t
-            return pj.rollout(slider, hand, path, pose=pose, friction=mu)
+            return pj.rollout(slider, hand, path_of(q0, q1), pose=pose, friction=mu)
 
-        inputs = (vertices, surface, *(record[k][rows] for k in ("rho", "hand_q0", "hand_q1", "obj_pose0", "mu")))
-        results[fingers] = rows, jax.jit(jax.vmap(run))(*inputs)
-    return record, results
+        found[fingers] = Grasps(record, rows, hand, jax.jit(jax.vmap(run)))
+    return found
+
+
+@pytest.fixture(scope="module")
+def reruns(grasps) -> dict[int, pj.Trajectory]:
+    return {fingers: each.again() for fingers, each in grasps.items()}
 
 
 @pytest.mark.parametrize("fingers", [2, 3])
-def test_recorded_grasps(grasps, fingers):
-    record, results = grasps
-    rows, runs = results[fingers]
+def test_recorded_grasps(grasps, reruns, fingers):
+    record, rows, runs = grasps[fingers].record, grasps[fingers].rows, reruns[fingers]
     checked = 0
     for k, i in enumerate(rows):
         if not record["ode_completed_ref_tight"][i] or i in DRIFTED:
@@ -83,9 +107,8 @@ def test_recorded_grasps(grasps, fingers):
 
 
 @pytest.mark.parametrize("fingers", [2, 3])
-def test_frozen_and_finite_after_a_jam(grasps, fingers):
-    _, results = grasps
-    rows, runs = results[fingers]
+def test_frozen_and_finite_after_a_jam(grasps, reruns, fingers):
+    rows, runs = grasps[fingers].rows, reruns[fingers]
     for k in range(len(rows)):
         stop = int(runs.stopped[k])
         if stop < 0:
@@ -106,24 +129,26 @@ def test_frozen_and_finite_after_a_jam(grasps, fingers):
 
 def test_recorded_drift_violates_the_conditions(grasps):
     """In two recorded runs the slider moves at the end as no solution does; ours there is clean and the only one."""
-    record, _ = grasps
-    for i in sorted(DRIFTED):
-        sample = 13
-        pose, t = record["obj_ref_tight"][i][sample], record["t"][sample]
-        q0, q1 = record["hand_q0"][i], record["hand_q1"][i]
-        hand = pj.Hand.two_fingers(record["finger_radius"][i])
+    record, rows, hand, _ = grasps[2]
+    sample = 13
+    t, start, end = record["t"][sample], record["hand_q0"][rows], record["hand_q1"][rows]
+    stop = record["t_freeze_ref_tight"][rows, None]
+    ends = start + t * (end - start), start + np.where(np.isfinite(stop), stop - 1e-4, 1.0) * (end - start)
+    runs = grasps[2].again(hand_q0=ends[0], hand_q1=ends[1], obj_pose0=record["obj_ref_tight"][rows, sample])
+    for k in np.flatnonzero(np.isin(rows, list(DRIFTED))):
+        i = rows[k]
+        ours = jax.tree.map(lambda leaf, k=k: leaf[k], runs)
+        path = path_of(ends[0][k], ends[1][k])
         slider = pj.Slider(
             pj.Polygon(record["vertices"][i][: record["n_vertices"][i]]),
             pj.Quartic(quartic_of(record, i), record["rho"][i]),
         )
-        stop = record["t_freeze_ref_tight"][i]
-        path = pj.line(q0 + t * (q1 - q0), q0 + (stop - 1e-4) * (q1 - q0), 400)
-        ours = pj.rollout(slider, hand, path, pose=pose, friction=record["mu"][i])
+        pose = record["obj_ref_tight"][i][sample]
         theirs = record["final_pose_ref_tight"][i] - pose
         drift = np.hypot(*(np.asarray(ours.pose[-1]) - pose - theirs)[:2])
         assert drift > 10 * DISTANCE
         # a step on the way, with both fingers in contact, judged by itself
-        step = int(np.flatnonzero(np.all(np.asarray(ours.mode) > 0, axis=1))[0]) + 5
+        step = int(np.flatnonzero(np.all(np.asarray(ours.mode) > 0, axis=1))[0]) + 40
         where, q, after = np.asarray(ours.pose[step]), path[step], path[step + 1]
         turn = np.array([[np.cos(where[2]), -np.sin(where[2])], [np.sin(where[2]), np.cos(where[2])]])
         begin, end = (np.asarray(hand.poses(c))[:, :2] for c in (q, after))
@@ -158,16 +183,15 @@ def test_two_fingers_centre_a_disc():
 
 
 def test_wide_flat_push_sticks_with_no_slip():
-    block = pj.Polygon.rectangle(0.09, 0.09)
-    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 300)
-    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
-    wide = pj.Hand([pj.Polygon.rectangle(0.01, 0.05)], lambda q: q[None], 3)
-    path = pj.line((-0.06, 0.004, 0.0), (0.0, 0.01, 0.0), 60)
-    push = pj.rollout(slider, wide, path, pose=jnp.zeros(3), friction=0.5)
-    moving = np.asarray(push.status) == pj.Status.MOVING
-    assert moving[15:].all()
-    assert (np.asarray(push.mode)[15:] == pj.ContactMode.STICKING).all()
-    relative = np.asarray(push.pose[15:, :2] - path[15:, :2])
+    """One pad of a wide open jaw pushes a square block that is flat against it, also sideways."""
+    block = pj.Slider(pj.Polygon.rectangle(0.09, 0.09), pj.Ellipsoid(np.diag([1.0, 1.3, 0.8]), 0.03))
+    path = pj.line((0.004, 0.05, 0.0, 0.2), (0.01, 0.1, 0.0, 0.2), 100)
+    push = pj.rollout(block, pj.Hand.parallel_jaw(0.05, 0.01), path, pose=jnp.zeros(3), friction=0.5)
+    status, mode = np.asarray(push.status), np.asarray(push.mode)
+    assert (status[12:] == pj.Status.MOVING).all()
+    assert (mode[12:, 2:] == pj.ContactMode.STICKING).all()
+    assert (mode[:, :2] == pj.ContactMode.SEPARATED).all()
+    relative = np.asarray(push.pose[12:, :2] - path[12:, :2])
     np.testing.assert_allclose(relative - relative[0], 0, atol=1e-15)
     np.testing.assert_allclose(push.pose[:, 2], 0, atol=1e-15)
 
@@ -196,45 +220,63 @@ def test_jam_threshold(model):
     assert (above == pj.Status.JAMMED).all()
 
 
-def test_gradients_through_two_contacts():
-    """Two fingers push a square, both in contact: by friction, pose and path."""
+GRADIENT_STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def pushed_by_two():
+    """Final poses of a square block between two fingers, their derivatives by path, pose and friction, the runs."""
     block = pj.Polygon.rectangle(0.09, 0.09)
     pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 300)
-    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=2))
     hand = pj.Hand.two_fingers(0.005)
 
-    def final(x):
-        path = pj.line(jnp.concatenate([jnp.array([-0.055, 0.0, 0.0]), x[3:4]]), x[:4], 20)
-        end = pj.rollout(slider, hand, path, pose=x[4:7], friction=x[7]).pose[-1]
-        end *= jnp.array([1.0, 1.0, 0.05])
-        return end, end
+    def final(given):
+        path, pose, friction = given
+        run = pj.rollout(slider, hand, path, pose=pose, friction=friction)
+        end = run.pose[-1] * jnp.array([1.0, 1.0, 0.05])
+        return end, (end, run)
 
-    run = jax.jit(jax.vmap(jax.jacrev(final, has_aux=True)))
+    return jax.jit(jax.vmap(jax.jacrev(final, has_aux=True)))
+
+
+PUSH = jnp.array([-0.029, 0.012, 0.303, 0.034, 0.005, 0.007, 0.006, 0.207])
+
+
+def push_of(x):
+    path = pj.line(jnp.concatenate([jnp.array([-0.055, 0.0, 0.0]), x[3:4]]), x[:4], GRADIENT_STEPS)
+    return path, x[4:7], x[7]
+
+
+def test_gradients_through_two_contacts(pushed_by_two):
+    """Two fingers push the block, both in contact: by friction, pose and path."""
     h = 1e-6
-    x = jnp.array([-0.029, 0.012, 0.303, 0.034, 0.005, 0.007, 0.006, 0.207])
-    steps = h * jnp.eye(8)
-    reverse, value = run(jnp.concatenate([x[None], x[None] + steps, x[None] - steps]))
+    shifts = jnp.concatenate([jnp.zeros((1, 8)), h * jnp.eye(8), -h * jnp.eye(8)])
+    gradient, (value, run) = pushed_by_two(jax.vmap(push_of)(PUSH + shifts))
+    assert np.all(run.mode[0, -5:] != pj.ContactMode.SEPARATED)
+    along = jax.jacfwd(push_of)(PUSH)
+    by_x = sum(
+        np.tensordot(np.asarray(g[0]).reshape(3, -1), np.asarray(d).reshape(-1, 8), axes=1)
+        for g, d in zip(gradient, along, strict=True)
+    )
     central = (value[1:9] - value[9:]) / (2 * h)
-    np.testing.assert_allclose(reverse[0].T, central, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(by_x.T, central, rtol=0, atol=1e-5)
 
 
-def test_gradients_are_finite_at_and_after_a_jam():
+def test_gradients_are_finite_at_and_after_a_jam(pushed_by_two):
     """Nothing of the closing that did not happen counts."""
-    disc = pj.Slider(pj.Disk(0.03), pj.Ellipsoid(np.eye(3), 0.02))
-    hand = pj.Hand.two_fingers(0.005)
-
-    def final(x):
-        still, end = jnp.zeros(3), jnp.array([0.0, 0.0, 0.0, 0.06])
-        closing = pj.line(jnp.array([0.0, 0.0, 0.0, 0.12]), end, 20)
-        path = jnp.concatenate([closing, pj.line(end, jnp.concatenate([still, x[:1]]), 20)[1:]])
-        grasp = pj.rollout(disc, hand, path, pose=x[1:4], friction=x[4])
-        return jnp.sum(grasp.pose[-1]), grasp.status[-1]
-
-    (_, status), gradient = jax.jit(jax.value_and_grad(final, has_aux=True))(jnp.array([0.05, 0.0, 0.003, 0.0, 0.3]))
-    assert pj.Status(int(status)) == pj.Status.GRASPED
-    assert np.all(np.isfinite(gradient))
-    assert np.any(gradient[1:4] != 0)
-    assert gradient[0] == 0
+    path, pose, friction = pj.line((0.0, 0, 0, 0.12), (0.0, 0, 0, 0.06), GRADIENT_STEPS), [0.0, 0.003, 0.0], 0.3
+    given = (jnp.tile(jnp.asarray(leaf)[None], (17, *[1] * jnp.ndim(leaf))) for leaf in (path, pose, friction))
+    gradient, (_, run) = pushed_by_two(tuple(given))
+    by_path, by_pose, by_friction = (np.asarray(g[0]) for g in gradient)
+    assert pj.Status(int(run.status[0, -1])) == pj.Status.GRASPED
+    for g in (by_path, by_pose, by_friction):
+        assert np.all(np.isfinite(g))
+    stopped = int(run.stopped[0])
+    assert 0 < stopped < GRADIENT_STEPS - 2
+    assert np.any(by_pose != 0)
+    assert np.any(by_path[:, : stopped + 1] != 0)
+    assert not np.any(by_path[:, stopped + 2 :])
 
 
 @pytest.mark.parametrize(
@@ -255,9 +297,8 @@ def test_laws_of_a_grasp(hand, opening):
     paths = np.stack([path, path, path * np.array([*mirror, 1.0])])
     paths[1, :, :3] = pj.se2.compose(shift, path[:, :3])
     poses = np.stack([pose, pj.se2.compose(shift, pose), pose * mirror])
-    run = jax.jit(jax.vmap(lambda path, pose: pj.rollout(slider, hand, path, pose=pose, friction=0.2)))
-    runs = run(paths, poses)
-    base, moved, mirrored = (jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), runs) for k in range(3))
+    runs = (pj.rollout(slider, hand, path, pose=pose, friction=0.2) for path, pose in zip(paths, poses, strict=True))
+    base, moved, mirrored = (jax.tree.map(np.asarray, run) for run in runs)
     assert np.any(base.status == pj.Status.MOVING)
     assert base.status[-1] in (pj.Status.GRASPED, pj.Status.JAMMED)
     np.testing.assert_array_equal(base.status, moved.status)

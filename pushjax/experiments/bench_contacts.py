@@ -1,9 +1,9 @@
 """Contact problems by the thousand: is any answer wrong, is any missing, and what does one cost.
 
 Random problems of `pushjax.problems` (rigid hands, closing and independent fingers, with and without gaps, flat faces,
-opposite pairs, wedges at the border of a jam, pushers that drag the slider along, well and badly conditioned surfaces). MOVING and FREE are checked against every condition by
-`pushjax.verify`, which shares no code with the solvers; JAMMED needs a positive squeeze power, by its own linear
-program, and no clean answer from many starts of a different solver.
+opposite pairs, wedges at the border of a jam, pushers that drag the slider along, well and badly conditioned surfaces).
+MOVING and FREE are checked against every condition by `pushjax.verify`, which shares no code with the solvers; JAMMED
+needs a positive squeeze power, by its own linear program, and no clean answer from many starts of a different solver.
 """
 
 import time
@@ -64,7 +64,7 @@ def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) 
     worst, elapsed, rounds = 0.0, [], -(-problems // CHUNK)
     key = jax.random.fold_in(jax.random.key(seed), 10 * m + MODELS[model])
     for chunk in range(rounds):
-        problem = draw(jax.random.split(jax.random.fold_in(key, chunk), CHUNK))
+        problem = jax.block_until_ready(draw(jax.random.split(jax.random.fold_in(key, chunk), CHUNK)))
         if not chunk:
             jax.block_until_ready(solve(problem))  # compiles
         begin = time.perf_counter()
