@@ -1,7 +1,6 @@
 """Hands: the fingers, and where a configuration puts them; paths through configurations."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -95,14 +94,17 @@ class Hand(eqx.Module):
     @staticmethod
     def parallel_jaw(width: Numeric, thickness: Numeric) -> "Hand":
         """Two rectangular pads that face each other along the hand's y axis: faces of `width` m along x, `thickness` m
-        behind them; configuration (x, y, theta, d), d the opening between the faces."""
-        pad = Polygon.rectangle(width, thickness)
-        half = float(as_float(thickness)) / 2
-        return Hand((pad, pad), _Jaw(half), 4, least=0.0)
+        behind them; configuration (x, y, theta, d), d the opening between the faces. A pad's pose is that of its face's
+        middle."""
+        pad = Polygon.rectangle(width, thickness).vertices
+        behind = jnp.stack([jnp.zeros_like(pad[0, 1]), pad[2, 1]])
+        upper, lower = (Polygon(pad + sign * behind[None], convex=True) for sign in (1, -1))
+        return Hand((upper, lower), _two, 4, least=0.0)
 
     def poses(self, path: Float[Array, "*steps dof"]) -> Float[Array, "*steps fingers width"]:
         """World poses (3) or centres (2) of the fingers along a path."""
-        return jax.vmap(self.kinematics)(path) if path.ndim > 1 else self.kinematics(path)
+        shape = jax.eval_shape(self.kinematics, jax.ShapeDtypeStruct((self.dof,), path.dtype)).shape
+        return jax.vmap(self.kinematics)(path.reshape(-1, self.dof)).reshape(*path.shape[:-1], *shape)
 
 
 def _finger(finger: Any) -> Finger:
@@ -128,15 +130,6 @@ def _two(q: Array) -> Array:
 def _three(q: Array) -> Array:
     side = 3**0.5 / 2 * q[3]
     return _placed(q, [(0.0, q[3]), (side, -q[3] / 2), (-side, -q[3] / 2)])
-
-
-@dataclass(frozen=True)
-class _Jaw:
-    half: float  # of the pads' thickness
-
-    def __call__(self, q: Array) -> Array:
-        away = q[3] / 2 + self.half
-        return _placed(q, [(0.0, away), (0.0, -away)])
 
 
 def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:

@@ -22,7 +22,15 @@ gc.freeze()
 gc.set_threshold(100_000, 50, 100)
 
 # Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
-LONG = ("random_contacts", "grasps", "several_contacts", "smooth_shapes", "commands", "rollout_gradients")
+LONG = (
+    "grasps",
+    "random_contacts",
+    "contact_derivatives",
+    "smooth_shapes",
+    "single_contact",
+    "commands",
+    "rollout_gradients",
+)
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"
 if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():

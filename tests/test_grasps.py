@@ -252,7 +252,7 @@ def test_gradients_through_two_contacts(pushed_by_two):
     """Two fingers push the block, both in contact: by friction, pose and path."""
     h = 1e-6
     shifts = jnp.concatenate([jnp.zeros((1, 8)), h * jnp.eye(8), -h * jnp.eye(8)])
-    gradient, (value, run) = pushed_by_two(jax.vmap(push_of)(PUSH + shifts))
+    gradient, (value, run) = pushed_by_two(jax.vmap(push_of)(PUSH[None] + shifts))
     assert np.all(run.mode[0, -5:] != pj.ContactMode.SEPARATED)
     along = jax.jacfwd(push_of)(PUSH)
     by_x = sum(
@@ -265,9 +265,9 @@ def test_gradients_through_two_contacts(pushed_by_two):
 
 def test_gradients_are_finite_at_and_after_a_jam(pushed_by_two):
     """Nothing of the closing that did not happen counts."""
-    path, pose, friction = pj.line((0.0, 0, 0, 0.12), (0.0, 0, 0, 0.06), GRADIENT_STEPS), [0.0, 0.003, 0.0], 0.3
-    given = (jnp.tile(jnp.asarray(leaf)[None], (17, *[1] * jnp.ndim(leaf))) for leaf in (path, pose, friction))
-    gradient, (_, run) = pushed_by_two(tuple(given))
+    path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), GRADIENT_STEPS)
+    case = path, jnp.array([0.0, 0.003, 0.0]), jnp.array(0.3)
+    gradient, (_, run) = pushed_by_two(jax.tree.map(lambda leaf: jnp.tile(leaf[None], (17, *[1] * leaf.ndim)), case))
     by_path, by_pose, by_friction = (np.asarray(g[0]) for g in gradient)
     assert pj.Status(int(run.status[0, -1])) == pj.Status.GRASPED
     for g in (by_path, by_pose, by_friction):

@@ -15,7 +15,7 @@ from pushjax.limit_surface import Form
 from pushjax.limit_surface._aligned import aligned_wrench
 from pushjax.solve._basis import Basis
 from pushjax.solve._edge_line import Line, roots
-from pushjax.solve._several import Index, Several, clean, pick
+from pushjax.solve._several import Index, Several, clean, pick, violation
 
 NONE = -1  # in place of a generator's number
 
@@ -53,7 +53,7 @@ def one_edge(problem: Several, edges: tuple[Vec3, ...], found: Found, e: Index) 
     k = push / jnp.where(along != 0, along, 1.0)  # both may be negative: a receding pusher can drag the slider along
     twist = settle(motion.scale(k), push)
     ((touching, slip),), apart = _seen(problem, twist, (contact,))
-    tolerance = clean(push.dtype)
+    tolerance = violation(twist)
     passes = (along != 0) & (k > 0) & touching & apart & (side * slip <= tolerance)
     one = jnp.ones_like(push)
     power = k * motion.dot(g)
@@ -72,7 +72,6 @@ def two_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, e1: Index
     b1, b2 = push1.x, jnp.where(sticks, push1.y, push2.x)
     across = row1.scale(b2) - row2.scale(b1)
     cubic = tuple(across.dot(motion) for motion in line.motions)
-    tolerance = clean(unit.dtype)
     normal = row1.cross(row2)
     independent = normal.dot(normal) > jnp.finfo(unit.dtype).eps * row1.dot(row1) * row2.dot(row2)
     places = roots(cubic, -line.nearest, 1 - line.nearest)
@@ -85,6 +84,7 @@ def two_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, e1: Index
         k = (b1 * u1 + b2 * u2) / jnp.where(squared > 0, squared, 1.0)
         twist = settle(motion.scale(k), unit)
         ((touching1, slip1), (touching2, slip2)), apart = _seen(problem, twist, (c1, c2))
+        tolerance = violation(twist)
         right_way = ((1 - 2 * (e1 % 2)) * slip1 <= tolerance) & ((1 - 2 * (e2 % 2)) * slip2 <= tolerance)
         stuck = jnp.abs(slip1) <= tolerance
         passes = is_root & independent & (k > 0) & touching1 & touching2 & apart & jnp.where(sticks, stuck, right_way)
@@ -114,13 +114,13 @@ def three_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, contact
     )
     twist, regular = solve_rows(rows, Vec3(push.x, second, pick(problem.approach, c3).x))
     twist = settle(twist, problem.speed)
-    tolerance = clean(problem.speed.dtype)
+    tolerance = violation(twist)
     seen, apart = _seen(problem, twist, contacts)
     feasible, allowed = regular & apart, []
     for touching, slip in seen:
         feasible &= touching
         allowed.append((slip <= tolerance, slip >= -tolerance))  # left edge, right edge; both where it sticks
-    f, aligned = aligned_wrench(problem.form, twist, tolerance)
+    f, aligned = aligned_wrench(problem.form, twist, clean(problem.speed.dtype))
     h = problem.form.value(f)
     feasible, allowed = settle((feasible & aligned & (h > 0), tuple(allowed)), problem.speed)
     choices = [(pick(edges, 2 * c), pick(edges, 2 * c + 1)) for c in contacts]
@@ -177,7 +177,7 @@ def _key(form: Form, power: Scalar, h: Scalar) -> Scalar:
 
 def _seen(problem: Several, twist: Vec3, contacts: tuple[Index, ...]):
     """Of some contacts, whether each counts and just touches, and its slip; and whether no contact is violated."""
-    tolerance = clean(problem.speed.dtype)
+    tolerance = violation(twist)
     slips = problem.slips(twist)
     apart = jnp.ones_like(problem.pushes)
     for slip, active in zip(slips, problem.active, strict=True):

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Vec2, Vec3, select, settle
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle
 from pushjax.limit_surface import Form
 from pushjax.solve._basis import Basis, completed
 from pushjax.solve._edge_sets import Found
-from pushjax.solve._several import Several, SeveralMotion, clean, pick
+from pushjax.solve._several import Several, SeveralMotion, clean, pick, rough, violation
 from pushjax.solve.share import share_force
 from pushjax.solve.squeeze import squeeze_power
 from pushjax.status import ContactMode, Status
@@ -97,7 +97,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     system = _system(problem, chosen, moves, edges)
     begin = jax.lax.stop_gradient(system.within(edges.total(chosen.weight)))
     beta = _polished(system, select(moves, _to_scale(system, begin), Vec3(zero, zero, zero)))
-    f = system.wrench(beta)
+    f = _facing(system, system.wrench(beta))
     alpha = edges.weights(f)
     alpha = settle(alpha + edges.weights(f - edges.total(alpha)), problem.speed)
     h = problem.form.value(f)
@@ -109,10 +109,10 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
         missing = system.b - Vec3(*(row.dot(twist) for row in system.rows))
         twist = settle(twist + _least(system, missing), problem.speed)
 
-    slips = jax.lax.stop_gradient(problem.slips(twist))
-    suitable = _suitable(problem, chosen, slips)
+    slips, tolerance = jax.lax.stop_gradient((problem.slips(twist), violation(twist)))
+    suitable = _suitable(problem, chosen, slips, tolerance)
     weights = share_force(problem.generators(), suitable, chosen.edges, alpha, f)
-    passes = _passes(problem, chosen, slips, alpha, motion, twist)
+    passes = _passes(problem, chosen, slips, tolerance, alpha, motion, twist)
     solved = settle(solved & passes, problem.speed)
 
     power = squeeze_power(problem)
@@ -135,7 +135,10 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
         where_moving(Vec3(moved.x, moved.y, moved.z / problem.form.length)),
         where_moving(f.scale(to_newton)),
         tuple(force),
-        tuple(jnp.where(solved, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in _modes(problem, slips)),
+        tuple(
+            jnp.where(solved, mode, ContactMode.SEPARATED).astype(jnp.int8)
+            for mode in _modes(problem, slips, tolerance)
+        ),
         status,
         -power * problem.speed,
         # where the slider may stay, it does; any set found is then another motion, of a pusher that drags it along
@@ -196,9 +199,21 @@ def _least(system: _System, missing: Vec3) -> Vec3:
     return completed(r1, r2, r3, system.idle.y == 0, system.idle.z == 0, relative).with_products(missing)
 
 
-def _suitable(problem: Several, chosen: Found, slips: tuple[Vec2, ...]) -> tuple[Bool[Array, ""], ...]:
+def _facing(system: _System, f: Vec3) -> Vec3:
+    """Of three edges, the wrench whose grad H is the motion that the conditions alone fix: rows that nearly depend on
+    each other leave Newton's method short of that by rounding, which they magnify. A constant to every derivative."""
+    fixed, f0 = jax.lax.stop_gradient((system, f))
+    motion = fixed.form.gradient(f0)
+    missing = fixed.b - Vec3(*(row.dot(motion) for row in fixed.rows))
+    step = fixed.form.hessian(f0).solve(_least(fixed, missing))
+    small = step.dot(step) < 1e-8 * f0.dot(f0)
+    return f + select((fixed.idle.z == 0) & small, step, Vec3(*(0 * x for x in step)))
+
+
+def _suitable(
+    problem: Several, chosen: Found, slips: tuple[Vec2, ...], tolerance: Scalar
+) -> tuple[Bool[Array, ""], ...]:
     """Which cone edges suit the motion: those of contacts that touch, on the side of their slip; the chosen ones do."""
-    tolerance = clean(problem.speed.dtype)
     edges = []
     for i, (slip, active) in enumerate(zip(slips, problem.active, strict=True)):
         touches = active & (jnp.abs(slip.x) <= tolerance)
@@ -211,12 +226,13 @@ def _suitable(problem: Several, chosen: Found, slips: tuple[Vec2, ...]) -> tuple
 
 
 def _passes(
-    problem: Several, chosen: Found, slips: tuple[Vec2, ...], alpha: Vec3, motion: Vec3, twist: Vec3
+    problem: Several, chosen: Found, slips: tuple[Vec2, ...], tolerance: Scalar, alpha: Vec3, motion: Vec3, twist: Vec3
 ) -> Bool[Array, ""]:
     """A last look at what is returned: no contact violated, forces inside their cones and on the side of the slip, the
     twist along grad H. The tolerance leaves some room to that of the search, whose numbers these are to rounding.
     """
-    tolerance = 1.25 * clean(problem.speed.dtype)
+    tolerance, relative = 1.25 * tolerance, 1.25 * clean(problem.speed.dtype)
+    along = 1.25 * rough(problem.speed.dtype)  # rows of a wedge, nearly dependent, leave grad H that much freedom
     passes = jnp.ones((), bool)
     for i, (slip, active) in enumerate(zip(slips, problem.active, strict=True)):
         passes &= (slip.x >= -tolerance) | ~active
@@ -225,14 +241,13 @@ def _passes(
                 passes &= (edge != 2 * i + side) | ((wrong <= tolerance) & (slip.x <= tolerance) & active)
     total = jnp.abs(alpha.x) + jnp.abs(alpha.y) + jnp.abs(alpha.z)
     for weight in alpha:
-        passes &= weight >= -tolerance / 4 * total  # times mu, the tangential force beyond the cone
+        passes &= weight >= -relative / 4 * total  # times mu, the tangential force beyond the cone
     off = twist - motion
-    return passes & (off.dot(off) <= tolerance**2 * twist.dot(twist))
+    return passes & (off.dot(off) <= along**2 * twist.dot(twist))
 
 
-def _modes(problem: Several, slips: tuple[Vec2, ...]):
+def _modes(problem: Several, slips: tuple[Vec2, ...], tolerance: Scalar):
     """From the motion alone, so that it does not depend on which of several equal force distributions is given."""
-    tolerance = clean(problem.speed.dtype)
     for slip, active in zip(slips, problem.active, strict=True):
         sliding = jnp.where(slip.y < 0, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT)
         touching = jnp.where(jnp.abs(slip.y) <= tolerance, ContactMode.STICKING, sliding)

@@ -17,7 +17,7 @@ from pushjax.verify.conditions import CLEAN as CLEAN
 from pushjax.verify.conditions import Violations as Violations
 from pushjax.verify.conditions import closing as closing
 from pushjax.verify.conditions import violations as violations
-from pushjax.verify.search import Found as Found
+from pushjax.verify.search import Searched as Searched
 from pushjax.verify.search import search as search
 from pushjax.verify.squeeze import squeeze_power as squeeze_power
 from pushjax.verify.squeeze import squeeze_power_enumerated as squeeze_power_enumerated

@@ -17,7 +17,7 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
-class Found(NamedTuple):
+class Searched(NamedTuple):
     """What `search` found.
 
     found: (N,), whether an answer with no violation above CLEAN. twist: (N, 3), m, m, rad; force: (N, m, 2) and
@@ -33,7 +33,7 @@ class Found(NamedTuple):
     reached: np.ndarray
 
 
-def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> Found:
+def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> Searched:
     """Looks for any answer at all, from `starts` random starts a problem.
 
     From each start the conditions, as smooth equations (`_Equations`), are solved by Levenberg and Marquardt's method;
@@ -46,7 +46,7 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     rng = np.random.default_rng(seed)
     twist, force, wrench = np.zeros((n, 3)), np.zeros((*order.shape, 2)), np.zeros((n, 3))
     still = violations(batch, twist, force).worst() <= CLEAN
-    result = Found(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
+    result = Searched(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
     done = 0
     for portion in (*portions, starts):
         portion = min(portion, starts - done)
@@ -64,7 +64,7 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     return result._replace(force=every)
 
 
-def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Found:
+def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searched:
     """Follows `starts` starts of each problem."""
     n = len(batch)
     equations = _Equations(batch, np.repeat(np.arange(n), starts), rng)
@@ -79,7 +79,7 @@ def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Found
     twist, force, wrench = (
         np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a[first], 0.0) for a in (twist, force, wrench)
     )
-    return Found(found, twist, force, wrench, np.full(n, starts), clean.sum(axis=1))
+    return Searched(found, twist, force, wrench, np.full(n, starts), clean.sum(axis=1))
 
 
 class _Equations:
