@@ -240,7 +240,7 @@ def pushed_by_two():
     return jax.jit(jax.vmap(jax.jacrev(final, has_aux=True)))
 
 
-PUSH = jnp.array([-0.029, 0.012, 0.303, 0.034, 0.005, 0.007, 0.006, 0.207])
+PUSH = jnp.array([-0.029, 0.012, 0.053, 0.034, 0.005, 0.007, 0.006, 0.207])
 
 
 def push_of(x):
