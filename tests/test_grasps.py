@@ -266,7 +266,7 @@ def test_gradients_through_two_contacts(pushed_by_two):
 def test_gradients_are_finite_at_and_after_a_jam(pushed_by_two):
     """Nothing of the closing that did not happen counts."""
     path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), GRADIENT_STEPS)
-    case = path, jnp.array([0.0, 0.003, 0.0]), jnp.array(0.3)
+    case = path, jnp.array([0.0, 0.003, 0.0]), jnp.full((), 0.3, float)
     gradient, (_, run) = pushed_by_two(jax.tree.map(lambda leaf: jnp.tile(leaf[None], (17, *[1] * leaf.ndim)), case))
     by_path, by_pose, by_friction = (np.asarray(g[0]) for g in gradient)
     assert pj.Status(int(run.status[0, -1])) == pj.Status.GRASPED
