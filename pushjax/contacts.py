@@ -49,8 +49,8 @@ class Touch(NamedTuple):
     normal: Vec2
 
 
-# One by one; or, of a pad, an array of them: written out, corner by corner, a jaw's program was twice as large, and took
-# nearly twice as long to compile.
+# One by one; or, of a pad, an array of them: written out, corner by corner, a jaw's program was twice as large, and
+# took nearly twice as long to compile.
 Touches = tuple[Touch, ...] | Touch
 
 
