@@ -6,6 +6,7 @@ ten times faster on a CPU. So everything below the public edge is written with `
 where a user sees them (`of`, `array`).
 """
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -101,6 +102,14 @@ class Vec3(NamedTuple):
 
     def array(self) -> Float[Array, "3"]:
         return jnp.stack(self)
+
+
+def weighted(vectors: Iterable[Vec3], weights: Iterable[Scalar]) -> Vec3:
+    """sum of weight_i vector_i, from left to right; of one at least."""
+    first, *others = (v.scale(weight) for v, weight in zip(vectors, weights, strict=True))
+    for v in others:
+        first = first + v
+    return first
 
 
 def turn(angle: Scalar) -> Vec2:

@@ -33,6 +33,20 @@ STYLE: Any = {
 }
 
 
+def _row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Panels side by side, each of that size in inches. shared: they show the same range."""
+    figure, axes = plt.subplots(
+        1, panels, figsize=(width * panels, height), sharex=shared, sharey=shared, layout="constrained", squeeze=False
+    )
+    return figure, list(axes[0])
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """One legend for all panels, of what `axes` shows."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
 def save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, bbox_inches="tight")
@@ -88,7 +102,7 @@ def motion_cone_figure(
     """One contact: support points, friction cone, motion cone, the push, and the centre of rotation with its sign."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
-        _outline(axes, shape, np.zeros(3), START, 1.4)
+        outline(axes, shape, np.zeros(3), START, 1.4)
         axes.plot(*(MM * np.asarray(support.point)).T, ".", color=BETWEEN, ms=3, label="support points")
         point, normal = np.asarray(contacts.point[0]), np.asarray(contacts.normal[0])
         mu = float(contacts.friction[0])
@@ -133,44 +147,27 @@ def push_figure(
 ) -> Figure:
     """Pushes side by side: outline and finger at the start black, at the end red, between grey; the centre's trace."""
     with plt.rc_context(STYLE):
-        figure, all_axes = plt.subplots(
-            1,
-            len(pushes),
-            figsize=(4.0 * len(pushes), 4.2),
-            sharex=True,
-            sharey=True,
-            layout="constrained",
-            squeeze=False,
-        )
-        for axes, (name, (push, path)) in zip(all_axes[0], pushes.items(), strict=True):
+        figure, all_axes = _row(len(pushes), 4.0, 4.2, shared=True)
+        for axes, (name, (push, path)) in zip(all_axes, pushes.items(), strict=True):
             pose, path = np.asarray(push.pose), np.asarray(path)
             shown = np.unique(np.linspace(0, len(pose) - 1, frames + 2).round().astype(int))
             for k in [*shown[1:-1], shown[0], shown[-1]]:
                 color = START if k == 0 else END if k == shown[-1] else BETWEEN
-                _outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
+                outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
             axes.set(title=name, xlabel="x / mm", ylabel="y / mm", aspect="equal")
         for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
-            all_axes[0, 0].plot([], [], color=color, label=label)
-        handles, labels = all_axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+            all_axes[0].plot([], [], color=color, label=label)
+        legend_below(figure, all_axes[0], columns=4)
         return figure
 
 
 def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], frames: int = 4) -> Figure:
     """Grasps side by side: slider and fingers at the start black, at the end red, between grey; the centre's trace."""
     with plt.rc_context(STYLE):
-        figure, all_axes = plt.subplots(
-            1,
-            len(grasps),
-            figsize=(3.1 * len(grasps), 3.9),
-            sharex=True,
-            sharey=True,
-            layout="constrained",
-            squeeze=False,
-        )
-        for axes, (name, grasp) in zip(all_axes[0], grasps.items(), strict=True):
+        figure, all_axes = _row(len(grasps), 3.1, 3.9, shared=True)
+        for axes, (name, grasp) in zip(all_axes, grasps.items(), strict=True):
             pose = np.asarray(grasp.pose)
             fingers = np.asarray(hand.poses(grasp.configuration))
             # only where the slider moves is there something to see
@@ -180,22 +177,21 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
             between = np.linspace(first, last, frames + 2).round().astype(int)[1:-1]
             for k, color in [*((k, BETWEEN) for k in between), (0, START), (last, END)]:
                 width = 0.8 if color == BETWEEN else 1.4
-                _outline(axes, shape, pose[k], color, width)
+                outline(axes, shape, pose[k], color, width)
                 for finger, where in zip(hand.fingers, fingers[k], strict=True):
                     _finger(axes, finger, where, color, width)
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
             axes.set(title=name.replace(": ", ":\n"), xlabel="x / mm", aspect="equal")
-        all_axes[0, 0].set_ylabel("y / mm")
+        all_axes[0].set_ylabel("y / mm")
         for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
-            all_axes[0, 0].plot([], [], color=color, label=label)
-        handles, labels = all_axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+            all_axes[0].plot([], [], color=color, label=label)
+        legend_below(figure, all_axes[0], columns=4)
         return figure
 
 
 def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
     if isinstance(finger, Pad):
-        _outline(axes, finger.shape, pose, color, width)
+        outline(axes, finger.shape, pose, color, width)
     else:
         axes.add_patch(Circle(tuple(MM * pose[:2]), MM * float(finger.radius), color=color, fill=False, lw=width))
 
@@ -208,13 +204,11 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
     along which they press on each other if it lies in both cones; the verdict, with the centre of rotation.
     """
     with plt.rc_context(STYLE):
-        figure, all_axes = plt.subplots(
-            1, len(panels), figsize=(5.0 * len(panels), 4.6), layout="constrained", squeeze=False
-        )
+        figure, all_axes = _row(len(panels), 5.0, 4.6)
         low, high = (MM * np.asarray(b) for b in shape.bounds)
         reach = 0.55 * (high - low).max()
         box = low - 0.4 * reach, high + 0.4 * reach
-        for axes, (contacts, motion) in zip(all_axes[0], panels, strict=True):
+        for axes, (contacts, motion) in zip(all_axes, panels, strict=True):
             point, normal = MM * np.asarray(contacts.point), np.asarray(contacts.normal)
             mu = np.asarray(contacts.friction)
             grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(*box, strict=True))), axis=-1)
@@ -227,7 +221,7 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
                     axes.contourf(grid[..., 0], grid[..., 1], region, levels=[0.5, 1.5], colors=[color], alpha=0.16)
                     label = "centre of rotation allowed, " + ("+" if sign > 0 else "\N{MINUS SIGN}")
                     axes.fill([], [], color=color, alpha=0.16, label=label)
-            _outline(axes, shape, np.zeros(3), START, 1.4)
+            outline(axes, shape, np.zeros(3), START, 1.4)
             for name, p, n, m in zip("AC", point, normal, mu, strict=False):
                 axes.plot(*np.array([p - 2 * reach * n, p + 2 * reach * n]).T, "--", color=BLUE, lw=0.9)
                 tangent = np.array([-n[1], n[0]])
@@ -249,17 +243,17 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
             axes.plot([], [], ":", color="0.2", label="line through both contacts")
             axes.set(title=f"$\\mu$ = {mu[0]:.2f}: {status}", xlabel="x / mm", ylabel="y / mm", aspect="equal")
             axes.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))
-        handles, labels = all_axes[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        legend_below(figure, all_axes[0], columns=3)
         return figure
 
 
-def _outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float) -> None:
+def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float, **line: Any) -> None:
+    """The shape at a pose (3,), in mm. line: anything else of `Axes.plot`."""
     points = getattr(shape, "vertices", None)
     p = np.asarray(shape.boundary(200) if points is None else points)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     p = p @ np.array([[c, s], [-s, c]]) + pose[:2]
-    axes.plot(*(MM * np.vstack([p, p[:1]])).T, color=color, lw=width)
+    axes.plot(*(MM * np.vstack([p, p[:1]])).T, color=color, lw=width, **line)
 
 
 def table_figure(cells: list[dict], title: str) -> Figure:

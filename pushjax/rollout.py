@@ -90,13 +90,17 @@ class Trajectory(eqx.Module):
     @property
     def stopped(self) -> Int[Array, ""]:
         """Index of the step at which the hand jammed or grasped, or -1."""
-        stops = _stops(self.status)
-        return jnp.where(jnp.any(stops, axis=-1), jnp.argmax(stops, axis=-1), -1)
+        return _first(_stops(self.status))
 
     @property
     def first_failure(self) -> Int[Array, ""]:
         """Index of the first failed step, or -1."""
-        return jnp.where(jnp.any(self.failed, axis=-1), jnp.argmax(self.failed, axis=-1), -1)
+        return _first(self.failed)
+
+
+def _first(steps: Bool[Array, "... steps"]) -> Int[Array, "..."]:
+    """Index of the first step that is True, or -1."""
+    return jnp.where(jnp.any(steps, axis=-1), jnp.argmax(steps, axis=-1), -1)
 
 
 class _Record(NamedTuple):
@@ -424,8 +428,8 @@ def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
     _, records = jax.lax.scan(body, (Vec3.of(pose), jnp.zeros((), jnp.int8)), ends)
     steps = _world(records, form.length)
     poses = jnp.concatenate([pose[None], steps.pose])
-    stops = _stops(steps.status)
-    reached = jnp.where(jnp.any(stops), jnp.argmax(stops), len(path) - 1)
+    stopped = _first(_stops(steps.status))
+    reached = jnp.where(stopped >= 0, stopped, len(path) - 1)
     configuration = path[jnp.minimum(jnp.arange(len(path)), reached)]
     return Trajectory(poses, configuration, steps.twist, steps.wrench, steps.force, steps.mode, steps.status)
 

@@ -43,12 +43,10 @@ def first(tree, count: int):
     return jax.tree.map(lambda leaf: leaf[:count], tree)
 
 
-def flat_push(mu=0.5, displacement=((0.001, 0.0), (0.001, 0.0)), tilt=0.0) -> pj.Contacts:
+def flat_push(displacement=((0.001, 0.0), (0.001, 0.0))) -> pj.Contacts:
     """Two points flat against the left side of a square, 40 mm apart."""
-    c, s = np.cos(tilt), np.sin(tilt)
-    d = jnp.asarray(displacement) @ jnp.array([[c, s], [-s, c]])
     point = jnp.array([[-0.045, 0.02], [-0.045, -0.02]])
-    return pj.Contacts(point, jnp.array([[1.0, 0.0], [1.0, 0.0]]), d, mu)
+    return pj.Contacts(point, jnp.array([[1.0, 0.0], [1.0, 0.0]]), jnp.asarray(displacement), 0.5)
 
 
 @functools.cache

@@ -42,10 +42,15 @@ def test_pinched_disc_moves_to_the_middle():
 
 
 def test_roots_of_very_different_sizes_are_found(rng):
-    """Of cubics on an interval of length one with zero in it: three real roots, or one, from 1e-6 to 1."""
+    """Of cubics on an interval of length one with zero in it: three real roots, or one, from 1e-6 to 1; the one also
+    beside the other two, where the cubic is nearly flat."""
     n = 20_000
     root = 10 ** rng.uniform(-6, 0, (3, n)) * rng.choice([-1, 1], (3, n))
     single = rng.random(n) < 0.4  # then the first two are a complex pair's two parts
+    beside = single & (rng.random(n) < 0.5)
+    pair = root[0], np.abs(root[0]) * 10 ** rng.uniform(-1, 0.3, n)
+    root[1] = np.where(beside, pair[1], root[1])
+    root[2] = np.where(beside, pair[0] + pair[1] * rng.uniform(-4, 4, n), root[2])
     a, b = np.where(single, -2 * root[0], -root[0] - root[1]), root[0] * root[1]
     b = np.where(single, root[0] ** 2 + root[1] ** 2, b)
     cubic = [-b * root[2], b - a * root[2], a - root[2], np.ones(n)]
@@ -110,3 +115,36 @@ def test_number_of_contacts(count):
 def test_a_solver_of_one_contact_refuses_two():
     with pytest.raises(ValueError, match="ScalarRoot solves one contact; got 2"):
         solve(square(4), flat_push(), solver=pj.ScalarRoot())
+
+
+ANGLES = np.linspace(0.1, 6.2, 40)
+
+
+def frictionless(leaning: float, count: int, angle: float) -> pj.Contacts:
+    """Two fingers opposite each other, or three about a disc of 30 mm, close; the first leans."""
+    around = angle + 2 * np.pi / count * np.arange(count)
+    point = 0.03 * np.stack([np.cos(around), np.sin(around)], axis=1)
+    lean = around + np.where(np.arange(count) == 0, leaning, 0.0)
+    normal = -np.stack([np.cos(lean), np.sin(lean)], axis=1)
+    return pj.Contacts(jnp.asarray(point), jnp.asarray(normal), jnp.asarray(1e-3 * normal), 0.0)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("count", [2, 3])
+def test_frictionless_fingers_jam_where_their_forces_balance_to_rounding(dtype, count):
+    """At any angle. Leaning a little more than rounding they squirt the slider out."""
+    surface = jax.tree.map(lambda leaf: leaf.astype(dtype), square(4))
+
+    def solved(leaning):
+        each = [frictionless(leaning, count, angle) for angle in ANGLES]
+        batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+        batch = jax.tree.map(lambda leaf: leaf.astype(dtype) if leaf.dtype != bool else leaf, batch)
+        return jax.vmap(lambda c: pj.solve_contacts(surface, c))(batch)
+
+    straight = solved(0.0)
+    assert (straight.status == pj.Status.JAMMED).all()
+    np.testing.assert_allclose(straight.margin, -1e-3, rtol=1e-4)
+    leaning = solved(1e-6 if dtype == jnp.float64 else 1e-3)
+    assert (leaning.status != pj.Status.JAMMED).all()
+    if dtype == jnp.float64:
+        assert (leaning.status == pj.Status.MOVING).all()

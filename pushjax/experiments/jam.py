@@ -46,23 +46,26 @@ def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     """The status over friction with both surfaces, the threshold found and expected; the picture into `out`."""
     block, both = surfaces(seed)
-    frictions = jnp.linspace(0.0, 0.8, 161)
-    rows, drawn = [], {}
+    scanned = jnp.linspace(0.0, 0.8, 161)
+    frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program for both
+    rows, motions = [], {}
     for name, surface in both.items():
         solved = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
-        jammed = np.asarray(solved.status) == pj.Status.JAMMED
+        status = np.asarray(solved.status)[: len(scanned)]
+        jammed = status == pj.Status.JAMMED
         rows.append(
             {
                 "model": name,
-                "jams_from": float(frictions[np.argmax(jammed)]) if jammed.any() else None,
-                "last_moving": float(frictions[np.flatnonzero(~jammed)[-1]]),
+                "jams_from": float(scanned[np.argmax(jammed)]) if jammed.any() else None,
+                "last_moving": float(scanned[np.flatnonzero(~jammed)[-1]]),
                 "threshold": threshold(),
-                "statuses": sorted({pj.Status(int(s)).name for s in np.asarray(solved.status)}),
+                "statuses": sorted({pj.Status(int(s)).name for s in status}),
             }
         )
-        drawn[name] = [pj.solve_contacts(surface, contacts(mu)) for mu in (BELOW, ABOVE)]
-    verdicts = {str(mu): pj.Status(int(m.status)).name for mu, m in zip((BELOW, ABOVE), drawn["quartic"], strict=True)}
-    pictures = [] if out is None else _draw(out, block, drawn["quartic"])
+        motions[name] = solved
+    drawn = [jax.tree.map(lambda leaf, k=k: leaf[k], motions["quartic"]) for k in (-2, -1)]
+    verdicts = {str(mu): pj.Status(int(m.status)).name for mu, m in zip((BELOW, ABOVE), drawn, strict=True)}
+    pictures = [] if out is None else _draw(out, block, drawn)
     settings = {"seed": seed, "half_width_m": HALF_WIDTH, "half_offset_m": HALF_OFFSET, "closing_m": CLOSING}
     return envelope("jam", settings, rows=rows, verdicts=verdicts, pictures=pictures)
 

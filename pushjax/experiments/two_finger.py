@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.datasets.pushes import rotation
 from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz, stick_deviation
 from pushjax.report import envelope
 
@@ -240,9 +241,9 @@ def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
 def _object_motion(log: TwoFingerLog) -> np.ndarray:
     """(n, 3): the end poses in the frames of the starts, where repeats of an action are the same push."""
     moved = log.pose_end - log.pose_start
-    c, s = np.cos(log.pose_start[:, 2]), np.sin(log.pose_start[:, 2])
-    x, y = moved[:, 0], moved[:, 1]
-    return np.stack([c * x + s * y, c * y - s * x, moved[:, 2]], axis=1)
+    # a row vector times R is R' times it
+    there = np.einsum("ki,kij->kj", moved[:, :2], rotation(log.pose_start[:, 2]))
+    return np.column_stack([there, moved[:, 2]])
 
 
 def _days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
@@ -279,8 +280,7 @@ def _draw(shown: list[tuple], out: Path) -> str:
                 push = order[round(share * (len(order) - 1))]
                 _one_push(panel, log, push, final[at][push])
                 panel.set_title(f"{name}, {word}: {errors[at][push]:.1f} mm")
-        handles, labels = axes[0, 1].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=5)
+        plot.legend_below(figure, axes[0, 1], columns=5)
         return str(plot.save(figure, out / "two_finger.png"))
 
 
@@ -301,16 +301,14 @@ def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> 
 def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
     from pushjax import plot
 
-    outline = np.vstack([log.vertices, log.vertices[:1]])
+    shape = pj.Polygon(log.vertices)
     drawn = (
         (log.pose_start[push], plot.BETWEEN, "-", "start"),
         (log.pose_end[push], plot.START, "-", "measured end"),
         (final, plot.BLUE, "--", "predicted end"),
     )
     for pose, color, dash, label in drawn:
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        points = 1e3 * (outline @ np.array([[c, s], [-s, c]]) + pose[:2])
-        axes.plot(*points.T, dash, color=color, lw=1.5, label=label)
+        plot.outline(axes, shape, pose, color, 1.5, linestyle=dash, label=label)
     for hand, color, label in (
         (log.hand_start[push], plot.BETWEEN, "fingers, start"),
         (log.hand_end[push], plot.ORANGE, "fingers, end"),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec3, select
+from pushjax._vec import Scalar, Vec3, select, weighted
 
 
 class Basis(NamedTuple):
@@ -34,20 +34,15 @@ class Basis(NamedTuple):
 
     def with_products(self, b: Vec3) -> Vec3:
         """v with vector_i . v = b_i."""
-        return _sum(self.crosses, b).scale(self.inverse)
+        return weighted(self.crosses, b).scale(self.inverse)
 
     def total(self, weight: Vec3) -> Vec3:
         """sum of weight_i vector_i."""
-        return _sum(self.vectors, weight)
+        return weighted(self.vectors, weight)
 
     def weights(self, v: Vec3) -> Vec3:
         """The weights with sum of weight_i vector_i = v."""
         return Vec3(*(cross.dot(v) for cross in self.crosses)).scale(self.inverse)
-
-
-def _sum(vectors: tuple[Vec3, Vec3, Vec3], weight: Vec3) -> Vec3:
-    v1, v2, v3 = vectors
-    return v1.scale(weight.x) + v2.scale(weight.y) + v3.scale(weight.z)
 
 
 def completed(v1: Vec3, v2: Vec3, v3: Vec3, used2: Bool[Array, ""], used3: Bool[Array, ""], relative: float) -> Basis:

@@ -123,13 +123,14 @@ def three_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, contact
     f, aligned = aligned_wrench(problem.form, twist, clean(problem.speed.dtype))
     h = problem.form.value(f)
     feasible, allowed = settle((feasible & aligned & (h > 0), tuple(allowed)), problem.speed)
+    steep = tuple(problem.beyond(c) for c in contacts)
     choices = [(pick(edges, 2 * c), pick(edges, 2 * c + 1)) for c in contacts]
 
     def try_sides(which, state):
         best, weight, chosen = state
         side = jnp.where(sticks, 0, which // 4), jnp.where(sticks, 1, which // 2 % 2), which % 2
         picked = tuple(select(k == 0, *pair) for pair, k in zip(choices, side, strict=True))
-        candidate, inside, least = _between(f, picked)
+        candidate, inside, least = _between(f, picked, steep)
         for (left, right), k in zip(allowed, side, strict=True):
             inside &= jnp.where(k == 0, left, right)
         better = settle(inside & (least > best), h)  # of several threes, the one farthest inside
@@ -198,8 +199,11 @@ def solve_rows(rows: tuple[Vec3, Vec3, Vec3], b: Vec3) -> tuple[Vec3, Bool[Array
     return v + basis.with_products(b - basis.products(v)), basis.regular
 
 
-def _between(f: Vec3, generators: tuple[Vec3, Vec3, Vec3]) -> tuple[Vec3, Bool[Array, ""], Scalar]:
-    """The weights of f in three generators, whether it lies between them, and the least weight's share of all."""
+def _between(
+    f: Vec3, generators: tuple[Vec3, Vec3, Vec3], steep: tuple[Scalar, ...]
+) -> tuple[Vec3, Bool[Array, ""], Scalar]:
+    """The weights of f in three generators, whether it lies between them (steep: `Several.beyond` of each, by which
+    less may be missing), and the least weight's share of all."""
     basis = Basis.of(*generators, _least(f.x.dtype))
     a = settle(basis.weights(f), basis.det)
     a = settle(a + basis.weights(f - basis.total(a)), basis.det)
@@ -207,8 +211,11 @@ def _between(f: Vec3, generators: tuple[Vec3, Vec3, Vec3]) -> tuple[Vec3, Bool[A
     share = jnp.minimum(jnp.minimum(a.x, a.y), a.z) / jnp.where(total > 0, total, 1.0)
     rest = f - basis.total(a)
     fits = rest.dot(rest) <= (64 * jnp.finfo(f.x.dtype).eps * total) ** 2
-    inside = basis.regular & fits & (f.dot(f) > (faint(f.x.dtype) * total) ** 2) & (share >= -clean(f.x.dtype))
-    return Vec3(*(jnp.maximum(x, 0) for x in a)), inside, jnp.maximum(share, 0)
+    inside = basis.regular & fits & (f.dot(f) > (faint(f.x.dtype) * total) ** 2)
+    for weight, beyond in zip(a, steep, strict=True):
+        inside &= beyond * weight >= -clean(f.x.dtype) / 2 * total
+    # a weight below zero stays: to the wrench, in which large forces may cancel, it can be more than rounding
+    return a, inside, jnp.maximum(share, 0)
 
 
 def same_twist(dtype) -> float:

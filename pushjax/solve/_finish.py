@@ -14,13 +14,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec2, Vec3, select, settle
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle, weighted
 from pushjax.limit_surface import Form
 from pushjax.solve._basis import Basis, completed
 from pushjax.solve._edge_sets import Found
 from pushjax.solve._several import Several, SeveralMotion, clean, pick, rough, violation
 from pushjax.solve.share import share_force
-from pushjax.solve.squeeze import squeeze_power
+from pushjax.solve.squeeze import squeeze
 from pushjax.status import ContactMode, Status
 
 Rows = tuple[Vec3, Vec3, Vec3]
@@ -36,8 +36,7 @@ class _System(NamedTuple):
     idle: Vec3
 
     def wrench(self, beta: Vec3) -> Vec3:
-        q1, q2, q3 = self.axes
-        return q1.scale(beta.x) + q2.scale(beta.y) + q3.scale(beta.z)
+        return weighted(self.axes, beta)
 
     def within(self, f: Vec3) -> Vec3:
         """Components of a wrench along the axes."""
@@ -115,8 +114,8 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     passes = _passes(problem, chosen, slips, tolerance, alpha, motion, twist)
     solved = settle(solved & passes, problem.speed)
 
-    power = squeeze_power(problem)
-    stuck = jnp.where(proves_jams & (power > 0), Status.JAMMED, Status.NOT_CONVERGED)
+    power, presses = squeeze(problem)
+    stuck = jnp.where(proves_jams & presses, Status.JAMMED, Status.NOT_CONVERGED)
     status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, stuck), Status.FREE)
     status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
 
@@ -240,8 +239,8 @@ def _passes(
             for edge in chosen.edges:
                 passes &= (edge != 2 * i + side) | ((wrong <= tolerance) & (slip.x <= tolerance) & active)
     total = jnp.abs(alpha.x) + jnp.abs(alpha.y) + jnp.abs(alpha.z)
-    for weight in alpha:
-        passes &= weight >= -relative / 4 * total  # times mu, the tangential force beyond the cone
+    for weight, edge in zip(alpha, chosen.edges, strict=True):
+        passes &= (problem.beyond(jnp.maximum(edge, 0) // 2) * weight >= -relative / 2 * total) | (edge < 0)
     off = twist - motion
     return passes & (off.dot(off) <= along**2 * twist.dot(twist))
 

@@ -67,6 +67,10 @@ class Several(NamedTuple):
             edges += [n + t.scale(mu), n - t.scale(mu)]
         return tuple(edges)
 
+    def beyond(self, contact: Index) -> Scalar:
+        """How far a contact's force is beyond its cone, if the weight of one of its edges is minus one."""
+        return jnp.maximum(2 * pick(self.friction, contact), 1)
+
     def slips(self, twist: Vec3) -> tuple[Vec2, ...]:
         """Motion of each contact point relative to its pusher, along normal (the gap added) and tangent."""
         rows = zip(self.normal, self.tangent, self.approach, strict=True)

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from pushjax._autodiff import undifferentiated
-from pushjax._vec import Scalar, Vec2, Vec3, select, settle
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle, weighted
 from pushjax.solve._edge_sets import Found, nothing, one_edge, three_edges, two_edges
 from pushjax.solve._finish import finish
 from pushjax.solve._several import ContactSolver, Several, SeveralMotion
@@ -67,10 +67,8 @@ def _forces(problem: Several, rounds: int, sweeps: int) -> tuple[Vec2, ...]:
 
 
 def _wrench(problem: Several, forces: tuple[Vec2, ...]) -> Vec3:
-    total = Vec3(*(jnp.zeros_like(problem.speed),) * 3)
-    for n, t, f in zip(problem.normal, problem.tangent, forces, strict=True):
-        total = total + n.scale(f.x) + t.scale(f.y)
-    return total
+    rows = [row for rows in zip(problem.normal, problem.tangent, strict=True) for row in rows]
+    return weighted(rows, [component for force in forces for component in force])
 
 
 def _linearised(problem: Several, wrench: Vec3) -> _Linear:

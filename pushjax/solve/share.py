@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._autodiff import undifferentiated
-from pushjax._vec import Scalar, Vec3, select, settle
+from pushjax._vec import Scalar, Vec3, select, settle, weighted
 from pushjax.limit_surface import Symmetric3
 from pushjax.solve._basis import completed
 from pushjax.solve._several import pick
@@ -50,9 +50,9 @@ def share_force(
     kept = tuple(select(s, g, Vec3(zero, zero, zero)) for g, s in zip(generators, suitable, strict=True))
     y, curvature = undifferentiated(_minimised, kept, chosen, alpha.scale(1 / unit), target)
     # Differentiated rounds: each makes one order of derivative exact, with the curvature held fixed
-    y = settle(y + _solve(curvature, target - _total(kept, _pulls(kept, y))), size)
+    y = settle(y + _solve(curvature, target - weighted(kept, _pulls(kept, y))), size)
     weights = settle(_pulls(kept, y), size)
-    step = settle(_solve(curvature, target - _total(kept, weights)), size)
+    step = settle(_solve(curvature, target - weighted(kept, weights)), size)
     # The step is zero but for rounding: its value is taken up by the weights, but not its product with their change
     rounding = jax.lax.stop_gradient(step)
     shared = []
@@ -61,7 +61,7 @@ def share_force(
         # only those that pull: the others would be given what the step rounds to
         shared.append(jnp.where(a > 0, jnp.maximum(a + more, 0), 0.0))
 
-    rest = target - _total(kept, shared)
+    rest = target - weighted(kept, shared)
     eps = jnp.finfo(size.dtype).eps
     fits = rest.dot(rest) <= (64 * eps * (1 + sum(shared, zero))) ** 2
     # three edges in one plane are all there are, and yet one too many: with independent ones both ways agree
@@ -85,13 +85,6 @@ def _begin(kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3) -> 
 
 def _pulls(kept: tuple[Vec3, ...], y: Vec3) -> list[Scalar]:
     return [jnp.maximum(g.dot(y), 0) for g in kept]
-
-
-def _total(kept: tuple[Vec3, ...], weights: list[Scalar]) -> Vec3:
-    total = Vec3(*(jnp.zeros_like(kept[0].x),) * 3)
-    for g, weight in zip(kept, weights, strict=True):
-        total = total + g.scale(weight)
-    return total
 
 
 def _curvature(kept: tuple[Vec3, ...], y: Vec3) -> Symmetric3:
@@ -129,7 +122,7 @@ def _solve(m: Symmetric3, v: Vec3) -> Vec3:
 def _searched(kept: tuple[Vec3, ...], target: Vec3, y: Vec3) -> Vec3:
     """The step from y: Newton's, shortened to where phi is least along it."""
     along = settle([g.dot(y) for g in kept], target.x)
-    step = _solve(_curvature(kept, y), target - _total(kept, [jnp.maximum(a, 0) for a in along]))
+    step = _solve(_curvature(kept, y), target - weighted(kept, [jnp.maximum(a, 0) for a in along]))
     step = settle(step, target.x)
     rates, gain = [g.dot(step) for g in kept], target.dot(step)
     one = jnp.ones_like(gain)
