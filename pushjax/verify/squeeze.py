@@ -38,16 +38,19 @@ def squeeze_power(batch: ProblemBatch) -> np.ndarray:
         if not on.any():
             continue
         unit = np.abs(powers[k, on]).max() or 1.0
-        result = linprog(
-            -powers[k, on] / unit,
-            A_eq=np.vstack([wrenches[k, on].T, np.ones(on.sum())]),
-            b_eq=[0, 0, 0, 1],
-            method="highs",
-            options={"primal_feasibility_tolerance": SHARE, "dual_feasibility_tolerance": SHARE},
-        )
-        if result.status == 0:
-            best[k] = -result.fun * unit
-        elif result.status != 2:
+        for method in ("highs", "highs-ipm"):  # where loads hardly balance, the simplex may not know whether they do
+            result = linprog(
+                -powers[k, on] / unit,
+                A_eq=np.vstack([wrenches[k, on].T, np.ones(on.sum())]),
+                b_eq=[0, 0, 0, 1],
+                method=method,
+                options={"primal_feasibility_tolerance": SHARE, "dual_feasibility_tolerance": SHARE},
+            )
+            if result.status == 0:
+                best[k] = -result.fun * unit
+            if result.status in (0, 2):
+                break
+        else:
             raise RuntimeError(f"linear program {k}: {result.message}")
     return best
 
