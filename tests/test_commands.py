@@ -88,10 +88,13 @@ def test_jam(tmp_path, capsys):
     cli.main(["reproduce", "jam", "--out", str(tmp_path), "--json", str(tmp_path / "jam.json")])
     record = json.loads((tmp_path / "jam.json").read_text())
     assert record["verdicts"] == {"0.25": "MOVING", "0.55": "JAMMED"}
+    assert [row["model"] for row in record["rows"]] == ["ellipsoid", "quartic"]
     for row in record["rows"]:
-        assert row["last_moving"] < row["threshold"] <= row["jams_from"] + 1e-6
+        assert row["threshold"] == pytest.approx(0.4)
+        assert 0.9989 < row["last_moving"] / row["threshold"] < row["jams_from"] / row["threshold"] < 1.0011
+        assert row["statuses"] == ["JAMMED", "MOVING"]
     assert (tmp_path / "jam.png").stat().st_size > 10_000
-    assert "jams from 0.400" in capsys.readouterr().out
+    assert "jams from 0.4004" in capsys.readouterr().out
 
 
 def test_bench_contacts(monkeypatch):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.experiments import jam, squeeze
+from pushjax.experiments import squeeze
 from pushjax.limit_surface.sums import squared_quadratics
 from pushjax.rollout import _overlap
 from pushjax.verify import ProblemBatch, violations
@@ -204,20 +204,6 @@ def test_squeeze_ends_as_the_paper_says():
     one, _, other, _ = (np.asarray(row["pose"]) for row in record["rows"])
     assert one[0] > 0.01
     assert other[0] < -0.01
-
-
-@pytest.mark.parametrize("model", ["ellipsoid", "quartic"])
-def test_jam_threshold(model):
-    surface = jam.surfaces(0)[1][model]
-    statuses = jax.vmap(lambda mu: pj.solve_contacts(surface, jam.contacts(mu)).status)
-    edge = jam.threshold()
-    assert edge == pytest.approx(0.4)
-    below, above = (
-        statuses(edge * (1 - jnp.array([1e-3, 0.1, 0.9]))),
-        statuses(edge * (1 + jnp.array([1e-3, 0.1, 2.0]))),
-    )
-    assert (below == pj.Status.MOVING).all()
-    assert (above == pj.Status.JAMMED).all()
 
 
 GRADIENT_STEPS = 20

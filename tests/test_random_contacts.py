@@ -200,20 +200,23 @@ def test_a_receding_pusher_can_drag_the_slider_along(degree, rng):
 
 
 def test_float32():
-    surface, contacts = problems(3, seed=5, condition=100.0)
+    """Never wrong either. What it cannot say is frictionless wedges whose slider is a thousand times faster than its
+    pushers: to write down such a twist takes more digits than there are."""
+    surface, contacts = problems(3, seed=5)
     as32 = jax.tree.map(
         lambda a: a.astype(jnp.float32) if jnp.issubdtype(a.dtype, jnp.floating) else a, (surface, contacts)
     )
     exact, rough = solve_all(surface, contacts), solve_all(*as32)
     assert rough.twist.dtype == jnp.float32
     status = np.asarray(rough.status)
-    # ill-conditioned sets lose float32's digits; they say so
-    assert np.mean(status == pj.Status.NOT_CONVERGED) < 0.01
+    counts, _ = bench_contacts.judge(ProblemBatch.of(*as32), rough, "float32", starts=50)
+    assert counts["wrong"] == 0
+    assert counts["not_converged"] < 0.005 * BATCH
+    lost = (status == pj.Status.NOT_CONVERGED) & (np.asarray(exact.status) == pj.Status.MOVING)
+    speed = np.linalg.norm(exact.twist, axis=1) / np.linalg.norm(contacts.displacement, axis=2).max(axis=1)
+    assert np.median(speed[lost]) > 300
     settled = (status != pj.Status.NOT_CONVERGED) & (np.asarray(exact.margin / np.abs(exact.margin)) != 0)
-    assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.99
-    batch = ProblemBatch.of(*as32)
-    worst = violations(batch, rough.twist, rough.force, rough.wrench)._replace(flow=np.zeros(BATCH)).worst()
-    assert worst[status == pj.Status.MOVING].max() < 1e-4
+    assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.999
 
 
 def test_projected_is_right_where_it_answers():

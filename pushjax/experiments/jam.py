@@ -23,6 +23,7 @@ from pushjax.report import envelope
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h, m
 CLOSING = 0.001  # of each finger, m
 BELOW, ABOVE = 0.25, 0.55  # frictions drawn
+NEAR = 1e-3  # of the threshold: the nearest frictions on both sides of it
 
 
 def contacts(friction) -> pj.Contacts:
@@ -46,7 +47,8 @@ def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     """The status over friction with both surfaces, the threshold found and expected; the picture into `out`."""
     block, both = surfaces(seed)
-    scanned = jnp.linspace(0.0, 0.8, 161)
+    close = threshold() * (1 + NEAR * jnp.array([-1.0, 1.0]))
+    scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), close))
     frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program for both
     rows, motions = [], {}
     for name, surface in both.items():
@@ -79,10 +81,10 @@ def _draw(out: Path, block: pj.Polygon, motions: list[pj.Motion]) -> list[str]:
 
 def summary(record: dict[str, Any]) -> str:
     """What the command prints."""
-    lines = [f"Two fingers close on opposite faces, offset: statics says they jam from mu = {threshold():.3f}."]
+    lines = [f"Two fingers close on opposite faces, offset: statics says they jam from mu = {threshold():.4f}."]
     for row in record["rows"]:
-        jams = "never jams" if row["jams_from"] is None else f"jams from {row['jams_from']:.3f}"
-        lines.append(f"  {row['model']:10} moves up to mu = {row['last_moving']:.3f}, {jams}")
+        jams = "never jams" if row["jams_from"] is None else f"jams from {row['jams_from']:.4f}"
+        lines.append(f"  {row['model']:10} moves up to mu = {row['last_moving']:.4f}, {jams}")
     lines += [f"  mu = {mu}: {status}" for mu, status in record["verdicts"].items()]
     lines += [f"drew {path}" for path in record["pictures"]]
     return "\n".join(lines)
