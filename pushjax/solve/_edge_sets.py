@@ -15,7 +15,7 @@ from pushjax.limit_surface import Form
 from pushjax.limit_surface._aligned import aligned_wrench
 from pushjax.solve._basis import Basis
 from pushjax.solve._edge_line import Line, roots
-from pushjax.solve._several import Index, Several, clean, pick, violation
+from pushjax.solve._several import Index, Several, clean, fastest, pick, violation
 
 NONE = -1  # in place of a generator's number
 
@@ -180,7 +180,7 @@ def _seen(problem: Several, twist: Vec3, contacts: tuple[Index, ...]):
     """Of some contacts, whether each counts and just touches, and its slip; and whether no contact is violated."""
     tolerance = violation(twist)
     slips = problem.slips(twist)
-    apart = jnp.ones_like(problem.pushes)
+    apart = twist.dot(twist) <= fastest(tolerance.dtype) ** 2
     for slip, active in zip(slips, problem.active, strict=True):
         apart &= (slip.x >= -tolerance) | ~active
     seen = []

@@ -158,6 +158,12 @@ def rough(dtype) -> float:
     return clean(dtype) * (15 if jnp.finfo(dtype).bits > 32 else 1)
 
 
+def fastest(dtype) -> float:
+    """Twist, in units of the fastest pusher, of which rounding alone violates a condition by all that is allowed
+    (1e-8, in float32 1e-4): no answer. 840 in float32."""
+    return (1e-8 if jnp.finfo(dtype).bits > 32 else 1e-4) / float(jnp.finfo(dtype).eps)
+
+
 def clean(dtype) -> float:
     """Violation of a condition, relative to the fastest pusher or the whole force, that passes: 4e-10, or 7e-5 in
     float32."""

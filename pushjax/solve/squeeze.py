@@ -26,7 +26,7 @@ from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.solve._several import Index, Several, pick
 
 # What may be left over of two or three edges that balance, of their sum: rounding of what a user computes them from.
-BALANCE = {4: 4e-6, 8: 1e-10}
+BALANCE = {4: 2e-6, 8: 1e-10}
 UNUSED = -1e30
 NOISE = 2  # roundings of its terms, which a determinant may be off by
 
