@@ -14,7 +14,8 @@ three edges   the conditions alone fix the twist. Its slip tells which edge of a
 
 A system whose three conditions depend on one another (parallel or concurrent normals) leaves a segment of solutions,
 whose ends other sets have; it is skipped. Whatever a set gives is checked against every condition of the problem, so
-a wrong answer cannot pass. Where none passes there is no solution: a jam.
+a wrong answer cannot pass. Where none passes and the hand's squeeze power is positive (`squeeze`), there is no
+solution: a jam. Where none passes and it is not, the digits do not suffice (`fastest` in `_several`).
 
 Source: Zhou et al. 2017, section IV.B, for the problem; this enumeration in place of its sequence of LCPs.
 """
