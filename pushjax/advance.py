@@ -1,0 +1,218 @@
+"""One step of all fingers, in scalars.
+
+Within it (body frame, after turning the hand's displacement by the slider's angle):
+
+1. the hand travels freely until a finger meets the slider (exactly, see `contacts`); the rest of the step pushes;
+2. predict: solve the contacts as they are then, and move the slider half of that;
+3. correct: solve the contacts as seen from halfway, with the halfway angle, and move the slider by that.
+
+This is the midpoint rule: second order within a mode and, with one finger, across changes of mode too, because the
+motion is continuous. The gaps at the beginning are part of the contact problem in both: a second finger that arrives
+within the step has no separate event (first order there), an overlap is pushed out within one step, and what the rule
+leaves does not add up (the paper's open problem 2: Zhou et al. 2017, section VII).
+
+The slider is moved so that its contact point (of several, their middle weighted by force) goes exactly where the
+contact problem says, in the world, and the rest turns about it. Where a finger sticks, slip is then zero to rounding,
+not to the order of the scheme; and so is that of a hand that pushes flat and straight.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
+from pushjax.contacts import FAR, Placement, Touch, choose, count, meet, overlap, places, taken
+from pushjax.hands import Finger, Hand, Pad
+from pushjax.limit_surface import Form
+from pushjax.shapes import Outline
+from pushjax.solve import Contact, ContactSolver, SeveralMotion, StickingSolver
+from pushjax.solve.contacts import motion_under
+from pushjax.status import ContactMode, Status
+
+# A finger holds a jammed slider if it is nearer than this, in units of the length, or than the hand goes in four steps:
+# a jam is found before the last gap is closed, and the slider swings faster than the fingers close.
+HOLDING = 1e-4
+
+
+class Record(NamedTuple):
+    """A step's outcome in scalars: what the scan stacks."""
+
+    pose: Vec3
+    twist: Vec3
+    wrench: Vec3
+    force: tuple[Vec2, ...]
+    mode: tuple[Int[Array, ""], ...]
+    status: Int[Array, ""]
+
+
+class Placed(NamedTuple):
+    """A pose, and the unit vector of its angle: sines cost as much as a contact."""
+
+    pose: Vec3
+    angle: Vec2
+
+    @staticmethod
+    def at(pose: Vec3) -> "Placed":
+        return Placed(pose, settle(turn(pose.z), pose.x))
+
+    def local(self, world: Vec2) -> Vec2:
+        """A world point in the body frame."""
+        return (world - self.pose.xy).unrotate(self.angle)
+
+    def moved(self, contact: Vec2, motion: Vec3, seen: Vec2) -> "Placed":
+        """After the body twist `motion`; the slider's point `contact` goes straight, the twist turned by `seen`."""
+        straight = (motion.xy + contact.perp().scale(motion.z)).rotate(seen)
+        theta = self.pose.z + motion.z
+        angle = settle(turn(theta), self.pose.x)
+        swing = contact.rotate(angle) - contact.rotate(self.angle)
+        return Placed(Vec3(self.pose.x + straight.x - swing.x, self.pose.y + straight.y - swing.y, theta), angle)
+
+
+class Grip(NamedTuple):
+    """A hand's finger over one step: from where to where (world), and its friction. angle, turning: None if it never
+    turns."""
+
+    finger: Finger
+    friction: Scalar
+    center: Vec2
+    path: Vec2
+    angle: Scalar | None
+    turning: Scalar | None
+
+    def seen(self, slider: Placed, share: Scalar) -> Placement:
+        """Where the finger is, in the slider's frame, after a share of its step."""
+        center = slider.local(self.center + self.path.scale(share))
+        if not isinstance(self.finger, Pad):  # a disc looks the same at any angle
+            return Placement(center, None)
+        if self.angle is None or self.turning is None:
+            raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centres")
+        return Placement(center, settle(turn(self.angle + share * self.turning), center.x).unrotate(slider.angle))
+
+    def motion(self, slider: Placed, point: Vec2, center: Vec2, rest: Scalar) -> Vec2:
+        """How far the finger's material at the slider's `point` goes in the last `rest` of its step, slider's frame."""
+        straight = self.path.scale(rest).unrotate(slider.angle)
+        if self.turning is None:
+            return straight
+        # the chord of a turn about the centre; at half of it, exact
+        return straight + (point - center).perp().scale(2 * jnp.sin(rest * self.turning / 2))
+
+
+def advance(
+    form: Form, outline: Outline, grips: tuple[Grip, ...], solver: ContactSolver | StickingSolver | None, pose: Vec3
+) -> Record:
+    """One step of all fingers."""
+    start = Placed.at(pose)
+    begin, overlapping = jnp.ones_like(pose.x), jnp.zeros((), bool)
+    for grip in grips:
+        at, path = settle((grip.seen(start, jnp.zeros_like(pose.x)), grip.path.unrotate(start.angle)), pose.x)
+        met = meet(grip.finger, outline, at, path, form.length)
+        begin, overlapping = jnp.minimum(begin, met.start), overlapping | met.overlapping
+    begin = settle(begin, pose.x)
+    rest = 1 - begin
+    counts = [count(grip.finger, outline) for grip in grips]
+    contacts = sum(counts)
+    zero = jnp.zeros_like(pose.x)
+    on = (jnp.ones((), bool),) * contacts
+    reach = HOLDING * form.length
+    for grip in grips:
+        reach = jnp.maximum(reach, jax.lax.stop_gradient(4 * (jnp.abs(grip.path.x) + jnp.abs(grip.path.y))))
+
+    def stage(carry, share):
+        """Solve the contacts as they are when `share` of the last stage's motion is done."""
+        twist, point, angle, status, begun, chosen, _ = carry
+        there = start.moved(point, twist.scale(share), angle)
+        first = share == 0
+        each, fresh, picked, holds = [], [], [], jnp.ones((), bool)
+        for k, grip in enumerate(grips):
+            at = grip.seen(there, begin + rest * share)
+            touches = settle(places(grip.finger, outline, at, form.length), pose.x)
+            mine = tuple(
+                jnp.where(first, new, old) for new, old in zip(choose(touches, form.length), chosen[k], strict=True)
+            )
+            picked.append(mine)
+            near = jnp.zeros((), bool)
+            for touch in taken(touches, mine):
+                before = select(first, touch, begun[len(each)])
+                # a corner that has passed the end of an edge by now still counts as it began
+                touch = select(settle(touch.distance > FAR / 2, pose.x), before, touch)
+                # the gap is that at the beginning, for both stages: what the rule leaves then does not add up
+                gap = before.distance
+                motion = grip.motion(there, touch.point, at.center, rest)
+                contact = Contact(touch.point, touch.normal, motion, grip.friction, gap)
+                near |= gap <= reach
+                each.append(contact)
+                fresh.append(before)
+            holds &= near
+        motion = motion_under(form, tuple(each), on, solver)
+        # A failed prediction must show, whatever the correction made of it
+        status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
+        where = _center(tuple(each), motion.force)
+        return (motion.twist, where, there.angle, status, tuple(fresh), tuple(picked), holds), motion
+
+    still = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
+    none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
+    nowhere = Touch(zero, Vec2(zero, zero), Vec2(zero, zero))
+    carry = (*still, (nowhere,) * contacts, none, jnp.zeros((), bool))
+    carry, motions = jax.lax.scan(stage, carry, jnp.array([0.0, 0.5], zero.dtype))
+    twist, point, angle, status, _, _, holds = carry
+    motion: SeveralMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
+    moved = start.moved(point, twist, angle).pose
+    status = jnp.where((status == Status.JAMMED) & holds, Status.GRASPED, status)
+    status = jnp.where(overlapping & (status != Status.INVALID), Status.OVERLAPPING, status).astype(jnp.int8)
+    return _guarded(motion, moved, pose, status)
+
+
+def _center(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...]) -> Vec2:
+    """The middle of the contact points, weighted by normal force: the point of the slider that goes straight."""
+    if len(contacts) == 1:
+        return contacts[0].point
+    total, middle = jnp.zeros_like(forces[0].x), Vec2(*(0 * x for x in contacts[0].point))
+    for contact, force in zip(contacts, forces, strict=True):
+        weight = jax.lax.stop_gradient(force.x)
+        total, middle = total + weight, middle + contact.point.scale(weight)
+    return middle.scale(1 / jnp.where(total > 0, total, 1.0))
+
+
+def grips_of(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[Grip, ...]:
+    """The fingers over a step, from the numbers of their poses at its ends."""
+    grips = []
+    for k, finger in enumerate(hand.fingers):
+        a, b = before[k], after[k]
+        angle, turning = (a[2], b[2] - a[2]) if len(a) == 3 else (None, None)
+        center = Vec2(a[0], a[1])
+        grips.append(Grip(finger, friction[k], center, Vec2(b[0], b[1]) - center, angle, turning))
+    return tuple(grips)
+
+
+def _guarded(motion: SeveralMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> Record:
+    """The record of a step; without motion the slider stays, untouched by arithmetic that might have failed."""
+    finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
+    moves = settle((status == Status.MOVING) & finite_pose, pose.x)
+    status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
+
+    def kept(moving):
+        return jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), moving)
+
+    return Record(
+        select(moves, moved, pose),
+        kept(motion.twist),
+        kept(motion.wrench),
+        kept(motion.force),
+        tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in motion.mode),
+        status,
+    )
+
+
+def columns(poses: Array) -> tuple[tuple[Array, ...], ...]:
+    """The numbers of each finger's pose, from (fingers, width), or with an axis of steps in front."""
+    return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
+
+
+def deepest(outline: Outline, grips: tuple[Grip, ...], pose: Vec3) -> Scalar:
+    """By how much the deepest finger overlaps the slider at the beginning, m."""
+    start, most = Placed.at(pose), jnp.full_like(pose.x, -jnp.inf)
+    for grip in grips:
+        most = jnp.maximum(most, overlap(grip.finger, outline, grip.seen(start, jnp.zeros_like(pose.x))))
+    return most
