@@ -27,7 +27,6 @@ from pushjax.solve._several import Index, Several, pick
 
 # What may be left over of two or three edges that balance, of their sum: rounding of what a user computes them from.
 BALANCE = {4: 2e-6, 8: 1e-10}
-UNUSED = -1e30
 NOISE = 2  # roundings of its terms, which a determinant may be off by
 
 
@@ -40,7 +39,7 @@ class Squeeze(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Every cone edge. wrench: of unit normal force, and power: its; of a contact that is not active, UNUSED.
+    """Every cone edge. wrench: of unit normal force, and power: its; active: whether its contact counts.
 
     friction: of its contact. turning: t x n of its contact, twice. After them come two that carry nothing, of the
     numbers `moment` and `across`: a pure moment, and the direction at right angles to a set's others.
@@ -48,6 +47,7 @@ class _Edges(NamedTuple):
 
     wrench: tuple[Vec3, ...]
     power: tuple[Scalar, ...]
+    active: tuple[Bool[Array, ""], ...]
     friction: tuple[Scalar, ...]
     turning: tuple[Vec3, ...]
 
@@ -91,7 +91,7 @@ def squeeze(problem: Several) -> Squeeze:
     first, second, third, fourth = best
     same = first // 2 == second // 2, third // 2 == fourth // 2
     again = _basic(edges, (first, second, third, fourth), *same, fourth == edges.across).power
-    return Squeeze(jnp.where(power > UNUSED / 2, again, lowest), presses)
+    return Squeeze(jnp.where(power > lowest, again, lowest), presses)
 
 
 def _edges(problem: Several) -> _Edges:
@@ -103,7 +103,8 @@ def _edges(problem: Several) -> _Edges:
     each = range(2 * problem.count)
     return _Edges(
         wrench,
-        (*(jnp.where(problem.active[k // 2], p, UNUSED) for k, p in enumerate(_powers(problem))), zero, zero),
+        (*_powers(problem), zero, zero),
+        (*(problem.active[k // 2] for k in each), *(jnp.ones((), bool),) * 2),
         (*(problem.friction[k // 2] for k in each), one, one),
         (*(turning[k // 2] for k in each), still, still),
     )
@@ -143,8 +144,10 @@ def _best(edges: _Edges, witness: Scalar) -> tuple:
             first, last = sets.same
             same = four[2] // 2 == four[3] // 2 if last is None else last
             found = _basic(edges, four, first, same, sets.by_itself)
-            better = found.exists & (found.power > largest)
-            better, sure = settle((better, found.exists & (found.power > found.noise)), witness)
+            exists = found.exists
+            for edge in four:
+                exists &= pick(edges.active, edge)
+            better, sure = settle((exists & (found.power > largest), exists & (found.power > found.noise)), witness)
             kept = (jnp.where(better, e, b) for e, b in zip(four, kept, strict=True))
             return (jnp.where(better, found.power, largest), presses | sure, *kept), None
 
