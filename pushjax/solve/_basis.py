@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import Scalar, Vec3, select, weighted
+from pushjax._vec import Scalar, Vec3, select, settle, weighted
 
 
 class Basis(NamedTuple):
@@ -53,4 +53,5 @@ def completed(v1: Vec3, v2: Vec3, v3: Vec3, used2: Bool[Array, ""], used3: Bool[
     aside = select(jnp.abs(v1.x) > jnp.abs(v1.y), Vec3(-v1.y, v1.x, zero), Vec3(zero, -v1.z, v1.y))
     v2 = select(used2, v2, aside)
     v3 = select(used3, v3, v1.cross(v2))
+    v1, v2, v3 = settle((v1, v2, v3), v1.x)
     return Basis.of(v1, v2, v3, relative * jnp.sqrt(v1.dot(v1) * v2.dot(v2) * v3.dot(v3)))

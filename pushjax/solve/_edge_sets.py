@@ -44,9 +44,9 @@ def nothing(problem: Several) -> Found:
     return Found((none, none, none), still, still, zero, no, no)
 
 
-def one_edge(problem: Several, edges: tuple[Vec3, ...], found: Found, e: Index) -> Found:
+def one_edge(problem: Several, found: Found, e: Index) -> Found:
     contact, side = e // 2, 1 - 2 * (e % 2)
-    g = pick(edges, e)
+    g = pick(problem.generators, e)
     motion = settle(problem.form.gradient(g), problem.speed)
     row, push = pick(problem.normal, contact), pick(problem.approach, contact).x
     along = row.dot(motion)
@@ -61,11 +61,11 @@ def one_edge(problem: Several, edges: tuple[Vec3, ...], found: Found, e: Index) 
     return _consider(found, passes, (e, NONE, NONE), Vec3(one, 0 * one, 0 * one), twist, key)
 
 
-def two_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, e1: Index, e2: Index) -> Found:
+def two_edges(problem: Several, found: Found, e1: Index, e2: Index) -> Found:
     c1, c2 = e1 // 2, e2 // 2
     sticks = c1 == c2
     form, unit = problem.form, problem.speed
-    line = settle(Line.between(form, pick(edges, e1), pick(edges, e2)), unit)
+    line = settle(Line.between(form, pick(problem.generators, e1), pick(problem.generators, e2)), unit)
     push1, push2 = pick(problem.approach, c1), pick(problem.approach, c2)
     row1 = pick(problem.normal, c1)
     row2 = select(sticks, pick(problem.tangent, c1), pick(problem.normal, c2))
@@ -98,7 +98,7 @@ def two_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, e1: Index
     return jax.lax.fori_loop(0, len(places), at_root, found)
 
 
-def three_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, contacts: tuple, sides: Index) -> Found:
+def three_edges(problem: Several, found: Found, contacts: tuple, sides: Index) -> Found:
     """Edges of three contacts, one each; or, the first two contacts being the same, both of that one, which sticks.
 
     sides: how many choices of edges to try: 8, or 2 where one sticks.
@@ -124,7 +124,7 @@ def three_edges(problem: Several, edges: tuple[Vec3, ...], found: Found, contact
     h = problem.form.value(f)
     feasible, allowed = settle((feasible & aligned & (h > 0), tuple(allowed)), problem.speed)
     steep = tuple(problem.beyond(c) for c in contacts)
-    choices = [(pick(edges, 2 * c), pick(edges, 2 * c + 1)) for c in contacts]
+    choices = [(pick(problem.generators, 2 * c), pick(problem.generators, 2 * c + 1)) for c in contacts]
 
     def try_sides(which, state):
         best, weight, chosen = state

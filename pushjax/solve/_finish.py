@@ -48,11 +48,11 @@ class _System(NamedTuple):
 
     def newton(self, beta: Vec3, residual: Vec3) -> Vec3:
         """-J^-1 residual, with J = R hess H Q; zero where J is singular."""
-        hessian = self.form.hessian(self.wrench(beta))
+        hessian = settle(self.form.hessian(self.wrench(beta)), beta.x)
         columns = [Vec3(*(row.dot(hessian.times(q)) for row in self.rows)) for q in self.axes]
         for k, idle in enumerate(self.idle):
             columns[k] = columns[k]._replace(**{"xyz"[k]: columns[k][k] + idle})
-        c1, c2, c3 = columns
+        c1, c2, c3 = settle(tuple(columns), beta.x)
         sizes = c1.dot(c1) * c2.dot(c2) * c3.dot(c3)
         basis = Basis.of(c1, c2, c3, jnp.finfo(sizes.dtype).eps * 1e-2 * jnp.sqrt(sizes))
         return basis.weights(residual.scale(-1.0))
@@ -96,13 +96,13 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     system = _system(problem, chosen, moves, edges)
     begin = jax.lax.stop_gradient(system.within(edges.total(chosen.weight)))
     beta = _polished(system, select(moves, _to_scale(system, begin), Vec3(zero, zero, zero)))
-    f = _facing(system, system.wrench(beta))
+    f = settle(_facing(system, system.wrench(beta)), problem.speed)
     alpha = edges.weights(f)
     alpha = settle(alpha + edges.weights(f - edges.total(alpha)), problem.speed)
     h = problem.form.value(f)
     solved = moves & (h > 0)
     # what the conditions fix of the twist is taken from them, not from H: a contact that sticks has no slip
-    motion = problem.form.gradient(f)
+    motion = settle(problem.form.gradient(f), problem.speed)
     twist = motion
     for _ in range(2):  # the second for rows that are nearly dependent
         missing = system.b - Vec3(*(row.dot(twist) for row in system.rows))
@@ -110,7 +110,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
 
     slips, tolerance = jax.lax.stop_gradient((problem.slips(twist), violation(twist)))
     suitable = _suitable(problem, chosen, slips, tolerance)
-    weights = share_force(problem.generators(), suitable, chosen.edges, alpha, f)
+    weights = settle(share_force(problem.generators, suitable, chosen.edges, alpha, f), problem.speed)
     passes = _passes(problem, chosen, slips, tolerance, alpha, motion, twist)
     solved = settle(solved & passes, problem.speed)
 
@@ -149,8 +149,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
 def _edges(problem: Several, chosen: Found, moves: Bool[Array, ""]) -> Basis:
     """The chosen edges, and in place of unused ones directions at right angles to them."""
     zero = jnp.zeros_like(problem.speed)
-    edges = settle(problem.generators(), problem.speed)
-    g1, g2, g3 = (pick(edges, jnp.maximum(edge, 0)) for edge in chosen.edges)
+    g1, g2, g3 = (pick(problem.generators, jnp.maximum(edge, 0)) for edge in chosen.edges)
     g1 = select(moves, g1, Vec3(zero + 1, zero, zero))
     used2, used3 = (moves & (edge >= 0) for edge in chosen.edges[1:])
     return completed(g1, g2, g3, used2, used3, 0.01 * float(jnp.finfo(zero.dtype).eps))
@@ -176,7 +175,8 @@ def _system(problem: Several, chosen: Found, moves: Bool[Array, ""], edges: Basi
     q1 = edges.vectors[0].unit()
     q3 = edges.vectors[0].cross(edges.vectors[1]).unit()
     axes = tuple(select(none == 0, q, blank) for q, none in zip((q1, q3.cross(q1), q3), idle, strict=True))
-    return _System(problem.form, axes, tuple(rows), Vec3(*bs), Vec3(*idle))
+    axes, rows, bs = settle((axes, tuple(rows), tuple(bs)), problem.speed)
+    return _System(problem.form, axes, rows, Vec3(*bs), Vec3(*idle))
 
 
 def _to_scale(system: _System, beta: Vec3) -> Vec3:

@@ -40,14 +40,16 @@ class SeveralMotion(NamedTuple):
 class Several(NamedTuple):
     """A contact problem in dimensionless numbers, a tuple entry for each contact.
 
-    normal, tangent: the rows. approach: what (n, t) the contact point must do to stay with its pusher, the gap taken
-    off. speed: the unit of displacement, m. size: what H was divided by. pushes: whether any contact would be violated
-    if the slider stayed. valid: whether every number was usable; if not, nothing pushes.
+    normal, tangent: the rows. generators: wrenches of the cones' edges, with unit normal force. approach: what (n,
+    t) the contact point must do to stay with its pusher, the gap taken off. speed: the unit of displacement, m.
+    size: what H was divided by. pushes: whether any contact would be violated if the slider stayed. valid: whether
+    every number was usable; if not, nothing pushes.
     """
 
     form: Form
     normal: tuple[Vec3, ...]
     tangent: tuple[Vec3, ...]
+    generators: tuple[Vec3, ...]
     approach: tuple[Vec2, ...]
     friction: tuple[Scalar, ...]
     active: tuple[Bool[Array, ""], ...]
@@ -59,13 +61,6 @@ class Several(NamedTuple):
     @property
     def count(self) -> int:
         return len(self.friction)
-
-    def generators(self) -> tuple[Vec3, ...]:
-        """Wrenches of the cones' edges, with unit normal force."""
-        edges = []
-        for n, t, mu in zip(self.normal, self.tangent, self.friction, strict=True):
-            edges += [n + t.scale(mu), n - t.scale(mu)]
-        return tuple(edges)
 
     def beyond(self, contact: Index) -> Scalar:
         """How far a contact's force is beyond its cone, if the weight of one of its edges is minus one."""
@@ -123,9 +118,12 @@ def assemble(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array
         pushes |= a & (approach.x > 0)
     friction = tuple(contact.friction for contact in contacts)
     normals, tangents, approaches = rows
-    pushes = settle(pushes, witness)
+    generators = []
+    for n, t, mu in zip(normals, tangents, friction, strict=True):
+        generators += [n + t.scale(mu), n - t.scale(mu)]
+    generators, pushes = settle((tuple(generators), pushes), witness)
     scaled = form.scaled(1 / size)
-    return Several(scaled, normals, tangents, approaches, friction, counts, speed, size, pushes, known)
+    return Several(scaled, normals, tangents, generators, approaches, friction, counts, speed, size, pushes, known)
 
 
 def _largest(values: list[Scalar]) -> Scalar:

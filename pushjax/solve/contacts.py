@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import Vec2, Vec3
+from pushjax._vec import Vec2, Vec3, entries
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve._several import ContactSolver, SeveralMotion, assemble
@@ -138,10 +138,9 @@ def solve_contacts(
 
 @eqx.filter_jit
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
-    m = contacts.point.shape[0]
     form, friction = ground(surface, contacts.friction)
-    each = tuple(_contact(contacts, friction, i) for i in range(m))
-    result = motion_under(form, each, tuple(contacts.active[i] for i in range(m)), solver)
+    each = _in_scalars(contacts, friction)
+    result = motion_under(form, each, entries(contacts.active), solver)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
         twist=result.twist.array(),
@@ -160,7 +159,7 @@ def motion_under(
     active: tuple[Bool[Array, ""], ...],
     solver: ContactSolver | StickingSolver | None,
 ) -> SeveralMotion:
-    """`solve_contacts` in scalars. One that is not active must be out of reach (`_contact`)."""
+    """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`)."""
     if solver is None:
         solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
     if not isinstance(solver, StickingSolver):
@@ -180,13 +179,18 @@ def ground(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
     return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), jnp.where(known, friction, jnp.nan)
 
 
-def _contact(contacts: Contacts, friction: Array, i: int) -> Contact:
-    """Contact i in scalars; one that is not active is out of reach, whatever its numbers are."""
-    normal = contacts.normal[i]
-    unit = jnp.abs(jnp.sum(normal**2) - 1) <= 2 * UNIT_TOLERANCE  # where traced, nothing has checked it yet
-    point, displacement = Vec2.of(contacts.point[i]), Vec2.of(contacts.displacement[i])
-    mu = jnp.where(unit, friction[i], jnp.nan)
-    return Contact(point, Vec2.of(normal), displacement, mu, contacts.gap[i]).where(contacts.active[i])
+def _in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, ...]:
+    """Each contact; one that is not active is out of reach, whatever its numbers are."""
+    rows = (contacts.point, contacts.normal, contacts.displacement)
+    found = []
+    for point, normal, displacement, mu, gap, active in zip(
+        *(entries(row) for row in (*rows, friction, contacts.gap, contacts.active)), strict=True
+    ):
+        n = Vec2.of(normal)
+        unit = jnp.abs(n.dot(n) - 1) <= 2 * UNIT_TOLERANCE  # where traced, nothing has checked it yet
+        mu = jnp.where(unit, mu, jnp.nan)
+        found.append(Contact(Vec2.of(point), n, Vec2.of(displacement), mu, gap).where(active))
+    return tuple(found)
 
 
 def friction_cone(normal: Numeric, friction: Numeric) -> Float[Array, "2 2"]:
@@ -226,4 +230,4 @@ def _at_rest(point: Numeric, normal: Numeric, friction: Numeric, dtype: Any) -> 
     shaped("normal", n, (2,))
     shaped("friction", mu, ())
     contacts = Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu)
-    return _contact(contacts, contacts.friction, 0)
+    return _in_scalars(contacts, contacts.friction)[0]

@@ -27,7 +27,6 @@ import jax
 import jax.numpy as jnp
 
 from pushjax._autodiff import undifferentiated
-from pushjax._vec import settle
 from pushjax.solve._edge_sets import Found, nothing, one_edge, three_edges, two_edges
 from pushjax.solve._finish import finish
 from pushjax.solve._several import ContactSolver, Several, SeveralMotion
@@ -42,15 +41,14 @@ class Exhaustive(ContactSolver):
 
 def enumerate_sets(problem: Several) -> Found:
     """The solution of largest power on H = 1, of equal ones the smallest twist. Not differentiable."""
-    edges = settle(problem.generators(), problem.speed)
     found = nothing(problem)
     m = problem.count
-    found = _over(lambda found, e: one_edge(problem, edges, found, *e), found, [(e,) for e in range(2 * m)])
+    found = _over(lambda found, e: one_edge(problem, found, *e), found, [(e,) for e in range(2 * m)])
     slides = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]
     sticks = [(2 * i, 2 * i + 1) for i in range(m)]
-    found = _over(lambda found, e: two_edges(problem, edges, found, *e), found, sticks + slides)
+    found = _over(lambda found, e: two_edges(problem, found, *e), found, sticks + slides)
     threes = [(i, i, j, 2) for i, j in permutations(range(m), 2)] + [(*c, 8) for c in combinations(range(m), 3)]
-    return _over(lambda found, c: three_edges(problem, edges, found, c[:3], c[3]), found, threes)
+    return _over(lambda found, c: three_edges(problem, found, c[:3], c[3]), found, threes)
 
 
 def _over(body: Callable[[Found, tuple], Found], found: Found, sets: list[tuple[int, ...]]) -> Found:

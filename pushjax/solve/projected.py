@@ -103,27 +103,26 @@ def _sweep(problem: Several, linear: _Linear, forces: tuple[Vec2, ...]) -> tuple
 
 def _finished(problem: Several, forces: tuple[Vec2, ...]) -> Found:
     """The exact solutions on the edges that carry the most force; the best that passes."""
-    edges = settle(problem.generators(), problem.speed)
     weights = []
     for force, mu in zip(forces, problem.friction, strict=True):
         side = jnp.where(mu > 0, force.y / jnp.where(mu > 0, mu, 1.0), force.x)
         weights += [jnp.maximum((force.x + side) / 2, 0), jnp.maximum((force.x - side) / 2, 0)]
     first = _heaviest(weights, ())
     second = _heaviest(weights, (first,))
-    found = one_edge(problem, edges, nothing(problem), first)
-    found = two_edges(problem, edges, found, jnp.minimum(first, second), jnp.maximum(first, second))
+    found = one_edge(problem, nothing(problem), first)
+    found = two_edges(problem, found, jnp.minimum(first, second), jnp.maximum(first, second))
     if problem.count == 1:
         return found
     least = [jnp.minimum(weights[2 * i], weights[2 * i + 1]) for i in range(problem.count)]
     whole = [weights[2 * i] + weights[2 * i + 1] for i in range(problem.count)]
     stuck = _heaviest(least, ())
-    found = two_edges(problem, edges, found, 2 * stuck, 2 * stuck + 1)
-    found = three_edges(problem, edges, found, (stuck, stuck, _heaviest(whole, (stuck,))), 2)
+    found = two_edges(problem, found, 2 * stuck, 2 * stuck + 1)
+    found = three_edges(problem, found, (stuck, stuck, _heaviest(whole, (stuck,))), 2)
     if problem.count == 2:
         return found
     one = _heaviest(whole, ())
     two = _heaviest(whole, (one,))
-    return three_edges(problem, edges, found, (one, two, _heaviest(whole, (one, two))), 8)
+    return three_edges(problem, found, (one, two, _heaviest(whole, (one, two))), 8)
 
 
 def _heaviest(weights: list[Scalar], others: tuple) -> jax.Array:

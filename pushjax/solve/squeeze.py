@@ -14,6 +14,7 @@ The weights of four edges are determinants. The cross product of the two edges o
 written as such, with mu taken out: so they are exact for the smallest friction, and no sign hangs on rounding.
 """
 
+from collections.abc import Callable
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ from pushjax.solve._several import Index, Several, pick
 # What may be left over of two or three edges that balance, of their sum: rounding of what a user computes them from.
 BALANCE = {4: 2e-6, 8: 1e-10}
 NOISE = 2  # roundings of its terms, which a determinant may be off by
+
+Flag = bool | Bool[Array, ""]  # known, or of a loop's numbers
 
 
 class Squeeze(NamedTuple):
@@ -59,20 +62,37 @@ class _Edges(NamedTuple):
     def across(self) -> int:
         return len(self.wrench) - 1
 
-    def cross(self, a: Index, b: Index, same: bool | Bool[Array, ""]) -> tuple[Vec3, Scalar | float, Scalar]:
-        """The product of edges a < b, as a vector and a factor, and the size of the vector's terms.
+    def four(self, numbers: tuple[Index, ...]) -> "_Four":
+        firsts = numbers[0], numbers[2]
+        return _Four(
+            tuple(pick(self.wrench, e) for e in numbers),
+            tuple(pick(self.power, e) for e in numbers),
+            tuple(pick(self.friction, e) for e in firsts),
+            tuple(pick(self.turning, e) for e in firsts),
+        )
+
+
+class _Four(NamedTuple):
+    """Four of the edges; friction and turning: of the first and the third."""
+
+    wrench: tuple[Vec3, ...]
+    power: tuple[Scalar, ...]
+    friction: tuple[Scalar, ...]
+    turning: tuple[Vec3, ...]
+
+    def cross(self, pair: int, same: Flag) -> tuple[Vec3, Scalar, Scalar]:
+        """The product of the first two (pair 0) or the last two (1), as a vector and a factor, and the size of the
+        vector's terms.
 
         same: whether both are of one contact.
         """
-        g, h = pick(self.wrench, a), pick(self.wrench, b)
-        apart = g.cross(h), 1.0, _size(g) * _size(h)
-        if same is False:
-            return apart
-        turning = pick(self.turning, a)
-        return _where(same, (turning, pick(self.friction, a), _size(turning)), apart)
+        g, h = self.wrench[2 * pair : 2 * pair + 2]
+        apart = g.cross(h), jnp.ones_like(g.x), _size(g) * _size(h)
+        turning = self.turning[pair]
+        return _where(same, (turning, self.friction[pair], _size(turning)), apart)
 
 
-def _where(condition: bool | Bool[Array, ""], yes, no):
+def _where(condition: Flag, yes, no):
     """`select`, also of what is known without numbers."""
     if isinstance(condition, bool):
         return yes if condition else no
@@ -89,8 +109,8 @@ def squeeze(problem: Several) -> Squeeze:
     power, presses, *best = undifferentiated(_best, edges, problem.speed)
     # Only the best is differentiated. That it exists is not decided again: another rounding could deny it.
     first, second, third, fourth = best
-    same = first // 2 == second // 2, third // 2 == fourth // 2
-    again = _basic(edges, (first, second, third, fourth), *same, fourth == edges.across).power
+    kind = _Kind(first // 2 == second // 2, third // 2 == fourth // 2, fourth == edges.across, third == edges.moment)
+    again = _basic(settle(edges.four(tuple(best)), problem.speed), kind).power
     return Squeeze(jnp.where(power > lowest, again, lowest), presses)
 
 
@@ -98,7 +118,7 @@ def _edges(problem: Several) -> _Edges:
     zero = jnp.zeros_like(problem.speed)
     one = zero + 1
     still, moment = Vec3(zero, zero, zero), Vec3(zero, zero, one)
-    wrench = (*problem.generators(), moment, still)
+    wrench = (*problem.generators, moment, still)
     turning = tuple(t.cross(n).scale(2) for n, t in zip(problem.normal, problem.tangent, strict=True))
     each = range(2 * problem.count)
     return _Edges(
@@ -110,17 +130,22 @@ def _edges(problem: Several) -> _Edges:
     )
 
 
-class _Sets(NamedTuple):
-    """Sets of one form. same: whether the first two, and the last two, are of one contact, as far as all agree.
-    by_itself: whether three balance, the fourth being `across`."""
+class _Kind(NamedTuple):
+    """Which four edges they are.
 
-    fours: list[tuple[int, ...]]
-    same: tuple[bool, bool | None]
-    by_itself: bool
+    same12, same34: whether the first two, and the last two, are of one contact. by_itself: whether the first three
+    are to balance, the fourth being `across`. twisting: whether the third is `moment`.
+    """
+
+    same12: Flag
+    same34: Flag
+    by_itself: Flag
+    twisting: Flag
 
 
-def _sets(edges: int) -> list[_Sets]:
-    """All fours, with the two edges of a contact first; all threes, and twos with the moment."""
+def _sets(edges: int) -> list[tuple[list[tuple[int, ...]], Callable[..., _Kind]]]:
+    """All fours, with the two edges of a contact first; all threes, and twos with the moment. With each list, the kind
+    of its members."""
     pairs, others = [], []
     for four in combinations(range(edges), 4):
         twice = [(a, b) for a, b in pairwise(four) if a // 2 == b // 2]
@@ -129,21 +154,22 @@ def _sets(edges: int) -> list[_Sets]:
         else:
             others.append(four)
     threes = [(*three, edges + 1) for three in combinations(range(edges + 1), 3)]
-    apart = False, False
-    return [_Sets(pairs, (True, None), False), _Sets(others, apart, False), _Sets(threes, apart, True)]
+    return [
+        (pairs, lambda four: _Kind(True, four[2] // 2 == four[3] // 2, False, False)),
+        (others, lambda four: _Kind(False, False, False, False)),
+        (threes, lambda four: _Kind(False, False, True, four[2] == edges)),
+    ]
 
 
 def _best(edges: _Edges, witness: Scalar) -> tuple:
     """The largest power, whether any is positive for certain, and the four edges of the largest."""
     lowest = jnp.full_like(witness, -jnp.inf)
     best = (lowest, jnp.zeros(lowest.shape, bool), *(jnp.zeros(lowest.shape, jnp.int32),) * 4)
-    for sets in _sets(edges.moment):
+    for fours, kind in _sets(edges.moment):
 
-        def body(best, four, sets=sets):
+        def body(best, four, kind=kind):
             largest, presses, *kept = best
-            first, last = sets.same
-            same = four[2] // 2 == four[3] // 2 if last is None else last
-            found = _basic(edges, four, first, same, sets.by_itself)
+            found = _basic(edges.four(four), kind(four))
             exists = found.exists
             for edge in four:
                 exists &= pick(edges.active, edge)
@@ -151,8 +177,8 @@ def _best(edges: _Edges, witness: Scalar) -> tuple:
             kept = (jnp.where(better, e, b) for e, b in zip(four, kept, strict=True))
             return (jnp.where(better, found.power, largest), presses | sure, *kept), None
 
-        if sets.fours:
-            columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*sets.fours, strict=True))
+        if fours:
+            columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*fours, strict=True))
             best = jax.lax.scan(body, best, columns)[0]
     return best
 
@@ -176,32 +202,21 @@ class _Basic(NamedTuple):
     exists: Bool[Array, ""]
 
 
-def _basic(
-    edges: _Edges,
-    four: tuple,
-    same12: bool | Bool[Array, ""],
-    same34: bool | Bool[Array, ""],
-    by_itself: bool | Bool[Array, ""],
-) -> _Basic:
-    """Of the edges with these numbers; what they are, see `_Sets`."""
-    g1, g2, g3 = (pick(edges.wrench, e) for e in four[:3])
-    x12, mu12, s12 = edges.cross(four[0], four[1], same12)
-    if by_itself is False:
-        g4 = pick(edges.wrench, four[3])
-        x34, mu34, s34 = edges.cross(four[2], four[3], same34)
-    else:
-        g4 = _normal(x12, g2.cross(g3), g3.cross(g1))
-        x34, mu34, s34 = g3.cross(g4), 1.0, _size(g3)
-        if by_itself is not True:
-            two = edges.cross(four[2], four[3], same34)
-            g4, (x34, mu34, s34) = select(by_itself, (g4, (x34, mu34, s34)), (pick(edges.wrench, four[3]), two))
+def _basic(four: _Four, kind: _Kind) -> _Basic:
+    g1, g2, g3, g4 = four.wrench
+    x12, mu12, s12 = four.cross(0, kind.same12)
+    x34, mu34, s34 = four.cross(1, kind.same34)
+    if kind.by_itself is not False:
+        normal = _normal(x12, g2.cross(g3), g3.cross(g1))
+        alone = normal, (g3.cross(normal), jnp.ones_like(g3.x), _size(g3))
+        g4, (x34, mu34, s34) = _where(kind.by_itself, alone, (g4, (x34, mu34, s34)))
     unit = jax.lax.stop_gradient(1 / jnp.maximum(jnp.maximum(mu12, mu34), jnp.finfo(g1.x.dtype).tiny))
     mu12, mu34 = mu12 * unit, mu34 * unit
     # settled: two roundings of a weight that cancels would differ by more than rounding
     weights = settle((mu34 * g2.dot(x34), -mu34 * g1.dot(x34), mu12 * g4.dot(x12), -mu12 * g3.dot(x12)), g1.x + g2.y)
     idle = 0 * weights[0]
-    if by_itself is not False:
-        carries = [True, True, four[2] < edges.moment, jnp.logical_not(by_itself)]
+    if kind.by_itself is not False:
+        carries = [True, True, jnp.logical_not(kind.twisting), jnp.logical_not(kind.by_itself)]
         idle = sum((jnp.where(c, 0.0, jnp.abs(w)) for w, c in zip(weights, carries, strict=True)), idle)
         weights = tuple(jnp.where(c, w, 0.0) for w, c in zip(weights, carries, strict=True))
     total = weights[0] + weights[1] + weights[2] + weights[3]
@@ -213,8 +228,7 @@ def _basic(
     exists = (jnp.abs(total) >= extent * (1 - 64 * eps)) & (extent > noise) & (idle <= balance * extent)
     share = 1 / jnp.where(total != 0, total, 1.0)
     power, most = 0 * total, 0 * total
-    for w, e in zip(weights, four, strict=True):
-        p = pick(edges.power, e)
+    for w, p in zip(weights, four.power, strict=True):
         power, most = power + w * p, jnp.maximum(most, jnp.abs(p))
     return _Basic(share * power, jnp.abs(share) * most * noise, exists)
 
