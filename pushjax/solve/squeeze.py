@@ -169,7 +169,7 @@ def _best(edges: _Edges, witness: Scalar) -> tuple:
 
         def body(best, four, kind=kind):
             largest, presses, *kept = best
-            found = _basic(edges.four(four), kind(four))
+            found = _basic(settle(edges.four(four), witness), kind(four))
             exists = found.exists
             for edge in four:
                 exists &= pick(edges.active, edge)
