@@ -47,6 +47,12 @@ def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
+def _legend_of_moments(figure: Figure, axes: Axes) -> None:
+    for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
+        axes.plot([], [], color=color, label=label)
+    legend_below(figure, axes, columns=4)
+
+
 def save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, bbox_inches="tight")
@@ -157,9 +163,7 @@ def push_figure(
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
             axes.set(title=name, xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
-            all_axes[0].plot([], [], color=color, label=label)
-        legend_below(figure, all_axes[0], columns=4)
+        _legend_of_moments(figure, all_axes[0])
         return figure
 
 
@@ -183,9 +187,7 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
             axes.set(title=name.replace(": ", ":\n"), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
-        for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
-            all_axes[0].plot([], [], color=color, label=label)
-        legend_below(figure, all_axes[0], columns=4)
+        _legend_of_moments(figure, all_axes[0])
         return figure
 
 

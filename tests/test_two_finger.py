@@ -13,6 +13,7 @@ import pytest
 from pushjax.datasets import LogError
 from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz, stick_deviation
 from pushjax.experiments import two_finger
+from pushjax.experiments.two_finger import predictions
 from pushjax.report import write_json
 
 EXACT = 1e-12
@@ -162,14 +163,14 @@ def test_real_archives_fit_together(log):
 def test_repeats_of_an_action_stay_on_one_side_of_a_split(tmp_path):
     log = load_two_finger_npz(written(tmp_path, archive(count=10)))
     errors = np.random.default_rng(0).uniform(size=(2, 3, 10))
-    tested = two_finger._splits(log, errors, np.random.default_rng(0))
-    assert len(tested.test) == two_finger.SPLITS
+    tested = predictions.splits(log, errors, np.random.default_rng(0))
+    assert len(tested.test) == predictions.SPLITS
     for pushes in tested.test:
         assert 0 < len(pushes) < 10
         assert not set(log.group[pushes]) & set(np.delete(log.group, pushes))
-    per_push = two_finger._per_push(errors, tested)
-    seen = np.isfinite(per_push)
-    assert np.all(per_push[seen] < 1)
+    mean = predictions.per_push(errors, tested)
+    seen = np.isfinite(mean)
+    assert np.all(mean[seen] < 1)
 
 
 @pytest.fixture(scope="module")
@@ -178,8 +179,8 @@ def record(data, tmp_path_factory):
         pytest.skip("no two_finger_push folder")
     folder = tmp_path_factory.mktemp("two_finger")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(two_finger, "FRICTIONS", np.linspace(0.2, 0.5, 4))
-        patch.setattr(two_finger, "RADII", (0.0, 0.001))
+        patch.setattr(predictions, "FRICTIONS", np.linspace(0.2, 0.5, 4))
+        patch.setattr(predictions, "RADII", (0.0, 0.001))
         found = two_finger.run(data, out=folder, steps=30)
     write_json(found, folder / "record.json")
     return json.loads((folder / "record.json").read_text())

@@ -1,0 +1,4 @@
+"""Two fingers turn a real triangle: `experiment` from `predictions`, `scores` and `picture`."""
+
+from pushjax.experiments.two_finger.experiment import run as run
+from pushjax.experiments.two_finger.experiment import summary as summary

@@ -1,0 +1,62 @@
+"""The picture: for each object the distribution of deviations, and three test pushes."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import pushjax as pj
+from pushjax import plot
+from pushjax.datasets.two_finger import TwoFingerLog
+from pushjax.experiments.two_finger.predictions import deviation_mm, per_push
+
+
+def draw(shown: list[tuple], out: Path) -> str:
+    """For each object the distribution of deviations, and three test pushes of the first split."""
+    with plt.rc_context(plot.STYLE):
+        figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
+        for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
+            each = per_push(errors, tested)
+            _distribution(row[0], name, each[np.isfinite(each)], deviation_mm(log, log.pose_start))
+            at, pushes = tested.chosen[0], tested.test[0]
+            order = pushes[np.argsort(errors[at][pushes])]
+            for panel, (word, share) in zip(
+                row[1:], (("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0)), strict=True
+            ):
+                push = order[round(share * (len(order) - 1))]
+                _one_push(panel, log, push, final[at][push])
+                panel.set_title(f"{name}, {word}: {errors[at][push]:.1f} mm")
+        plot.legend_below(figure, axes[0, 1], columns=5)
+        return str(plot.save(figure, out / "two_finger.png"))
+
+
+def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> None:
+    for values, color, dash, label in (
+        (predicted, plot.BLUE, "-", "predicted"),
+        (still, plot.BETWEEN, "--", "no motion"),
+    ):
+        order = np.sort(values)
+        axes.step(order, 100 * np.arange(1, len(order) + 1) / len(order), dash, color=color, where="post", label=label)
+    axes.set(xscale="log", xlim=(0.4, 200), ylim=(0, 100), title=f"{name}, test pushes")
+    axes.set(xlabel="deviation of the final pose / mm", ylabel="pushes below / %")
+    axes.legend(loc="upper left")
+
+
+def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
+    shape = pj.Polygon(log.vertices)
+    drawn = (
+        (log.pose_start[push], plot.BETWEEN, "-", "start"),
+        (log.pose_end[push], plot.START, "-", "measured end"),
+        (final, plot.BLUE, "--", "predicted end"),
+    )
+    for pose, color, dash, label in drawn:
+        plot.outline(axes, shape, pose, color, 1.5, linestyle=dash, label=label)
+    for hand, color, label in (
+        (log.hand_start[push], plot.BETWEEN, "fingers, start"),
+        (log.hand_end[push], plot.ORANGE, "fingers, end"),
+    ):
+        aside = log.spacing / 2 * np.array([-np.sin(hand[2]), np.cos(hand[2])])
+        fingers = 1e3 * np.stack([hand[:2] + aside, hand[:2] - aside])
+        axes.plot(*fingers.T, "o", color=color, ms=5, label=label)
+    axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
+    axes.set_aspect("equal", adjustable="datalim")

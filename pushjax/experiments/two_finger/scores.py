@@ -1,0 +1,133 @@
+"""How good the predictions are: deviations, stuck or not, beside what repeats of one action differ by."""
+
+from typing import Any
+
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets.pushes import rotation
+from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
+from pushjax.experiments.two_finger import predictions
+from pushjax.experiments.two_finger.predictions import SPLITS, Prediction, Tested, deviation_mm, per_push
+
+BOOTSTRAPS = 2000
+STUCK = 0.003  # m
+FEWEST_OF_A_DAY = 10
+DAY = 86400.0  # s
+
+
+def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int) -> dict[str, Any]:
+    """Every figure of one object."""
+    still = deviation_mm(log, log.pose_start)
+    pairs = list(zip(tested.chosen, tested.test, strict=True))
+    means = [errors[at][pushes].mean() for at, pushes in pairs]
+    no_motion = float(np.mean([still[pushes].mean() for pushes in tested.test]))
+    mean = float(np.mean(means))
+    each = per_push(errors, tested)
+    seen = np.isfinite(each)
+    interval = _interval(each[seen], log.group[seen], np.random.default_rng(seed))
+    return {
+        "mean_mm": mean,
+        "no_motion_mm": no_motion,
+        "ratio": mean / no_motion,
+        "ci95_mm": float(1.96 * np.std(means, ddof=1) / np.sqrt(SPLITS)),
+        "ci95_bootstrap_mm": interval,
+        "median_mm": float(np.median(each[seen])),
+        "worst_mm": float(each[seen].max()),
+        "worst_push": int(log.index[np.nanargmax(each)]),
+        "friction": float(np.mean([predictions.FRICTIONS[friction] for _, friction in tested.chosen])),
+        "radius_mm": float(1e3 * np.mean([predictions.RADII[radius] for radius, _ in tested.chosen])),
+        "pushes": len(log),
+        "unusable": len(log.problems),
+        "actions": len(np.unique(log.group)),
+        "splits": SPLITS,
+        "failed_steps": int(prediction.failed.sum()),
+        "jammed_pushes": float(np.mean([prediction.jammed[at].sum() for at in tested.chosen])),
+        "repeats": _repeats(log, each),
+    } | _stick(log, prediction.final, tested)
+
+
+def _interval(per_push: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
+    """Half a 95 % interval of the mean, by bootstrap over actions: repeats are not independent."""
+    actions, of = np.unique(group, return_inverse=True)
+    total, count = np.bincount(of, per_push), np.bincount(of)
+    drawn = rng.integers(len(actions), size=(BOOTSTRAPS, len(actions)))
+    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    return float(np.diff(np.quantile(means, [0.025, 0.975]))[0] / 2)
+
+
+def _stick(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
+    """How often prediction and measurement agree on stuck or not, and the shares of the four cases, over the tests."""
+    really = log.stick_deviation < STUCK
+    table = np.zeros((2, 2))
+    for at, pushes in zip(tested.chosen, tested.test, strict=True):
+        found = stick_deviation(log.hand_start, log.hand_end, log.pose_start, final[at], log.length) < STUCK
+        np.add.at(table, (really[pushes].astype(int), found[pushes].astype(int)), 1.0)
+    table /= table.sum()
+    shares = {
+        "both": table[1, 1],
+        "only_measured": table[1, 0],
+        "only_predicted": table[0, 1],
+        "neither": table[0, 0],
+    }
+    return {
+        "stick_agreement": float(table[0, 0] + table[1, 1]),
+        # what always giving the commoner answer would reach
+        "stick_by_chance": float(max(table.sum(axis=1))),
+        "stuck": {name: float(share) for name, share in shares.items()},
+    }
+
+
+def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
+    """How well the repeats of an action agree, and the model's deviation on the same pushes.
+
+    floor_mm: mean deviation of a push from what its action does on average, as the mean of the others tells it: of k
+    repeats that is too large by sqrt(k / (k - 1)), which is taken out. floor_agreement: how often two repeats agree on
+    stuck or not.
+    """
+    moved, stuck = _object_motion(log), log.stick_deviation < STUCK
+    floor, model, agree = [], [], []
+    for action in np.unique(log.group):
+        mine = np.flatnonzero(log.group == action)
+        if len(mine) < 2:
+            continue
+        for push in mine:
+            others = mine[mine != push]
+            away = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
+            floor.append(1e3 * float(away) * np.sqrt(len(others) / len(mine)))
+            model.append(per_push[push])
+            agree += list(stuck[others] == stuck[push])
+    if not floor:
+        return {"pushes": 0}
+    model = np.array(model)[np.isfinite(model)]
+    return {
+        "pushes": len(floor),
+        "floor_mm": float(np.mean(floor)),
+        "floor_median_mm": float(np.median(floor)),
+        "model_mm": float(np.mean(model)) if len(model) else None,
+        "model_median_mm": float(np.median(model)) if len(model) else None,
+        "floor_agreement": float(np.mean(agree)),
+    }
+
+
+def _object_motion(log: TwoFingerLog) -> np.ndarray:
+    """(n, 3): the end poses in the frames of the starts, where repeats of an action are the same push."""
+    moved = log.pose_end - log.pose_start
+    # a row vector times R is R' times it
+    there = np.einsum("ki,kij->kj", moved[:, :2], rotation(log.pose_start[:, 2]))
+    return np.column_stack([there, moved[:, 2]])
+
+
+def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
+    """The friction and radius that suit each day's pushes (UTC) best, nothing held back: was the set-up the same?"""
+    rows, day = [], np.floor(log.time / DAY).astype(int)
+    for number in np.unique(day):
+        mine = day == number
+        if np.count_nonzero(mine) < FEWEST_OF_A_DAY:
+            continue
+        scores = errors[..., mine].mean(axis=-1)
+        radius, friction = np.unravel_index(int(np.argmin(scores)), scores.shape)
+        date = str(np.datetime64(int(number), "D"))
+        best = {"friction": float(predictions.FRICTIONS[friction]), "radius_mm": 1e3 * predictions.RADII[int(radius)]}
+        rows.append({"day": date, "pushes": int(mine.sum()), **best, "mean_mm": float(scores.min())})
+    return rows
