@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
 from pushjax.contacts import FAR, Placement, Touch, choose, count, meet, overlap, places, taken
@@ -31,6 +31,8 @@ from pushjax.solve import Contact, ContactSolver, SeveralMotion, StickingSolver
 from pushjax.solve.contacts import motion_under
 from pushjax.status import ContactMode, Status
 
+# rad: a step that turns the slider farther is not an answer. What touches it, and where, was seen at the start.
+FARTHEST_TURN = 0.5
 # A finger holds a jammed slider if it is nearer than this, in units of the length, or than the hand goes in four steps:
 # a jam is found before the last gap is closed, and the slider swings faster than the fingers close.
 HOLDING = 1e-4
@@ -90,11 +92,16 @@ class Grip(NamedTuple):
             raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centres")
         return Placement(center, settle(turn(self.angle + share * self.turning), center.x).unrotate(slider.angle))
 
-    def motion(self, slider: Placed, point: Vec2, center: Vec2, rest: Scalar) -> Vec2:
-        """How far the finger's material at the slider's `point` goes in the last `rest` of its step, slider's frame."""
+    def motion(self, slider: Placed, point: Vec2, center: Vec2, rest: Scalar, first: Bool[Array, ""]) -> Vec2:
+        """How far the finger's material at the slider's `point` goes in the last `rest` of its step, slider's frame.
+
+        first: seen from the beginning of that rest, not from halfway. Then a turning hand sets out along the tangent
+        of its arc; its chord would close two fingers on what they hold, and jam.
+        """
         straight = self.path.scale(rest).unrotate(slider.angle)
         if self.turning is None:
             return straight
+        straight = straight.unrotate(turn(jnp.where(first, rest * self.turning / 2, 0.0)))
         # the chord of a turn about the centre; at half of it, exact
         return straight + (point - center).perp().scale(2 * jnp.sin(rest * self.turning / 2))
 
@@ -139,7 +146,7 @@ def advance(
                 touch = select(settle(touch.distance > FAR / 2, pose.x), before, touch)
                 # the gap is that at the beginning, for both stages: what the rule leaves then does not add up
                 gap = before.distance
-                motion = grip.motion(there, touch.point, at.center, rest)
+                motion = grip.motion(there, touch.point, at.center, rest, first)
                 contact = Contact(touch.point, touch.normal, motion, grip.friction, gap)
                 near |= gap <= reach
                 each.append(contact)
@@ -160,6 +167,8 @@ def advance(
     motion: SeveralMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
     moved = start.moved(point, twist, angle).pose
     status = jnp.where((status == Status.JAMMED) & holds, Status.GRASPED, status)
+    too_far = (status == Status.MOVING) & (jnp.abs(twist.z) > FARTHEST_TURN)
+    status = jnp.where(too_far, Status.NOT_CONVERGED, status)
     status = jnp.where(overlapping & (status != Status.INVALID), Status.OVERLAPPING, status).astype(jnp.int8)
     return _guarded(motion, moved, pose, status)
 
@@ -180,10 +189,15 @@ def grips_of(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[
     grips = []
     for k, finger in enumerate(hand.fingers):
         a, b = before[k], after[k]
-        angle, turning = (a[2], b[2] - a[2]) if len(a) == 3 else (None, None)
+        angle, turning = (a[2], _shortest(b[2] - a[2])) if len(a) == 3 else (None, None)
         center = Vec2(a[0], a[1])
         grips.append(Grip(finger, friction[k], center, Vec2(b[0], b[1]) - center, angle, turning))
     return tuple(grips)
+
+
+def _shortest(angle: Scalar) -> Scalar:
+    """The same turn, by half a revolution at most: recorded angles may jump from pi to -pi."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def _guarded(motion: SeveralMotion, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> Record:

@@ -54,12 +54,12 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     for name, surface in both.items():
         solved = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
         status = np.asarray(solved.status)[: len(scanned)]
-        jammed = status == pj.Status.JAMMED
+        jammed, moves = status == pj.Status.JAMMED, status == pj.Status.MOVING
         rows.append(
             {
                 "model": name,
                 "jams_from": float(scanned[np.argmax(jammed)]) if jammed.any() else None,
-                "last_moving": float(scanned[np.flatnonzero(~jammed)[-1]]),
+                "last_moving": float(scanned[np.flatnonzero(moves)[-1]]),
                 "threshold": threshold(),
                 "statuses": sorted({pj.Status(int(s)).name for s in status}),
             }

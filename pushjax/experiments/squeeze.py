@@ -58,7 +58,7 @@ def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
     status = pj.Status(int(grasp.status[-1]))
     stopped = int(grasp.stopped)
     tilt = abs((float(grasp.pose[-1, 2]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-    words = "slipped out" if stopped < 0 else "grasped" if tilt < FLAT else "jammed"
+    words = "failed" if status.failed else "slipped out" if stopped < 0 else "grasped" if tilt < FLAT else "jammed"
     return {
         "outcome": words,
         "status": status.name,

@@ -15,7 +15,7 @@ from pushjax.limit_surface import Form
 from pushjax.limit_surface._aligned import aligned_wrench
 from pushjax.solve._basis import Basis
 from pushjax.solve._edge_line import Line, roots
-from pushjax.solve._several import Index, Several, clean, fastest, pick, violation
+from pushjax.solve._several import HASTY, Index, Several, clean, fastest, pick, violation
 
 NONE = -1  # in place of a generator's number
 
@@ -25,7 +25,8 @@ class Found(NamedTuple):
 
     edges: numbers of its generators, the used ones first. weight: of each in the wrench, up to one common factor.
     twist: dimensionless. key: power on H = 1, what is largest where solutions are several. found: whether there is any.
-    several: whether a second twist passed too.
+    several: whether a second twist passed too. hasty: whether one passed that is too fast to be an answer (`fastest`),
+    which is no jam either.
     """
 
     edges: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
@@ -34,6 +35,7 @@ class Found(NamedTuple):
     key: Scalar
     found: Bool[Array, ""]
     several: Bool[Array, ""]
+    hasty: Bool[Array, ""]
 
 
 def nothing(problem: Several) -> Found:
@@ -41,7 +43,7 @@ def nothing(problem: Several) -> Found:
     zero = jnp.zeros_like(problem.speed)
     none, no = jnp.full(zero.shape, NONE, jnp.int32), jnp.zeros(zero.shape, bool)
     still = Vec3(zero, zero, zero)
-    return Found((none, none, none), still, still, zero, no, no)
+    return Found((none, none, none), still, still, zero, no, no, no)
 
 
 def one_edge(problem: Several, found: Found, e: Index) -> Found:
@@ -146,8 +148,10 @@ def three_edges(problem: Several, found: Found, contacts: tuple, sides: Index) -
 
 def _consider(found: Found, passes, edges: tuple, weight: Vec3, twist: Vec3, key: Scalar) -> Found:
     """Keep the better of two: more power at H = 1, and where that is equal the smaller twist."""
-    passes = settle(passes & (key > 0), key)
     size, size_before = twist.dot(twist), found.twist.dot(found.twist)
+    too_fast, hopeless = (size > (k * fastest(key.dtype)) ** 2 for k in (1, HASTY))
+    passes &= key > 0
+    passes, hasty = settle((passes & ~too_fast, passes & too_fast & ~hopeless), key)
     apart = twist - found.twist
     several = passes & found.found & (apart.dot(apart) > same_twist(key.dtype) ** 2 * (size + size_before))
     tie = jnp.abs(key - found.key) <= 4 * clean(key.dtype) * found.key
@@ -165,6 +169,7 @@ def _consider(found: Found, passes, edges: tuple, weight: Vec3, twist: Vec3, key
         jnp.where(better, key, found.key),
         found.found | passes,
         several,
+        found.hasty | hasty,
     )
 
 
@@ -180,7 +185,7 @@ def _seen(problem: Several, twist: Vec3, contacts: tuple[Index, ...]):
     """Of some contacts, whether each counts and just touches, and its slip; and whether no contact is violated."""
     tolerance = violation(twist)
     slips = problem.slips(twist)
-    apart = twist.dot(twist) <= fastest(tolerance.dtype) ** 2
+    apart = jnp.ones((), bool)
     for slip, active in zip(slips, problem.active, strict=True):
         apart &= (slip.x >= -tolerance) | ~active
     seen = []

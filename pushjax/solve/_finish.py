@@ -115,8 +115,8 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     solved = settle(solved & passes, problem.speed)
 
     power, presses = squeeze(problem)
-    # what the search found and the last look refused proves nothing
-    stuck = jnp.where(proves_jams & presses & ~chosen.found, Status.JAMMED, Status.NOT_CONVERGED)
+    # what the search found and the last look refused, or it could not write down, proves nothing
+    stuck = jnp.where(proves_jams & presses & ~chosen.found & ~chosen.hasty, Status.JAMMED, Status.NOT_CONVERGED)
     status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, stuck), Status.FREE)
     status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
 

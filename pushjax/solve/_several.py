@@ -143,11 +143,13 @@ def pick(values: tuple[Any, ...], index: Index) -> Any:
 
 def violation(twist: Vec3) -> Scalar:
     """Violation of a kinematic condition, in units of the fastest pusher, that passes: `clean`, and what rounding makes
-    of a twist that is much faster than the pushers, as of one squirting out of a wedge: up to 6e-9 in float64."""
+    of a twist that is much faster than the pushers, as of one squirting out of a wedge: up to 6e-9 in float64. Of one
+    too fast to be an answer, what rounding leaves at least."""
     dtype = twist.x.dtype
     eps = float(jnp.finfo(dtype).eps)
     size = jnp.abs(twist.x) + jnp.abs(twist.y) + jnp.abs(twist.z)
-    return jnp.minimum(clean(dtype) + 64 * eps * size, rough(dtype))
+    slow = twist.dot(twist) <= fastest(dtype) ** 2
+    return jnp.where(slow, jnp.minimum(clean(dtype) + 64 * eps * size, rough(dtype)), 8 * eps * size)
 
 
 def rough(dtype) -> float:
@@ -160,6 +162,9 @@ def fastest(dtype) -> float:
     """Twist, in units of the fastest pusher, of which rounding alone violates a condition by all that is allowed
     (1e-8, in float32 1e-4): no answer. 840 in float32."""
     return (1e-8 if jnp.finfo(dtype).bits > 32 else 1e-4) / float(jnp.finfo(dtype).eps)
+
+
+HASTY = 8  # times that, a twist is still known to be a motion; beyond, rows that depend by rounding give anything
 
 
 def clean(dtype) -> float:

@@ -14,6 +14,7 @@ The weights of four edges are determinants. The cross product of the two edges o
 written as such, with mu taken out: so they are exact for the smallest friction, and no sign hangs on rounding.
 """
 
+import functools
 from collections.abc import Callable
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -69,16 +70,18 @@ class _Edges(NamedTuple):
             tuple(pick(self.power, e) for e in numbers),
             tuple(pick(self.friction, e) for e in firsts),
             tuple(pick(self.turning, e) for e in firsts),
+            functools.reduce(jnp.logical_and, (pick(self.active, e) for e in numbers)),
         )
 
 
 class _Four(NamedTuple):
-    """Four of the edges; friction and turning: of the first and the third."""
+    """Four of the edges. friction, turning: of the first and the third. active: whether all are."""
 
     wrench: tuple[Vec3, ...]
     power: tuple[Scalar, ...]
     friction: tuple[Scalar, ...]
     turning: tuple[Vec3, ...]
+    active: Bool[Array, ""]
 
     def cross(self, pair: int, same: Flag) -> tuple[Vec3, Scalar, Scalar]:
         """The product of the first two (pair 0) or the last two (1), as a vector and a factor, and the size of the
@@ -169,11 +172,10 @@ def _best(edges: _Edges, witness: Scalar) -> tuple:
 
         def body(best, four, kind=kind):
             largest, presses, *kept = best
+            # settled, or everything that uses an edge would pick it again
             found = _basic(settle(edges.four(four), witness), kind(four))
-            exists = found.exists
-            for edge in four:
-                exists &= pick(edges.active, edge)
-            better, sure = settle((exists & (found.power > largest), exists & (found.power > found.noise)), witness)
+            better, sure = found.exists & (found.power > largest), found.exists & (found.power > found.noise)
+            better, sure = settle((better, sure), witness)
             kept = (jnp.where(better, e, b) for e, b in zip(four, kept, strict=True))
             return (jnp.where(better, found.power, largest), presses | sure, *kept), None
 
@@ -225,7 +227,7 @@ def _basic(four: _Four, kind: _Kind) -> _Basic:
     terms = mu34 * s34 * (_size(g1) + _size(g2)) + mu12 * s12 * (_size(g3) + _size(g4))
     noise = jax.lax.stop_gradient(NOISE * eps * terms)
     # all of one sign, to rounding, not all rounding, and nothing left over
-    exists = (jnp.abs(total) >= extent * (1 - 64 * eps)) & (extent > noise) & (idle <= balance * extent)
+    exists = four.active & (jnp.abs(total) >= extent * (1 - 64 * eps)) & (extent > noise) & (idle <= balance * extent)
     share = 1 / jnp.where(total != 0, total, 1.0)
     power, most = 0 * total, 0 * total
     for w, p in zip(weights, four.power, strict=True):

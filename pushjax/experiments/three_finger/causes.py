@@ -78,9 +78,10 @@ def parting(log: ThreeFingerLog, which: np.ndarray, friction: float) -> Parting:
     back = np.full(steady.shape, -1)
     back[steady] = np.arange(len(run))
     at = back[np.arange(len(which)), place]
+    any_steady = at >= 0  # else nothing, and not the last run's
     residual = law_residual(log, answers.problem.take(at), twist[at])
-    found = (answers.clean[at], answers.unique[at], answers.cancel[at])
-    return Parting(place, np.where(at >= 0, other.max(axis=1), 0.0), residual, *found)
+    found = (other.max(axis=1), residual, answers.clean[at], answers.unique[at], answers.cancel[at])
+    return Parting(place, *(np.where(any_steady, part, np.zeros_like(part)) for part in found))
 
 
 def explain(
