@@ -89,6 +89,13 @@ def _demo(command: Demo, progress: Progress) -> Result:
 def _reproduce(command: Reproduce, progress: Progress) -> Result:
     from pushjax.experiments import jam, squeeze, table2, three_finger, two_finger
 
+    for option, given, takes in (
+        ("--geometry", command.geometry != "nominal", ("table2",)),
+        ("--steps", command.steps is not None, ("table2", "squeeze", "two-finger", "three-finger")),
+        ("--data", command.data is not None, ("table2", "two-finger", "three-finger")),
+    ):
+        if given and command.experiment not in takes:
+            raise ValueError(f"{option} is for {', '.join(takes)}; got it with {command.experiment}")
     own: Any = {} if command.steps is None else {"steps": command.steps}
     if command.experiment == "jam":
         record = jam.run(command.seed, command.out)

@@ -165,8 +165,9 @@ def through(configurations: Numeric, steps: int | Sequence[int]) -> Float[Array,
 def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
     """A recorded path (points, dof) as `steps` steps of equal length along it; its first and last points stay.
 
-    Length is measured in the configuration's own units, straight from point to point. A path that does not move
-    repeats its first point. Raises ValueError for fewer than two points or one step, or values that are not finite.
+    Length is measured in the configuration's own units, straight from point to point; an angle that jumps from pi to
+    -pi on the way would be turned back through zero: unwrap it first. A path that does not move repeats its first
+    point. Raises ValueError for fewer than two points or one step, or values that are not finite.
     """
     _check_steps(steps)
     p = checked_path(path, None)

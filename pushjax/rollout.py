@@ -37,8 +37,9 @@ class Step(eqx.Module):
 
     pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
     along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
-    halfway; zero and SEPARATED where nothing pushes. The pose after is that before moved by the twist to the second
-    order (the contact point goes straight), not its exponential. status: `Status`.
+    halfway; zero and SEPARATED where nothing pushes. Contacts are in the order of the fingers: one of a round finger,
+    two on an outline that is not convex; two of a pad on a polygon, one on a disk. The pose after is that before moved
+    by the twist to the second order (the contact point goes straight), not its exponential. status: `Status`.
     """
 
     pose: Float[Array, "3"]
@@ -157,10 +158,12 @@ def step(
 ) -> Step:
     """Move the hand from configuration `q0` (dof,) to `q1` (dof,), world, m: the one step that `rollout` scans.
 
-    pose: (3,), the slider's, world. friction: mu between fingers and slider, a scalar or (fingers,).
+    pose: (3,), the slider's, world. friction: mu between fingers and slider, a scalar or (fingers,). solver: as in
+    `solve_contacts`.
 
-    Raises ValueError for arguments of the wrong shape, not finite, or a negative friction, where they are not traced;
-    where they are, and for a finger that is inside the slider, the step's status says so.
+    Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a hand closed on itself,
+    where they are not traced, for more than eight contacts, and more than the solver solves. A traced value that is not
+    finite or a negative friction, and a finger inside the slider, show in the step's status.
     """
     slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype), as_float(q1, dtype)
@@ -192,13 +195,17 @@ def rollout(
 
     path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose:
     (3,), the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,).
-    There is no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
+    solver: as in `solve_contacts`. There is no other state: a push goes on with `rollout(..., rest_of_path,
+    pose=push.pose[-1])`.
 
     Differentiable, forward and reverse, in slider, hand, path, pose and friction. Batches come from `vmap`.
 
-    Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a finger that starts inside
-    the slider by more than a fifth of the surface's length (less is pushed out in the first step), where they are not
-    traced; where they are, `status` says so at every step, and `first_failure` where.
+    Raises ValueError as `step` does, and for a finger that starts inside the slider by more than a fifth of the
+    surface's length (less is pushed out in the first step), where it is not traced. Traced values, `status` at every
+    step tells of as there, and `first_failure` where.
+
+    A hand whose kinematics give angles may turn with what it holds; of one that gives only centres, every finger goes
+    straight in each step, and two that hold something between them close on it by the arc's sagitta.
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; the header of `advance` has the scheme.
     """

@@ -123,6 +123,14 @@ def test_bench_of_too_many_contacts(capsys):
     assert "contacts must be from 1 to 8; got 9" in capsys.readouterr().err
 
 
+def test_options_that_would_do_nothing_are_refused(capsys):
+    for options in (["jam", "--steps", "10"], ["squeeze", "--data", "."], ["two-finger", "--geometry", "measured"]):
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["reproduce", *options])
+        assert stop.value.code == 1
+        assert f"{options[1]} is for " in capsys.readouterr().err
+
+
 def test_table2_wants_data(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PUSHJAX_DATA", str(tmp_path / "nowhere"))
     with pytest.raises(SystemExit) as stop:

@@ -182,6 +182,31 @@ def test_two_fingers_centre_a_disc():
     assert float(grasp.configuration[-1, 3]) == pytest.approx(0.07, abs=2e-4)
 
 
+def test_what_is_held_turns_with_the_hand_and_no_step_turns_it_too_far():
+    """Two fingers around a small block, with a hair of room, turn by half a radian: it follows, also where the recorded
+    angle jumps from pi to minus pi. Closing without friction, the block snaps round in one step: that is no answer."""
+    block = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), pj.Ellipsoid(np.eye(3), 0.03))
+    hand, half, room = pj.Hand.two_fingers(0.005), 0.25, 1e-7
+    around = np.array([0.0, 0.0, 0.0, 0.045 + room])
+    angle = np.array([0.0, 0.0, 1.0, 0.0])
+    turning = np.array(pj.line(around - half * angle, around + half * angle, 50))
+    opposite = turning + np.pi * angle
+    jumping = np.where(np.arange(4) == 2, (opposite + np.pi) % (2 * np.pi) - np.pi, opposite)
+    closing = np.array(pj.line((0, 0, 0, 0.06), (0, 0, 0, 0.03), 50))
+    paths = jnp.array([turning, opposite, jumping, closing])
+    starts = jnp.array([[0, 0, -half], [0, 0, np.pi - half], [0, 0, np.pi - half], [1e-3, 0, 0.1]])
+    push = jax.jit(jax.vmap(lambda p, s, mu: pj.rollout(block, hand, p, pose=s, friction=mu)))
+    run = push(paths, starts, jnp.array([0.3, 0.3, 0.3, 0.0]))
+    status, pose = np.asarray(run.status), np.asarray(run.pose)
+    assert np.all(status[:3] == pj.Status.MOVING)
+    turned = pose[:, -1, 2] - pose[:, 0, 2]
+    # once the room, seen from a corner contact's arm, is taken up, it turns as far as the hand
+    assert np.all(turned[:3] > 2 * half - 0.01)
+    np.testing.assert_allclose(turned[1:3], turned[0], atol=1e-6)
+    assert np.any(status[3] == pj.Status.NOT_CONVERGED)
+    assert np.max(np.abs(np.diff(pose[3, :, 2]))) <= 0.5
+
+
 def test_wide_flat_push_sticks_with_no_slip():
     """One pad of a wide open jaw pushes a square block that is flat against it, also sideways."""
     block = pj.Slider(pj.Polygon.rectangle(0.09, 0.09), pj.Ellipsoid(np.diag([1.0, 1.3, 0.8]), 0.03))
@@ -318,6 +343,14 @@ def test_laws_of_a_grasp(hand, opening):
 def test_hands_refuse_bad_input(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_no_hand_makes_more_contacts_than_are_supported():
+    hand = pj.Hand((0.005,) * 5, lambda q: jnp.stack([q + 0.02 * k for k in range(5)]), 2)
+    notched = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0.05, 0.02], [0, 0.1]])
+    slider = pj.Slider(pj.Polygon(notched), pj.Ellipsoid(np.eye(3), 0.03))
+    with pytest.raises(ValueError, match="from one to 8 are supported; got 10"):
+        pj.rollout(slider, hand, pj.line((-0.1, 0.3), (0.0, 0.3), 3), pose=np.zeros(3), friction=0.3)
 
 
 def test_grasps_refuse_bad_input():

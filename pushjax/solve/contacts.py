@@ -93,7 +93,7 @@ class Motion(eqx.Module):
     forces that cancel through the slider. A positive margin guarantees a motion, and is how far the fingers may still
     close on each other; where JAMMED it is negative, and its size is how far they would have to open. Infinite where
     no forces can cancel, as with one contact. Seldom is it negative where there is a motion: a jam is possible too.
-    unique: False where another twist satisfies every condition too.
+    unique: False where another twist satisfies every condition too, of those that the solver tries: `Exhaustive` all.
     """
 
     twist: Float[Array, "3"]
@@ -130,10 +130,13 @@ def solve_contacts(
 
     Source: Zhou et al. 2017, sections IV.A and IV.B; the gap is that of Stewart & Trinkle 1996.
     """
-    m = contacts.point.shape[0]
-    if not 1 <= m <= MAX_CONTACTS:
-        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {m}")
+    _countable(contacts.point.shape[0])
     return _solved(surface, contacts, solver)
+
+
+def _countable(contacts: int) -> None:
+    if not 1 <= contacts <= MAX_CONTACTS:
+        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {contacts}")
 
 
 @eqx.filter_jit
@@ -160,6 +163,7 @@ def motion_under(
     solver: ContactSolver | StickingSolver | None,
 ) -> SeveralMotion:
     """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`)."""
+    _countable(len(contacts))  # a hand's too
     if solver is None:
         solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
     if not isinstance(solver, StickingSolver):

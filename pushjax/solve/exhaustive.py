@@ -15,7 +15,8 @@ three edges   the conditions alone fix the twist. Its slip tells which edge of a
 A system whose three conditions depend on one another (parallel or concurrent normals) leaves a segment of solutions,
 whose ends other sets have; it is skipped. Whatever a set gives is checked against every condition of the problem, so
 a wrong answer cannot pass. Where none passes and the hand's squeeze power is positive (`squeeze`), there is no
-solution: a jam. Where none passes and it is not, the digits do not suffice (`fastest` in `_several`).
+solution: a jam. Where it is not, or what passes is too fast to be written down (`fastest` in `_several`), the digits do
+not suffice.
 
 Source: Zhou et al. 2017, section IV.B, for the problem; this enumeration in place of its sequence of LCPs.
 """
@@ -33,7 +34,8 @@ from pushjax.solve._several import ContactSolver, Several, SeveralMotion
 
 
 class Exhaustive(ContactSolver):
-    """Tries every set of cone edges: exact, at a fixed cost, and what it calls jammed is."""
+    """Tries every set of cone edges: exact, at a fixed cost, and what it calls jammed is (in float32 but for a few
+    of 100 000 at the border of a jam)."""
 
     def solve(self, problem: Several) -> SeveralMotion:
         return finish(problem, undifferentiated(enumerate_sets, problem), proves_jams=True)
