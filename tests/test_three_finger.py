@@ -1,5 +1,7 @@
 """Grasps with three fingers: the archive, and the authors' simulation against ours."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -105,3 +107,8 @@ def test_a_motion_that_breaks_the_law_is_seen(log):
         assert law.law_residual(log, answers.problem, answers.twist)[0] < 1e-6
         wrong = answers.twist + np.array([0.0, 0.0, 0.02])
         assert law.law_residual(log, answers.problem, wrong)[0] > law.BROKEN
+
+
+def test_half_of_one_run_is_nothing_to_fit():
+    with pytest.raises(ValueError, match="limit must be at least 2"):
+        three_finger.run(Path("nowhere"), limit=1)

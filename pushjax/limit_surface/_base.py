@@ -190,8 +190,7 @@ def checked_length(length: Numeric, dtype) -> Float[Array, ""]:
 
 def angle_between(a: Vec3, b: Vec3) -> Scalar:
     """Angle of two vectors in rad, accurate also when it is small; zero with a zero vector."""
-    cross = Vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x)
-    return jnp.arctan2(norm(cross), a.x * b.x + a.y * b.y + a.z * b.z)
+    return jnp.arctan2(norm(a.cross(b)), a.dot(b))
 
 
 def angle_tolerance(angle: Scalar) -> float:
@@ -200,5 +199,5 @@ def angle_tolerance(angle: Scalar) -> float:
 
 
 def norm(a: Vec3) -> Scalar:
-    squared = a.x * a.x + a.y * a.y + a.z * a.z
+    squared = a.dot(a)
     return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

@@ -36,8 +36,7 @@ class EllipsoidForm(_EllipsoidFields):
         return self.a.times(f).scale(2.0)
 
     def value(self, f: Vec3) -> Scalar:
-        g = self.a.times(f)
-        return f.x * g.x + f.y * g.y + f.z * g.z
+        return f.dot(self.a.times(f))
 
     def spin(self, f: Vec3) -> Scalar:
         return 2 * (self.a.xz * f.x + self.a.yz * f.y + self.a.zz * f.z)
@@ -47,11 +46,7 @@ class EllipsoidForm(_EllipsoidFields):
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
         ga, gb = self.a.times(a), self.a.times(b)
-        return (
-            a.x * ga.x + a.y * ga.y + a.z * ga.z,
-            2 * (b.x * ga.x + b.y * ga.y + b.z * ga.z),
-            b.x * gb.x + b.y * gb.y + b.z * gb.z,
-        )
+        return a.dot(ga), 2 * b.dot(ga), b.dot(gb)
 
 
 class Ellipsoid(LimitSurface):
@@ -93,10 +88,9 @@ class Ellipsoid(LimitSurface):
         form = self.form()
         f = settle(form.a.solve(v), v.x)
         for _ in range(2):
-            g = form.a.times(f)
-            more = form.a.solve(Vec3(v.x - g.x, v.y - g.y, v.z - g.z))
+            more = form.a.solve(v - form.a.times(f))
             # one rounding of it: refined, judged and given
-            f = settle(Vec3(f.x + more.x, f.y + more.y, f.z + more.z), v.x)
+            f = settle(f + more, v.x)
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
         solved = usable & (h > 0) & (angle <= angle_tolerance(angle))

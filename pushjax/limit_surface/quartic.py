@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pushjax._checks import Numeric, as_float, concrete, finite, shaped
-from pushjax._vec import Scalar, Vec3
+from pushjax._vec import Scalar, Vec3, entries
 from pushjax.limit_surface._base import (
     InverseMap,
     LimitSurface,
@@ -48,8 +48,7 @@ class QuarticForm(_QuarticFields):
         return QuarticForm(tuple(factor * c for c in self.c), self.length)
 
     def value(self, f: Vec3) -> Scalar:
-        g = self.gradient(f)
-        return (f.x * g.x + f.y * g.y + f.z * g.z) / 4
+        return f.dot(self.gradient(f)) / 4
 
     def gradient(self, f: Vec3) -> Vec3:
         c, (x, y, z) = self.c, f
@@ -90,11 +89,11 @@ class QuarticForm(_QuarticFields):
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
         ga, gb, hb = self.gradient(a), self.gradient(b), self.hessian(a).times(b)
         return (
-            (a.x * ga.x + a.y * ga.y + a.z * ga.z) / 4,
-            b.x * ga.x + b.y * ga.y + b.z * ga.z,
-            (b.x * hb.x + b.y * hb.y + b.z * hb.z) / 2,
-            a.x * gb.x + a.y * gb.y + a.z * gb.z,
-            (b.x * gb.x + b.y * gb.y + b.z * gb.z) / 4,
+            a.dot(ga) / 4,
+            b.dot(ga),
+            b.dot(hb) / 2,
+            a.dot(gb),
+            b.dot(gb) / 4,
         )
 
 
@@ -129,7 +128,7 @@ class Quartic(LimitSurface):
         self.length = checked_length(length, array.dtype)
 
     def form(self) -> QuarticForm:
-        return QuarticForm(tuple(self.coefficients[k] for k in range(15)), self.length)
+        return QuarticForm(entries(self.coefficients), self.length)
 
     def is_convex(self) -> bool:
         return least_curvature(np.asarray(self.coefficients)) >= -CONVEXITY_TOLERANCE
@@ -159,13 +158,12 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
     form = QuarticForm(c, jnp.ones_like(v.x))
 
     def rescaled(f: Vec3) -> Vec3:
-        power = jnp.maximum(v.x * f.x + v.y * f.y + v.z * f.z, 0)
+        power = jnp.maximum(v.dot(f), 0)
         h = form.value(f)
         return f.scale(jnp.cbrt(power / jnp.where(h > 0, 4 * h, 1.0)))
 
     def residual(f: Vec3) -> Vec3:
-        g = form.gradient(f)
-        return Vec3(v.x - g.x, v.y - g.y, v.z - g.z)
+        return v - form.gradient(f)
 
     def size(r: Vec3) -> Scalar:
         return jnp.maximum(jnp.maximum(jnp.abs(r.x), jnp.abs(r.y)), jnp.abs(r.z))
@@ -176,7 +174,7 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
         f, _, rounds = state
         step = form.hessian(f).solve(residual(f))
         along = form.restrict(f, step)
-        power = v.x * step.x + v.y * step.y + v.z * step.z
+        power = v.dot(step)
         cost = sum(a * halvings**k for k, a in enumerate(along[1:], start=1)) - power * halvings
         t = halvings[jnp.argmin(cost)]
         new = rescaled(Vec3(f.x + t * step.x, f.y + t * step.y, f.z + t * step.z))

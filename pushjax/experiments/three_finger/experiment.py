@@ -41,7 +41,12 @@ def run(
     progress: Callable[[int, int], None] = lambda done, total: None,
     limit: int | None = None,
 ) -> dict[str, Any]:
-    """All three objects. folder: the data's, with `three_finger_sim/`. limit: take only so many runs of each."""
+    """All three objects. folder: the data's, with `three_finger_sim/`. limit: take only so many runs of each.
+
+    Raises ValueError for a limit below two: the friction is fitted on half of the runs, the other half is reported.
+    """
+    if limit is not None and limit < 2:
+        raise ValueError(f"limit must be at least 2, half of it to fit and half to report; got {limit}")
     cells, shown, found = [], {}, []
     with float64():
         for done, name in enumerate(OBJECTS):
