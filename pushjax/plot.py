@@ -74,7 +74,8 @@ def limit_surfaces(surfaces: Mapping[str, LimitSurface], pairs: WrenchTwistPairs
             x, y, z = np.moveaxis(_on_level_set(surface, ball) / load, -1, 0)
             axes.plot_surface(x, y, z, color=colors[name], alpha=0.35, linewidth=0.2, edgecolor=colors[name])  # type: ignore[attr-defined]
             axes.scatter(*wrench.T, s=3, color="0.2", depthshade=False)
-            axes.set(title=name, xlabel="$f_x$ / load", ylabel="$f_y$ / load")
+            # few ticks: in between, the labels of the axes run into them
+            axes.set(title=name, xlabel="$f_x$ / load", ylabel="$f_y$ / load", xticks=[-1, 0, 1], yticks=[-1, 0, 1])
             axes.set_zlabel(r"$\tau$ / (length · load)")  # type: ignore[attr-defined]
             axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
         for row, (title, other, label) in enumerate(
