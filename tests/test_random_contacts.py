@@ -120,7 +120,7 @@ def test_order_frame_mirror_and_padding_do_not_matter():
     compare(base, jax.tree.map(lambda a: a[:, :3] if a.ndim > 1 and a.shape[1] == 8 else a, more))
 
     # an ellipsoid turned and mirrored with everything else
-    surface, contacts = problems(3, 2, seed=4)
+    surface, contacts = problems(3, 2, seed=4, slots=slots(3, 2))
     base = solve_all(surface, contacts)
     c, s = np.cos(0.7), np.sin(0.7)
     for linear in (np.array([[c, -s], [s, c]]), np.array([[1.0, 0.0], [0.0, -1.0]])):
@@ -131,6 +131,7 @@ def test_order_frame_mirror_and_padding_do_not_matter():
             *(a @ linear.T for a in (contacts.point, contacts.normal, contacts.displacement)),
             contacts.friction,
             contacts.gap,
+            contacts.active,
         )
         other = solve_all(turned, moved)
         np.testing.assert_array_equal(base.status, other.status)

@@ -63,7 +63,7 @@ def run(
 
 def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) -> dict[str, Any]:
     draw = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=m, degree=MODELS[model])))
-    solve = jax.jit(jax.vmap(lambda p: pj.solve_contacts(p.surface, p.contacts)))
+    solve = jax.jit(jax.vmap(pj.solve_contacts))
     names = ("solved", "jammed", "wrong", "borderline", "not_converged", "nonunique")
     counts: dict[str, int] = dict.fromkeys(names, 0)
     worst, elapsed, rounds = 0.0, [], -(-problems // CHUNK)
@@ -71,9 +71,9 @@ def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) 
     for chunk in range(rounds):
         problem = jax.block_until_ready(draw(jax.random.split(jax.random.fold_in(key, chunk), CHUNK)))
         if not chunk:
-            jax.block_until_ready(solve(problem))  # compiles
+            jax.block_until_ready(solve(problem.surface, problem.contacts))  # compiles
         begin = time.perf_counter()
-        motion = jax.block_until_ready(solve(problem))
+        motion = jax.block_until_ready(solve(problem.surface, problem.contacts))
         elapsed.append(time.perf_counter() - begin)
         found, violated = judge(ProblemBatch.of(problem.surface, problem.contacts), motion, dtype, starts, seed + chunk)
         worst = max(worst, violated)
