@@ -175,8 +175,8 @@ def test_padding_may_be_no_number():
     everything = spread(Weights(np.ones(3), np.ones(3), np.ones((SLOTS, 2)), 1.0))
     others = everything, spread(square(4)), jnp.broadcast_to(active, (FEW, SLOTS))
     (_, motion), slope = reverse(spread(given), *others)
-    (_, expected), known = reverse(spread(jax.tree.map(jnp.nan_to_num, given)), *others)
-    assert np.all(np.asarray(motion.status) == pj.Status.MOVING)
-    jax.tree.map(np.testing.assert_array_equal, (motion, slope), (expected, known))
+    np.testing.assert_allclose(motion.twist[0], pj.solve_contacts(square(4), flat).twist, atol=1e-15)
+    with_numbers = reverse(spread(jax.tree.map(jnp.nan_to_num, given)), *others)
+    jax.tree.map(np.testing.assert_array_equal, (motion, slope), (with_numbers[0][1], with_numbers[1]))
     for leaf in jax.tree.leaves(slope):
         assert np.all(np.isfinite(leaf))

@@ -177,7 +177,7 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
         power = v.dot(step)
         cost = sum(a * halvings**k for k, a in enumerate(along[1:], start=1)) - power * halvings
         t = halvings[jnp.argmin(cost)]
-        new = rescaled(Vec3(f.x + t * step.x, f.y + t * step.y, f.z + t * step.z))
+        new = rescaled(f + step.scale(t))
         return new, size(residual(new)), rounds + 1
 
     tolerance = 32 * jnp.finfo(v.x.dtype).eps
@@ -194,7 +194,7 @@ def _inverse_jvp(primals, tangents) -> Any:
     f, rounds = _inverse(c, v)
     one = jnp.ones_like(v.x)
     g = QuarticForm(dc, one).gradient(f)  # grad H is linear in the coefficients
-    df = QuarticForm(c, one).hessian(f).solve(Vec3(dv.x - g.x, dv.y - g.y, dv.z - g.z))
+    df = QuarticForm(c, one).hessian(f).solve(dv - g)
     return (f, rounds), (df, np.zeros(rounds.shape, jax.dtypes.float0))
 
 
