@@ -4,6 +4,7 @@ from pushjax import se2 as se2
 from pushjax.fit import FitReport as FitReport
 from pushjax.fit import fit_limit_surface as fit_limit_surface
 from pushjax.fit import mean_twist_angle as mean_twist_angle
+from pushjax.friction_model import FrictionModel as FrictionModel
 from pushjax.hands import Hand as Hand
 from pushjax.hands import line as line
 from pushjax.hands import resample as resample

@@ -27,17 +27,15 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped, weights_of
 from pushjax._vec import Vec3
 from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, angle_between
-from pushjax.limit_surface.sums import squared_quadratics
+from pushjax.limit_surface.sums import TERMS, near_ball, of_lower, squared_quadratics
 from pushjax.status import Status
 
 VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
-TERMS = 5
 CLIP_ROUNDS = 4
 MAX_STEPS = 500
 
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
-_LOWER = np.tril_indices(3)
 
 
 class FitReport(eqx.Module):
@@ -194,7 +192,7 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
     v = v / jnp.linalg.norm(v, axis=1, keepdims=True)
     scale = share @ jnp.linalg.norm(f, axis=1)
     pairs = _in_monomials(f / scale, v, share, degree)
-    start = _start(degree, terms, pairs.value.dtype)
+    start = near_ball(degree, terms, pairs.value.dtype)
 
     def again(state):
         _, _, _, good, rounds = state
@@ -251,8 +249,7 @@ def _loss(pairs: _Pairs, along: Bool[Array, "pairs"], value_weight: Array, ridge
 
 
 def _coefficients(parameters: Float[Array, "terms 6"], degree: int) -> Float[Array, "m"]:
-    lower = jnp.zeros((parameters.shape[0], 3, 3), parameters.dtype).at[:, *_LOWER].set(parameters)
-    p = lower @ jnp.swapaxes(lower, 1, 2)
+    p = of_lower(parameters)
     if degree == 4:
         return squared_quadratics(p)
     a = p[0]
@@ -262,18 +259,6 @@ def _coefficients(parameters: Float[Array, "terms 6"], degree: int) -> Float[Arr
 def _symmetric(a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     xy, xz, yz = a[3] / 2, a[4] / 2, a[5] / 2
     return jnp.stack([jnp.stack([a[0], xy, xz]), jnp.stack([xy, a[1], yz]), jnp.stack([xz, yz, a[2]])])
-
-
-def _start(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 6"]:
-    """Near the ball; the terms differ, each a ball stretched along its own direction, or they would never part."""
-    k = np.arange(terms) + 0.5
-    height, angle = 1 - k / terms, np.pi * (1 + 5**0.5) * k
-    ring = np.sqrt(1 - height**2)
-    u = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-    spread = 0.5 if terms > 1 else 0.0
-    lower = np.linalg.cholesky(np.eye(3) + spread * (3 * u[:, :, None] * u[:, None] - np.eye(3)))
-    size = terms ** (-1 / degree)
-    return jnp.asarray(size * lower[:, *_LOWER], dtype)
 
 
 def _minimise(loss: _Quadratic, parameters: Array, degree: int) -> tuple[Array, Array, Array]:

@@ -17,6 +17,7 @@ from pushjax.limit_surface._base import (
     angle_tolerance,
     checked_length,
 )
+from pushjax.limit_surface._rays import half_sphere
 from pushjax.status import Status
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients.
@@ -205,10 +206,7 @@ def least_curvature(coefficients: np.ndarray) -> float:
     alternates: z the Hessian's lowest eigenvector at F, then F the lowest at z. Each half step can only lower it.
     """
     tensor = _curvature_tensor(np.asarray(coefficients, np.float64))
-    k = np.arange(2000) + 0.5
-    height, angle = 1 - k / 2000, np.pi * (1 + 5**0.5) * k  # a half sphere: the form is even
-    ring = np.sqrt(1 - height**2)
-    direction = np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
+    direction = half_sphere(2000)
     values, vectors = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, direction, direction))
     worst = np.argsort(values[:, 0])[:32]
     lowest, z = values[worst, 0], vectors[worst, :, 0]

@@ -1,0 +1,250 @@
+"""Random friction: moments, convexity and its certificate, derivatives, keys, bad input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import pushjax as pj
+from pushjax._vec import Vec3
+from pushjax.friction_model import FrictionModel
+from pushjax.limit_surface.gram import Gram, antisymmetric_of, coefficients_of, largest_share
+from pushjax.limit_surface.quartic import MONOMIALS, least_curvature
+from pushjax.limit_surface.sums import split, squared_quadratics
+
+DRAWS = 20_000
+
+
+@pytest.fixture(scope="module")
+def quartic():
+    """Of a square on 64 points: the paper's set-up."""
+    support = pj.Support.uniform(pj.Polygon.rectangle(0.09, 0.09), points=64)
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(0), 400), degree=4)
+
+
+@pytest.fixture(scope="module")
+def tripod():
+    """Of three points: convex, but only just."""
+    support = pj.Support.points(np.array([[0.03, 0.0], [-0.02, 0.03], [-0.02, -0.02]]), np.array([1.0, 2.0, 0.3]))
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(0), 400), degree=4)
+
+
+def dense(lower):
+    return np.array([[np.asarray(lower[max(i, j)][min(i, j)]) for j in range(len(lower))] for i in range(len(lower))])
+
+
+def convex(coefficients: np.ndarray, loose: float = 1e-9) -> np.ndarray:
+    """By a sweep of the Hessian that knows of no certificate."""
+    return np.array([least_curvature(c / np.abs(c).max()) >= -loose for c in coefficients])
+
+
+@jax.jit
+def _sampled(model, surface, keys):
+    drawn = jax.vmap(model.around(surface).sample)(keys)
+    return drawn.surface.coefficients, drawn.pull
+
+
+def sampled(model, surface, keys=None):
+    """Coefficients and pulls of `DRAWS` samples, all by one program."""
+    keys = jax.random.split(jax.random.key(1), DRAWS) if keys is None else keys
+    return tuple(np.asarray(x, float) for x in _sampled(model, surface, keys))
+
+
+def test_a_gram_matrix_is_one(quartic, rng):
+    """Of H, and of z' hess H(F) z / 12, whatever N; and gives both back."""
+    c = np.asarray(quartic.coefficients)
+    n = rng.normal(size=6)
+    gram = Gram.of(tuple(map(jnp.asarray, c)), tuple(map(jnp.asarray, n)))
+    six, three = (dense(block) for block in gram)
+    for _ in range(5):
+        f, z = rng.normal(size=(2, 3))
+        products = np.array([f[0] ** 2, f[1] ** 2, f[2] ** 2, f[0] * f[1], f[0] * f[2], f[1] * f[2]])
+        wrench = f * np.array([1, 1, quartic.length])
+        assert products @ six @ products == pytest.approx(float(quartic.value(wrench)))
+        s, a = (np.outer(z, f) + np.outer(f, z)) / 2, np.cross(z, f) / 2
+        v = np.array([s[0, 0], s[1, 1], s[2, 2], s[0, 1], s[0, 2], s[1, 2]])
+        assert v @ six @ v + a @ three @ a == pytest.approx(
+            z @ np.asarray(quartic.form().hessian(Vec3(*f)).array()) @ z / 12
+        )
+    np.testing.assert_allclose(coefficients_of(gram.symmetric), c, rtol=1e-12)
+    np.testing.assert_allclose(antisymmetric_of(gram.symmetric), n, rtol=1e-10, atol=1e-12)
+
+
+def test_certificate_agrees_with_the_sweep(quartic):
+    """Of Wishart samples before any repair, and of the quartics they are pulled to."""
+    c, pull = sampled(FrictionModel(dof=12, friction=0.3), quartic)
+    c, pull = c[:400], pull[:400, None]
+    raw = (c - pull * np.asarray(quartic.coefficients)) / (1 - pull)
+    curvature = np.array([least_curvature(x) for x in raw])
+    assert 0.02 < np.mean(pull > 0) < 0.4
+    assert np.all(curvature[pull[:, 0] == 0] >= -1e-9)
+    # a search that ends a thousandth short calls no more than these not convex
+    assert np.all(curvature[pull[:, 0] > 2e-3] < 0)
+    assert np.all(convex(c))
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("sampler", ["gram", "terms"])
+def test_samples_are_convex_around_their_mean(quartic, sampler, dtype):
+    surface = jax.tree.map(lambda leaf: leaf.astype(dtype), quartic)
+    mean = np.asarray(surface.coefficients, float)
+    rays = np.random.default_rng(0).normal(size=(1000, 3))
+    products = np.prod(rays[:, None] ** MONOMIALS, axis=2)
+    for dof in (10, 20, 50, 250):
+        c, pull = sampled(FrictionModel(dof=np.float32(dof), friction=0.3, sampler=sampler), surface)
+        # in float32 a coefficient is rounded, and so is a border
+        assert np.all(convex(c[:60], 1e-9 if dtype == "float64" else 1e-6))
+        raw = (c - pull[:, None] * mean) / (1 - pull[:, None])
+        error = raw.std(axis=0) / np.sqrt(DRAWS)
+        assert np.all(np.abs(raw.mean(axis=0) - mean) < 4.5 * error)
+        if sampler == "terms":
+            assert not pull.any()
+        # along every ray of one, in the mean over rays of the other, the relative variance of H is 2 / n
+        values = raw @ products.T
+        relative = values.var(axis=0) / values.mean(axis=0) ** 2
+        if sampler == "gram":
+            np.testing.assert_allclose(relative, 2 / dof, rtol=0.1)
+        assert relative.mean() == pytest.approx(2 / dof, rel=0.04)
+
+
+def test_moments_of_the_ellipsoid(rng):
+    root = rng.normal(size=(3, 3))
+    mean, n = root @ root.T + np.eye(3), 12.0
+    model = FrictionModel(dof=n, friction=0.3).around(pj.Ellipsoid(mean, 0.03))
+    drawn = np.asarray(jax.jit(jax.vmap(model.sample))(jax.random.split(jax.random.key(0), 200_000)).surface.A)
+    variance = (mean**2 + np.outer(np.diag(mean), np.diag(mean))) / n
+    assert np.all(np.abs(drawn.mean(axis=0) - mean) < 4.5 * np.sqrt(variance / len(drawn)))
+    np.testing.assert_allclose(drawn.var(axis=0), variance, rtol=0.03)
+    assert np.all(np.linalg.eigvalsh(drawn) > 0)
+
+
+def test_a_mean_that_is_only_just_convex(tripod):
+    c, pull = sampled(FrictionModel(dof=20, friction=0.3), tripod)
+    assert np.all(convex(c[:300]))
+    assert np.mean(pull > 0) > 0.02
+    assert np.all(pull <= 1)
+
+
+def test_a_quartic_on_the_border():
+    """x^4 + y^4 + z^4, straight in many places: any further and it is not convex."""
+    surface = pj.Quartic([1.0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], 0.03)
+    found = split(surface.coefficients)
+    np.testing.assert_allclose(
+        squared_quadratics(found.lower @ jnp.swapaxes(found.lower, 1, 2)), surface.coefficients, atol=2 * found.error
+    )
+    c, pull = sampled(FrictionModel(dof=20, friction=0.3), surface)
+    assert np.all(np.isfinite(c))
+    assert np.all(pull <= 1)
+    assert np.all(convex(c[:100], 1e-6))
+
+
+def test_derivative_by_dof_is_that_of_the_quantile():
+    """Of an ellipsoid of one number: A_11 = a chi2(n) / n, at a fixed probability."""
+    surface, n = pj.Ellipsoid(2 * np.eye(3), 0.03), 7.5
+
+    def drawn(dof, key):
+        return FrictionModel(dof=dof, friction=0.3).sample(key, surface)[0].A[0, 0]
+
+    keys = jax.random.split(jax.random.key(5), 50)
+    value, slope = jax.jit(jax.vmap(jax.value_and_grad(drawn), in_axes=(None, 0)))(n, keys)
+    probability, h = scipy.stats.chi2.cdf(np.asarray(value) * n / 2, n), 1e-3
+    above, below = (2 * scipy.stats.chi2.ppf(probability, n + d) / (n + d) for d in (h, -h))
+    np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(("sampler", "dtype"), [("gram", "float32"), ("gram", "float64"), ("terms", "float32")])
+def test_derivatives(quartic, sampler, dtype):
+    """By dof, the friction's range and the mean: in the mean over draws, those of the moments."""
+    surface = jax.tree.map(lambda leaf: leaf.astype(dtype), quartic)
+    wrench = jnp.asarray([0.3, -0.2, 0.01], dtype)
+    level = surface.value(wrench)
+
+    def values(dof, low, scale, key):
+        """H along a ray, of the mean's; its square; mu."""
+        mean = pj.Quartic(scale * surface.coefficients, surface.length)
+        model = FrictionModel(dof=dof, friction=jnp.stack([low, low + 0.2]), sampler=sampler)
+        noisy, mu = model.sample(key, mean)
+        h = noisy.value(wrench) / level
+        return jnp.stack([h, h * h, mu])
+
+    at, n = tuple(jnp.asarray(x, dtype) for x in (150.0, 0.1, 1.0)), 2000  # of that dof none is repaired
+    keys = jax.random.split(jax.random.key(3), n)
+    slopes = jax.jit(jax.vmap(jax.jacrev(values, argnums=(0, 1, 2)), in_axes=(None, None, None, 0)))(*at, keys)
+    by_dof, by_low, by_scale = (np.asarray(slope) for slope in slopes)
+    assert by_dof.dtype == by_low.dtype == by_scale.dtype == dtype
+    assert np.isfinite([by_dof, by_low, by_scale]).all()
+
+    def agrees(slope, expected):
+        assert abs(slope.mean() - expected) < 4.5 * slope.std() / np.sqrt(n)
+
+    agrees(by_dof[:, 0], 0.0)
+    if sampler == "gram":
+        agrees(by_dof[:, 1], -2 / 150**2)
+        agrees(by_scale[:, 1], 2 * (1 + 2 / 150))
+    else:
+        assert by_dof[:, 1].mean() < -1 / 150**2
+    agrees(by_scale[:, 0], 1.0)
+    np.testing.assert_allclose(by_low[:, 2], 1, rtol=1e-6)
+    assert not by_low[:, :2].any()
+    assert not by_scale[:, 2].any()
+
+
+def test_keys(quartic):
+    """The same key, the same bits; in another batch as well."""
+    model = FrictionModel(dof=20, friction=(0.15, 0.35))
+    keys = jax.random.split(jax.random.key(0), DRAWS)
+    many, again, back = (sampled(model, quartic, k)[0] for k in (keys, keys, keys[::-1]))
+    np.testing.assert_array_equal(many, again)
+    np.testing.assert_array_equal(many, back[::-1])
+    surface = pj.Ellipsoid(np.diag([1.0, 2.0, 3.0]), 0.03)
+    drawn = jax.jit(jax.vmap(lambda k: model.sample(k, surface)))
+    a, mu = drawn(keys[:5])
+    assert len(np.unique(np.asarray(mu))) == 5
+    assert np.all((np.asarray(mu) >= 0.15) & (np.asarray(mu) <= 0.35))
+    one, its = model.sample(keys[2], surface)
+    np.testing.assert_allclose(one.A, a.A[2], rtol=1e-12)
+    np.testing.assert_allclose(its, mu[2], rtol=1e-12)
+    # and the model's surface is that of `around`, for the first half of the key
+    first, _ = jax.random.split(keys[2])
+    np.testing.assert_allclose(model.around(surface).sample(first).surface.A, one.A, rtol=1e-12)
+
+
+def test_nothing_random():
+    surface = pj.Ellipsoid(np.eye(3), 0.03)
+    same, mu = FrictionModel(dof=None, friction=0.3).sample(jax.random.key(0), surface)
+    np.testing.assert_array_equal(same.A, surface.A)
+    assert mu == pytest.approx(0.3)
+
+
+def test_bad_input(quartic):
+    for dof, message in (
+        (2.0, "dof must be at least 3"),
+        (np.nan, "dof must be finite"),
+        ([1.0, 2.0], "dof has shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            FrictionModel(dof=dof, friction=0.3)
+    for friction, message in (
+        ((0.4, 0.2), r"friction must be \(lowest, highest\); got \(0.4, 0.2\)"),
+        (-0.1, "friction must not be negative"),
+        ((0.1, 0.2, 0.3), "friction has shape"),
+        (np.inf, "friction must be finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            FrictionModel(dof=20, friction=friction)
+    with pytest.raises(ValueError, match="sampler must be 'gram' or 'terms'"):
+        FrictionModel(dof=20, friction=0.3, sampler="wishart")
+    with pytest.raises(ValueError, match="dof must be at least 9, the size of a quartic's Gram matrix; got 5"):
+        FrictionModel(dof=5, friction=0.3).sample(jax.random.key(0), quartic)
+
+
+def test_largest_share_of_itself(quartic):
+    """Of a Gram matrix, exactly all of it can be taken off; of the ball's, more than nothing."""
+    c = tuple(map(jnp.asarray, np.asarray(quartic.coefficients) / float(quartic.coefficients[0])))
+    ball = (jnp.asarray(0.2),) * 3 + (jnp.asarray(0.0),) * 3
+    one = largest_share(c, ball, Gram.identity(c[0]), enough=np.inf, tolerance=1e-6)
+    assert one.settled
+    assert one.share > 0
+    again = largest_share(c, ball, Gram.of(c, one.n), enough=np.inf, tolerance=1e-6)
+    assert float(again.share) == pytest.approx(1.0, abs=1e-5)
