@@ -13,6 +13,9 @@ from pushjax.limit_surface import Ellipsoid as Ellipsoid
 from pushjax.limit_surface import InverseMap as InverseMap
 from pushjax.limit_surface import LimitSurface as LimitSurface
 from pushjax.limit_surface import Quartic as Quartic
+from pushjax.monte_carlo import MonteCarlo as MonteCarlo
+from pushjax.monte_carlo import monte_carlo as monte_carlo
+from pushjax.random_rollout import random_rollout as random_rollout
 from pushjax.rollout import Slider as Slider
 from pushjax.rollout import Step as Step
 from pushjax.rollout import Trajectory as Trajectory

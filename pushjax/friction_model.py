@@ -63,24 +63,29 @@ class RandomSurface(eqx.Module):
 class FrictionModel(eqx.Module):
     """How uncertain friction is: the limit surface's, and that between the fingers and the slider.
 
+    every: a rollout draws anew after so many steps; None: once.
+
     dof: n, the degrees of freedom: the relative variance of H along a ray is 2 / n. At least 3 for an `Ellipsoid`, at
     least 9 for a `Quartic` (the size of the matrix that is drawn); need not be whole. None: the surface is certain.
     friction: mu, or the range (lowest, highest) on which it is uniform. sampler: of a `Quartic`, see this module's
     header; "gram" (the paper's) takes any, "terms" one that is a sum of squared quadratic forms, as all fits are.
 
     Raises ValueError for a dof that is not finite and at least 3, a friction that is negative, not finite or upside
-    down, or another sampler.
+    down, another sampler, or an `every` that is no number of steps.
     """
 
     dof: Float[Array, ""] | None
     friction: Float[Array, "2"]
     sampler: Sampler = eqx.field(static=True)
+    every: int | None = eqx.field(static=True)
 
-    def __init__(self, dof: Numeric | None, friction: Numeric, sampler: Sampler = "gram"):
+    def __init__(self, dof: Numeric | None, friction: Numeric, sampler: Sampler = "gram", *, every: int | None = None):
         dtype = common_dtype(dof, friction)
         if sampler not in ("gram", "terms"):
             raise ValueError(f"sampler must be 'gram' or 'terms'; got {sampler!r}")
-        self.sampler = sampler
+        if every is not None and (not isinstance(every, int) or every < 1):
+            raise ValueError(f"every must be a whole number of steps, at least 1, or None; got {every!r}")
+        self.sampler, self.every = sampler, every
         self.dof = None
         if dof is not None:
             self.dof = as_float(dof, dtype)
@@ -172,6 +177,7 @@ class _GramQuartic(RandomSurface):
     dof: Float[Array, ""]
 
     @staticmethod
+    @eqx.filter_jit
     def of(mean: Quartic, dof: Array) -> "_GramQuartic":
         form = mean.form()
         size = jax.lax.stop_gradient(form.c[0] + form.c[1] + form.c[2])
@@ -216,7 +222,7 @@ class _TermsQuartic(RandomSurface):
 
     @staticmethod
     def of(mean: Quartic, dof: Array) -> "_TermsQuartic":
-        terms = split(mean.coefficients)
+        terms = eqx.filter_jit(split)(mean.coefficients)
         error = concrete(terms.error)
         if error is not None and not error < SPLIT_TOLERANCE:
             raise ValueError(

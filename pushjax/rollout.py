@@ -6,6 +6,8 @@ pushed slider's pose is all the state there is.
 Where no motion satisfies every contact the hand has jammed: it stops at the beginning of that step, for good.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,7 +20,7 @@ from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.advance import Record, advance, columns, deepest, grips_of
 from pushjax.contacts import DEEPEST_OVERLAP, count
 from pushjax.hands import Hand, checked_path
-from pushjax.limit_surface import LimitSurface
+from pushjax.limit_surface import Form, LimitSurface
 from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
@@ -99,11 +101,15 @@ def _world(record: Record, length: Scalar) -> Step:
     )
 
 
-def _arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *paths: Numeric):
-    """Everything in one floating dtype, and checked as far as values are known."""
+def arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *paths: Numeric, pushes: int | None = None):
+    """Everything in one floating dtype, and checked as far as values are known. pushes: that many poses may be given
+    in place of one."""
     dtype = common_dtype(slider, hand, pose, friction, *paths)
     start, mu = as_float(pose, dtype), as_float(friction, dtype)
-    shaped("pose", start, (3,))
+    if pushes is None or start.ndim == 1:
+        shaped("pose", start, (3,))
+    elif start.shape != (pushes, 3):
+        raise ValueError(f"pose has shape {start.shape}; expected (3,) or ({pushes}, 3)")
     finite("pose", start)
     fingers = len(hand.fingers)
     if mu.shape not in ((), (fingers,)):
@@ -114,27 +120,31 @@ def _arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *pa
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
 
 
-def _check_start(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> None:
-    if traced((slider, hand, pose, configuration)):
+def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:
+    """poses: (3,), or (pushes, 3)."""
+    if traced((slider, hand, poses, configuration)):
         return
-    overlap = float(_overlap(slider, hand, pose, configuration))
+    many = jnp.atleast_2d(poses)
+    overlap = np.asarray(_overlaps(slider, hand, many, configuration))
+    worst = int(np.argmax(overlap))
     allowed = DEEPEST_OVERLAP * float(slider.surface.length)
-    if overlap > allowed:
+    if overlap[worst] > allowed:
+        where = "" if poses.ndim == 1 else f" at pose {worst}"
         raise ValueError(
-            f"path starts with the hand inside the slider: a finger overlaps it by {1e3 * overlap:.3g} mm; at most "
-            f"{1e3 * allowed:.3g} mm ({DEEPEST_OVERLAP:g} of the surface's length) is pushed out"
+            f"path starts with the hand inside the slider{where}: a finger overlaps it by {1e3 * overlap[worst]:.3g} "
+            f"mm; at most {1e3 * allowed:.3g} mm ({DEEPEST_OVERLAP:g} of the surface's length) is pushed out"
         )
 
 
 @eqx.filter_jit
-def _overlap(slider: Slider, hand: Hand, pose: Array, configuration: Array) -> Scalar:
-    """By how much the deepest finger overlaps the slider, m."""
+def _overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
+    """By how much the deepest finger overlaps the slider, m, of each pose."""
     where = columns(hand.poses(configuration))
-    grips = grips_of(hand, jnp.zeros(len(hand.fingers), pose.dtype), where, where)
-    return deepest(slider.shape.outline(), grips, Vec3.of(pose))
+    grips = grips_of(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)
+    return jax.vmap(lambda pose: deepest(slider.shape.outline(), grips, Vec3.of(pose)))(poses)
 
 
-def _check_opening(hand: Hand, path: Array) -> None:
+def check_opening(hand: Hand, path: Array) -> None:
     least, known = hand.least, concrete(path)
     if least is None or known is None or traced(least):
         return
@@ -165,12 +175,12 @@ def step(
     where they are not traced, for more than eight contacts, and more than the solver solves. A traced value that is not
     finite or a negative friction, and a finger inside the slider, show in the step's status.
     """
-    slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, q0, q1)
+    slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype), as_float(q1, dtype)
     for name, q in zip(("q0", "q1"), ends, strict=True):
         shaped(name, q, (hand.dof,))
         finite(name, q)
-        _check_opening(hand, q)
+        check_opening(hand, q)
     return _step(slider, hand, *ends, start, mu, solver)
 
 
@@ -209,22 +219,35 @@ def rollout(
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; the header of `advance` has the scheme.
     """
-    slider, hand, start, mu, dtype = _arguments(slider, hand, pose, friction, path)
+    slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, path)
     p = checked_path(path, hand.dof, dtype)
-    _check_opening(hand, p)
-    _check_start(slider, hand, start, p[0])
+    check_opening(hand, p)
+    check_start(slider, hand, start, p[0])
     return _rollout(slider, hand, p, start, mu, solver)
 
 
 @eqx.filter_jit
 def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
-    outline = slider.shape.outline()
-    form, mu = ground(slider.surface, friction)
+    grounded = ground(slider.surface, friction)
+    return scan(slider.shape, hand, path, pose, solver, lambda step: grounded)
+
+
+def scan(
+    shape: Shape,
+    hand: Hand,
+    path: Array,
+    pose: Array,
+    solver: ContactSolver | StickingSolver | None,
+    grounded: Callable[[Array], tuple[Form, Array]],
+) -> Trajectory:
+    """The rollout itself. `grounded` gives a step's surface and friction, by its index; all are of one length."""
+    outline = shape.outline()
     fingers = columns(hand.poses(path))
     one = sum(count(finger, outline) for finger in hand.fingers) == 1  # which cannot jam
 
-    def body(carry, ends):
-        pose, stopped = carry
+    def body(carry, along):
+        (pose, stopped), (step, ends) = carry, along
+        form, mu = grounded(step)
         record = advance(form, outline, grips_of(hand, mu, *ends), solver, pose)
         if not one:
             record, stopped = _frozen(record, pose, stopped)
@@ -236,8 +259,9 @@ def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
     # Only poses, and what searches found, are kept for reverse mode, and a step is worked out again there: writing out
     # everything a step computes, and reading it back, took twice as long as computing it again.
     body = jax.checkpoint(body, prevent_cse=False, policy=keep_found)
-    _, records = jax.lax.scan(body, (Vec3.of(pose), jnp.zeros((), jnp.int8)), ends)
-    steps = _world(records, form.length)
+    indices = jnp.arange(len(path) - 1)
+    _, records = jax.lax.scan(body, (Vec3.of(pose), jnp.zeros((), jnp.int8)), (indices, ends))
+    steps = _world(records, grounded(indices[0])[0].length)
     poses = jnp.concatenate([pose[None], steps.pose])
     stopped = _first(_stops(steps.status))
     reached = jnp.where(stopped >= 0, stopped, len(path) - 1)

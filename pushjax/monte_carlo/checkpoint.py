@@ -1,0 +1,115 @@
+"""What is done of a run, in a folder: a manifest that says of which, and the pushes, block after block.
+
+Files are written beside their place and moved there when they are whole, so that a run that is killed leaves no half of
+one; and what a run is to go on from is compared with what it asks for, part by part.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+MANIFEST = "manifest.json"
+FORMAT = 1
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be gone on from, or not be written."""
+
+
+def digest(*trees: Any) -> str:
+    """Of everything in pytrees: their structure, static parts included, and every bit of their arrays."""
+    found = hashlib.sha256()
+    leaves, structure = jax.tree.flatten(trees)
+    found.update(_plain(structure).encode())
+    for leaf in leaves:
+        array = np.asarray(leaf)
+        found.update(f"{array.dtype} {array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _plain(structure: Any) -> str:
+    """A functions' address is another in every process: what it does shows in where it puts the fingers."""
+    words = str(structure).split(" at 0x")
+    return words[0] + "".join(word[word.find(">") :] for word in words[1:])
+
+
+class Checkpoint:
+    """A run's folder. Blocks are (first, last + 1) ranges of pushes, in order, without gaps."""
+
+    def __init__(self, folder: Path, parts: dict[str, Any], writes: bool = True):
+        """Raises CheckpointError where the folder holds another run, or is damaged."""
+        self.folder, self.writes = folder, writes
+        wanted = {"format": FORMAT} | parts
+        path = folder / MANIFEST
+        if path.exists():
+            self._same(path, wanted)
+        elif writes:
+            self._write(path, lambda file: file.write(json.dumps(wanted, indent=2).encode()))
+
+    def _same(self, path: Path, wanted: dict[str, Any]) -> None:
+        try:
+            there = json.loads(path.read_text())
+            others = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
+        except (ValueError, AttributeError):
+            raise CheckpointError(f"checkpoint: {path} is damaged; give another folder") from None
+        if others:
+            name = others[0]
+            raise CheckpointError(
+                f"checkpoint: {self.folder} holds another run: {', '.join(others)} differ ({name} was "
+                f"{there.get(name)!r}, is {wanted.get(name)!r}); give another folder"
+            )
+
+    def blocks(self) -> list[tuple[int, int, Path]]:
+        """What is there, in order, up to the first gap."""
+        found, reached = [], 0
+        for path in sorted(self.folder.glob("pushes-*.npz")):
+            first, last = (int(word) for word in path.stem.split("-")[1:])
+            if first != reached:
+                break
+            found.append((first, last, path))
+            reached = last
+        return found
+
+    def read(self, path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Raises CheckpointError for a block that is not whole; the others are left as they are."""
+        try:
+            with np.load(path) as file:
+                return {name: file[name] for name in names}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(
+                f"checkpoint: {path} is damaged ({type(error).__name__}); remove it, and what follows it is computed "
+                "again"
+            ) from None
+
+    def write(self, first: int, last: int, arrays: dict[str, np.ndarray]) -> None:
+        """Raises CheckpointError where it cannot, with every block before left as it is."""
+        if self.writes:
+            self._write(
+                self.folder / f"pushes-{first:012d}-{last:012d}.npz",
+                lambda file: np.savez(file, allow_pickle=False, **arrays),
+            )
+
+    def _write(self, path: Path, put: Any) -> None:
+        partial = None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".partial-", delete=False) as file:
+                partial = Path(file.name)
+                put(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except OSError as error:
+            if partial is not None:
+                partial.unlink(missing_ok=True)
+            raise CheckpointError(
+                f"checkpoint: {path} cannot be written ({error.strerror or error}); what was written before is kept"
+            ) from None

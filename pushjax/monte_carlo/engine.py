@@ -1,0 +1,151 @@
+"""`monte_carlo`: from a key and a number to the distribution of where a slider ends up."""
+
+import time
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+from jaxtyping import PRNGKeyArray
+
+from pushjax._checks import Numeric
+from pushjax._progress import Report, progress_bar
+from pushjax.friction_model import FrictionModel
+from pushjax.hands import Hand, checked_path
+from pushjax.monte_carlo.checkpoint import Checkpoint, digest
+from pushjax.monte_carlo.result import MonteCarlo
+from pushjax.monte_carlo.tiles import AXIS, Outcome, Setup, fetch, submit
+from pushjax.rollout import Slider, arguments, check_opening, check_start
+from pushjax.solve import ContactSolver, StickingSolver
+
+TILE = 2048
+SMALLEST_TILE = 64
+BLOCK = 16 * TILE  # pushes between two files of a checkpoint, at least
+
+
+def monte_carlo(
+    key: PRNGKeyArray,
+    n: int,
+    slider: Slider,
+    hand: Hand,
+    path: Numeric,
+    *,
+    pose: Numeric,
+    model: FrictionModel,
+    solver: ContactSolver | StickingSolver | None = None,
+    trajectories: bool = False,
+    tile: int | None = None,
+    devices: Sequence[Any] | None = None,
+    checkpoint: str | Path | None = None,
+    progress: bool | Report = False,
+) -> MonteCarlo:
+    """Push the slider `n` times along one path, each time under other friction.
+
+    pose: (3,), or (n, 3), a start for each push, world. model: of which friction is drawn around `slider.surface`; push
+    i is `random_rollout(fold_in(key, i), ...)`. path, solver: as in `rollout`. trajectories: keep every pose of
+    every push (12 bytes a step in float32), not only the last.
+
+    tile: how many pushes a device makes at once, in one compiled program; default 2048, or the next power of two for
+    fewer. The memory it takes does not depend on n but for the results, some 60 bytes a push. devices: default all,
+    also those of other processes (`jax.distributed`). The bits of push i depend on key, tile, n's tile where none is
+    given, and machine, not on how many devices and processes there are.
+
+    checkpoint: a folder, seen by all processes, where what is done is kept; a run that finds its beginning there goes
+    on from it to the same bits. progress: True for a bar on the terminal; or a function of (done, n).
+
+    Raises ValueError as `rollout` and `FrictionModel.around` do, for n, tile below one, and CheckpointError (a
+    ValueError) for a checkpoint of another run, a damaged one or one that cannot be written; what is there is kept.
+
+    Source: Zhou et al. 2017, sections V and VI.
+    """
+    begun = time.perf_counter()
+    for name, value in (("n", n), ("tile", TILE if tile is None else tile)):
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
+    n = int(n)
+    slider, hand, start, _, dtype = arguments(slider, hand, pose, 0.0, path, pushes=n)
+    p = checked_path(path, hand.dof, dtype)
+    check_opening(hand, p)
+    check_start(slider, hand, start, p[0])
+    width = int(tile) if tile is not None else min(TILE, max(SMALLEST_TILE, 1 << (n - 1).bit_length()))
+    raw, impl = _raw(key)
+    mesh = Mesh(np.array(jax.devices() if devices is None else list(devices)), (AXIS,))
+    shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver
+    run = _Run(n, width, Setup(*shared), impl, mesh, np.asarray(start), trajectories)
+    kept = None
+    if checkpoint is not None:
+        parts = {"n": n, "tile": width, "trajectories": trajectories, "key": digest(raw, impl)}
+        parts |= {"slider": digest(slider), "hand": digest(hand, hand.poses(p)), "path": digest(p)}
+        parts |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
+        parts |= {"jax": jax.__version__, "platform": mesh.devices.flat[0].platform}
+        kept = Checkpoint(Path(checkpoint), parts, writes=jax.process_index() == 0)
+    shown = progress_bar() if progress is True else nullcontext(progress or (lambda done, total: None))
+    with shown as report:
+        found = run.all(kept, report)
+    starts = np.broadcast_to(run.start, (n, 3))
+    return MonteCarlo(starts, *found, time.perf_counter() - begun)
+
+
+def _raw(key: Any) -> tuple[Any, Any]:
+    """A key's data, and of which kind it is."""
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return jax.random.key_data(key), str(jax.random.key_impl(key))
+    return key, str(jax.random.key_impl(jax.random.wrap_key_data(key)))
+
+
+class _Run:
+    """A run, and how far it is."""
+
+    def __init__(self, n: int, tile: int, setup: Setup, impl: Any, mesh: Mesh, start: np.ndarray, keep: bool):
+        self.n, self.setup, self.impl, self.mesh, self.start, self.keep = n, setup, impl, mesh, start, keep
+        self.round = tile * mesh.size
+
+    def all(self, kept: Checkpoint | None, report: Report) -> Outcome:
+        parts, done = self._resumed(kept)
+        block, begun = [], done  # what is not in the checkpoint yet, and from where
+        waiting: tuple[int, int, Outcome] | None = None
+        report(done, self.n)
+        while done < self.n or waiting is not None:
+            ahead = self._submit(done) if done < self.n else None  # the devices go on while the host copies
+            if waiting is not None:
+                first, last, outcome = waiting
+                host = fetch(outcome)
+                block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], host))
+                if kept is not None and (last - begun >= BLOCK or last == self.n):
+                    parts.append(_joined(block))
+                    kept.write(begun, last, _named(parts[-1]))
+                    block, begun = [], last
+                report(last, self.n)
+            waiting = ahead
+            done = done if ahead is None else ahead[1]
+        return _joined(parts + block)
+
+    def _submit(self, first: int) -> tuple[int, int, Outcome]:
+        last = min(first + self.round, self.n)
+        indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32)
+        poses = np.broadcast_to(self.start, (self.n, 3))[indices]
+        return first, last, submit(self.setup, self.impl, self.mesh, indices, poses, self.keep)
+
+    def _resumed(self, kept: Checkpoint | None) -> tuple[list[Outcome], int]:
+        if kept is None:
+            return [], 0
+        blocks = kept.blocks()
+        if jax.process_count() > 1:  # as the one sees it that writes
+            reached = int(multihost_utils.broadcast_one_to_all(np.int32(blocks[-1][1] if blocks else 0)))
+            blocks = [block for block in blocks if block[1] <= reached]
+        names = tuple(name for name in Outcome._fields if self.keep or name != "trajectory")
+        parts = [Outcome(**({"trajectory": None} | kept.read(path, names))) for _, _, path in blocks]
+        return parts, blocks[-1][1] if blocks else 0
+
+
+def _joined(parts: list[Outcome]) -> Outcome:
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _named(outcome: Outcome) -> dict[str, np.ndarray]:
+    return {name: leaf for name, leaf in outcome._asdict().items() if leaf is not None}
