@@ -21,7 +21,11 @@ from pushjax.rollout import Step as Step
 from pushjax.rollout import Trajectory as Trajectory
 from pushjax.rollout import rollout as rollout
 from pushjax.rollout import step as step
+from pushjax.scores import coverage as coverage
 from pushjax.scores import deviation as deviation
+from pushjax.scores import energy_score as energy_score
+from pushjax.scores import histogram_distance as histogram_distance
+from pushjax.scores import log_density as log_density
 from pushjax.shapes import Curve as Curve
 from pushjax.shapes import Disk as Disk
 from pushjax.shapes import Ellipse as Ellipse

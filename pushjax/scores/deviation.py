@@ -1,4 +1,4 @@
-"""How far a prediction is from what happened."""
+"""How far one pose is from another."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
