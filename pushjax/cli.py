@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,6 +29,19 @@ class Demo(Common):
     """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result."""
 
 
+Experiment = Literal[
+    "table2",
+    "squeeze",
+    "jam",
+    "two-finger",
+    "three-finger",
+    "stochastic-push",
+    "capture",
+    "grasp-rectangle",
+    "grasp-butterfly",
+]
+
+
 @dataclass
 class Reproduce(Common):
     """Reproduce an experiment of the paper beside the paper's own figures.
@@ -35,20 +49,25 @@ class Reproduce(Common):
     table2: a triangle on three support points, pushed by a robot; predicted against measured final poses.
     squeeze: a parallel jaw closes on a rectangle from four start poses. jam: two fingers that jam, and from what
     friction. two-finger: the triangle pushed by two fingers, predicted against measured. three-finger: the original
-    authors' simulated grasps, run again.
+    authors' simulated grasps, run again. stochastic-push: a square pushed 2000 times under random friction. capture:
+    two fingers push a disc from anywhere. grasp-rectangle, grasp-butterfly: a jaw closes on them from random poses.
     """
 
-    experiment: Annotated[Literal["table2", "squeeze", "jam", "two-finger", "three-finger"], tyro.conf.Positional] = (
-        tyro.MISSING
-    )
+    experiment: Annotated[Experiment, tyro.conf.Positional] = tyro.MISSING
     """Which."""
     data: Path | None = None
     """Folder of the recorded pushes. Default: the environment variable PUSHJAX_DATA."""
-    geometry: Literal["nominal", "measured"] = "nominal"
-    """table2: nominal, as in the paper; or measured, contact and the push's end as force sensor and robot command
-    tell."""
+    geometry: Literal["nominal", "measured"] | None = None
+    """table2: nominal (the default), as in the paper; or measured, contact and the push's end as force sensor and robot
+    command tell."""
     steps: int | None = None
     """Steps of each push or grasp. Default: the experiment's own."""
+    n: int | None = None
+    """Random experiments: how many pushes or grasps. Default: the paper's."""
+    dof: tuple[float, ...] | None = None
+    """Random experiments: degrees of freedom of the limit surface's noise; capture: two, to compare."""
+    friction: tuple[float, ...] | None = None
+    """Random experiments: lowest and highest; capture: one or more to push with."""
 
 
 @dataclass
@@ -86,34 +105,56 @@ def _demo(command: Demo, progress: Progress) -> Result:
     return record, demo.summary(record)
 
 
-def _reproduce(command: Reproduce, progress: Progress) -> Result:
-    from pushjax.experiments import jam, squeeze, table2, three_finger, two_finger
+RANDOM = ("n", "steps", "dof", "friction")
+TAKES: dict[str, tuple[str, ...]] = {
+    "table2": ("data", "geometry", "steps"),
+    "squeeze": ("steps",),
+    "jam": (),
+    "two-finger": ("data", "steps"),
+    "three-finger": ("data", "steps"),
+    "stochastic-push": RANDOM,
+    "capture": RANDOM,
+    "grasp-rectangle": RANDOM,
+    "grasp-butterfly": RANDOM,
+}
 
-    for option, given, takes in (
-        ("--geometry", command.geometry != "nominal", ("table2",)),
-        ("--steps", command.steps is not None, ("table2", "squeeze", "two-finger", "three-finger")),
-        ("--data", command.data is not None, ("table2", "two-finger", "three-finger")),
-    ):
-        if given and command.experiment not in takes:
-            raise ValueError(f"{option} is for {', '.join(takes)}; got it with {command.experiment}")
-    own: Any = {} if command.steps is None else {"steps": command.steps}
-    if command.experiment == "jam":
-        record = jam.run(command.seed, command.out)
-        return record, jam.summary(record)
-    if command.experiment == "squeeze":
-        record = squeeze.run(command.seed, command.out, **own)
-        return record, squeeze.summary(record)
-    folder = command.data or find_data()
-    if folder is None:
-        raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
-    if command.experiment == "table2":
-        record = table2.run(folder, command.seed, command.out, command.geometry, progress=progress, **own)
-        return record, table2.summary(record)
-    if command.experiment == "two-finger":
-        record = two_finger.run(folder, command.seed, command.out, progress=progress, **own)
-        return record, two_finger.summary(record)
-    record = three_finger.run(folder, command.seed, command.out, progress=progress, **own)
-    return record, three_finger.summary(record)
+
+def _reproduce(command: Reproduce, progress: Progress) -> Result:
+    name = command.experiment
+    takes, given = TAKES[name], {}
+    for option in ("data", "geometry", *RANDOM):
+        value = getattr(command, option)
+        if value is None:
+            continue
+        if option not in takes:
+            others = ", ".join(other for other in TAKES if option in TAKES[other])
+            raise ValueError(f"--{option} is for {others}; got it with {name}")
+        given[option] = value
+    if "dof" in given and name != "capture":
+        if len(given["dof"]) != 1:
+            raise ValueError(f"--dof: {name} takes one; got {len(given['dof'])}")
+        given["dof"] = given["dof"][0]
+    if "friction" in given and name != "capture" and len(given["friction"]) != 2:
+        raise ValueError(f"--friction: {name} takes two, lowest and highest; got {len(given['friction'])}")
+    if "data" in takes:
+        folder = given.pop("data", None) or find_data()
+        if folder is None:
+            raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
+        given["folder"] = folder
+    if name not in ("squeeze", "jam"):
+        given["progress"] = progress
+    experiment: Any
+    if name.startswith("grasp-"):
+        from pushjax.experiments import grasps as experiment
+
+        given["slider"] = name.removeprefix("grasp-")
+    else:
+        experiment = import_module(f"pushjax.experiments.{name.replace('-', '_')}")
+    record = experiment.run(seed=command.seed, out=command.out, **given)
+    text = experiment.summary(record)
+    from pushjax.page import write_page
+
+    return record, f"{text}\nwrote {write_page(record, text, command.out / f'{name}.html')}"
 
 
 def _bench(command: Bench, progress: Progress) -> Result:
@@ -144,15 +185,11 @@ def main(arguments: list[str] | None = None) -> None:
     import matplotlib
 
     matplotlib.use("Agg")  # draws to files; there may be no screen
-    from rich.progress import Progress as Bar
+
+    from pushjax._progress import progress_bar
 
     try:
-        with Bar(transient=True) as bar:
-            task = bar.add_task("working", total=None, visible=not isinstance(command, Demo))
-
-            def progress(done: int, total: int) -> None:
-                bar.update(task, completed=done, total=total)
-
+        with progress_bar(visible=not isinstance(command, Demo)) as progress:
             if isinstance(command, Reproduce):
                 record, text = _reproduce(command, progress)
             elif isinstance(command, Bench):

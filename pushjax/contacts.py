@@ -7,7 +7,8 @@ problem's to find.
 
 A round finger has one such place, or two on an outline that is not convex. A pad against a polygon has two: of all
 corners of either, seen from the other's outline, the two nearest in different places (an edge flat on an edge rests
-on the two ends of what they share). All are chosen anew in each step, and stay the same within it.
+on the two ends of what they share). So it has against a smooth outline, of the places that `_smooth_pads` finds. All
+are chosen anew in each step, and stay the same within it.
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from pushjax import _smooth_pads
 from pushjax._vec import Scalar, Vec2, select, settle
 from pushjax.hands import Finger, RoundFinger
 from pushjax.shapes import DiskOutline, Outline, PolygonOutline
@@ -64,6 +66,8 @@ def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> T
         seen = pad.closest((outline.center - at.center).unrotate(angle))
         normal = seen.normal.rotate(angle)
         return (Touch(seen.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
+    if not isinstance(outline, PolygonOutline):
+        return _beside_smooth(pad, outline, at.center, angle, length)
     mine = _beside(outline, corners(pad).turned(angle, at.center), length)
     away, own = Vec2(angle.x, -angle.y), corners(outline)
     seen = _beside(pad, own.turned(away, (-at.center).unrotate(angle)), length)
@@ -104,6 +108,21 @@ def _beside(outline: Outline, corner: Corner, length: Scalar) -> Touch:
         found = select(nearer, touch, found)
     assert found is not None
     return found
+
+
+def _beside_smooth(pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar) -> Touch:
+    """A pad's corners, each against the place of a smooth outline nearest to it, and what faces the pad's edges."""
+    deep, corner = -2 * DEEPEST_OVERLAP * length, corners(pad).turned(angle, center)
+    seen = jax.vmap(outline.closest)(corner.point)
+    points = (corner.onward.dot(seen.normal) >= -BLUNT) & (corner.back.dot(seen.normal) >= -BLUNT)
+    points &= seen.distance > deep
+    found = [Touch(jnp.where(points, seen.distance, FAR), seen.point, -seen.normal)]
+    for edge, facing, _, along, height in _smooth_pads.seen_by(edges(pad), outline, center, angle):
+        loose = LOOSE * edge.length
+        beside = facing.real & (along >= -loose) & (along <= edge.length + loose) & (height > deep)
+        normal = jax.tree.map(lambda entry, like=height: jnp.full_like(like, entry), edge.normal.rotate(angle))
+        found.append(Touch(jnp.where(beside, height, FAR), facing.point, normal))
+    return jax.tree.map(lambda *entries: jnp.concatenate(entries), *found)
 
 
 def count(finger: Finger, outline: Outline) -> int:
@@ -172,8 +191,11 @@ def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
     pad, angle = finger.shape.outline(), _angle(at)
     if isinstance(outline, DiskOutline):
         return outline.radius - pad.closest((outline.center - at.center).unrotate(angle)).distance
-    mine = outline.closest(at.center + corners(pad).point.rotate(angle)).distance
+    tips = at.center + corners(pad).point.rotate(angle)
+    if not isinstance(outline, PolygonOutline):
+        return _smooth_pads.overlap(pad, _smooth_pads.seen_by(edges(pad), outline, at.center, angle), outline, tips)
     theirs = pad.closest((corners(outline).point - at.center).unrotate(angle)).distance
+    mine = outline.closest(tips).distance
     return jnp.maximum(jnp.max(-mine), jnp.max(-theirs))
 
 
@@ -184,7 +206,11 @@ def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scala
     back = (-path).unrotate(angle)
     if isinstance(outline, DiskOutline):
         return pad.sweep((outline.center - at.center).unrotate(angle), back, outline.radius)
-    mine = outline.sweep(at.center + corners(pad).point.rotate(angle), path, zero)
+    tips = at.center + corners(pad).point.rotate(angle)
+    if not isinstance(outline, PolygonOutline):
+        seen = _smooth_pads.seen_by(edges(pad), outline, at.center, angle)
+        return _smooth_pads.sweep(pad, seen, outline, tips, path, back)
+    mine = outline.sweep(tips, path, zero)
     theirs = pad.sweep((corners(outline).point - at.center).unrotate(angle), back, zero)
     return jnp.minimum(jnp.min(mine), jnp.min(theirs))
 
@@ -192,7 +218,7 @@ def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scala
 def edges(outline: Outline) -> tuple[Edge, ...]:
     """Of a polygon with few of them, as pads and what they touch must be."""
     if not isinstance(outline, PolygonOutline):
-        raise ValueError("hand: pads can touch a Polygon or a Disk; other shapes need round fingers")
+        raise TypeError(f"not a polygon's outline: {type(outline).__name__}")
     if isinstance(outline.edges, Edge):
         many = outline.edges.start_x.shape[0]
         raise ValueError(f"hand: pads can touch a Polygon of up to twelve vertices; got {many}")

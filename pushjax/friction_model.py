@@ -198,6 +198,7 @@ class _GramQuartic(RandomSurface):
         reference = self.gram.plus(jnp.maximum(-2 * self.loading, 0), identity)
         found = undifferentiated(_certified, coefficients, antisymmetric_of(drawn), reference)
         pull = jnp.where(found.share < 0, -found.share / (1 - found.share), 0.0)
+        pull = jnp.where(jnp.isfinite(found.share), pull, 1.0)  # never seen: of numbers that are none
         moved = [c + pull * (m - c) for c, m in zip(coefficients, mean, strict=True)]
         return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, jnp.stack(moved)), pull)
 

@@ -36,10 +36,11 @@ def envelope(experiment: str, settings: dict[str, Any], **figures: Any) -> dict[
 def write_json(record: dict[str, Any], path: Path) -> None:
     """Write a record; numpy and JAX numbers and arrays become plain ones. NaN is refused."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2, default=_plain, allow_nan=False) + "\n")
+    path.write_text(json.dumps(record, indent=2, default=plain, allow_nan=False) + "\n")
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """What `json` cannot write by itself."""
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
         return np.asarray(value).tolist()
     if isinstance(value, Path):

@@ -125,7 +125,7 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
     if traced((slider, hand, poses, configuration)):
         return
     many = jnp.atleast_2d(poses)
-    overlap = np.asarray(_overlaps(slider, hand, many, configuration))
+    overlap = np.asarray(overlaps(slider, hand, many, configuration))
     worst = int(np.argmax(overlap))
     allowed = DEEPEST_OVERLAP * float(slider.surface.length)
     if overlap[worst] > allowed:
@@ -137,7 +137,7 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
 
 
 @eqx.filter_jit
-def _overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
+def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
     """By how much the deepest finger overlaps the slider, m, of each pose."""
     where = columns(hand.poses(configuration))
     grips = grips_of(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)

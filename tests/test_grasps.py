@@ -11,7 +11,7 @@ import pytest
 import pushjax as pj
 from pushjax.experiments import squeeze
 from pushjax.limit_surface.sums import squared_quadratics
-from pushjax.rollout import _overlap
+from pushjax.rollout import overlaps
 from pushjax.verify import ProblemBatch, violations
 
 DISTANCE, ANGLE = 1e-4, np.radians(0.1)  # of a final pose from a recorded one
@@ -326,7 +326,7 @@ def test_laws_of_a_grasp(hand, opening):
     np.testing.assert_allclose(base.pose * mirror, mirrored.pose, atol=1e-9)
     assert np.min(np.sum(base.twist * base.wrench, axis=-1)) >= -1e-15
     # once in contact
-    depth = jax.jit(jax.vmap(lambda p, q: _overlap(slider, hand, p, q)))(base.pose, base.configuration)
+    depth = jax.jit(jax.vmap(lambda p, q: overlaps(slider, hand, p[None], q)[0]))(base.pose, base.configuration)
     assert np.max(depth) < 2e-5
 
 
@@ -362,6 +362,6 @@ def test_grasps_refuse_bad_input():
         pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.02), (0, 0, 0, 0.01), 5), **still)
     with pytest.raises(ValueError, match=r"friction has shape \(3,\); expected a scalar or \(2,\)"):
         pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.05), (0, 0, 0, 0.04), 5), pose=jnp.zeros(3), friction=jnp.ones(3))
-    ellipse = pj.Slider(pj.Ellipse(0.03, 0.02), slider.surface)
-    with pytest.raises(ValueError, match="pads can touch a Polygon or a Disk"):
-        pj.rollout(ellipse, jaw, pj.line((0, 0, 0, 0.07), (0, 0, 0, 0.06), 5), **still)
+    many = pj.Slider(pj.Polygon.regular(13, 0.02), slider.surface)
+    with pytest.raises(ValueError, match="pads can touch a Polygon of up to twelve vertices; got 13"):
+        pj.rollout(many, jaw, pj.line((0, 0, 0, 0.07), (0, 0, 0, 0.06), 5), **still)

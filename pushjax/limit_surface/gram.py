@@ -124,13 +124,16 @@ def largest_share(coefficients: Column, n: Column, reference: Gram, *, enough: f
         s, n, weight, rounds, done = state
         s_new, n_new, moved = _newton(coefficients, n, s, reference, weight)
         centred = moved < 1
-        done_now = (s_new >= enough) | (centred & (BLOCKS / weight < tolerance))
+        # near the border a round may come to nothing in so few digits: what was found before stands
+        lost = ~jnp.isfinite(s_new + sum(n_new))
+        done_now = lost | (s_new >= enough) | (centred & (BLOCKS / weight < tolerance))
         weight_new = jnp.where(centred, WEIGHTS[1] * weight, weight)
 
-        def kept(new, old):
-            return jax.tree.map(lambda a, b: jnp.where(done, b, a), new, old)
+        def kept(new, old, held):
+            return jax.tree.map(lambda a, b: jnp.where(held, b, a), new, old)
 
-        return kept((s_new, n_new, weight_new, rounds + 1, done_now), state)
+        s_new, n_new = kept((s_new, n_new), (s, n), lost)
+        return kept((s_new, n_new, weight_new, rounds + 1, done_now), state, done)
 
     s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MOST_ROUNDS), body, state)
     return Share(s, n, done)

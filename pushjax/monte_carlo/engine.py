@@ -24,7 +24,7 @@ from pushjax.rollout import Slider, arguments, check_opening, check_start
 from pushjax.solve import ContactSolver, StickingSolver
 
 TILE = 2048
-SMALLEST_TILE = 64
+GRAIN = 64  # of tiles for fewer pushes
 BLOCK = 16 * TILE  # pushes between two files of a checkpoint, at least
 
 
@@ -50,10 +50,10 @@ def monte_carlo(
     i is `random_rollout(fold_in(key, i), ...)`. path, solver: as in `rollout`. trajectories: keep every pose of
     every push (12 bytes a step in float32), not only the last.
 
-    tile: how many pushes a device makes at once, in one compiled program; default 2048, or the next power of two for
+    tile: how many pushes a device makes at once, in one compiled program; default 2048, or the next multiple of 64 for
     fewer. The memory it takes does not depend on n but for the results, some 60 bytes a push. devices: default all,
-    also those of other processes (`jax.distributed`). The bits of push i depend on key, tile, n's tile where none is
-    given, and machine, not on how many devices and processes there are.
+    also those of other processes (`jax.distributed`). The bits of push i depend on key, tile and machine, not on how
+    many devices and processes there are, nor on n.
 
     checkpoint: a folder, seen by all processes, where what is done is kept; a run that finds its beginning there goes
     on from it to the same bits. progress: True for a bar on the terminal; or a function of (done, n).
@@ -72,7 +72,7 @@ def monte_carlo(
     p = checked_path(path, hand.dof, dtype)
     check_opening(hand, p)
     check_start(slider, hand, start, p[0])
-    width = int(tile) if tile is not None else min(TILE, max(SMALLEST_TILE, 1 << (n - 1).bit_length()))
+    width = int(tile) if tile is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
     mesh = Mesh(np.array(jax.devices() if devices is None else list(devices)), (AXIS,))
     shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver

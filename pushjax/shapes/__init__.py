@@ -1,6 +1,7 @@
 """Outlines of sliders: signed distance, closest point, normal, swept contact."""
 
 from pushjax.shapes._base import Closest as Closest
+from pushjax.shapes._base import Facing as Facing
 from pushjax.shapes._base import Outline as Outline
 from pushjax.shapes._base import Shape as Shape
 from pushjax.shapes.curve import Curve as Curve

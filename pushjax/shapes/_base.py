@@ -7,7 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, shaped
 from pushjax._vec import Scalar, Vec2
@@ -23,6 +23,13 @@ class Closest(NamedTuple):
     distance: Scalar
     point: Vec2
     normal: Vec2
+
+
+class Facing(NamedTuple):
+    """Places of an outline, as arrays, and which of them there are."""
+
+    point: Vec2
+    real: Bool[Array, "places"]
 
 
 class Outline(eqx.Module):
@@ -49,6 +56,11 @@ class Outline(eqx.Module):
         Starts outside, or touching to rounding (then 0, if it approaches). Infinite where it does not touch within
         the path. Exact for any length of path, so nothing tunnels.
         """
+
+    def facing(self, direction: Vec2) -> Facing:
+        """Where the outward normal of a smooth outline is the unit vector `direction` and it curves away from there:
+        what a straight edge on that side may rest on."""
+        raise NotImplementedError(f"{type(self).__name__} has corners")
 
 
 class Shape(eqx.Module):

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from pushjax._vec import Scalar, Vec2, select, settle
-from pushjax.shapes._base import Closest, Outline
+from pushjax.shapes._base import Closest, Facing, Outline
 from pushjax.shapes._pieces import Piece, normal_of
 from pushjax.shapes._spline_sweep import first_contact
 
@@ -127,6 +127,23 @@ class SplineOutline(Outline):
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         return first_contact(self.pieces, x, path, radius, convex=self.convex)
+
+    def facing(self, direction: Vec2) -> Facing:
+        """One place a piece: the height over `direction` has a quadratic as slope, which falls through zero once."""
+        c1, c2, c3 = (direction.dot(c) for c in (self.pieces.c1, self.pieces.c2, self.pieces.c3))
+        a, b, c = jax.lax.stop_gradient((3 * c3, 2 * c2, c1))
+        inside = b * b - 4 * a * c
+        root = jnp.sqrt(jnp.maximum(inside, 0))
+        low = b < 0  # of the two ways to write that root, the one that does not cancel
+        top, bottom = jnp.where(low, -2 * c, b + root), jnp.where(low, b - root, -2 * a)
+        t = top / jnp.where(bottom == 0, jnp.inf, bottom)
+        real = (inside > 0) & (bottom != 0) & (t >= 0) & (t < 1)
+        t = jnp.where(real, t, 0.5)
+        slope = c1 + t * (2 * c2 + 3 * t * c3)
+        t = t + slope / jnp.where(real, root, 1.0)  # its derivatives
+        point, velocity, _ = self.pieces.at(jnp.where(real, t, 0.5))
+        # in a hollow a height is greatest where the outline faces the other way
+        return Facing(point, real & (velocity.cross(direction) < 0))
 
 
 def _seen(piece: Piece, t: Scalar, x: Vec2) -> Closest:

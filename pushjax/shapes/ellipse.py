@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, positive, shaped
 from pushjax._vec import Scalar, Vec2, select, settle
-from pushjax.shapes._base import Closest, Outline, Shape, equally_spaced, rounding
+from pushjax.shapes._base import Closest, Facing, Outline, Shape, equally_spaced, rounding
 
 # Most points take 6 rounds to rounding; but near the evolute's cusps each round gains only a digit, in float32 too.
 CLOSEST_ROUNDS = {False: 8, True: 16}  # by whether it is float64
@@ -46,6 +46,12 @@ class EllipseOutline(Outline):
         q = _foot(self.semi, rel)
         foot, normal, _ = self._at(q)
         return Closest(normal.dot(rel - foot), self.center + foot, normal)
+
+    def facing(self, direction: Vec2) -> Facing:
+        across = Vec2(self.semi.x * direction.x, self.semi.y * direction.y)
+        reach = jnp.sqrt(across.dot(across))
+        point = self.center + Vec2(self.semi.x * across.x, self.semi.y * across.y).scale(1 / reach)
+        return Facing(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         rel = x - self.center

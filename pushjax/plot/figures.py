@@ -183,13 +183,18 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
             for k, color in [*((k, BETWEEN) for k in between), (0, START), (last, END)]:
                 width = 0.8 if color == BETWEEN else 1.4
                 outline(axes, shape, pose[k], color, width)
-                for finger, where in zip(hand.fingers, fingers[k], strict=True):
-                    _finger(axes, finger, where, color, width)
+                hand_at(axes, hand, fingers[k], color, width)
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
             axes.set(title=name.replace(": ", ":\n"), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         _legend_of_moments(figure, all_axes[0])
         return figure
+
+
+def hand_at(axes: Axes, hand: Hand, poses: np.ndarray, color: str, width: float) -> None:
+    """The fingers at their poses (fingers, width), in mm."""
+    for finger, where in zip(hand.fingers, poses, strict=True):
+        _finger(axes, finger, where, color, width)
 
 
 def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:

@@ -1,0 +1,152 @@
+"""Two fingers push a disc: from where do they end up with it between them, and what does noise change?
+
+A disc of 52.5 mm under uniform pressure, two point fingers 100 mm apart that go 262.5 mm straight, 500 start centres
+uniform in a circle of 78.8 mm ahead of them. A push converges where the disc ends with its centre within 1 mm of where
+it rests on both fingers. Left open by the paper and chosen here: where the circle lies, how far the fingers go into it,
+their radius, the friction, and what counts as converged. The same starts are pushed with every noise and friction.
+
+Source: Zhou et al. 2017, section VI.B, figure on two point fingers pushing a circle.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+import pushjax as pj
+from pushjax.report import envelope
+
+DISC, FINGER, APART, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
+CIRCLE, AHEAD = 0.0788, 0.135  # m: radius of the circle of start centres, and its middle
+N, STEPS, DRAWN = 500, 525, 100
+DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the first friction is the one compared and drawn
+NEAR = 1e-3  # m
+CELLS, PAIRS, GRID = 150, 400, 80
+
+
+def run(
+    seed: int = 0,
+    out: Path | None = None,
+    n: int = N,
+    steps: int = STEPS,
+    dof: Sequence[float] = DOFS,
+    friction: Sequence[float] = FRICTIONS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Convergent shares by noise and friction; pictures into `out`. dof: two, less noise first."""
+    if len(dof) != 2:
+        raise ValueError(f"dof must be two, to compare; got {len(dof)}")
+    disc = pj.Disk(DISC)
+    pairs = pj.Support.uniform(disc, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    slider = pj.Slider(disc, pj.fit_limit_surface(*pairs, degree=2))
+    hand = pj.Hand.two_fingers(FINGER)
+    path = pj.line((0, 0, np.pi / 2, APART), (0, TRAVEL, np.pi / 2, APART), steps)
+    starts = start_poses(n, seed)
+    rows, shown = [], {}
+    for k, mu in enumerate(friction):
+        for degrees in dof:
+            model = pj.FrictionModel(dof=degrees, friction=mu)
+            # twice, with other draws: what verdicts the draw alone changes
+            for again in (False, True):
+                key = jax.random.fold_in(jax.random.key(seed + 1 + again), len(rows))
+                kept = k == 0 and not again
+                pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=kept)
+                shown[mu, degrees, again] = pushes, converged(pushes)
+            (pushes, settled), (_, other) = (shown[mu, degrees, again] for again in (False, True))
+            row = {"friction": mu, "dof": degrees, "converged": float(settled.mean()), "outcomes": pushes.outcomes()}
+            row["changed_by_draw_percent"] = 100 * float(np.mean(settled != other))
+            rows.append(row | {"seconds": pushes.seconds, "settled": np.flatnonzero(settled)})
+            progress(len(rows), len(friction) * len(dof))
+        less, more = (shown[mu, degrees, False][1] for degrees in dof)
+        for row in rows[-2:]:
+            row["difference_percent"] = 100 * abs(float(less.mean() - more.mean()))
+            row["changed_by_noise_percent"] = 100 * float(np.mean(less != more))
+    drawn = {degrees: shown[friction[0], degrees, False] for degrees in dof}
+    pictures = [] if out is None else _draw(out, slider, hand, path, drawn)
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "disc_m": DISC, "finger_m": FINGER}
+    settings |= {"apart_m": APART, "travel_m": TRAVEL, "circle_m": CIRCLE, "ahead_m": AHEAD, "near_m": NEAR}
+    return envelope(
+        "capture",
+        settings,
+        n=n,
+        dof={f"{row['dof']:g}": {"converged": row["converged"]} for row in rows[:2]},
+        difference_percent=rows[0]["difference_percent"],
+        starts=starts[:, :2],
+        rows=rows,
+        pictures=pictures,
+    )
+
+
+def start_poses(n: int, seed: int) -> np.ndarray:
+    """(n, 3), centres uniform in the circle."""
+    rng = np.random.default_rng(seed)
+    radius, angle = CIRCLE * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    poses = np.stack([radius * np.cos(angle), AHEAD + radius * np.sin(angle), np.zeros(n)], axis=1)
+    return poses.astype(jnp.result_type(float))
+
+
+def converged(pushes: pj.MonteCarlo) -> np.ndarray:
+    """Which discs end between both fingers."""
+    rests = TRAVEL + np.sqrt((DISC + FINGER) ** 2 - (APART / 2) ** 2)
+    return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - rests) < NEAR
+
+
+def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: dict[float, tuple]) -> list[str]:
+    import matplotlib.pyplot as plt
+
+    from pushjax import plot
+
+    with plt.rc_context(plot.STYLE):
+        ratios = [*[1.0] * len(shown), 1.45]
+        figure, panels = plt.subplots(
+            1, len(shown) + 1, figsize=(12.5, 5.6), layout="constrained", gridspec_kw={"width_ratios": ratios}
+        )
+        for axes, (degrees, (pushes, settled)) in zip(panels, shown.items(), strict=False):
+            few = slice(0, DRAWN)
+            for which, color in ((settled[few], plot.END), (~settled[few], plot.START)):
+                plot.traces(axes, pushes.trajectory[few][which], color, alpha=0.5)
+                axes.plot(*(plot.MM * pushes.start[few][which, :2].T), ".", color=color, ms=3)
+            for at, color in ((path[0], plot.BETWEEN), (path[-1], plot.BLUE)):
+                plot.hand_at(axes, hand, np.asarray(hand.poses(at)), color, 2.0)
+            ends = pushes.pose[settled]
+            if len(ends):
+                plot.outline(axes, slider.shape, ends[0], plot.BLUE, 1.0)
+            axes.set(title=f"dof {degrees:g}: {settled.mean():.1%} of {len(settled)} converge", aspect="equal")
+            axes.set(xlabel="x / mm")
+        panels[0].set_ylabel("y / mm")
+        _, (pushes, settled) = list(shown.items())[-1]
+        axes, inside, outside = panels[-1], pushes.start[settled, :2], pushes.start[~settled, :2]
+        if len(inside) > 2:
+            x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
+            at = np.stack(np.meshgrid(x, y))
+            kernel = scipy.stats.gaussian_kde(inside.T)
+            plot.density_figure(
+                axes, (at[0], at[1]), kernel(at.reshape(2, -1)).reshape(GRID, GRID) / 1e6, inside, outside
+            )
+        axes.set(title=f"start centres, dof {list(shown)[-1]:g}")
+        for color, label in ((plot.END, "converge"), (plot.START, "do not")):
+            panels[0].plot([], [], color=color, label=label)
+        plot.legend_below(figure, panels[0], columns=2)
+        return [str(plot.save(figure, out / "capture.png"))]
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    lines = [f"Two fingers push a disc {1e3 * TRAVEL:.1f} mm, {record['n']} start centres:"]
+    for row in record["rows"]:
+        failed = row["outcomes"]["failed"]
+        lines.append(
+            f"  friction {row['friction']:<5g} dof {row['dof']:<5g} {row['converged']:6.1%} converge; another draw "
+            f"changes {row['changed_by_draw_percent']:.1f} % of the verdicts{f'; {failed} failed' if failed else ''}"
+        )
+    for row in record["rows"][::2]:
+        lines.append(
+            f"  friction {row['friction']:g}: the convergent shares differ by {row['difference_percent']:.1f} %, "
+            f"{row['changed_by_noise_percent']:.1f} % of the single verdicts"
+        )
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

@@ -1,0 +1,113 @@
+"""Grasping under uncertainty: where a parallel jaw leaves a rectangle, or a butterfly, that lay anywhere in it.
+
+The jaw's pads are 27 x 10 mm; it closes from 85 mm until it is stopped, or shut. The limit surface is an ellipsoid with
+250 degrees of freedom around the one that the pressure gives (along the rim; of the rectangle also six points), the
+friction of the pads uniform in [0.015, 0.02]. Left open by the paper and chosen here: how far the jaw is open at first,
+and that start poses which the open jaw would overlap are drawn again.
+
+Source: Zhou et al. 2017, section VI.C, figures on grasping under uncertainty.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.experiments.grasps.outcomes import classify, spikes, start_poses
+from pushjax.experiments.grasps.sliders import SLIDERS
+from pushjax.report import envelope
+
+PAD, THICKNESS = 0.027, 0.010  # m
+STEPS, DOF, FRICTION, PAIRS, HOLD = 840, 250.0, (0.015, 0.02), 400, 5
+BINS = 45
+OUTCOMES = ("grasped", "jammed", "free", "failed")
+
+
+def run(
+    slider: str,
+    seed: int = 0,
+    out: Path | None = None,
+    n: int | None = None,
+    steps: int = STEPS,
+    dof: float = DOF,
+    friction: tuple[float, float] = FRICTION,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """slider: "rectangle" or "butterfly". One cell for each pressure; pictures into `out`."""
+    if slider not in SLIDERS:
+        raise ValueError(f"slider must be one of {', '.join(SLIDERS)}; got {slider!r}")
+    setting = SLIDERS[slider]()
+    count = setting.n if n is None else n
+    hand = pj.Hand.parallel_jaw(PAD, THICKNESS)
+    opened, shut = ((0.0, 0.0, 0.0, d) for d in setting.opening)
+    path = jnp.concatenate([pj.line(opened, shut, steps), jnp.asarray([shut] * HOLD)])
+    model = pj.FrictionModel(dof=dof, friction=friction)
+    bodies = {}
+    for name, support in setting.supports.items():
+        pairs = support.wrench_twist_pairs(jax.random.key(seed), PAIRS)
+        bodies[name] = pj.Slider(setting.shape, pj.fit_limit_surface(*pairs, degree=2))
+    starts, again = start_poses(next(iter(bodies.values())), hand, path[0], setting.circle, count, seed)
+    cells, shown = [], {}
+    for k, (name, body) in enumerate(bodies.items()):
+
+        def told(done: int, total: int, before: int = k * count) -> None:
+            progress(before + done, len(bodies) * count)
+
+        key = jax.random.key(seed + 1)
+        grasps = pj.monte_carlo(key, count, body, hand, path, pose=starts, model=model, progress=told)
+        became = classify(grasps, setting.shape, PAD)
+        cells.append({"pressure": name} | _figures(grasps, became, setting.symmetry))
+        shown[name] = grasps, became
+    pictures = []
+    if out is not None:
+        from pushjax.experiments.grasps.picture import draw
+
+        pictures = draw(out, f"grasp_{slider}", setting, hand, path, starts, shown)
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "pad_m": (PAD, THICKNESS)}
+    settings |= {"opening_m": setting.opening, "circle_m": setting.circle, "pairs": PAIRS}
+    first = cells[0]
+    return envelope(
+        f"grasp-{slider}",
+        settings,
+        n=count,
+        outcomes=first["outcomes"],
+        redrawn=again,
+        starts=starts,
+        cells=cells,
+        pictures=pictures,
+    )
+
+
+def _figures(grasps: pj.MonteCarlo, became: np.ndarray, symmetry: float) -> dict[str, Any]:
+    held = grasps.stopped >= 0
+    pose = np.asarray(grasps.pose, np.float64)
+    histograms = {
+        name: grasps.histogram(pose[held, k], BINS) for k, name in enumerate(("x", "y", "theta")) if held.any()
+    }
+    return {
+        "outcomes": {name: int(np.sum(became == name)) for name in OUTCOMES},
+        "statuses": grasps.summary()["statuses"],
+        "failed_steps": int(grasps.failed.sum()),
+        "spikes": spikes(pose[held, 2], symmetry) if held.any() else [],
+        "held": histograms,
+        "pose": pose,
+        "outcome_of_each": became,
+        "seconds": grasps.seconds,
+    }
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    name = record["experiment"].removeprefix("grasp-")
+    lines = [f"A jaw closes on a {name} from {record['n']} poses ({record['redrawn']} drawn again, being in its way):"]
+    for cell in record["cells"]:
+        counts = ", ".join(f"{count} {word}" for word, count in cell["outcomes"].items())
+        found = ", ".join(f"{spike['degrees']:.0f}° {spike['share']:.0%}" for spike in cell["spikes"][:8])
+        lines.append(f"  {cell['pressure']:10} {counts}   ({cell['seconds']:.0f} s)")
+        lines.append(f"  {'':10} angles that hold: {found or 'none above the others'}")
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

@@ -1,0 +1,75 @@
+"""What became of each grasp.
+
+Every hand that stopped is held between both pads. Called grasped is what is stable there: turned a little either way it
+would need the jaw wider. Jammed is what friction alone keeps, where a turn would let the jaw close.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+
+TURN = np.radians(1.0)
+POINTS = 2000
+SPIKE = np.radians(1.0)  # the width of a bin of angles in which to look for spikes
+FEWEST = 0.02  # of all, that make one
+
+
+def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
+    """How far apart pads of width `pad`, centred at the origin, must be at least for the slider at each pose."""
+    outline = np.asarray(shape.boundary(POINTS), np.float64)
+    if isinstance(shape, pj.Polygon):
+        outline = np.concatenate([outline, np.asarray(shape.vertices)])
+    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
+    x = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
+    y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
+    between = np.abs(x) <= pad / 2
+    top, bottom = np.where(between, y, -np.inf).max(axis=1), np.where(between, y, np.inf).min(axis=1)
+    return np.where(between.any(axis=1), top - bottom, 0.0)
+
+
+def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
+    """(n,) of "grasped", "jammed", "free", "failed"."""
+    pose = np.asarray(grasps.pose, np.float64)
+    held, failed = grasps.stopped >= 0, grasps.failed > 0
+    here = openings(shape, pose, pad)
+    turned = [openings(shape, pose + np.array([0, 0, sign * TURN]), pad) for sign in (1, -1)]
+    stable = (turned[0] >= here) & (turned[1] >= here)
+    return np.select([failed, held & stable, held], ["failed", "grasped", "jammed"], "free")
+
+
+def start_poses(
+    slider: pj.Slider, hand: pj.Hand, configuration: Any, circle: float, n: int, seed: int
+) -> tuple[np.ndarray, int]:
+    """(n, 3): centres uniform in a circle, angles within 90 degrees; and how many were drawn again because the open
+    jaw would already have overlapped them."""
+    from pushjax.rollout import overlaps
+
+    rng = np.random.default_rng(seed)
+    kept, again = np.zeros((0, 3)), 0
+    dtype = jnp.result_type(float)
+    while len(kept) < n:
+        radius, angle = circle * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+        turn = rng.uniform(-np.pi / 2, np.pi / 2, n)
+        poses = np.stack([radius * np.cos(angle), radius * np.sin(angle), turn], axis=1).astype(dtype)
+        apart = np.asarray(overlaps(slider, hand, jnp.asarray(poses), jnp.asarray(configuration))) <= 0
+        wanted = n - len(kept)
+        last = np.flatnonzero(apart)[:wanted]
+        again += int(np.sum(~apart[: last[-1] + 1])) if len(last) == wanted else int(np.sum(~apart))
+        kept = np.concatenate([kept, poses[last]])
+    return kept.astype(dtype), again
+
+
+def spikes(angles: np.ndarray, symmetry: float) -> list[dict[str, float]]:
+    """Where at least `FEWEST` of the angles, taken modulo the symmetry, lie within one bin, largest first."""
+    wrapped = np.mod(np.asarray(angles, np.float64) + symmetry / 2, symmetry) - symmetry / 2
+    bins = round(symmetry / SPIKE)
+    # bins about multiples of a degree, so that a spike at a right angle is in one
+    number = np.mod(np.round(wrapped / SPIKE).astype(int), bins)
+    counts = np.bincount(number, minlength=bins)
+    found = np.flatnonzero(counts >= FEWEST * len(angles))
+    signed = np.where(found > bins / 2, found - bins, found)
+    order = np.argsort(-counts[found])
+    return [{"degrees": float(signed[k]), "share": float(counts[found[k]] / len(angles))} for k in order]

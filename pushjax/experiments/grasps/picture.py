@@ -1,0 +1,52 @@
+"""The pictures: where it lay, where it is left, and histograms of both."""
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+import pushjax as pj
+from pushjax import plot
+from pushjax.experiments.grasps.sliders import Setting
+
+COLORS = {"grasped": plot.END, "jammed": plot.ORANGE, "free": plot.BETWEEN, "failed": plot.PURPLE}
+NUMBERS = ((plot.MM, "x / mm"), (plot.MM, "y / mm"), (180 / np.pi, "θ / °"))
+BINS = 60
+
+
+def draw(
+    out: Path, name: str, setting: Setting, hand: pj.Hand, path: Any, starts: np.ndarray, shown: dict[str, tuple]
+) -> list[str]:
+    with plt.rc_context(plot.STYLE):
+        rows = len(shown) + 1
+        figure, axes = plt.subplots(rows, 4, figsize=(14.0, 3.4 * rows), layout="constrained")
+        first = axes[0]
+        plot.pose_panel(first[0], starts, plot.START)
+        plot.outline(first[0], setting.shape, np.zeros(3), plot.BLUE, 1.0)
+        plot.hand_at(first[0], hand, np.asarray(hand.poses(path[0])), plot.BLUE, 1.0)
+        first[0].set_title(f"{len(starts)} start poses")
+        _histograms(first[1:], starts)
+        for row, (pressure, (grasps, became)) in zip(axes[1:], shown.items(), strict=True):
+            for word, color in COLORS.items():
+                which = became == word
+                if which.any():
+                    plot.pose_panel(row[0], grasps.pose[which], color, f"{word}: {which.sum()}")
+            ends = plot.MM * np.abs(grasps.pose[:, :2]).max(axis=0) + 4
+            row[0].set(xlim=(-ends[0], ends[0]), ylim=(-ends[1], ends[1]))
+            row[0].set(title=f"where they end, pressure: {pressure}", aspect="equal")
+            row[0].legend(loc="upper right", markerscale=3, fontsize=7)
+            held = np.array(grasps.pose[grasps.stopped >= 0], np.float64)
+            # a spike at a right angle is one, not two halves
+            held[:, 2] = np.mod(held[:, 2] + setting.symmetry / 4, setting.symmetry) - setting.symmetry / 4
+            _histograms(row[1:], held)
+            row[2].set_title("of those held (θ modulo its symmetry)")
+        return [str(plot.save(figure, out / f"{name}.png"))]
+
+
+def _histograms(panels, poses: np.ndarray) -> None:
+    for k, (axes, (scale, label)) in enumerate(zip(panels, NUMBERS, strict=True)):
+        values = scale * np.asarray(poses[:, k], np.float64)
+        if len(values):
+            counts, edges = np.histogram(values, BINS)
+            plot.histogram_panel(axes, {"edges": edges, "counts": counts}, label)

@@ -1,0 +1,49 @@
+"""What is grasped: outlines, what carries them, and from where.
+
+The rectangle is the paper's. Of the butterfly the paper gives two diameters, 39 mm across its convex ends and 28.6 mm
+across its concave waist; the outline here is r(angle) = a + b cos(2 angle) + c cos(4 angle) with these two, and a c of
+-1 mm, which makes the waist a hollow of 17 mm radius.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+
+LONG, WAIST = 0.039, 0.0286  # m, the butterfly's diameters
+HOLLOW = -0.001  # m, c
+CONTROLS = 24
+
+
+class Setting(NamedTuple):
+    """One experiment. circle: m, the radius in which start centres lie. symmetry: the angle after which the outline is
+    the same."""
+
+    shape: pj.Shape
+    supports: dict[str, pj.Support]
+    n: int
+    circle: float
+    symmetry: float
+    opening: tuple[float, float]
+
+
+def rectangle() -> Setting:
+    block = pj.Polygon.rectangle(0.050, 0.035)
+    x, y = 0.025, 0.0175
+    six = np.array([(-x, -y), (0, -y), (x, -y), (x, y), (0, y), (-x, y)])
+    supports = {"rim": pj.Support.rim(block, points=200), "six points": pj.Support.points(six)}
+    return Setting(block, supports, 600, 0.020, np.pi, (0.085, 0.001))
+
+
+def butterfly() -> Setting:
+    angle = 2 * np.pi * np.arange(CONTROLS) / CONTROLS
+    b = (LONG - WAIST) / 4
+    r = LONG / 2 - b - HOLLOW + b * np.cos(2 * angle) + HOLLOW * np.cos(4 * angle)
+    points = jnp.asarray(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1), jnp.result_type(float))
+    curve = pj.Curve.through(points)
+    return Setting(curve, {"rim": pj.Support.rim(curve, points=200)}, 900, 0.030, np.pi, (0.085, 0.001))
+
+
+SLIDERS: dict[str, Any] = {"rectangle": rectangle, "butterfly": butterfly}

@@ -1,0 +1,158 @@
+"""Many pushes of one square: where random friction leaves it.
+
+2000 pushes of the 90 mm square of the MIT data set by its round tip, all alike but for friction: the quartic's Gram
+matrix with 20 degrees of freedom, the contact's coefficient uniform in [0.15, 0.35]. Left open by the paper and chosen
+here: where the tip touches (70 % along the side) and in how many steps.
+
+Source: Zhou et al. 2017, section VI.B, figures on pushing with stochasticity; the setting of Yu et al. 2016, figures 9
+and 10.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+
+import pushjax as pj
+from pushjax.monte_carlo.result import COORDINATES
+from pushjax.report import envelope
+from pushjax.verify.convexity import least_curvatures
+
+SIDE, RADIUS = 0.09, 0.00475  # m
+ALONG, TRAVEL = 0.018, 0.05  # m: of the side's middle, and how far the tip goes
+CELLS, PAIRS = 64, 400
+N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
+BINS, MOST_DRAWN = 40, 2000
+# Of the largest coefficient, the least curvature that is none: coefficients are rounded to float32
+CONVEX = -3e-7
+LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi, "Δθ / °")}
+
+
+def setting(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
+    block = pj.Polygon.rectangle(SIDE, SIDE)
+    pairs = pj.Support.uniform(block, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    start = -SIDE / 2 - RADIUS
+    return slider, pj.Hand.finger(RADIUS), pj.line((start, ALONG), (start + TRAVEL, ALONG), steps)
+
+
+def run(
+    seed: int = 0,
+    out: Path | None = None,
+    n: int = N,
+    steps: int = STEPS,
+    dof: float = DOF,
+    friction: tuple[float, float] = FRICTION,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """The distribution of how far the square moves; pictures into `out`."""
+    slider, hand, path = setting(seed, steps)
+    model = pj.FrictionModel(dof=dof, friction=friction)
+    key = jax.random.key(seed + 1)
+    arguments = (key, n, slider, hand, path)
+    rest: dict[str, Any] = {"pose": jnp.zeros(3), "model": model}
+    first = pj.monte_carlo(*arguments, **rest, progress=progress)  # compiles
+    pushes = pj.monte_carlo(*arguments, **rest)
+    delta = np.asarray(pushes.delta, np.float64)
+    pictures = []
+    if out is not None:
+        drawn = pj.monte_carlo(
+            key, min(n, MOST_DRAWN), slider, hand, path, **rest, trajectories=True
+        )  # the same pushes
+        pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
+    settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": CELLS, "pairs": PAIRS}
+    return envelope(
+        "stochastic-push",
+        settings,
+        n=n,
+        delta={name: _figures(delta[:, k]) for k, name in enumerate(COORDINATES)},
+        correlation=np.corrcoef(delta.T),
+        nonconvex=int(np.sum(_curvatures(key, model, slider.surface, n) < CONVEX)),
+        repaired=float(np.mean(pushes.pull > 0)),
+        mean_pull=pushes.summary()["repaired"]["mean_pull"],
+        outcomes=pushes.outcomes(),
+        run_s=pushes.seconds,
+        compile_s=first.seconds - pushes.seconds,
+        pictures=pictures,
+    )
+
+
+def _figures(values: np.ndarray) -> dict[str, Any]:
+    counts, edges = np.histogram(values, bins=BINS)
+    figures: dict[str, Any] = {"mean": values.mean(), "std": values.std(ddof=1), "edges": edges, "counts": counts}
+    test = scipy.stats.normaltest(values)
+    normality = {"skewness": scipy.stats.skew(values), "excess_kurtosis": scipy.stats.kurtosis(values)}
+    figures["normality"] = normality | {"statistic": test.statistic, "p_value": test.pvalue}
+    return {name: float(v) if np.ndim(v) == 0 and not isinstance(v, dict) else v for name, v in figures.items()}
+
+
+def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -> np.ndarray:
+    """Of every surface that was drawn, drawn again."""
+    around: Any = model.around(surface)
+
+    def drawn(index):
+        return around.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
+
+    return least_curvatures(np.asarray(jax.jit(jax.vmap(drawn))(jnp.arange(n, dtype=jnp.uint32))))
+
+
+def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: pj.MonteCarlo, trajectory) -> list[str]:
+    import matplotlib.pyplot as plt
+
+    from pushjax import plot
+
+    with plt.rc_context(plot.STYLE):
+        ways, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
+        plot.traces(axes, trajectory)
+        plot.outline(axes, slider.shape, np.zeros(3), plot.START, 1.4, label="start")
+        spread = np.argsort(pushes.pose[:, 2])
+        ends = [spread[round(q * (len(spread) - 1))] for q in (0.025, 0.5, 0.975)]
+        for k, style in zip(ends, (":", "-", ":"), strict=True):
+            label = "median end" if style == "-" else "end, 2.5 and 97.5 % of θ"
+            plot.outline(axes, slider.shape, pushes.pose[k], plot.END, 1.2, linestyle=style, label=label)
+        for at, color in ((path[0], plot.START), (path[-1], plot.END)):
+            plot.hand_at(axes, hand, np.asarray(at)[None], color, 1.0)
+        axes.plot([], [], color=plot.BLUE, lw=0.8, label="ways of the centre")
+        axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=f"{len(trajectory)} of {len(pushes)} pushes")
+        handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+        axes.legend(handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        counts, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
+        for k, (axes, name) in enumerate(zip(panels, COORDINATES, strict=True)):
+            scale, label = LABELS[name]
+            values = scale * np.asarray(pushes.delta[:, k], np.float64)
+            test = scipy.stats.normaltest(values)
+            gaussian = values.mean(), values.std(ddof=1)
+            plot.histogram_panel(axes, pushes.histogram(values, BINS), label, gaussian=gaussian)
+            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f}, normal: p = {test.pvalue:.1g}")
+        panels[0].legend()
+        drawn = (ways, "stochastic_push.png"), (counts, "stochastic_push_histograms.png")
+        return [str(plot.save(figure, out / name)) for figure, name in drawn]
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    settings, delta = record["settings"], record["delta"]
+    lines = [
+        f"{record['n']} pushes of a 90 mm square over {1e3 * TRAVEL:.0f} mm, dof {settings['dof']:g}, friction "
+        f"{settings['friction'][0]:g} to {settings['friction'][1]:g}:"
+    ]
+    for name, (scale, label) in LABELS.items():
+        row = delta[name]
+        test = row["normality"]
+        lines.append(
+            f"  {label:9} {scale * row['mean']:8.2f} ± {scale * row['std']:.2f}   skewness {test['skewness']:5.2f},"
+            f" excess kurtosis {test['excess_kurtosis']:5.2f}, normal: p = {test['p_value']:.2g}"
+        )
+    failed = record["outcomes"]["failed"]
+    lines.append(
+        f"  surfaces: {record['nonconvex']} not convex by an independent sweep, {record['repaired']:.1%} had been "
+        f"repaired{f'; {failed} pushes failed' if failed else ''}"
+    )
+    lines.append(f"  ran in {record['run_s']:.2f} s, after {record['compile_s']:.1f} s of compiling")
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

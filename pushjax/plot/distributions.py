@@ -1,0 +1,48 @@
+"""Pictures of where many pushes end. Panels are drawn into given axes, so that an experiment lays them out."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from pushjax.plot.figures import BLUE, END, MM, ORANGE, START
+
+TICK = 1.6  # mm, half the length of a pose's tick
+
+
+def traces(axes: Axes, trajectory: np.ndarray, color: str = BLUE, alpha: float = 0.06) -> None:
+    """The ways (n, steps + 1, 3) of the slider's origin, in mm."""
+    axes.add_collection(LineCollection(list(MM * trajectory[..., :2]), colors=color, linewidths=0.6, alpha=alpha))
+    axes.autoscale_view()
+
+
+def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = None, alpha: float = 0.6) -> None:
+    """Poses (n, 3): a dot at each position with a tick along its x axis, in mm."""
+    at = MM * poses[:, :2]
+    along = TICK * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    axes.add_collection(LineCollection(list(np.stack([at, at + along], axis=1)), colors=color, lw=0.5, alpha=alpha))
+    axes.plot(*at.T, ".", color=color, ms=2.2, alpha=alpha, label=label, lw=0)
+    axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
+
+
+def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian: tuple[float, float] | None = None):
+    """Bars of a histogram (edges, counts); gaussian: mean and deviation of one to draw over it."""
+    edges, counts = np.asarray(counted["edges"]), np.asarray(counted["counts"])
+    axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75)
+    if gaussian is not None and gaussian[1] > 0:
+        mean, std = gaussian
+        x = np.linspace(edges[0], edges[-1], 300)
+        height = np.diff(edges).mean() * counts.sum() / (std * np.sqrt(2 * np.pi))
+        axes.plot(x, height * np.exp(-0.5 * ((x - mean) / std) ** 2), color=ORANGE, lw=1.4, label="Gaussian")
+    axes.set(xlabel=label, ylabel="count", ylim=(0, None))
+
+
+def density_figure(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside, outside) -> Any:
+    """A density over (x, y) in mm, with the points (n, 2) m that made it in red and the others in black."""
+    drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
+    axes.plot(*(MM * np.asarray(outside)).T, ".", color=START, ms=2.5)
+    axes.plot(*(MM * np.asarray(inside)).T, ".", color=END, ms=2.5)
+    axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
+    return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)

@@ -1,0 +1,146 @@
+"""Pads against smooth outlines: where they face each other, when they meet, what a jaw closes to."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax._vec import Vec2
+from pushjax.contacts import FAR, Placement, meet, overlap, places
+from pushjax.experiments.grasps.sliders import butterfly
+from pushjax.hands import Pad
+
+SEMI = np.array([0.02, 0.014])
+LENGTH = 0.015
+
+
+def wavy() -> pj.Curve:
+    """Four hollows of different depth."""
+    angle = 2 * np.pi * np.arange(32) / 32
+    r = 0.02 + 0.003 * np.cos(4 * angle) + 0.001 * np.cos(3 * angle)
+    return pj.Curve.through(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
+
+
+def shapes():
+    return {"ellipse": pj.Ellipse(*SEMI, center=(0.002, -0.001)), "curve": wavy(), "butterfly": butterfly().shape}
+
+
+def dense(shape, count=40_000) -> np.ndarray:
+    return np.asarray(shape.boundary(count))
+
+
+@pytest.mark.parametrize("name", ["ellipse", "curve", "butterfly"])
+def test_facing_is_every_place_that_stands_out(name):
+    """All local maxima of the height over a direction on a dense outline where it curves outwards, and no others."""
+    shape = shapes()[name]
+    points, found = dense(shape), jax.jit(lambda d: shape.outline().facing(d))
+    for angle in np.linspace(0.01, 6.2, 12):
+        d = np.array([np.cos(angle), np.sin(angle)])
+        height = points @ d
+        # the outward normal: clockwise from the direction of travel
+        velocity = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+        outward = velocity[:, 1] * d[0] - velocity[:, 0] * d[1] > 0
+        peaks = (height > np.roll(height, 1)) & (height >= np.roll(height, -1)) & outward
+        facing = found(Vec2.of(jnp.asarray(d)))
+        mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.real)]
+        assert len(mine) == peaks.sum()
+        apart = np.linalg.norm(mine[:, None] - points[peaks][None], axis=-1)
+        assert np.all(apart.min(axis=1) < 1e-5)
+        assert np.all(apart.min(axis=0) < 1e-5)
+
+
+def test_derivatives_of_facing():
+    outline = wavy().outline()
+
+    def point(angle):
+        facing = outline.facing(Vec2(jnp.cos(angle), jnp.sin(angle)))
+        return jnp.stack([jnp.where(facing.real, facing.point.x, 0.0), jnp.where(facing.real, facing.point.y, 0.0)])
+
+    angle, h = 0.7, 1e-6
+    slope = jax.jit(jax.jacfwd(point))(angle)
+    np.testing.assert_allclose(slope, (point(angle + h) - point(angle - h)) / (2 * h), atol=1e-8)
+    assert np.abs(np.asarray(slope)).max() > 1e-3
+
+
+def pad() -> Pad:
+    return pj.Hand.parallel_jaw(0.027, 0.010).fingers[0]
+
+
+def inside(points: np.ndarray, at: Placement) -> float:
+    """The deepest overlap, by brute force: outline points in the pad."""
+    finger = pad()
+    local = (points - np.array([float(at.center.x), float(at.center.y)])) @ np.array(
+        [[float(at.angle.x), -float(at.angle.y)], [float(at.angle.y), float(at.angle.x)]]
+    )
+    low, high = (np.asarray(b) for b in finger.shape.bounds)
+    return float(np.max(np.minimum(local - low, high - local).min(axis=1)))
+
+
+def placed(x, y, turn) -> Placement:
+    return Placement(Vec2(jnp.asarray(x), jnp.asarray(y)), Vec2(jnp.asarray(np.cos(turn)), jnp.asarray(np.sin(turn))))
+
+
+@pytest.mark.parametrize("name", ["ellipse", "butterfly"])
+def test_meets_where_brute_force_does(name, rng):
+    shape, finger = shapes()[name], pad()
+    outline, points = shape.outline(), dense(shape, 4000)
+    met = jax.jit(lambda at, path: meet(finger, outline, at, path, jnp.asarray(LENGTH)))
+    hits = 0
+    for _ in range(25):
+        turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
+        at, path = placed(aside, 0.04, turn), Vec2(jnp.asarray(rng.uniform(-0.01, 0.01)), jnp.asarray(-0.05))
+        start = float(met(at, path).start)
+        shares = np.linspace(0, 1, 1001)
+        depth = np.array(
+            [inside(points, placed(aside + s * float(path.x), 0.04 + s * float(path.y), turn)) for s in shares[::10]]
+        )
+        first = shares[::10][np.argmax(depth > 0)] if (depth > 0).any() else 1.0
+        hits += start < 1
+        # brute force sees outline points only, and a corner that pokes between two of them late
+        assert start - 0.002 <= first <= start + 0.0125 or (first == 1.0 and start > 0.98)
+        touching = placed(aside + start * float(path.x), 0.04 + start * float(path.y), turn)
+        if start < 1:
+            assert abs(float(overlap(finger, outline, touching))) < 1e-9
+    assert hits > 10
+
+
+@pytest.mark.parametrize("name", ["ellipse", "butterfly"])
+def test_places_are_at_their_distance(name):
+    """A pad over the outline: contacts lie on the outline, and as far from the pad as they say, along the normal."""
+    shape, finger = shapes()[name], pad()
+    seen = jax.jit(lambda at: places(finger, shape.outline(), at, jnp.asarray(LENGTH)))
+    for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
+        at = placed(aside, 0.025, turn)
+        touches = seen(at)
+        near = np.flatnonzero(np.asarray(touches.distance) < FAR / 2)
+        assert near.size
+        points = dense(shape)
+        for k in near:
+            point = np.array([float(touches.point.x[k]), float(touches.point.y[k])])
+            assert np.linalg.norm(points - point, axis=1).min() < 1e-5
+            assert np.hypot(float(touches.normal.x[k]), float(touches.normal.y[k])) == pytest.approx(1)
+        assert min(float(d) for d in touches.distance) == pytest.approx(
+            -float(overlap(finger, shape.outline(), at)), abs=1e-9
+        )
+
+
+def test_a_jaw_closes_to_the_width():
+    """On an ellipse, between wide pads, in float32: it is never closer than the ellipse is wide at that angle, and ends
+    that close, near the short axis."""
+    dtype = "float32"
+    slider = pj.Slider(pj.Ellipse(*SEMI.astype(dtype)), pj.Ellipsoid(np.eye(3, dtype=dtype), np.asarray(LENGTH, dtype)))
+    hand = pj.Hand.parallel_jaw(np.asarray(0.08, dtype), np.asarray(0.01, dtype))
+    path = np.linspace((0, 0, 0, 0.05), (0, 0, 0, 0.027), 400).astype(dtype)
+    poses = np.array([(0, 0.003, 0.9), (0.004, -0.002, -0.4), (0, 0, 1.3)], dtype)
+    mu = jnp.asarray(0.1, dtype)
+    grasps = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, hand, path, pose=pose, friction=mu)))(poses)
+    assert not np.asarray(grasps.failed).any()
+    assert np.all(np.asarray(grasps.status[:, -1]) == pj.Status.GRASPED)
+    pose, opening = np.asarray(grasps.pose, float), np.asarray(grasps.configuration, float)[..., 3]
+    width = 2 * np.hypot(SEMI[0] * np.sin(pose[..., 2]), SEMI[1] * np.cos(pose[..., 2]))
+    assert np.all(opening >= width - 5e-6)
+    step = 0.023 / 399
+    np.testing.assert_allclose(opening[:, -1], width[:, -1], atol=1.1 * step)
+    # what friction of 0.1 keeps askew
+    assert np.all(np.abs(pose[:, -1, 2]) < 0.2)
