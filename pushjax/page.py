@@ -8,7 +8,7 @@ from typing import Any
 
 from pushjax.report import plain
 
-MOST_ROWS = 400  # of the table: histograms and the like are in the JSON, which is on the page whole
+FEW = 8  # numbers that the table shows one by one: histograms and the like are in the JSON, on the page whole
 
 TEMPLATE = """<!doctype html>
 <html lang="en">
@@ -74,10 +74,10 @@ def _leaves(tree: Any, name: str = ""):
     if isinstance(tree, dict):
         for key, value in tree.items():
             yield from _leaves(value, f"{name}.{key}" if name else str(key))
-    elif isinstance(tree, list) and any(isinstance(value, (dict, list)) for value in tree[:1]):
-        for k, value in enumerate(tree[:MOST_ROWS]):
+    elif isinstance(tree, list) and tree and isinstance(tree[0], dict):
+        for k, value in enumerate(tree):
             yield from _leaves(value, f"{name}[{k}]")
-    elif isinstance(tree, list) and len(tree) > 8:
+    elif isinstance(tree, list) and (len(tree) > FEW or (tree and isinstance(tree[0], list))):
         yield name, f"{len(tree)} values"
     elif isinstance(tree, list):
         yield name, ", ".join(_brief(value) for value in tree)

@@ -31,10 +31,13 @@ LONG = (
     "grasps",
     "random_contacts",
     "contact_derivatives",
+    "commands",
+    "friction_model",
     "smooth_shapes",
     "single_contact",
-    "commands",
     "rollout_gradients",
+    "smooth_pads",
+    "monte_carlo",
 )
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"

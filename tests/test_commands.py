@@ -1,6 +1,8 @@
 """The command line: what it prints, draws and writes, and how it ends on bad input."""
 
+import html
 import json
+import re
 import subprocess
 import sys
 
@@ -8,6 +10,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+import pushjax as pj
 from pushjax import cli
 from pushjax.experiments import table2
 
@@ -172,3 +175,120 @@ def test_float32_is_the_default():
         "assert push.pose[-1, 0] > 0.03; assert push.mode.dtype == push.status.dtype == 'int8'"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
+
+
+RANDOM = {
+    "stochastic-push": ["--n", "60", "--steps", "20"],
+    "capture": ["--n", "60", "--steps", "60", "--friction", "0.25"],
+    "grasp-rectangle": ["--n", "40", "--steps", "150"],
+    "grasp-butterfly": ["--n", "40", "--steps", "420"],
+}
+
+
+@pytest.fixture(scope="module")
+def random_records(tmp_path_factory):
+    """Every random experiment, small."""
+    folder, records = tmp_path_factory.mktemp("random"), {}
+    for name, options in RANDOM.items():
+        cli.main(["reproduce", name, *options, "--out", str(folder), "--json", str(folder / f"{name}.json")])
+        records[name] = read(folder / f"{name}.json")
+    return folder, records
+
+
+def test_stochastic_push(random_records):
+    _, records = random_records
+    record = records["stochastic-push"]
+    assert record["n"] == 60
+    assert record["nonconvex"] == 0
+    assert 0 <= record["repaired"] < 0.3
+    assert record["run_s"] > 0
+    for name, middle, spread in (("x", 0.0396, 0.0033), ("y", -0.0155, 0.0037), ("theta", -0.42, 0.11)):
+        row = record["delta"][name]
+        assert len(row["edges"]) == len(row["counts"]) + 1
+        assert sum(row["counts"]) == 60
+        # what 2000 pushes gave, within what 60 may be off
+        assert abs(row["mean"] - middle) < 4 * spread / 60**0.5 + 0.02 * abs(middle)
+        assert 0.6 < row["std"] / spread < 1.5
+        assert 0 <= row["normality"]["p_value"] <= 1
+
+
+def test_capture(random_records):
+    _, records = random_records
+    record = records["capture"]
+    assert list(record["dof"]) == ["200", "10"]
+    for row in record["rows"]:
+        assert row["outcomes"]["failed"] == 0
+        assert 0.4 < row["converged"] < 0.85
+        assert len(row["settled"]) == round(60 * row["converged"])
+    a, b = (cell["converged"] for cell in record["dof"].values())
+    assert record["difference_percent"] == pytest.approx(100 * abs(a - b))
+    # who starts before the middle of both fingers is caught, who starts far aside is not
+    starts, settled = np.array(record["starts"]), set(record["rows"][0]["settled"])
+    caught = np.array([k in settled for k in range(60)])
+    assert caught[(np.abs(starts[:, 0]) < 0.02) & (starts[:, 1] < 0.16)].all()
+    assert not caught[np.abs(starts[:, 0]) > 0.07].any()
+
+
+@pytest.mark.parametrize("slider", ["rectangle", "butterfly"])
+def test_grasps_under_uncertainty(random_records, slider):
+    _, records = random_records
+    record = records[f"grasp-{slider}"]
+    cells = record["cells"]
+    assert len(cells) == (2 if slider == "rectangle" else 1)
+    assert record["outcomes"] == cells[0]["outcomes"]
+    for cell in cells:
+        assert sum(cell["outcomes"].values()) == record["n"] == 40
+        assert cell["outcomes"]["failed"] == 0
+        assert cell["outcomes"]["grasped"] >= 5
+        # flat between the pads
+        assert cell["spikes"][0]["degrees"] == 0
+        assert len(cell["outcome_of_each"]) == len(cell["pose"]) == 40
+
+
+def test_random_experiments_draw_and_write_a_page(random_records):
+    """One file that holds its pictures and needs no other."""
+    folder, records = random_records
+    for name, record in records.items():
+        for picture in record["pictures"]:
+            assert matplotlib.image.imread(picture)[..., :3].std() > 0.02
+        page = (folder / f"{name}.html").read_text()
+        assert page.count("data:image/png;base64,") == len(record["pictures"]) >= 1
+        for outside in ("http://", "https://", 'src="/', "<script", "<link"):
+            assert outside not in page
+        inside = html.unescape(page.split('<pre id="record">')[1].split("</pre>")[0])
+        assert json.loads(inside)["experiment"] == name
+
+
+def test_classes_of_grasps():
+    """A rectangle flat between the pads is stable; on its diagonal, and in a corner's way, it is not."""
+    from pushjax.experiments.grasps.outcomes import openings, spikes
+
+    block = pj.Polygon.rectangle(0.050, 0.035)
+    diagonal = np.arctan2(0.050, 0.035)
+    poses = np.array([(0, 0, 0), (0, 0, np.pi / 2), (0, 0, diagonal), (0.012, 0, 0), (0.1, 0, 0)])
+    np.testing.assert_allclose(
+        openings(block, poses, 0.027), [0.035, 0.050, np.hypot(0.05, 0.035), 0.035, 0], atol=1e-5
+    )
+    found = spikes(np.radians([0.1, -0.2, 180.3, 90, -90, 45.0]), np.pi)
+    assert [spike["degrees"] for spike in found] == [0, 90, 45]
+    assert [spike["share"] for spike in found] == pytest.approx([1 / 2, 1 / 3, 1 / 6])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["squeeze", "--n", "5"], "--n is for stochastic-push, capture, grasp-rectangle, grasp-butterfly; got it with"),
+        (["stochastic-push", "--dof", "5"], "dof must be at least 9"),
+        (["stochastic-push", "--dof", "20", "30"], "--dof: stochastic-push takes one; got 2"),
+        (["stochastic-push", "--friction", "0.3", "0.2"], r"friction must be \(lowest, highest\)"),
+        (["grasp-rectangle", "--friction", "0.3"], "--friction: grasp-rectangle takes two"),
+        (["capture", "--dof", "20"], "dof must be two"),
+        (["capture", "--friction", "-0.1"], "friction must not be negative"),
+        (["stochastic-push", "--n", "0"], "n must be a whole number, at least 1"),
+    ],
+)
+def test_random_experiments_refuse_bad_input(options, message, capsys, tmp_path):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["reproduce", *options, "--out", str(tmp_path)])
+    assert end.value.code == 1
+    assert re.search(message, capsys.readouterr().err)
