@@ -65,7 +65,8 @@ def test_random_problems(count, degree):
     contacts: `pushjax bench contacts` has all) find no motion; nothing stays open."""
     surface, contacts = problems(count, degree, seed=count, slots=slots(count, degree))
     motion = (solve_one_as_several if count == 1 else solve_all)(surface, contacts)
-    counts, worst = bench_contacts.judge(ProblemBatch.of(surface, contacts), motion, "float64", starts=50 if count <= 4 else 10)
+    starts = 50 if count <= 4 else 10
+    counts, worst = bench_contacts.judge(ProblemBatch.of(surface, contacts), motion, "float64", starts)
     assert counts["wrong"] == counts["not_converged"] == 0, worst
     assert counts["solved"] + counts["jammed"] == BATCH
     assert (counts["jammed"] > 0) == (count > 1)
