@@ -136,7 +136,8 @@ def advance(
             at = grip.seen(there, begin + rest * share)
             touches = settle(places(grip.finger, outline, at, form.length), pose.x)
             mine = tuple(
-                jnp.where(first, new, old) for new, old in zip(choose(touches, form.length), chosen[k], strict=True)
+                jnp.where(first, new, old)
+                for new, old in zip(choose(touches, form.length, outline), chosen[k], strict=True)
             )
             picked.append(mine)
             near = jnp.zeros((), bool)

@@ -31,8 +31,9 @@ DEEPEST_OVERLAP = 0.2
 BLUNT = 0.3
 LOOSE = 1e-6  # of an edge's length: how far past its end a corner still lies beside it
 FAR = 1e3  # m, out of any reach
-# Two places nearer to each other than this, in the same unit, are one.
-SAME_PLACE = 1e-3
+# Two places nearer to each other than this, in the same unit, are one: of a polygon, and of a smooth outline, where a
+# pad's corner and its edge both find the same bump.
+SAME_PLACE, SAME_BUMP = 1e-3, 0.1
 
 
 class Placement(NamedTuple):
@@ -132,7 +133,7 @@ def count(finger: Finger, outline: Outline) -> int:
     return 2 if isinstance(found, Touch) else len(found)
 
 
-def choose(touches: Touches, length: Scalar) -> tuple[Int[Array, ""] | int, ...]:
+def choose(touches: Touches, length: Scalar, outline: Outline) -> tuple[Int[Array, ""] | int, ...]:
     """Which places are contacts: of an array the nearest and the nearest elsewhere, the same one twice if there is
     none; else all."""
     if not isinstance(touches, Touch):
@@ -141,7 +142,8 @@ def choose(touches: Touches, length: Scalar) -> tuple[Int[Array, ""] | int, ...]
     first = jnp.argmin(distance)
     nearest = _at(touches, first)
     apart = touches.point - nearest.point
-    elsewhere = apart.dot(apart) > (SAME_PLACE * length) ** 2
+    same = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
+    elsewhere = apart.dot(apart) > (same * length) ** 2
     elsewhere = settle(elsewhere & (distance < nearest.distance + 1e3 * length), length)
     second = jnp.where(jnp.any(elsewhere), jnp.argmin(jnp.where(elsewhere, distance, jnp.inf)), first)
     return first.astype(jnp.int32), second.astype(jnp.int32)
@@ -185,7 +187,10 @@ def meet(finger: Finger, outline: Outline, at: Placement, path: Vec2, length: Sc
 
 
 def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
-    """How deep a finger is inside the slider, or a corner of either in the other, m; negative where they are apart."""
+    """How deep a finger is inside the slider, or a corner of either in the other, m; negative where they are apart.
+
+    A pad that lies right across a slider, no corner in it, is not noticed.
+    """
     if isinstance(finger, RoundFinger):
         return finger.radius - outline.closest(at.center).distance
     pad, angle = finger.shape.outline(), _angle(at)

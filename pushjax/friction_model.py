@@ -28,7 +28,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._autodiff import undifferentiated
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._vec import entries
 from pushjax._wishart import lower_of, wishart
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
 from pushjax.limit_surface._dense import Cholesky, Lower, combined, entry
@@ -83,9 +82,9 @@ class FrictionModel(eqx.Module):
         dtype = common_dtype(dof, friction)
         if sampler not in ("gram", "terms"):
             raise ValueError(f"sampler must be 'gram' or 'terms'; got {sampler!r}")
-        if every is not None and (not isinstance(every, int) or every < 1):
+        if every is not None and (not isinstance(every, (int, np.integer)) or every < 1):
             raise ValueError(f"every must be a whole number of steps, at least 1, or None; got {every!r}")
-        self.sampler, self.every = sampler, every
+        self.sampler, self.every = sampler, None if every is None else int(every)
         self.dof = None
         if dof is not None:
             self.dof = as_float(dof, dtype)
@@ -193,9 +192,10 @@ class _GramQuartic(RandomSurface):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         identity = Gram.identity(self.loading)
         drawn = combined(wishart(key, self.factor, self.dof), self.loading, identity.symmetric)
-        coefficients, mean = coefficients_of(drawn), entries(self.mean.coefficients)
+        coefficients = coefficients_of(drawn)
         # a mean on the border is no measure in every direction: a hair is added to it
         reference = self.gram.plus(jnp.maximum(-2 * self.loading, 0), identity)
+        mean = coefficients_of(reference.symmetric)
         found = undifferentiated(_certified, coefficients, antisymmetric_of(drawn), reference)
         pull = jnp.where(found.share < 0, -found.share / (1 - found.share), 0.0)
         pull = jnp.where(jnp.isfinite(found.share), pull, 1.0)  # never seen: of numbers that are none

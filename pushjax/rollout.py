@@ -26,6 +26,8 @@ from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
 from pushjax.status import Status
 
+OVERLAPS = 4096  # poses that are looked at together
+
 
 class Slider(eqx.Module):
     """What is pushed: its outline and how it slides, both in its body frame."""
@@ -124,8 +126,12 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
     """poses: (3,), or (pushes, 3)."""
     if traced((slider, hand, poses, configuration)):
         return
-    many = jnp.atleast_2d(poses)
-    overlap = np.asarray(overlaps(slider, hand, many, configuration))
+    many = np.atleast_2d(poses)
+    some, found = min(len(many), OVERLAPS), []
+    for first in range(0, len(many), some):  # as many at once, however many there are
+        part = many[np.minimum(np.arange(first, first + some), len(many) - 1)]
+        found.append(np.asarray(overlaps(slider, hand, jnp.asarray(part), configuration)))
+    overlap = np.concatenate(found)
     worst = int(np.argmax(overlap))
     allowed = DEEPEST_OVERLAP * float(slider.surface.length)
     if overlap[worst] > allowed:

@@ -161,7 +161,7 @@ def test_derivative_by_dof_is_that_of_the_quantile():
     np.testing.assert_allclose(slope, (above - below) / (2 * h), rtol=1e-4, atol=1e-7)
 
 
-@pytest.mark.parametrize(("sampler", "dtype"), [("gram", "float32"), ("gram", "float64"), ("terms", "float32")])
+@pytest.mark.parametrize(("sampler", "dtype"), [("gram", "float64"), ("terms", "float32")])
 def test_derivatives(quartic, sampler, dtype):
     """By dof, the friction's range and the mean: in the mean over draws, those of the moments."""
     surface = jax.tree.map(lambda leaf: leaf.astype(dtype), quartic)

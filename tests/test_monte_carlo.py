@@ -199,7 +199,10 @@ def test_checkpoints_that_will_not_do(whole, tmp_path):
     torn.unlink()
     assert same(arrays(run(checkpoint=kept)), arrays(whole))
     (kept / "manifest.json").write_text("{")
-    with pytest.raises(CheckpointError, match=r"manifest.json is damaged"):
+    with pytest.raises(CheckpointError, match=r"manifest.json cannot be read \(it is damaged\)"):
+        run(checkpoint=kept)
+    (kept / "manifest.json").unlink()
+    with pytest.raises(CheckpointError, match=r"has pushes but no manifest.json to say whose"):
         run(checkpoint=kept)
 
 
@@ -237,6 +240,14 @@ def test_outcomes_add_up():
     result = MonteCarlo(poses, poses, status, none[..., 0], none, failed, index, index, poses, poses, None, 0.0)
     assert result.outcomes() == {"grasped": 1, "jammed": 1, "free": 1, "failed": 1}
     assert result.summary()["statuses"] == {"MOVING": 1, "JAMMED": 2, "GRASPED": 1}
+
+
+def test_keys_and_devices_that_will_not_do():
+    for key in (0, jax.random.split(jax.random.key(0)), np.zeros(3, np.uint32)):
+        with pytest.raises(ValueError, match="key must be one key"):
+            pj.monte_carlo(key, N, **setting())
+    with pytest.raises(ValueError, match="devices must not be empty"):
+        run(devices=[])
 
 
 def test_bad_input():

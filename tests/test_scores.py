@@ -22,17 +22,21 @@ def test_energy_score_is_its_definition(samples, rng, dtype):
     loose = 1e-6 if dtype == "float32" else 1e-12
     score = pj.energy_score(samples.astype(dtype), observed.astype(dtype), LENGTH)
     assert score.dtype == dtype
-    apart = np.asarray(pj.deviation(samples[:, None], samples[None], LENGTH))
-    spread = apart.sum() / (400 * 399)
-    to = np.asarray(pj.deviation(samples[:, None], observed[None], LENGTH)).mean(axis=0)
+
+    def embedded(poses):
+        return np.c_[poses[:, :2], LENGTH * np.cos(poses[:, 2]), LENGTH * np.sin(poses[:, 2])]
+
+    x, y = embedded(samples), embedded(observed)
+    spread = np.linalg.norm(x[:, None] - x[None], axis=-1).sum() / (400 * 399)
+    to = np.linalg.norm(x[:, None] - y[None], axis=-1).mean(axis=0)
     np.testing.assert_allclose(score, to - spread / 2, atol=loose)
     assert pj.energy_score(samples, observed[0], LENGTH).shape == ()
 
 
-def test_energy_score_of_a_certain_prediction_is_the_deviation():
-    pose, seen = np.array([0.01, 0.0, 0.2]), np.array([0.0, 0.004, -6.1])
-    certain = np.tile(pose, (3, 1))
-    assert float(pj.energy_score(certain, seen, LENGTH)) == pytest.approx(float(pj.deviation(pose, seen, LENGTH)))
+def test_energy_score_of_a_certain_prediction_is_its_distance():
+    seen = np.array([0.0, 0.004, 0.2 - 2 * np.pi])
+    certain = np.tile([0.003, 0.0, 0.2], (3, 1))
+    assert float(pj.energy_score(certain, seen, LENGTH)) == pytest.approx(0.005)
 
 
 def test_energy_score_is_proper(rng):
@@ -44,13 +48,27 @@ def test_energy_score_is_proper(rng):
         assert float(jnp.mean(pj.energy_score(other, seen, LENGTH))) > 1.01 * best
 
 
+def test_energy_score_sees_dependence_and_half_turns(rng):
+    """The same position and the same angle, each for itself, but not together; and angles a quarter turn off that have
+    the same arc length to everything."""
+    x = rng.normal(size=1000)
+    together = np.stack([0.003 * x, 0 * x, 0.1 * x], axis=1)
+    against = together * np.array([1, 1, -1])
+    half = np.zeros((1000, 3))
+    half[:500, 2] = np.pi
+    quarter = half + np.array([0, 0, np.pi / 2])
+    for truth, other in ((together, against), (half, quarter)):
+        best = float(jnp.mean(pj.energy_score(truth, truth, LENGTH)))
+        assert float(jnp.mean(pj.energy_score(other, truth, LENGTH))) > 1.05 * best
+
+
 def test_log_density_of_a_gaussian(rng):
     """Like scipy's estimate where the blur does not matter; near the density itself."""
     scale = np.array([0.003, 0.002, 0.1])
     x, at = rng.normal(size=(4000, 3)) * scale, rng.normal(size=(50, 3)) * scale
     unit = np.array([1, 1, LENGTH])
-    found = pj.log_density(x, at, LENGTH, blur=0.0)
-    np.testing.assert_allclose(found, scipy.stats.gaussian_kde((x * unit).T).logpdf((at * unit).T), atol=1e-9)
+    found = pj.log_density(x, at, LENGTH, blur=1e-9)
+    np.testing.assert_allclose(found, scipy.stats.gaussian_kde((x * unit).T).logpdf((at * unit).T), atol=1e-7)
     exact = scipy.stats.multivariate_normal(cov=np.diag((scale * unit) ** 2)).logpdf(at * unit)
     assert np.mean(np.abs(np.asarray(found) - exact)) < 0.25
 
@@ -73,6 +91,16 @@ def test_coverage_of_the_truth(rng, dtype):
     narrow = np.asarray(pj.coverage(0.3 * x, seen, LENGTH))
     assert np.all(narrow < [0.1, 0.35])
     assert pj.coverage(x, seen[0], LENGTH, levels=(0.2, 0.5, 0.99)).shape == (3,)
+
+
+def test_density_repeats_after_a_turn(rng):
+    """Of angles all round: as dense at the cut as anywhere."""
+    x = np.stack([*(1e-3 * rng.normal(size=(2, 4000))), rng.uniform(-np.pi, np.pi, 4000)], axis=1)
+    angles = np.linspace(-np.pi, np.pi, 9)
+    at = np.stack([np.zeros(9), np.zeros(9), angles], axis=1)
+    found = np.asarray(pj.log_density(x, at, LENGTH))
+    assert np.ptp(found) < 0.35  # half of it would be 0.69 less
+    assert found[0] == pytest.approx(found[-1], abs=1e-9)
 
 
 def test_no_density_is_blurred(rng):
@@ -112,10 +140,13 @@ def test_bad_input(samples):
         ((samples, samples[0, :2], LENGTH), "observed has shape"),
         ((samples, samples[0] * np.nan, LENGTH), "observed must be finite"),
         ((samples, samples[0], -1.0), "length must be positive"),
+        ((samples, samples[0], [0.1, 0.1]), r"length has shape \(2,\)"),
     ):
         for score in (pj.energy_score, pj.log_density, pj.coverage):
             with pytest.raises(ValueError, match=message):
                 score(*arguments)
+    with pytest.raises(ValueError, match="blur must be positive"):
+        pj.log_density(samples, samples[0], LENGTH, blur=0.0)
     with pytest.raises(ValueError, match="levels must be numbers between 0 and 1"):
         pj.coverage(samples, samples[0], LENGTH, levels=(0.5, 1.0))
     for counts, message in (

@@ -35,7 +35,8 @@ def test_facing_is_every_place_that_stands_out(name):
     """All local maxima of the height over a direction on a dense outline where it curves outwards, and no others."""
     shape = shapes()[name]
     points, found = dense(shape), jax.jit(lambda d: shape.outline().facing(d))
-    for angle in np.linspace(0.01, 6.2, 12):
+    # the ellipse's and the butterfly's axes are where their pieces meet
+    for angle in (*np.linspace(0.01, 6.2, 12), *(k * np.pi / 2 for k in range(4))):
         d = np.array([np.cos(angle), np.sin(angle)])
         height = points @ d
         # the outward normal: clockwise from the direction of travel
@@ -44,7 +45,7 @@ def test_facing_is_every_place_that_stands_out(name):
         peaks = (height > np.roll(height, 1)) & (height >= np.roll(height, -1)) & outward
         facing = found(Vec2.of(jnp.asarray(d)))
         mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.real)]
-        assert len(mine) == peaks.sum()
+        assert len(np.unique(np.round(mine / 1e-5), axis=0)) >= peaks.sum() > 0
         apart = np.linalg.norm(mine[:, None] - points[peaks][None], axis=-1)
         assert np.all(apart.min(axis=1) < 1e-5)
         assert np.all(apart.min(axis=0) < 1e-5)
@@ -86,6 +87,7 @@ def test_meets_where_brute_force_does(name, rng):
     shape, finger = shapes()[name], pad()
     outline, points = shape.outline(), dense(shape, 4000)
     met = jax.jit(lambda at, path: meet(finger, outline, at, path, jnp.asarray(LENGTH)))
+    deep = jax.jit(lambda at: overlap(finger, outline, at))
     hits = 0
     for _ in range(25):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
@@ -101,7 +103,7 @@ def test_meets_where_brute_force_does(name, rng):
         assert start - 0.002 <= first <= start + 0.0125 or (first == 1.0 and start > 0.98)
         touching = placed(aside + start * float(path.x), 0.04 + start * float(path.y), turn)
         if start < 1:
-            assert abs(float(overlap(finger, outline, touching))) < 1e-9
+            assert abs(float(deep(touching))) < 1e-9
     assert hits > 10
 
 
@@ -110,6 +112,7 @@ def test_places_are_at_their_distance(name):
     """A pad over the outline: contacts lie on the outline, and as far from the pad as they say, along the normal."""
     shape, finger = shapes()[name], pad()
     seen = jax.jit(lambda at: places(finger, shape.outline(), at, jnp.asarray(LENGTH)))
+    deep = jax.jit(lambda at: overlap(finger, shape.outline(), at))
     for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
         at = placed(aside, 0.025, turn)
         touches = seen(at)
@@ -120,9 +123,7 @@ def test_places_are_at_their_distance(name):
             point = np.array([float(touches.point.x[k]), float(touches.point.y[k])])
             assert np.linalg.norm(points - point, axis=1).min() < 1e-5
             assert np.hypot(float(touches.normal.x[k]), float(touches.normal.y[k])) == pytest.approx(1)
-        assert min(float(d) for d in touches.distance) == pytest.approx(
-            -float(overlap(finger, shape.outline(), at)), abs=1e-9
-        )
+        assert min(float(d) for d in touches.distance) == pytest.approx(-float(deep(at)), abs=1e-9)
 
 
 def test_a_jaw_closes_to_the_width():

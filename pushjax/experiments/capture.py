@@ -38,8 +38,10 @@ def run(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Convergent shares by noise and friction; pictures into `out`. dof: two, less noise first."""
-    if len(dof) != 2:
-        raise ValueError(f"dof must be two, to compare; got {len(dof)}")
+    if len(dof) != 2 or dof[0] == dof[1]:
+        raise ValueError(f"dof must be two different ones, to compare; got {', '.join(f'{d:g}' for d in dof)}")
+    if not friction or len(set(friction)) != len(friction):
+        raise ValueError(f"friction must be one or more, each once; got {', '.join(f'{mu:g}' for mu in friction)}")
     disc = pj.Disk(DISC)
     pairs = pj.Support.uniform(disc, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
     slider = pj.Slider(disc, pj.fit_limit_surface(*pairs, degree=2))
@@ -47,14 +49,13 @@ def run(
     path = pj.line((0, 0, np.pi / 2, APART), (0, TRAVEL, np.pi / 2, APART), steps)
     starts = start_poses(n, seed)
     rows, shown = [], {}
-    for k, mu in enumerate(friction):
+    for mu in friction:
         for degrees in dof:
             model = pj.FrictionModel(dof=degrees, friction=mu)
             # twice, with other draws: what verdicts the draw alone changes
             for again in (False, True):
-                key = jax.random.fold_in(jax.random.key(seed + 1 + again), len(rows))
-                kept = k == 0 and not again
-                pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=kept)
+                key = jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + again)
+                pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True)
                 shown[mu, degrees, again] = pushes, converged(pushes)
             (pushes, settled), (_, other) = (shown[mu, degrees, again] for again in (False, True))
             row = {"friction": mu, "dof": degrees, "converged": float(settled.mean()), "outcomes": pushes.outcomes()}

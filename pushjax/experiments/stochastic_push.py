@@ -26,7 +26,7 @@ SIDE, RADIUS = 0.09, 0.00475  # m
 ALONG, TRAVEL = 0.018, 0.05  # m: of the side's middle, and how far the tip goes
 CELLS, PAIRS = 64, 400
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
-BINS, MOST_DRAWN = 40, 2000
+BINS, MOST_DRAWN, FEWEST = 40, 2000, 20
 # Of the largest coefficient, the least curvature that is none: coefficients are rounded to float32
 CONVEX = -3e-7
 LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi, "Δθ / °")}
@@ -50,19 +50,21 @@ def run(
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """The distribution of how far the square moves; pictures into `out`."""
+    if n < FEWEST:
+        raise ValueError(f"n must be at least {FEWEST}, for a test of normality; got {n}")
     slider, hand, path = setting(seed, steps)
     model = pj.FrictionModel(dof=dof, friction=friction)
     key = jax.random.key(seed + 1)
     arguments = (key, n, slider, hand, path)
-    rest: dict[str, Any] = {"pose": jnp.zeros(3), "model": model}
+    few = n <= MOST_DRAWN
+    rest: dict[str, Any] = {"pose": jnp.zeros(3), "model": model, "trajectories": few}
     first = pj.monte_carlo(*arguments, **rest, progress=progress)  # compiles
     pushes = pj.monte_carlo(*arguments, **rest)
     delta = np.asarray(pushes.delta, np.float64)
     pictures = []
     if out is not None:
-        drawn = pj.monte_carlo(
-            key, min(n, MOST_DRAWN), slider, hand, path, **rest, trajectories=True
-        )  # the same pushes
+        rest["trajectories"] = True
+        drawn = pushes if few else pj.monte_carlo(key, MOST_DRAWN, slider, hand, path, **rest)  # the first of them
         pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
     settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": CELLS, "pairs": PAIRS}
@@ -72,7 +74,7 @@ def run(
         n=n,
         delta={name: _figures(delta[:, k]) for k, name in enumerate(COORDINATES)},
         correlation=np.corrcoef(delta.T),
-        nonconvex=int(np.sum(_curvatures(key, model, slider.surface, n) < CONVEX)),
+        nonconvex=int(np.sum(~(_curvatures(key, model, slider.surface, n) >= CONVEX))),
         repaired=float(np.mean(pushes.pull > 0)),
         mean_pull=pushes.summary()["repaired"]["mean_pull"],
         outcomes=pushes.outcomes(),
@@ -98,7 +100,11 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
     def drawn(index):
         return around.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
 
-    return least_curvatures(np.asarray(jax.jit(jax.vmap(drawn))(jnp.arange(n, dtype=jnp.uint32))))
+    some, program, found = min(n, MOST_DRAWN), jax.jit(jax.vmap(drawn)), []
+    for first in range(0, n, some):
+        indices = np.minimum(np.arange(first, first + some), n - 1).astype(np.uint32)
+        found.append(least_curvatures(np.asarray(program(indices)))[: n - first])
+    return np.concatenate(found)
 
 
 def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: pj.MonteCarlo, trajectory) -> list[str]:

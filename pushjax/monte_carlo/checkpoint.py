@@ -7,6 +7,7 @@ one; and what a run is to go on from is compared with what it asks for, part by 
 import hashlib
 import json
 import os
+import re
 import tempfile
 import zipfile
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-MANIFEST = "manifest.json"
+MANIFEST, NAME = "manifest.json", re.compile(r"pushes-\d{12}-\d{12}\.npz")
 FORMAT = 1
 
 
@@ -51,6 +52,10 @@ class Checkpoint:
         path = folder / MANIFEST
         if path.exists():
             self._same(path, wanted)
+        elif self._files():
+            raise CheckpointError(
+                f"checkpoint: {folder} has pushes but no {MANIFEST} to say whose; give another folder"
+            )
         elif writes:
             self._write(path, lambda file: file.write(json.dumps(wanted, indent=2).encode()))
 
@@ -58,8 +63,9 @@ class Checkpoint:
         try:
             there = json.loads(path.read_text())
             others = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
-        except (ValueError, AttributeError):
-            raise CheckpointError(f"checkpoint: {path} is damaged; give another folder") from None
+        except (ValueError, AttributeError, OSError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is damaged"
+            raise CheckpointError(f"checkpoint: {path} cannot be read ({why}); give another folder") from None
         if others:
             name = others[0]
             raise CheckpointError(
@@ -67,10 +73,13 @@ class Checkpoint:
                 f"{there.get(name)!r}, is {wanted.get(name)!r}); give another folder"
             )
 
+    def _files(self) -> list[Path]:
+        return sorted(path for path in self.folder.glob("pushes-*.npz") if NAME.fullmatch(path.name))
+
     def blocks(self) -> list[tuple[int, int, Path]]:
         """What is there, in order, up to the first gap."""
         found, reached = [], 0
-        for path in sorted(self.folder.glob("pushes-*.npz")):
+        for path in self._files():
             first, last = (int(word) for word in path.stem.split("-")[1:])
             if first != reached:
                 break
@@ -101,6 +110,8 @@ class Checkpoint:
         partial = None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            for left in self.folder.glob(".partial-*"):  # by a run that was killed while it wrote
+                left.unlink(missing_ok=True)
             with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".partial-", delete=False) as file:
                 partial = Path(file.name)
                 put(file)

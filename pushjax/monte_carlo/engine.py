@@ -1,8 +1,10 @@
 """`monte_carlo`: from a key and a number to the distribution of where a slider ends up."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +16,19 @@ from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
 from pushjax._checks import Numeric
-from pushjax._progress import Report, progress_bar
 from pushjax.friction_model import FrictionModel
 from pushjax.hands import Hand, checked_path
-from pushjax.monte_carlo.checkpoint import Checkpoint, digest
+from pushjax.monte_carlo.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.monte_carlo.result import MonteCarlo
 from pushjax.monte_carlo.tiles import AXIS, Outcome, Setup, fetch, submit
 from pushjax.rollout import Slider, arguments, check_opening, check_start
 from pushjax.solve import ContactSolver, StickingSolver
 
 TILE = 2048
+Report = Callable[[int, int], None]
 GRAIN = 64  # of tiles for fewer pushes
-BLOCK = 16 * TILE  # pushes between two files of a checkpoint, at least
+# Between two files of a checkpoint, at most: pushes (and the rest of a round), s (likewise)
+BLOCK, PATIENCE = 16 * TILE, 20.0
 
 
 def monte_carlo(
@@ -52,8 +55,8 @@ def monte_carlo(
 
     tile: how many pushes a device makes at once, in one compiled program; default 2048, or the next multiple of 64 for
     fewer. The memory it takes does not depend on n but for the results, some 60 bytes a push. devices: default all,
-    also those of other processes (`jax.distributed`). The bits of push i depend on key, tile and machine, not on how
-    many devices and processes there are, nor on n.
+    also those of other processes (`jax.distributed`), which then all make the same call. The bits of push i depend on
+    key, tile, `trajectories` and machine, not on how many devices and processes there are.
 
     checkpoint: a folder, seen by all processes, where what is done is kept; a run that finds its beginning there goes
     on from it to the same bits. progress: True for a bar on the terminal; or a function of (done, n).
@@ -74,28 +77,54 @@ def monte_carlo(
     check_start(slider, hand, start, p[0])
     width = int(tile) if tile is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
-    mesh = Mesh(np.array(jax.devices() if devices is None else list(devices)), (AXIS,))
+    mesh = _mesh(devices)
     shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver
     run = _Run(n, width, Setup(*shared), impl, mesh, np.asarray(start), trajectories)
-    kept = None
+    kept: Checkpoint | None = None
     if checkpoint is not None:
         parts = {"n": n, "tile": width, "trajectories": trajectories, "key": digest(raw, impl)}
         parts |= {"slider": digest(slider), "hand": digest(hand, hand.poses(p)), "path": digest(p)}
         parts |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
-        parts |= {"jax": jax.__version__, "platform": mesh.devices.flat[0].platform}
-        kept = Checkpoint(Path(checkpoint), parts, writes=jax.process_index() == 0)
-    shown = progress_bar() if progress is True else nullcontext(progress or (lambda done, total: None))
-    with shown as report:
+        versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
+        parts |= versions | {"platform": mesh.devices.flat[0].platform}
+        folder = Path(checkpoint)
+        kept = run.together(lambda: Checkpoint(folder, parts, writes=run.writes))
+    with _shown(progress) as report:
         found = run.all(kept, report)
     starts = np.broadcast_to(run.start, (n, 3))
     return MonteCarlo(starts, *found, time.perf_counter() - begun)
 
 
+def _shown(progress: bool | Report) -> Any:
+    if progress is True:
+        from pushjax._progress import progress_bar  # draws on terminals: not for who only imports this
+
+        return progress_bar()
+    return nullcontext(progress or (lambda done, total: None))
+
+
 def _raw(key: Any) -> tuple[Any, Any]:
     """A key's data, and of which kind it is."""
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        return jax.random.key_data(key), str(jax.random.key_impl(key))
-    return key, str(jax.random.key_impl(jax.random.wrap_key_data(key)))
+    message = f"key must be one key, of jax.random.key or PRNGKey; got {key!r}"
+    if not isinstance(key, (jax.Array, np.ndarray)):
+        raise ValueError(message)
+    try:
+        typed = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(jnp.asarray(key))
+    except (TypeError, ValueError):
+        raise ValueError(message) from None
+    if typed.shape != ():
+        raise ValueError(message)
+    return jax.random.key_data(typed), str(jax.random.key_impl(typed))
+
+
+def _mesh(devices: Sequence[Any] | None) -> Mesh:
+    every = list(jax.devices() if devices is None else devices)
+    if not every:
+        raise ValueError("devices must not be empty")
+    processes = {device.process_index for device in every}
+    if len(processes) not in (1, jax.process_count()):
+        raise ValueError("devices must be those of one process or of all")
+    return Mesh(np.array(every), (AXIS,))
 
 
 class _Run:
@@ -104,10 +133,30 @@ class _Run:
     def __init__(self, n: int, tile: int, setup: Setup, impl: Any, mesh: Mesh, start: np.ndarray, keep: bool):
         self.n, self.setup, self.impl, self.mesh, self.start, self.keep = n, setup, impl, mesh, start, keep
         self.round = tile * mesh.size
+        processes = {device.process_index for device in mesh.devices.flat}
+        self.several, self.writes = len(processes) > 1, jax.process_index() == min(processes)
+
+    def together(self, action: Callable[[], Any]) -> Any:
+        """What `action` gives; where it fails in one process it fails in all, so that none waits for another."""
+        error, value = None, None
+        try:
+            value = action()
+        except CheckpointError as caught:
+            error = caught
+        failed = error is not None
+        if self.several:
+            failed = bool(np.any(multihost_utils.process_allgather(np.int32(failed))))
+        if failed:
+            raise error or CheckpointError("checkpoint: another process could not go on; it says why")
+        return value
+
+    def _due(self, pushes: int, seconds: float) -> bool:
+        due = pushes >= BLOCK or seconds >= PATIENCE
+        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.several else due
 
     def all(self, kept: Checkpoint | None, report: Report) -> Outcome:
         parts, done = self._resumed(kept)
-        block, begun = [], done  # what is not in the checkpoint yet, and from where
+        block, begun, since = [], done, time.perf_counter()  # what is not in the checkpoint yet, and from where
         waiting: tuple[int, int, Outcome] | None = None
         report(done, self.n)
         while done < self.n or waiting is not None:
@@ -116,10 +165,10 @@ class _Run:
                 first, last, outcome = waiting
                 host = fetch(outcome)
                 block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], host))
-                if kept is not None and (last - begun >= BLOCK or last == self.n):
+                if kept is not None and (last == self.n or self._due(last - begun, time.perf_counter() - since)):
                     parts.append(_joined(block))
-                    kept.write(begun, last, _named(parts[-1]))
-                    block, begun = [], last
+                    self.together(partial(kept.write, begun, last, _named(parts[-1])))
+                    block, begun, since = [], last, time.perf_counter()
                 report(last, self.n)
             waiting = ahead
             done = done if ahead is None else ahead[1]
@@ -135,12 +184,17 @@ class _Run:
         if kept is None:
             return [], 0
         blocks = kept.blocks()
-        if jax.process_count() > 1:  # as the one sees it that writes
-            reached = int(multihost_utils.broadcast_one_to_all(np.int32(blocks[-1][1] if blocks else 0)))
-            blocks = [block for block in blocks if block[1] <= reached]
+        reached = blocks[-1][1] if blocks else 0
         names = tuple(name for name in Outcome._fields if self.keep or name != "trajectory")
-        parts = [Outcome(**({"trajectory": None} | kept.read(path, names))) for _, _, path in blocks]
-        return parts, blocks[-1][1] if blocks else 0
+
+        def read() -> list[Outcome]:
+            if self.several and len(np.unique(multihost_utils.process_allgather(np.int32(reached)))) > 1:
+                raise CheckpointError(
+                    f"checkpoint: not every process sees the same in {kept.folder}; give a shared one"
+                )
+            return [Outcome(**({"trajectory": None} | kept.read(path, names))) for _, _, path in blocks]
+
+        return self.together(read), reached
 
 
 def _joined(parts: list[Outcome]) -> Outcome:

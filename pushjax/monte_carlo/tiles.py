@@ -64,9 +64,12 @@ def spread(tree: Any, mesh: Mesh, spec: PartitionSpec) -> Any:
 
 def fetch(tree: Any) -> Any:
     """The same on the host, whole in every process, whichever device has what."""
-    if jax.process_count() > 1:
-        return jax.tree.map(lambda leaf: multihost_utils.process_allgather(leaf, tiled=True), tree)
-    return jax.tree.map(np.asarray, tree)
+
+    def whole(leaf: Array) -> np.ndarray:
+        # of one process's devices it is whole already, and gathering would mix what each process does for itself
+        return np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(whole, tree)
 
 
 def submit(setup: Setup, impl: Any, mesh: Mesh, indices: np.ndarray, poses: np.ndarray, keep: bool) -> Outcome:

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, positive
-from pushjax.scores.deviation import deviation
+from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
 
 # m: what poses are blurred by, at least, where a density is asked for. No tracker sees less, and grasps end in
 # distributions that have no density.
@@ -20,17 +19,18 @@ BLUR = 1e-4
 
 
 def energy_score(samples: Numeric, observed: Numeric, length: Numeric) -> Float[Array, "*observations"]:
-    """E d(X, y) - E d(X, X') / 2, d the paper's `deviation`; in m, less is better, and strictly proper: no forecast
-    scores better, in the mean, than the distribution itself.
+    """E d(X, y) - E d(X, X') / 2, in m; less is better, and in the mean over what happens no other distribution scores
+    as well as the true one.
 
-    The second mean is over pairs of different samples, so that the score does not depend on n in the mean. Of one
-    certain sample it is the deviation. Differentiable in the samples.
+    d is the distance of (x, y, length cos theta, length sin theta): for small angles that of (x, y, length theta). The
+    paper's `deviation` would not do: a sum of distances does not see how position and angle hang together, nor an arc
+    length all there is to see on a circle. The second mean is over pairs of different samples, so that the score does
+    not depend on n in the mean. Differentiable in the samples.
 
     Raises ValueError for other shapes, fewer than two samples, values that are not finite, a length that is not
     positive.
 
-    Source: Gneiting & Raftery 2007, section 4.3. `deviation` is a sum of a distance in the plane and one on the circle,
-    both of negative type, which is what makes it proper.
+    Source: Gneiting & Raftery 2007, section 4.3.
     """
     return _energy_score(*_checked(samples, observed, length))
 
@@ -39,9 +39,20 @@ def energy_score(samples: Numeric, observed: Numeric, length: Numeric) -> Float[
 def _energy_score(x: Array, y: Array, scale: Array) -> Array:
     n = x.shape[0]
     # row by row: all pairs at once would take n^2 numbers
-    within = jax.lax.map(lambda row: jnp.sum(deviation(row, x, scale)), x, batch_size=min(n, 64))
-    spread = jnp.sum(within) / (n * (n - 1))
-    return jnp.mean(deviation(x, y[..., None, :], scale), axis=-1) - spread / 2
+    within = jax.lax.map(lambda row: jnp.mean(_apart(row[None], x, scale)), x, batch_size=min(n, 64))
+    spread = jnp.mean(within) * (n / (n - 1))
+    to = jax.lax.map(lambda one: jnp.mean(_apart(one[None], x, scale)), y.reshape(-1, 3), batch_size=64)
+    return to.reshape(y.shape[:-1]) - spread / 2
+
+
+def _apart(a: Array, b: Array, length: Array) -> Array:
+    """The distance of poses; its derivative at none, where it has a corner, is zero."""
+    a, b = jnp.broadcast_arrays(a, b)
+    rel = a - b
+    chord = 2 * length * jnp.sin(rel[..., 2] / 2)
+    squared = rel[..., 0] ** 2 + rel[..., 1] ** 2 + chord**2
+    same = squared == 0
+    return jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, squared)))
 
 
 def log_density(
@@ -50,17 +61,18 @@ def log_density(
     """The logarithm of a kernel density estimate at `observed`, per cubic metre of (x, y, length * theta).
 
     The kernel is a Gaussian of the samples' covariance times n^(-2/7) (Scott's rule in three dimensions), and `blur`
-    (m) on top in every direction. Differentiable. Raises ValueError as `energy_score`.
+    (m) on top in every direction; it repeats after a turn. Differentiable. Raises ValueError as `energy_score`, and for
+    a blur that is not positive.
     """
     x, y, scale = _checked(samples, observed, length)
-    non_negative("blur", blur)
+    positive("blur", blur)
     return _log_density(x, y, scale, as_float(blur, x.dtype))
 
 
 @jax.jit
 def _log_density(x: Array, y: Array, scale: Array, blur: Array) -> Array:
     points, at = _unrolled(x, y, scale)
-    kernel = _Kernel(points, blur)
+    kernel = _Kernel(points, blur, scale)
     flat = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log(p)), at.reshape(-1, 3))
     return flat.reshape(at.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
 
@@ -76,7 +88,7 @@ def coverage(
     """
     x, y, scale = _checked(samples, observed, length)
     asked = np.asarray(levels, float)
-    non_negative("blur", blur)
+    positive("blur", blur)
     if asked.ndim != 1 or not np.all((asked > 0) & (asked < 1)):
         raise ValueError(f"levels must be numbers between 0 and 1; got {levels!r}")
     return _coverage(x, y, scale, jnp.asarray(asked, x.dtype), as_float(blur, x.dtype))
@@ -85,7 +97,7 @@ def coverage(
 @jax.jit
 def _coverage(x: Array, y: Array, scale: Array, levels: Array, blur: Array) -> Array:
     points, at = _unrolled(x, y, scale)
-    kernel = _Kernel(points, blur)
+    kernel = _Kernel(points, blur, scale)
 
     def without(index: Array) -> Array:
         log = kernel.log(points[index])
@@ -120,10 +132,11 @@ def histogram_distance(counts_a: Numeric, counts_b: Numeric) -> float:
 
 
 class _Kernel:
-    """A Gaussian about each sample (n, 3)."""
+    """A Gaussian about each sample (n, 3), and a turn on either side of it."""
 
-    def __init__(self, points: Array, blur: Array):
+    def __init__(self, points: Array, blur: Array, length: Array):
         n = points.shape[0]
+        self.turn = 2 * jnp.pi * length
         centered = points - jnp.mean(points, axis=0, keepdims=True)
         covariance = centered.T @ centered / (n - 1) * n ** (-2 / 7)
         self.factor = jnp.linalg.cholesky(covariance + blur**2 * jnp.eye(3, dtype=points.dtype))
@@ -134,8 +147,9 @@ class _Kernel:
         return jax.scipy.linalg.solve_triangular(self.factor, points.T, lower=True).T
 
     def log(self, at: Float[Array, "3"]) -> Float[Array, "n"]:
-        apart = self.points - self._white(at[None])
-        return -jnp.sum(apart**2, axis=1) / 2 - self.norm
+        images = jnp.stack([at.at[2].add(k * self.turn) for k in (-1, 0, 1)])
+        apart = self.points[None] - self._white(images)[:, None]
+        return jax.nn.logsumexp(-jnp.sum(apart**2, axis=2) / 2, axis=0) - self.norm
 
 
 def _unrolled(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
@@ -162,6 +176,6 @@ def _checked(samples: Numeric, observed: Numeric, length: Numeric) -> tuple[Arra
         raise ValueError(f"observed has shape {y.shape}; expected (3,) or (observations, 3)")
     for name, value in (("samples", x), ("observed", y), ("length", scale)):
         finite(name, value)
-    if scale.ndim or (concrete(scale) is not None and not float(scale) > 0):
-        positive("length", scale)
+    shaped("length", scale, ())
+    positive("length", scale)
     return x, y, scale

@@ -20,6 +20,7 @@ from pushjax.shapes._pieces import Piece, normal_of
 from pushjax.shapes._spline_sweep import first_contact
 
 SAMPLES = 4
+KNOT = 1e-3  # of a piece, how far past its end it still answers
 # The cubic through two nodes is that good a start that each of these squares an error of less than a percent.
 CLOSEST_ROUNDS = {False: 4, True: 6}  # by whether it is float64
 
@@ -137,7 +138,8 @@ class SplineOutline(Outline):
         low = b < 0  # of the two ways to write that root, the one that does not cancel
         top, bottom = jnp.where(low, -2 * c, b + root), jnp.where(low, b - root, -2 * a)
         t = top / jnp.where(bottom == 0, jnp.inf, bottom)
-        real = (inside > 0) & (bottom != 0) & (t >= 0) & (t < 1)
+        # at a knot, rounding may put it past the end of both its pieces: better twice than never
+        real = (inside > 0) & (bottom != 0) & (t >= -KNOT) & (t <= 1 + KNOT)
         t = jnp.where(real, t, 0.5)
         slope = c1 + t * (2 * c2 + 3 * t * c3)
         t = t + slope / jnp.where(real, root, 1.0)  # its derivatives

@@ -47,15 +47,17 @@ def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
     lowest = _least_eigenvalue(*hessians)
     best = jax.lax.top_k(-lowest.T, REFINED)[1].T  # (refined, n)
     refine = jax.vmap(jax.vmap(partial(_refined, table)), in_axes=(0, None))
-    return jnp.minimum(jnp.min(refine(rays[best], c), axis=0), jnp.min(lowest, axis=0))
+    return jnp.min(refine(rays[best], c), axis=0)
 
 
 def _refined(table: Array, f: Float[Array, "3"], c: Float[Array, "15"]) -> Array:
     def half(carry, _):
         at, least = carry
         entries = jnp.einsum("epm,p,m->e", table, _products(at[None])[0], c)
-        value = _least_eigenvalue(*entries)
-        return (_eigenvector(entries, value), jnp.minimum(least, value)), None
+        z = _eigenvector(entries, _least_eigenvalue(*entries))
+        # of a double eigenvalue the cubic's root has but half the digits
+        value = _products(z[None])[0] @ (entries * jnp.asarray([1.0, 1, 1, 2, 2, 2], c.dtype))
+        return (z, jnp.minimum(least, value)), None
 
     return jax.lax.scan(half, (f, jnp.asarray(jnp.inf, c.dtype)), None, length=2 * ROUNDS)[0][1]
 
@@ -72,7 +74,8 @@ def _least_eigenvalue(xx, yy, zz, xy, xz, yz):
     p = (a * a + b * b + d * d + 2 * (xy * xy + xz * xz + yz * yz)) / 6
     size = jnp.sqrt(jnp.maximum(p, jnp.finfo(p.dtype).tiny))
     det = a * (b * d - yz * yz) - xy * (xy * d - yz * xz) + xz * (xy * yz - b * xz)
-    angle = jnp.arccos(jnp.clip(det / (2 * size**3), -1, 1)) / 3
+    cubed = jnp.maximum(2 * size**3, jnp.finfo(p.dtype).tiny)  # of a multiple of the identity there is no angle
+    angle = jnp.arccos(jnp.clip(det / cubed, -1, 1)) / 3
     return mean + 2 * size * jnp.cos(angle + 2 * np.pi / 3)
 
 

@@ -1,7 +1,8 @@
 """What became of each grasp.
 
-Every hand that stopped is held between both pads. Called grasped is what is stable there: turned a little either way it
-would need the jaw wider. Jammed is what friction alone keeps, where a turn would let the jaw close.
+Every slider whose hand stopped is held between both pads. Here, other than in `MonteCarlo.outcomes`, called grasped is
+what is stable there: turned a little either way it would need the jaw wider. Jammed is what friction alone keeps, where
+a turn would let the jaw close.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pushjax as pj
 
 TURN = np.radians(1.0)
-POINTS = 2000
+POINTS = 500
 SPIKE = np.radians(1.0)  # the width of a bin of angles in which to look for spikes
 FEWEST = 0.02  # of all, that make one
 
@@ -21,13 +22,24 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     """How far apart pads of width `pad`, centred at the origin, must be at least for the slider at each pose."""
     outline = np.asarray(shape.boundary(POINTS), np.float64)
     if isinstance(shape, pj.Polygon):
-        outline = np.concatenate([outline, np.asarray(shape.vertices)])
+        corners = np.asarray(shape.vertices, np.float64)
+        share = np.arange(POINTS)[:, None, None] / POINTS
+        outline = (corners + share * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 2)
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
     y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
+    top, bottom = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
+    after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    for side in (-pad / 2, pad / 2):  # where the outline passes the pads' corners
+        across = (x - side) * (after_x - side) < 0
+        share = np.where(across, (side - x) / np.where(across, after_x - x, 1.0), 0.0)
+        height = y + share * (after_y - y)
+        top = np.maximum(top, np.where(across, height, -np.inf).max(axis=1))
+        bottom = np.minimum(bottom, np.where(across, height, np.inf).min(axis=1))
     between = np.abs(x) <= pad / 2
-    top, bottom = np.where(between, y, -np.inf).max(axis=1), np.where(between, y, np.inf).min(axis=1)
-    return np.where(between.any(axis=1), top - bottom, 0.0)
+    top = np.maximum(top, np.where(between, y, -np.inf).max(axis=1))
+    bottom = np.minimum(bottom, np.where(between, y, np.inf).min(axis=1))
+    return np.where(top >= bottom, top - bottom, 0.0)
 
 
 def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
@@ -36,7 +48,7 @@ def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
     held, failed = grasps.stopped >= 0, grasps.failed > 0
     here = openings(shape, pose, pad)
     turned = [openings(shape, pose + np.array([0, 0, sign * TURN]), pad) for sign in (1, -1)]
-    stable = (turned[0] >= here) & (turned[1] >= here)
+    stable = (here > 0) & (turned[0] >= here) & (turned[1] >= here)
     return np.select([failed, held & stable, held], ["failed", "grasped", "jammed"], "free")
 
 
