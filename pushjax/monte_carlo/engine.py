@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
@@ -12,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh
 from jaxtyping import PRNGKeyArray
 
 from pushjax._checks import Numeric
@@ -20,7 +20,7 @@ from pushjax.friction_model import FrictionModel
 from pushjax.hands import Hand, checked_path
 from pushjax.monte_carlo.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.monte_carlo.result import MonteCarlo
-from pushjax.monte_carlo.tiles import AXIS, Outcome, Setup, fetch, submit
+from pushjax.monte_carlo.tiles import Devices, Outcome, Setup, fetch, placed, submit
 from pushjax.rollout import Slider, arguments, check_opening, check_start
 from pushjax.solve import ContactSolver, StickingSolver
 
@@ -56,7 +56,8 @@ def monte_carlo(
     tile: how many pushes a device makes at once, in one compiled program; default 2048, or the next multiple of 64 for
     fewer. The memory it takes does not depend on n but for the results, some 60 bytes a push. devices: default all,
     also those of other processes (`jax.distributed`), which then all make the same call. The bits of push i depend on
-    key, tile, `trajectories` and machine, not on how many devices and processes there are.
+    key, tile, `trajectories` and machine, not on how many devices and processes there are. Each device compiles its
+    own program, once.
 
     checkpoint: a folder, seen by all processes, where what is done is kept; a run that finds its beginning there goes
     on from it to the same bits. progress: True for a bar on the terminal; or a function of (done, n).
@@ -77,18 +78,18 @@ def monte_carlo(
     check_start(slider, hand, start, p[0])
     width = int(tile) if tile is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
-    mesh = _mesh(devices)
+    on = Devices.of(devices)
     shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver
-    run = _Run(n, width, Setup(*shared), impl, mesh, np.asarray(start), trajectories)
+    run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), trajectories)
     kept: Checkpoint | None = None
     if checkpoint is not None:
         parts = {"n": n, "tile": width, "trajectories": trajectories, "key": digest(raw, impl)}
         parts |= {"slider": digest(slider), "hand": digest(hand, hand.poses(p)), "path": digest(p)}
         parts |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
         versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
-        parts |= versions | {"platform": mesh.devices.flat[0].platform}
+        parts |= versions | {"platform": on.mine[0].platform}
         folder = Path(checkpoint)
-        kept = run.together(lambda: Checkpoint(folder, parts, writes=run.writes))
+        kept = run.together(lambda: Checkpoint(folder, parts, writes=on.writes))
     with _shown(progress) as report:
         found = run.all(kept, report)
     starts = np.broadcast_to(run.start, (n, 3))
@@ -117,24 +118,12 @@ def _raw(key: Any) -> tuple[Any, Any]:
     return jax.random.key_data(typed), str(jax.random.key_impl(typed))
 
 
-def _mesh(devices: Sequence[Any] | None) -> Mesh:
-    every = list(jax.devices() if devices is None else devices)
-    if not every:
-        raise ValueError("devices must not be empty")
-    processes = {device.process_index for device in every}
-    if len(processes) not in (1, jax.process_count()):
-        raise ValueError("devices must be those of one process or of all")
-    return Mesh(np.array(every), (AXIS,))
-
-
 class _Run:
     """A run, and how far it is."""
 
-    def __init__(self, n: int, tile: int, setup: Setup, impl: Any, mesh: Mesh, start: np.ndarray, keep: bool):
-        self.n, self.setup, self.impl, self.mesh, self.start, self.keep = n, setup, impl, mesh, start, keep
-        self.round = tile * mesh.size
-        processes = {device.process_index for device in mesh.devices.flat}
-        self.several, self.writes = len(processes) > 1, jax.process_index() == min(processes)
+    def __init__(self, n: int, tile: int, setup: Setup, impl: Any, devices: Devices, start: np.ndarray, keep: bool):
+        self.n, self.tile, self.impl, self.devices, self.start, self.keep = n, tile, impl, devices, start, keep
+        self.setups, self.round = placed(setup, devices), tile * devices.count
 
     def together(self, action: Callable[[], Any]) -> Any:
         """What `action` gives; where it fails in one process it fails in all, so that none waits for another."""
@@ -144,7 +133,7 @@ class _Run:
         except CheckpointError as caught:
             error = caught
         failed = error is not None
-        if self.several:
+        if self.devices.several:
             failed = bool(np.any(multihost_utils.process_allgather(np.int32(failed))))
         if failed:
             raise error or CheckpointError("checkpoint: another process could not go on; it says why")
@@ -152,18 +141,22 @@ class _Run:
 
     def _due(self, pushes: int, seconds: float) -> bool:
         due = pushes >= BLOCK or seconds >= PATIENCE
-        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.several else due
+        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.several else due
 
     def all(self, kept: Checkpoint | None, report: Report) -> Outcome:
+        with ThreadPoolExecutor(len(self.setups)) as pool:
+            return self._all(kept, report, pool)
+
+    def _all(self, kept: Checkpoint | None, report: Report, pool: ThreadPoolExecutor) -> Outcome:
         parts, done = self._resumed(kept)
         block, begun, since = [], done, time.perf_counter()  # what is not in the checkpoint yet, and from where
-        waiting: tuple[int, int, Outcome] | None = None
+        waiting: tuple[int, int, list[Outcome]] | None = None
         report(done, self.n)
         while done < self.n or waiting is not None:
-            ahead = self._submit(done) if done < self.n else None  # the devices go on while the host copies
+            ahead = self._submit(done, pool) if done < self.n else None  # the devices go on while the host copies
             if waiting is not None:
                 first, last, outcome = waiting
-                host = fetch(outcome)
+                host = fetch(outcome, self.devices)
                 block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], host))
                 if kept is not None and (last == self.n or self._due(last - begun, time.perf_counter() - since)):
                     parts.append(_joined(block))
@@ -174,11 +167,11 @@ class _Run:
             done = done if ahead is None else ahead[1]
         return _joined(parts + block)
 
-    def _submit(self, first: int) -> tuple[int, int, Outcome]:
+    def _submit(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[Outcome]]:
         last = min(first + self.round, self.n)
-        indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32)
+        indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
         poses = np.broadcast_to(self.start, (self.n, 3))[indices]
-        return first, last, submit(self.setup, self.impl, self.mesh, indices, poses, self.keep)
+        return first, last, submit(self.setups, self.impl, self.devices, indices, poses, self.keep, pool)
 
     def _resumed(self, kept: Checkpoint | None) -> tuple[list[Outcome], int]:
         if kept is None:
@@ -188,7 +181,7 @@ class _Run:
         names = tuple(name for name in Outcome._fields if self.keep or name != "trajectory")
 
         def read() -> list[Outcome]:
-            if self.several and len(np.unique(multihost_utils.process_allgather(np.int32(reached)))) > 1:
+            if self.devices.several and len(np.unique(multihost_utils.process_allgather(np.int32(reached)))) > 1:
                 raise CheckpointError(
                     f"checkpoint: not every process sees the same in {kept.folder}; give a shared one"
                 )

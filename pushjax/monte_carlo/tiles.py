@@ -1,10 +1,13 @@
 """One round of a Monte Carlo run: a tile of pushes on every device.
 
-A device always runs whole tiles, by a program for the shape of one, whatever the number of devices and processes: so
-the bits do not depend on it. Push i's key is `fold_in(key, i)`; what is drawn is a program of its own, so that it does
-not depend on what is done with it either.
+Each device runs a program of its own for a whole tile, the same whatever the number of devices and processes, so the
+bits do not depend on it. (One program partitioned over the devices is optimised differently from one for a single
+device: of a million draws, some thousands came out a rounding apart.) Push i's key is `fold_in(key, i)`; what is drawn
+is a program apart, so that it does not depend on what is done with it either.
 """
 
+from collections.abc import Sequence
+from concurrent.futures import Executor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,17 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from pushjax.friction_model import FrictionModel, RandomSurface
 from pushjax.hands import Hand
-from pushjax.random_rollout import Draws, draw, push_under
+from pushjax.random_rollout import draw, push_under
 from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.status import ContactMode
-
-AXIS = "devices"
 
 
 class Setup(NamedTuple):
@@ -52,56 +52,70 @@ class Outcome(NamedTuple):
     trajectory: Any
 
 
-def spread(tree: Any, mesh: Mesh, spec: PartitionSpec) -> Any:
-    """Arrays on all devices of all processes; every process gives the same."""
+class Devices(NamedTuple):
+    """Those of a run, first those of the first process. mine: this process's own. first: the place among all of the
+    first of mine. several: whether other processes have a part."""
 
-    def placed(leaf: Any) -> Array:
-        whole = np.asarray(leaf)
-        return jax.make_array_from_callback(whole.shape, NamedSharding(mesh, spec), lambda index: whole[index])
+    count: int
+    mine: tuple[Any, ...]
+    first: int
+    several: bool
+    writes: bool
 
-    return jax.tree.map(placed, tree)
-
-
-def fetch(tree: Any) -> Any:
-    """The same on the host, whole in every process, whichever device has what."""
-
-    def whole(leaf: Array) -> np.ndarray:
-        # of one process's devices it is whole already, and gathering would mix what each process does for itself
-        return np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True))
-
-    return jax.tree.map(whole, tree)
-
-
-def submit(setup: Setup, impl: Any, mesh: Mesh, indices: np.ndarray, poses: np.ndarray, keep: bool) -> Outcome:
-    """Start one round; it is done when its numbers are asked for. indices, poses: (devices * tile, ...)."""
-    mine, shared = PartitionSpec(AXIS), PartitionSpec()
-    placed = spread((indices, poses), mesh, mine)
-    setup = spread(setup, mesh, shared)
-    draws = _draw(mesh, impl, len(setup.path) - 1, setup.key, setup.around, setup.model, placed[0])
-    rest = setup.shape, setup.hand, setup.path, setup.solver
-    return _push(mesh, setup.model.every, keep, draws, rest, placed[1])
+    @staticmethod
+    def of(devices: Sequence[Any] | None) -> "Devices":
+        every = list(jax.devices() if devices is None else devices)
+        if not every:
+            raise ValueError("devices must not be empty")
+        me = jax.process_index()
+        held = [[d for d in every if d.process_index == process] for process in range(jax.process_count())]
+        part = [len(devices) for devices in held if devices]
+        if len(part) not in (1, jax.process_count()) or len(set(part)) != 1 or not held[me]:
+            raise ValueError("devices must be this process's own, or as many of each of all processes")
+        several = len(part) > 1
+        first = me * part[0] if several else 0
+        return Devices(len(every), tuple(held[me]), first, several, me == 0 or not several)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _draw(mesh: Mesh, impl: Any, steps: int, key: Array, around: RandomSurface, model: FrictionModel, index: Array):
-    def tile(key, around, model, index):
-        root = jax.random.wrap_key_data(key, impl=impl)
-        return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), around, model, steps))(index)
-
-    mine, shared = PartitionSpec(AXIS), PartitionSpec()
-    specs = (shared, shared, shared, mine)
-    return jax.shard_map(tile, mesh=mesh, in_specs=specs, out_specs=mine, check_vma=False)(key, around, model, index)
+def placed(setup: Setup, devices: Devices) -> list[Setup]:
+    """The setup on each device."""
+    return [jax.device_put(setup, device) for device in devices.mine]
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _push(mesh: Mesh, every: int | None, keep: bool, draws: Draws, rest: tuple, poses: Array) -> Outcome:
-    def tile(draws, rest, poses):
-        shape, hand, path, solver = rest
-        return jax.vmap(lambda draws, pose: _outcome(draws, shape, hand, path, pose, solver, every, keep))(draws, poses)
+def submit(
+    setups: list[Setup], impl: Any, devices: Devices, indices: np.ndarray, poses: np.ndarray, keep: bool, pool: Executor
+) -> list[Outcome]:
+    """Start one round; it is done when its numbers are asked for. indices, poses: (devices, tile, ...), of all."""
 
-    mine, shared = PartitionSpec(AXIS), PartitionSpec()
-    specs = (mine, shared, mine)
-    return jax.shard_map(tile, mesh=mesh, in_specs=specs, out_specs=mine, check_vma=False)(draws, rest, poses)
+    def start(k: int) -> Outcome:
+        setup, there = setups[k], devices.first + k
+        index, pose = jax.device_put((indices[there], poses[there]), devices.mine[k])
+        steps = len(setup.path) - 1
+        draws = _draw(impl, steps, setup.key, setup.around, setup.model, index)
+        rest = setup.shape, setup.hand, setup.path, setup.solver
+        return _push(setup.model.every, keep, draws, rest, pose)
+
+    return list(pool.map(start, range(len(setups))))  # side by side: each compiles its own, once
+
+
+def fetch(outcomes: list[Outcome], devices: Devices) -> Outcome:
+    """All that a round gave, of all processes, on the host, in order."""
+    mine = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *outcomes)
+    if not devices.several:
+        return mine
+    return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), mine)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _draw(impl: Any, steps: int, key: Array, around: RandomSurface, model: FrictionModel, index: Array):
+    root = jax.random.wrap_key_data(key, impl=impl)
+    return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), around, model, steps))(index)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _push(every: int | None, keep: bool, draws, rest: tuple, poses: Array) -> Outcome:
+    shape, hand, path, solver = rest
+    return jax.vmap(lambda draws, pose: _outcome(draws, shape, hand, path, pose, solver, every, keep))(draws, poses)
 
 
 def _outcome(draws, shape, hand, path, pose, solver, every, keep) -> Outcome:
