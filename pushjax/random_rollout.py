@@ -9,9 +9,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._checks import Numeric
 from pushjax.friction_model import FrictionModel, RandomSurface
-from pushjax.hands import Hand, checked_path
+from pushjax.hands import Hand
 from pushjax.limit_surface import LimitSurface
-from pushjax.rollout import Slider, Trajectory, arguments, check_opening, check_start, scan
+from pushjax.rollout import Slider, Trajectory, prepared, scan
 from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
@@ -84,18 +84,15 @@ def random_rollout(
 ) -> RandomRollout:
     """Push the slider along a path under friction drawn from `model` around the slider's surface.
 
-    key: of everything random; the rest is as in `rollout`. Differentiable also in the model's dof and the range of its
-    friction, for the draw of this key (`FrictionModel`). Batches come from `vmap` over keys; for large ones
-    `monte_carlo` is faster, and shows progress.
+    key: of everything random; the rest is as in `rollout`. Differentiable also in the range of the model's friction and
+    in its dof, there so that the mean over keys is right (the draw of one key jumps). Batches come from `vmap` over
+    keys; for large ones `monte_carlo` is faster, and shows progress.
 
     Raises ValueError as `rollout` and `FrictionModel.around` do.
 
     Source: Zhou et al. 2017, section V.
     """
-    slider, hand, start, _, dtype = arguments(slider, hand, pose, 0.0, path)
-    p = checked_path(path, hand.dof, dtype)
-    check_opening(hand, p)
-    check_start(slider, hand, start, p[0])
+    slider, hand, p, start, _ = prepared(slider, hand, path, pose, 0.0)
     return _random_rollout(key, model.around(slider.surface), slider.shape, hand, p, start, model, solver)
 
 

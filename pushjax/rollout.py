@@ -42,7 +42,7 @@ class Step(eqx.Module):
     pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
     along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
     halfway; zero and SEPARATED where nothing pushes. Contacts are in the order of the fingers: one of a round finger,
-    two on an outline that is not convex; two of a pad on a polygon, one on a disk. The pose after is that before moved
+    two on an outline that is not convex; two of a pad, one on a disk. The pose after is that before moved
     by the twist to the second order (the contact point goes straight), not its exponential. status: `Status`.
     """
 
@@ -120,6 +120,15 @@ def arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *pat
     non_negative("friction", mu)
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
+
+
+def prepared(slider: Slider, hand: Hand, path: Numeric, pose: Numeric, friction: Numeric, pushes: int | None = None):
+    """What every rollout begins with: slider, hand, path, start and friction as `arguments` gives them, all checked."""
+    slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, path, pushes=pushes)
+    p = checked_path(path, hand.dof, dtype)
+    check_opening(hand, p)
+    check_start(slider, hand, start, p[0])
+    return slider, hand, p, start, mu
 
 
 def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:
@@ -225,11 +234,7 @@ def rollout(
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; the header of `advance` has the scheme.
     """
-    slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, path)
-    p = checked_path(path, hand.dof, dtype)
-    check_opening(hand, p)
-    check_start(slider, hand, start, p[0])
-    return _rollout(slider, hand, p, start, mu, solver)
+    return _rollout(*prepared(slider, hand, path, pose, friction), solver)
 
 
 @eqx.filter_jit

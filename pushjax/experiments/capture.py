@@ -18,6 +18,7 @@ import numpy as np
 import scipy.stats
 
 import pushjax as pj
+from pushjax.experiments._starts import in_circle
 from pushjax.report import envelope
 
 DISC, FINGER, APART, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
@@ -84,10 +85,8 @@ def run(
 
 def start_poses(n: int, seed: int) -> np.ndarray:
     """(n, 3), centres uniform in the circle."""
-    rng = np.random.default_rng(seed)
-    radius, angle = CIRCLE * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    poses = np.stack([radius * np.cos(angle), AHEAD + radius * np.sin(angle), np.zeros(n)], axis=1)
-    return poses.astype(jnp.result_type(float))
+    centers = in_circle(np.random.default_rng(seed), CIRCLE, n) + np.array([0, AHEAD])
+    return np.column_stack([centers, np.zeros(n)]).astype(jnp.result_type(float))
 
 
 def converged(pushes: pj.MonteCarlo) -> np.ndarray:
@@ -125,7 +124,7 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: d
             x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
             at = np.stack(np.meshgrid(x, y))
             kernel = scipy.stats.gaussian_kde(inside.T)
-            plot.density_figure(
+            plot.density_panel(
                 axes, (at[0], at[1]), kernel(at.reshape(2, -1)).reshape(GRID, GRID) / 1e6, inside, outside
             )
         axes.set(title=f"start centres, dof {list(shown)[-1]:g}")

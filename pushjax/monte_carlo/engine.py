@@ -17,11 +17,11 @@ from jaxtyping import PRNGKeyArray
 
 from pushjax._checks import Numeric
 from pushjax.friction_model import FrictionModel
-from pushjax.hands import Hand, checked_path
+from pushjax.hands import Hand
 from pushjax.monte_carlo.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.monte_carlo.result import MonteCarlo
 from pushjax.monte_carlo.tiles import Devices, Outcome, Setup, fetch, placed, submit
-from pushjax.rollout import Slider, arguments, check_opening, check_start
+from pushjax.rollout import Slider, prepared
 from pushjax.solve import ContactSolver, StickingSolver
 
 TILE = 2048
@@ -72,10 +72,7 @@ def monte_carlo(
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
     n = int(n)
-    slider, hand, start, _, dtype = arguments(slider, hand, pose, 0.0, path, pushes=n)
-    p = checked_path(path, hand.dof, dtype)
-    check_opening(hand, p)
-    check_start(slider, hand, start, p[0])
+    slider, hand, p, start, _ = prepared(slider, hand, path, pose, 0.0, pushes=n)
     width = int(tile) if tile is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
     on = Devices.of(devices)

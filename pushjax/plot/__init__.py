@@ -1,6 +1,6 @@
 """Pictures: of single pushes and tables (`figures`), of distributions (`distributions`)."""
 
-from pushjax.plot.distributions import density_figure as density_figure
+from pushjax.plot.distributions import density_panel as density_panel
 from pushjax.plot.distributions import histogram_panel as histogram_panel
 from pushjax.plot.distributions import pose_panel as pose_panel
 from pushjax.plot.distributions import traces as traces

@@ -39,7 +39,7 @@ def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian
     axes.set(xlabel=label, ylabel="count", ylim=(0, None))
 
 
-def density_figure(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside, outside) -> Any:
+def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside, outside) -> Any:
     """A density over (x, y) in mm, with the points (n, 2) m that made it in red and the others in black."""
     drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
     axes.plot(*(MM * np.asarray(outside)).T, ".", color=START, ms=2.5)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.experiments._starts import in_circle
 
 TURN = np.radians(1.0)
 POINTS = 500
@@ -63,9 +64,8 @@ def start_poses(
     kept, again = np.zeros((0, 3)), 0
     dtype = jnp.result_type(float)
     while len(kept) < n:
-        radius, angle = circle * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-        turn = rng.uniform(-np.pi / 2, np.pi / 2, n)
-        poses = np.stack([radius * np.cos(angle), radius * np.sin(angle), turn], axis=1).astype(dtype)
+        centers = in_circle(rng, circle, n)
+        poses = np.column_stack([centers, rng.uniform(-np.pi / 2, np.pi / 2, n)]).astype(dtype)
         apart = np.asarray(overlaps(slider, hand, jnp.asarray(poses), jnp.asarray(configuration))) <= 0
         wanted = n - len(kept)
         last = np.flatnonzero(apart)[:wanted]
