@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax import _smooth_pads
+from pushjax._smooth_pads import Seen
 from pushjax._vec import Scalar, Vec2, select, settle
 from pushjax.hands import Finger, RoundFinger
 from pushjax.shapes import DiskOutline, Outline, PolygonOutline
@@ -57,22 +58,24 @@ class Touch(NamedTuple):
 Touches = tuple[Touch, ...] | Touch
 
 
-def places(finger: Finger, outline: Outline, at: Placement, length: Scalar) -> Touches:
-    """Every place where a finger and the slider may touch."""
+def places(finger: Finger, outline: Outline, at: Placement, length: Scalar, seen: Seen | None = None) -> Touches:
+    """Every place where a finger and the slider may touch. seen: what `facing` gives, if it is known."""
     if isinstance(finger, RoundFinger):
         seen = outline.touches(at.center)
         return tuple(Touch(s.distance - finger.radius, s.point, -s.normal) for s in seen)
     pad, angle = finger.shape.outline(), _angle(at)
     if isinstance(outline, DiskOutline):
-        seen = pad.closest((outline.center - at.center).unrotate(angle))
-        normal = seen.normal.rotate(angle)
-        return (Touch(seen.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
+        near = pad.closest((outline.center - at.center).unrotate(angle))
+        normal = near.normal.rotate(angle)
+        return (Touch(near.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
     if not isinstance(outline, PolygonOutline):
-        return _beside_smooth(pad, outline, at.center, angle, length)
+        if seen is None:
+            seen = facing(finger, outline, at)
+        return _beside_smooth(pad, outline, at.center, angle, length, seen)
     mine = _beside(outline, corners(pad).turned(angle, at.center), length)
     away, own = Vec2(angle.x, -angle.y), corners(outline)
-    seen = _beside(pad, own.turned(away, (-at.center).unrotate(angle)), length)
-    theirs = Touch(seen.distance, own.point, -seen.normal.rotate(angle))
+    near = _beside(pad, own.turned(away, (-at.center).unrotate(angle)), length)
+    theirs = Touch(near.distance, own.point, -near.normal.rotate(angle))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), mine, theirs)
 
 
@@ -111,19 +114,27 @@ def _beside(outline: Outline, corner: Corner, length: Scalar) -> Touch:
     return found
 
 
-def _beside_smooth(pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar) -> Touch:
+def facing(finger: Finger, outline: Outline, at: Placement) -> Seen | None:
+    """What of a smooth outline faces a pad's edges: needed by all that follows, and worked out once. Else None."""
+    if isinstance(finger, RoundFinger) or isinstance(outline, PolygonOutline | DiskOutline):
+        return None
+    return _smooth_pads.seen_by(edges(finger.shape.outline()), outline, at.center, _angle(at))
+
+
+def _beside_smooth(
+    pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, seen: Seen | None
+) -> Touch:
     """A pad's corners, each against the place of a smooth outline nearest to it, and what faces the pad's edges."""
+    assert seen is not None
     deep, corner = -2 * DEEPEST_OVERLAP * length, corners(pad).turned(angle, center)
-    seen = jax.vmap(outline.closest)(corner.point)
-    points = (corner.onward.dot(seen.normal) >= -BLUNT) & (corner.back.dot(seen.normal) >= -BLUNT)
-    points &= seen.distance > deep
-    found = [Touch(jnp.where(points, seen.distance, FAR), seen.point, -seen.normal)]
-    for edge, facing, _, along, height in _smooth_pads.seen_by(edges(pad), outline, center, angle):
-        loose = LOOSE * edge.length
-        beside = facing.real & (along >= -loose) & (along <= edge.length + loose) & (height > deep)
-        normal = jax.tree.map(lambda entry, like=height: jnp.full_like(like, entry), edge.normal.rotate(angle))
-        found.append(Touch(jnp.where(beside, height, FAR), facing.point, normal))
-    return jax.tree.map(lambda *entries: jnp.concatenate(entries), *found)
+    near = jax.vmap(outline.closest)(corner.point)
+    points = (corner.onward.dot(near.normal) >= -BLUNT) & (corner.back.dot(near.normal) >= -BLUNT)
+    points &= near.distance > deep
+    loose = LOOSE * seen.length
+    beside = seen.real & (seen.along >= -loose) & (seen.along <= seen.length + loose) & (seen.height > deep)
+    at_corners = Touch(jnp.where(points, near.distance, FAR), near.point, -near.normal)
+    at_edges = Touch(jnp.where(beside, seen.height, FAR), seen.point, seen.normal)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), at_corners, at_edges)
 
 
 def count(finger: Finger, outline: Outline) -> int:
@@ -175,18 +186,19 @@ class Meeting(NamedTuple):
 
 def meet(finger: Finger, outline: Outline, at: Placement, path: Vec2, length: Scalar) -> Meeting:
     """The first contact of a finger that moves along `path`, in the frame of a slider at rest, without turning."""
-    pressing, touches = jnp.zeros((), bool), places(finger, outline, at, length)
+    seen = facing(finger, outline, at)
+    pressing, touches = jnp.zeros((), bool), places(finger, outline, at, length, seen)
     for touch in (touches,) if isinstance(touches, Touch) else touches:
         # In contact and pressing on: from the start
         pressing |= jnp.any((touch.distance <= 0) & (touch.normal.dot(path) > touch.distance))
     # Else, also when touching but leaving, whatever is hit first
-    hit = _sweep(finger, outline, at, path)
+    hit = _sweep(finger, outline, at, path, seen)
     pressing, hits = settle((pressing, hit <= 1), at.center.x)
     start = jnp.where(pressing, 0.0, jnp.where(hits, hit, 1.0))
-    return Meeting(start, overlap(finger, outline, at) > DEEPEST_OVERLAP * length)
+    return Meeting(start, overlap(finger, outline, at, seen) > DEEPEST_OVERLAP * length)
 
 
-def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
+def overlap(finger: Finger, outline: Outline, at: Placement, seen: Seen | None = None) -> Scalar:
     """How deep a finger is inside the slider, or a corner of either in the other, m; negative where they are apart.
 
     A pad that lies right across a slider, no corner in it, is not noticed.
@@ -198,13 +210,15 @@ def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
         return outline.radius - pad.closest((outline.center - at.center).unrotate(angle)).distance
     tips = at.center + corners(pad).point.rotate(angle)
     if not isinstance(outline, PolygonOutline):
-        return _smooth_pads.overlap(pad, _smooth_pads.seen_by(edges(pad), outline, at.center, angle), outline, tips)
+        seen = facing(finger, outline, at) if seen is None else seen
+        assert seen is not None
+        return _smooth_pads.overlap(pad, seen, outline, tips)
     theirs = pad.closest((corners(outline).point - at.center).unrotate(angle)).distance
     mine = outline.closest(tips).distance
     return jnp.maximum(jnp.max(-mine), jnp.max(-theirs))
 
 
-def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scalar:
+def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2, seen: Seen | None) -> Scalar:
     if isinstance(finger, RoundFinger):
         return outline.sweep(at.center, path, finger.radius)
     pad, angle, zero = finger.shape.outline(), _angle(at), jnp.zeros_like(path.x)
@@ -213,7 +227,7 @@ def _sweep(finger: Finger, outline: Outline, at: Placement, path: Vec2) -> Scala
         return pad.sweep((outline.center - at.center).unrotate(angle), back, outline.radius)
     tips = at.center + corners(pad).point.rotate(angle)
     if not isinstance(outline, PolygonOutline):
-        seen = _smooth_pads.seen_by(edges(pad), outline, at.center, angle)
+        assert seen is not None
         return _smooth_pads.sweep(pad, seen, outline, tips, path, back)
     mine = outline.sweep(tips, path, zero)
     theirs = pad.sweep((corners(outline).point - at.center).unrotate(angle), back, zero)

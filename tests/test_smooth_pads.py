@@ -68,14 +68,11 @@ def pad() -> Pad:
     return pj.Hand.parallel_jaw(0.027, 0.010).fingers[0]
 
 
-def inside(points: np.ndarray, at: Placement) -> float:
-    """The deepest overlap, by brute force: outline points in the pad."""
-    finger = pad()
-    local = (points - np.array([float(at.center.x), float(at.center.y)])) @ np.array(
-        [[float(at.angle.x), -float(at.angle.y)], [float(at.angle.y), float(at.angle.x)]]
-    )
-    low, high = (np.asarray(b) for b in finger.shape.bounds)
-    return float(np.max(np.minimum(local - low, high - local).min(axis=1)))
+def inside(points: np.ndarray, bounds, center, turn: float) -> float:
+    """The deepest overlap, by brute force: outline points in the pad, from `bounds`, about `center`."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    local = (points - center) @ np.array([[cos, -sin], [sin, cos]])
+    return float(np.max(np.minimum(local - bounds[0], bounds[1] - local).min(axis=1)))
 
 
 def placed(x, y, turn) -> Placement:
@@ -85,7 +82,7 @@ def placed(x, y, turn) -> Placement:
 @pytest.mark.parametrize("name", ["ellipse", "butterfly"])
 def test_meets_where_brute_force_does(name, rng):
     shape, finger = shapes()[name], pad()
-    outline, points = shape.outline(), dense(shape, 4000)
+    outline, points, bounds = shape.outline(), dense(shape, 4000), [np.asarray(b) for b in finger.shape.bounds]
     met = jax.jit(lambda at, path: meet(finger, outline, at, path, jnp.asarray(LENGTH)))
     deep = jax.jit(lambda at: overlap(finger, outline, at))
     hits = 0
@@ -93,15 +90,13 @@ def test_meets_where_brute_force_does(name, rng):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
         at, path = placed(aside, 0.04, turn), Vec2(jnp.asarray(rng.uniform(-0.01, 0.01)), jnp.asarray(-0.05))
         start = float(met(at, path).start)
-        shares = np.linspace(0, 1, 1001)
-        depth = np.array(
-            [inside(points, placed(aside + s * float(path.x), 0.04 + s * float(path.y), turn)) for s in shares[::10]]
-        )
-        first = shares[::10][np.argmax(depth > 0)] if (depth > 0).any() else 1.0
+        shares, begin, way = np.linspace(0, 1, 101), np.array([aside, 0.04]), np.array([float(path.x), float(path.y)])
+        depth = np.array([inside(points, bounds, begin + share * way, turn) for share in shares])
+        first = shares[np.argmax(depth > 0)] if (depth > 0).any() else 1.0
         hits += start < 1
         # brute force sees outline points only, and a corner that pokes between two of them late
         assert start - 0.002 <= first <= start + 0.0125 or (first == 1.0 and start > 0.98)
-        touching = placed(aside + start * float(path.x), 0.04 + start * float(path.y), turn)
+        touching = placed(*(begin + start * way), turn)
         if start < 1:
             assert abs(float(deep(touching))) < 1e-9
     assert hits > 10
