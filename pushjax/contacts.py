@@ -61,8 +61,7 @@ Touches = tuple[Touch, ...] | Touch
 def places(finger: Finger, outline: Outline, at: Placement, length: Scalar, seen: Seen | None = None) -> Touches:
     """Every place where a finger and the slider may touch. seen: what `facing` gives, if it is known."""
     if isinstance(finger, RoundFinger):
-        seen = outline.touches(at.center)
-        return tuple(Touch(s.distance - finger.radius, s.point, -s.normal) for s in seen)
+        return tuple(Touch(s.distance - finger.radius, s.point, -s.normal) for s in outline.touches(at.center))
     pad, angle = finger.shape.outline(), _angle(at)
     if isinstance(outline, DiskOutline):
         near = pad.closest((outline.center - at.center).unrotate(angle))
