@@ -9,6 +9,10 @@ from pushjax.hands import Hand as Hand
 from pushjax.hands import line as line
 from pushjax.hands import resample as resample
 from pushjax.hands import through as through
+from pushjax.identify import Identified as Identified
+from pushjax.identify import Pushes as Pushes
+from pushjax.identify import Unknowns as Unknowns
+from pushjax.identify import identify as identify
 from pushjax.limit_surface import Ellipsoid as Ellipsoid
 from pushjax.limit_surface import InverseMap as InverseMap
 from pushjax.limit_surface import LimitSurface as LimitSurface

@@ -60,6 +60,8 @@ class Reproduce(Common):
     geometry: Literal["nominal", "measured"] | None = None
     """table2: nominal (the default), as in the paper; or measured, contact and the push's end as force sensor and robot
     command tell."""
+    method: tuple[Literal["ideal", "wrench_twist", "identified"], ...] | None = None
+    """table2: where the limit surface is from: the known support, measured forces, or final poses. Default: all."""
     steps: int | None = None
     """Steps of each push or grasp. Default: the experiment's own."""
     n: int | None = None
@@ -107,7 +109,7 @@ def _demo(command: Demo, progress: Progress) -> Result:
 
 RANDOM = ("n", "steps", "dof", "friction")
 TAKES: dict[str, tuple[str, ...]] = {
-    "table2": ("data", "geometry", "steps"),
+    "table2": ("data", "geometry", "method", "steps"),
     "squeeze": ("steps",),
     "jam": (),
     "two-finger": ("data", "steps"),
@@ -122,7 +124,7 @@ TAKES: dict[str, tuple[str, ...]] = {
 def _reproduce(command: Reproduce, progress: Progress) -> Result:
     name = command.experiment
     takes, given = TAKES[name], {}
-    for option in ("data", "geometry", *RANDOM):
+    for option in ("data", "geometry", "method", *RANDOM):
         value = getattr(command, option)
         if value is None:
             continue

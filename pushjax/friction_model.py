@@ -230,7 +230,7 @@ class _TermsQuartic(RandomSurface):
                 f"surface: the nearest sum of five squared quadratic forms is {error:.1g} of its coefficients away; "
                 "the sampler 'gram' takes every convex quartic"
             )
-        return _TermsQuartic(mean, terms.lower, _dof_of_terms(terms.lower, dof))
+        return _TermsQuartic(mean, terms.lower, dof_of_terms(terms.lower, dof))
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         def term(lower: Array, key: PRNGKeyArray) -> Array:
@@ -243,7 +243,7 @@ class _TermsQuartic(RandomSurface):
         return SurfaceSample(surface, jnp.zeros_like(self.dof))
 
 
-def _dof_of_terms(lower: Array, dof: Array) -> Array:
+def dof_of_terms(lower: Array, dof: Array) -> Array:
     """m, with which the relative variance of H, in the mean over rays, is 2 / dof.
 
     (F' P F)^2 has the relative variance (8 m + 24) / (m (m + 2)); of a sum, that times the mean of the terms' squared

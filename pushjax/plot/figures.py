@@ -271,6 +271,8 @@ def table_figure(cells: list[dict], title: str) -> Figure:
         figure, axes = plt.subplots(figsize=(8.6, 3.8), layout="constrained")
         for k, (model, color) in enumerate((("quartic", BLUE), ("ellipsoid", ORANGE))):
             mine = [cell for cell in cells if cell["model"] == model]
+            if not mine:
+                continue
             x = np.arange(len(conditions)) + (k - 0.5) * 0.36
             height = [cell["mean_mm"] for cell in mine]
             error = [cell["ci95_bootstrap_mm"] for cell in mine]

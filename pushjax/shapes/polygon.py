@@ -275,6 +275,16 @@ class Polygon(Shape):
         at = (jnp.arange(points, dtype=edge.dtype) + 0.5) / points * arc[-1]
         return jnp.stack([jnp.interp(at, arc, closed[:, 0]), jnp.interp(at, arc, closed[:, 1])], axis=1)
 
+    def inset(self, depth: Numeric) -> "Polygon":
+        """The polygon with every edge moved inwards by `depth` m (negative: outwards). The edges must stay edges."""
+        by = as_float(depth, self.vertices.dtype)
+        edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
+        normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
+        before = jnp.roll(normal, 1, axis=0)
+        # the corner's shift s has n.s = -depth for both of its edges' normals
+        corner = (before + normal) / (1 + jnp.sum(before * normal, axis=1, keepdims=True))
+        return Polygon(self.vertices - by * corner, convex=self.convex)
+
     def outline(self) -> PolygonOutline:
         v = self.vertices
         edge = jnp.roll(v, -1, axis=0) - v

@@ -1,0 +1,81 @@
+"""The eight conditions, the paper's figures for them, and where the robot's finger really was."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets import PushLog, load_push_npz, load_triangle_log
+
+SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4")
+CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
+MODELS = {"quartic": 4, "ellipsoid": 2}
+PAIRS, SPLITS = 400, 10
+
+# Mean deviation in mm, Zhou et al. 2017, table 2; and the mean over conditions of deviation over no-motion, percent.
+PAPER_MM = {
+    ("hardboard", "quartic"): (3.52, 2.75, 2.92, 2.80),
+    ("hardboard", "ellipsoid"): (3.82, 3.63, 3.35, 3.96),
+    ("plywood", "quartic"): (3.78, 2.80, 2.84, 3.26),
+    ("plywood", "ellipsoid"): (4.24, 3.56, 3.28, 4.12),
+}
+PAPER_NO_MOTION_MM = {"hardboard": (16.63, 13.86, 14.83, 15.15), "plywood": (16.56, 13.81, 15.27, 14.20)}
+PAPER_PERCENT = {"quartic": 20.48, "ellipsoid": 24.97}
+
+
+class Geometry(NamedTuple):
+    """Where the robot's finger really was: its radius, by how much the outline is smaller than nominal (m), and
+    whether the path goes on to where the robot was told to stop, past the last logged sample."""
+
+    radius: float
+    inset: float
+    commanded_end: bool
+
+
+# nominal: the paper's set-up. measured: contact began, by the force sensor, with the finger's centre 0.7 mm inside the
+# nominal outline, and the log misses the last millimetre of the motion.
+GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 0.0007, True)}
+
+
+def load(folder: Path, surface: str, name: str) -> PushLog:
+    """A condition's pushes: its tidy archive, or else an original log whose name begins with the condition."""
+    archive = folder / f"{surface}_{name}.npz"
+    originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
+    if archive.exists() or not originals:
+        return load_push_npz(archive)
+    return load_triangle_log(originals[0], surface=surface, arrangement=name)
+
+
+def ideal_surface(log: PushLog, model: str, key: jax.Array) -> pj.LimitSurface:
+    """Fitted to pairs of the known support points under the loads that statics gives them."""
+    support = pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(key, PAIRS), degree=MODELS[model])
+
+
+def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
+    polygon = pj.Polygon(log.vertices)
+    return polygon.inset(geometry.inset) if geometry.inset else polygon
+
+
+def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
+    paths = [np.asarray(pj.resample(_path(log, push, geometry), steps)) for push in log.pushes]
+    start, end = (np.stack([getattr(push, name) for push in log.pushes]) for name in ("pose_start", "pose_end"))
+    dtype = jnp.result_type(float)
+    return pj.Pushes(start.astype(dtype), np.stack(paths).astype(dtype), end.astype(dtype))
+
+
+def _path(log: PushLog, push, geometry: Geometry) -> np.ndarray:
+    if not geometry.commanded_end:
+        return push.tip
+    return np.vstack([push.tip, np.asarray(log.commanded_tip_end(push))[None]])
+
+
+def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:
+    """(splits, pushes): True for the random part that each split learns from."""
+    chosen = np.zeros((SPLITS, len(log.pushes)), bool)
+    for row in chosen:
+        row[rng.permutation(len(row))[: round(share * len(row))]] = True
+    return chosen

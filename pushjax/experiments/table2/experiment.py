@@ -1,0 +1,171 @@
+"""Table 2 of the paper: a triangle on three known support points, pushed by a robot; predicted against measured.
+
+Each condition's limit surface is that of its ideal pressure (the support points are known, statics gives their loads),
+or fitted to measured forces, or identified from where the triangle ended up (`methods`); part of the pushes is learned
+from and the others are predicted: the mean deviation of the final poses, over ten random splits (Zhou et al. 2017,
+section VI.A).
+
+Deviations from the paper: the surface is normalised with the support's own radius of gyration, not with the length of
+the error metric; for the narrow support (3pts1) that is four times shorter, and the paper's choice squeezes the part of
+the surface that matters there into a thin disc (quartic: 3.0 against 5.2 mm). One set of pairs serves all splits. A
+surface is fitted to the forces of half of the pushes, not 40 percent: of what we have, that is the first share with as
+many pairs as a quartic has coefficients.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets import PushLog
+from pushjax.experiments.table2 import methods
+from pushjax.experiments.table2.conditions import (
+    CONDITIONS,
+    GEOMETRIES,
+    MODELS,
+    OBJECTS,
+    PAIRS,
+    PAPER_MM,
+    PAPER_NO_MOTION_MM,
+    PAPER_PERCENT,
+    SPLITS,
+    SURFACES,
+    ideal_surface,
+    load,
+    training,
+)
+from pushjax.experiments.table2.methods import FRICTIONS, Predicted
+from pushjax.report import envelope
+
+BOOTSTRAPS = 2000
+
+
+def run(
+    folder: Path,
+    seed: int = 0,
+    out: Path | None = None,
+    geometry: str = "nominal",
+    steps: int = 100,
+    method: Sequence[str] = tuple(methods.TRAIN_SHARE),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Sixteen cells a method. folder: the data's, with `three_point_push/`. geometry: "nominal" or "measured". method:
+    one or more of "ideal", "wrench_twist" and "identified"."""
+    if geometry not in GEOMETRIES:
+        raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}; got {geometry!r}")
+    unknown = [name for name in method if name not in methods.TRAIN_SHARE]
+    if unknown or not method:
+        raise ValueError(f"method must be one or more of {', '.join(methods.TRAIN_SHARE)}; got {unknown or 'none'}")
+    logs = [load(folder / "three_point_push", *condition) for condition in CONDITIONS]
+    done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(CONDITIONS) for name in method)
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        progress(done, total)
+
+    cells = []
+    for model in MODELS:
+        # keys and generators are each condition's own, so that a cell does not depend on which others there are
+        surfaces = [ideal_surface(log, model, jax.random.key(seed + k)) for k, log in enumerate(logs)]
+        for name in method:
+            rngs = [np.random.default_rng(seed + k) for k in range(len(logs))]
+            train = [training(log, methods.TRAIN_SHARE[name], rng) for log, rng in zip(logs, rngs, strict=True)]
+            found = _predicted(name, model, logs, surfaces, train, geometry, steps, step)
+            for k, (surface, target) in enumerate(CONDITIONS):
+                labels = {"surface": surface, "object": target, "model": model, "method": name}
+                paper = {"paper_mm": PAPER_MM[surface, model][OBJECTS.index(target)]}
+                cells.append(labels | _cell(logs[k], found[k], train[k], rngs[k]) | paper)
+    means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
+    pictures = [] if out is None else _draw(cells, out)
+    settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
+    settings |= GEOMETRIES[geometry]._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
+    return envelope("table2", settings, cells=cells, means=means, pictures=pictures)
+
+
+def _predicted(name, model, logs, surfaces, train, geometry, steps, done) -> list[Predicted]:
+    where = GEOMETRIES[geometry]
+    if name == "identified":
+        return methods.identified(logs, surfaces, train, where, steps, done)
+    found = []
+    for log, surface, mine in zip(logs, surfaces, train, strict=True):
+        if name == "ideal":
+            found.append(methods.ideal(log, surface, mine, where, steps))
+        else:
+            found.append(methods.wrench_twist(log, surface.length, model, mine, where, steps))
+        done()
+    return found
+
+
+def _cell(log: PushLog, found: Predicted, train: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+    """What the pushes that were not learned from say, over all splits."""
+    still = 1e3 * np.array([float(pj.deviation(p.pose_start, p.pose_end, log.length)) for p in log.pushes])
+    test = ~train
+    means = [error[mine].mean() for error, mine in zip(found.errors, test, strict=True)]
+    times = test.sum(axis=0)
+    per_push = (found.errors * test).sum(axis=0)[times > 0] / times[times > 0]
+    resampled = rng.choice(per_push, (BOOTSTRAPS, len(per_push))).mean(axis=1)
+    return {
+        "mean_mm": float(np.mean(means)),
+        "ci95_mm": float(1.96 * np.std(means, ddof=1) / np.sqrt(len(train))),
+        "ci95_bootstrap_mm": float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2),
+        "no_motion_mm": float(np.mean([still[mine].mean() for mine in test])),
+        "worst_mm": float(per_push.max()),
+        "friction": float(np.mean(found.friction)),
+        "pushes": train.shape[1],
+        "splits": len(train),
+        "failed_steps": found.failed,
+    }
+
+
+def _mean(cells: list[dict], method: str, model: str) -> dict[str, float]:
+    mine = [cell for cell in cells if (cell["method"], cell["model"]) == (method, model)]
+    return {
+        "mean_mm": float(np.mean([cell["mean_mm"] for cell in mine])),
+        "paper_mm": float(np.mean([cell["paper_mm"] for cell in mine])),
+        "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in mine])),
+        "paper_percent": PAPER_PERCENT[model],
+    }
+
+
+def _draw(cells: list[dict], out: Path) -> list[str]:
+    from pushjax import plot
+
+    title, drawn = "Triangle on three points: final pose, predicted against measured", []
+    for name in dict.fromkeys(cell["method"] for cell in cells):
+        mine = [cell for cell in cells if cell["method"] == name]
+        file = "table2.png" if name == "ideal" else f"table2_{name}.png"
+        drawn.append(str(plot.save(plot.table_figure(mine, f"{title} ({name.replace('_', '-')})"), out / file)))
+    return drawn
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints: the paper's table with ours beside it."""
+    lines = [f"Mean deviation in mm, test pushes, {SPLITS} splits; the paper's in brackets."]
+    for name, means in record["means"].items():
+        cells = [cell for cell in record["cells"] if cell["method"] == name]
+        lines += ["", f"{name:22}" + "".join(f"{target:>20}" for target in OBJECTS)]
+        for surface in SURFACES:
+            for model in MODELS:
+                row = [c for c in cells if (c["surface"], c["model"]) == (surface, model)]
+                entries = (f"{c['mean_mm']:.2f} ± {c['ci95_bootstrap_mm']:.2f} ({c['paper_mm']:.2f})" for c in row)
+                lines.append(f"{surface:10} {model:11}" + "".join(f"{entry:>20}" for entry in entries))
+            row = [c for c in cells if (c["surface"], c["model"]) == (surface, "quartic")]
+            still = zip(row, PAPER_NO_MOTION_MM[surface], strict=True)
+            entries = (f"{c['no_motion_mm']:.2f} ({paper:.2f})" for c, paper in still)
+            lines.append(f"{surface:10} {'no motion':11}" + "".join(f"{entry:>20}" for entry in entries))
+        for model, mean in means.items():
+            lines.append(
+                f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}), "
+                f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
+            )
+    lines.append("")
+    failed = sum(cell["failed_steps"] for cell in record["cells"])
+    if failed:
+        lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
+    lines.append("The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON.")
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

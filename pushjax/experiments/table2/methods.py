@@ -1,0 +1,104 @@
+"""Three ways to predict the pushes that were not learned from. Each gives the deviation of every push, in mm, under
+every split: (splits, pushes); what friction it found, (splits,); and how many steps failed.
+
+ideal         the surface of the known support, the friction by a grid (the paper's).
+wrench_twist  the surface fitted to the forces measured on the way, the friction by a grid (the paper's other way).
+identified    friction, surface and how far the hand really went from the final poses alone: `pushjax.identify`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets import PushLog
+from pushjax.experiments.table2.conditions import MODELS, Geometry, outline, recorded
+
+FRICTIONS = np.linspace(0.0, 0.8, 41)
+# Of the pushes, to learn from. A quartic has fifteen coefficients, a push gives one pair.
+TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
+IDENTIFY_STEPS = 40  # at most: derivatives are for the fit, whose answer does not change with more
+# The supports are known to a millimetre or so, the robot's set-up less well.
+DOF, INSET, END = 200.0, 0.002, 0.001
+
+
+class Predicted(NamedTuple):
+    errors: np.ndarray
+    friction: np.ndarray
+    failed: int
+
+
+def ideal(log: PushLog, surface: pj.LimitSurface, train: np.ndarray, geometry: Geometry, steps: int) -> Predicted:
+    errors, failed = _on_grid(log, surface, geometry, steps)
+    return _best(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
+
+
+def wrench_twist(
+    log: PushLog, length: jax.Array, model: str, train: np.ndarray, geometry: Geometry, steps: int
+) -> Predicted:
+    """length: of the surfaces, m."""
+    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in log.wrench_twist_pairs())
+    errors, failed = [], 0
+    for mine in train:
+        surface = pj.fit_limit_surface(wrench[mine], twist[mine], length, degree=MODELS[model])
+        each, wrong = _on_grid(log, surface, geometry, steps)
+        errors.append(each)
+        failed += int(wrong.sum())
+    return _best(np.stack(errors), train, np.asarray(failed))
+
+
+def identified(
+    logs: list[PushLog], surfaces: list[pj.LimitSurface], train: list[np.ndarray], geometry: Geometry, steps: int, done
+) -> list[Predicted]:
+    """All conditions at once: they share the robot, whose geometry is not taken as given. `done` is called after each
+    split."""
+    pushes, fine = (
+        pj.Pushes.conditions([recorded(log, geometry, count) for log in logs])
+        for count in (min(steps, IDENTIFY_STEPS), steps)
+    )
+    slider = pj.Slider(outline(logs[0], geometry), jax.tree.map(lambda *each: jnp.stack(each), *surfaces))
+    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, inset=INSET, end=END)
+    hand, length = pj.Hand.finger(geometry.radius), logs[0].length
+    errors, friction, failed = [], [], np.zeros(len(logs), int)
+    for split in range(len(train[0])):
+        weight = np.zeros(pushes.weight.shape)
+        for condition, chosen in enumerate(train):
+            weight[condition, : chosen.shape[1]] = chosen[split]
+        found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
+        predicted = found.predict(fine, slider, hand)
+        errors.append(1e3 * np.asarray(pj.deviation(predicted.pose[..., -1, :], fine.end, length), np.float64))
+        failed += np.asarray(predicted.failed).sum(axis=(1, 2))
+        friction.append(np.asarray(found.friction))
+        done()
+    return [
+        Predicted(np.stack([e[k, : train[k].shape[1]] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
+        for k in range(len(logs))
+    ]
+
+
+def _on_grid(log: PushLog, surface: pj.LimitSurface, geometry: Geometry, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Deviation in mm of every push at every friction, (frictions, pushes), and how many steps failed of each."""
+    pushes = recorded(log, geometry, steps)
+    slider = pj.Slider(outline(log, geometry), surface)
+    hand = pj.Hand.finger(geometry.radius)
+    final, failed = _final_poses(slider, hand, pushes.path, pushes.start, jnp.asarray(FRICTIONS, pushes.path.dtype))
+    return 1e3 * np.asarray(pj.deviation(final, pushes.end[None], log.length), np.float64), np.asarray(failed)
+
+
+@jax.jit
+def _final_poses(slider: pj.Slider, hand: pj.Hand, paths, starts, frictions):
+    def one(path, start, friction):
+        push = pj.rollout(slider, hand, path, pose=start, friction=friction)
+        return push.pose[-1], jnp.sum(push.failed)
+
+    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
+    return jax.vmap(over_pushes, in_axes=(None, None, 0))(paths, starts, frictions)
+
+
+def _best(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
+    """Of each split's errors (frictions, pushes) those at the friction that is best on what it learns from."""
+    best = [int(np.argmin(e[:, mine].mean(axis=1))) for e, mine in zip(errors, train, strict=True)]
+    chosen = np.stack([e[b] for e, b in zip(errors, best, strict=True)])
+    return Predicted(chosen, FRICTIONS[best], int(failed.sum()))

@@ -1,0 +1,109 @@
+"""From pushes to what they tell."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
+from pushjax.hands import Hand
+from pushjax.identify.fit import Fit, fit, whitened
+from pushjax.identify.identified import Identified
+from pushjax.identify.model import Setup
+from pushjax.identify.pushes import Pushes
+from pushjax.identify.unknowns import Prior, Unknowns
+from pushjax.rollout import Slider
+from pushjax.status import Status
+
+ROBUST = 2.0
+SIGMA = 0.002  # m, where the search for it begins
+FRICTIONS = 9  # from which the search begins
+
+
+def identify(
+    pushes: Pushes,
+    slider: Slider,
+    hand: Hand,
+    unknowns: Unknowns | None = None,
+    *,
+    friction: Numeric = 0.25,
+    length: Numeric | None = None,
+    robust: float | None = ROBUST,
+    sigma: Numeric | None = None,
+) -> Identified:
+    """Friction, limit surface and calibration from recorded pushes, with how well they are known.
+
+    pushes: of one condition, or of several (`Pushes.conditions`), which share what `unknowns` says. slider: the
+    outline, and the limit surface that is expected before any push was seen, as from its pressure; it may have a
+    leading axis of conditions. hand: what pushed. unknowns: what is to be found (default: friction and surface).
+    friction: mu, where it is known. length: m, makes angles commensurate with positions in what is minimised; the
+    surface's unless given. sigma: m, by how much each of x, y and length * theta of a final pose is off its prediction,
+    as standard deviation; None: found too. robust: pushes that are farther off than so many sigma count less, by
+    pseudo-Huber's loss; None: by least squares.
+
+    Maximises the posterior: pushes, and the prior that `unknowns` describes, by Levenberg and Marquardt's method, from
+    the best of several frictions. Its normal distribution is that of the linearised pushes.
+
+    Works under `vmap`, of many objects at once, and `jit`; not under `grad`.
+
+    Raises ValueError for arrays of the wrong shape, values that are not finite or out of range.
+    """
+    unknowns = Unknowns() if unknowns is None else unknowns
+    dtype = common_dtype(pushes, slider, hand)
+    pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
+    single = pushes.weight.ndim == 1
+    several = jax.tree.map(lambda leaf: leaf[None], pushes) if single else pushes
+    conditions = several.weight.shape[0]
+    surface = slider.surface
+    if surface.length.ndim == 0:
+        surface = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (conditions, *leaf.shape)), surface)
+    shaped("slider.surface.length", surface.length, (conditions,))
+    if several.path.shape[-1] != hand.dof:
+        raise ValueError(f"path has {several.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
+    mu = as_float(friction, dtype)
+    if mu.shape not in ((), (conditions,)):
+        raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({conditions},), one per condition")
+    finite("friction", mu)
+    non_negative("friction", mu)
+    metric = surface.length[0] if length is None else as_float(length, dtype)
+    first = as_float(SIGMA if sigma is None else sigma, dtype)
+    for name, value in (("length", metric), ("sigma", first)):
+        shaped(name, value, ())
+        finite(name, value)
+        positive(name, value)
+    if robust is not None:
+        positive("robust", robust)
+    found, prior = _identify(
+        several, slider.shape, hand, surface, unknowns, mu, metric, first, robust=robust, known=sigma is not None
+    )
+    residual = found.residual[0] if single else found.residual
+    status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
+    return Identified(found.z, found.precision, prior, found.sigma, residual, metric, found.steps, status, single)
+
+
+@eqx.filter_jit
+def _identify(
+    pushes, shape, hand, surface, unknowns, friction, length, sigma, *, robust: float | None, known: bool
+) -> tuple[Fit, Prior]:
+    prior = Prior.of(unknowns, surface, friction)
+    setup = Setup(shape, hand, surface, prior, length)
+    return fit(setup, pushes, _best_start(setup, pushes, sigma, robust), sigma, robust, known), prior
+
+
+def _best_start(setup: Setup, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
+    """Everything else at its mean, the friction with which that explains most: of each condition, or of all."""
+    z, layout = setup.prior.start, setup.prior.layout
+    if "friction" not in layout.names:
+        return z
+    share = (jnp.arange(FRICTIONS, dtype=z.dtype) + 0.5) / FRICTIONS
+    tried = jnp.log(share / (1 - share))
+    places = layout.index[:, layout.local["friction"]][:, 0]
+
+    def losses(value: Array) -> Array:
+        left = whitened(setup.residuals(z.at[places].set(value), pushes), pushes.weight, sigma, robust)
+        return jnp.sum(left**2, axis=(1, 2))
+
+    loss = jax.lax.map(losses, tried)
+    if "friction" in layout.shared:
+        loss = jnp.broadcast_to(jnp.sum(loss, axis=1, keepdims=True), loss.shape)
+    return z.at[places].set(tried[jnp.argmin(loss, axis=0)])

@@ -1,0 +1,112 @@
+"""What was found, and how well it is known."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from scipy.stats import norm
+
+from pushjax.hands import Hand
+from pushjax.identify.model import moved, smaller, trajectories
+from pushjax.identify.pushes import Pushes
+from pushjax.identify.unknowns import Physical, Prior
+from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
+from pushjax.rollout import Slider, Trajectory
+
+
+class Identified(eqx.Module):
+    """The most probable values of what was unknown, with a normal distribution about them (Laplace's).
+
+    z: (size,), those values as `prior` writes them; precision: (size, size), the inverse of their covariance. prior:
+    what turns them into physics. sigma: m, the standard deviation of each of x, y and length * theta of a measured
+    final pose about its prediction. residual: (..., pushes, 3), predicted less measured, in those, m. length: m, the
+    metric's. steps: of the optimiser. status: MOVING, or NOT_CONVERGED.
+
+    All properties have a leading axis of conditions if the pushes had one; what conditions share is repeated.
+    """
+
+    z: Float[Array, "size"]
+    precision: Float[Array, "size size"]
+    prior: Prior
+    sigma: Float[Array, ""]
+    residual: Float[Array, "*conditions pushes 3"]
+    length: Float[Array, ""]
+    steps: Int[Array, ""]
+    status: Int[Array, ""]
+    single: bool = eqx.field(static=True)
+
+    @property
+    def physical(self) -> Physical:
+        """Everything a push depends on, as arrays."""
+        return self._own(self.prior.physical(self.z))
+
+    @property
+    def friction(self) -> Float[Array, "*conditions"]:
+        """mu."""
+        return self.physical.friction
+
+    @property
+    def surface(self) -> LimitSurface:
+        """The limit surface, centre of pressure included; with conditions, its arrays have them in front."""
+        return self._own(surfaces(self.prior, self.prior.physical(self.z)))
+
+    @property
+    def covariance(self) -> Float[Array, "size size"]:
+        """Of z."""
+        return jnp.linalg.inv(self.precision)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each number of z."""
+        return self.prior.layout.labels
+
+    def draws(self, key: PRNGKeyArray, n: int) -> Physical:
+        """`n` values from the distribution, each as likely as the next; fields as in `physical`, with (n,) in front."""
+        return jax.vmap(lambda z: self._own(self.prior.physical(z)))(self._draws(key, n))
+
+    def _draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n size"]:
+        upper = jnp.linalg.cholesky(self.precision).T
+        normal = jax.random.normal(key, (len(self.z), n), self.z.dtype)
+        return self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
+
+    def interval(self, level: float = 0.9) -> dict[str, tuple[Array, Array]]:
+        """The lowest and highest value of friction, center, inset, end, lag and offset, as far as they were unknown,
+        that hold a share `level` of the distribution; arrays like the estimates.
+
+        Each is that of its own number of z, so that a friction stays in its range.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must be between 0 and 1; got {level!r}")
+        reach = float(norm.ppf(0.5 + level / 2)) * jnp.sqrt(jnp.diagonal(self.covariance))
+        low, high = (self._own(self.prior.physical(self.z + sign * reach)) for sign in (-1, 1))
+        names = [name for name in self.prior.layout.names if name != "surface"]
+        return {name: (getattr(low, name), getattr(high, name)) for name in names}
+
+    def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
+        """Slider, hand and path as they really are, to roll out with: for one condition. path: (steps + 1, dof)."""
+        if not self.single:
+            raise ValueError("applied: found of several conditions; take one of them first, with `condition`")
+        own = self.physical
+        shape, hand = smaller(slider.shape, hand, own.inset)
+        return Slider(shape, self.surface), hand, moved(path, own.end, own.lag, own.offset)
+
+    def predict(self, pushes: Pushes, slider: Slider, hand: Hand) -> Trajectory:
+        """These or other pushes, of the same conditions, rolled out; every array with axes (..., pushes) in front.
+        slider: its outline counts, hand: as it was said to be."""
+        theta = self.prior.physical(self.z)
+        several = pushes if not self.single else jax.tree.map(lambda leaf: leaf[None], pushes)
+        return self._own(_trajectories(theta, surfaces(self.prior, theta), slider.shape, hand, several))
+
+    def _own(self, several: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[0], several) if self.single else several
+
+
+_trajectories = eqx.filter_jit(trajectories)
+
+
+def surfaces(prior: Prior, theta: Physical) -> LimitSurface:
+    """With a leading axis of conditions."""
+    kind = Quartic if prior.mean.lower.shape[1] > 1 else Ellipsoid
+    return jax.vmap(kind)(theta.surface, prior.mean.length)

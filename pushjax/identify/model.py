@@ -1,0 +1,138 @@
+"""Predicted final poses, and their derivatives by what is to be found."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pushjax.hands import Hand, RoundFinger
+from pushjax.identify.pushes import Pushes
+from pushjax.identify.unknowns import Physical, Prior
+from pushjax.limit_surface import LimitSurface
+from pushjax.rollout import Slider, Trajectory, rollout
+from pushjax.shapes import Polygon, Shape
+
+STRAIGHT = 5  # the direction in which a path goes on is that of a fifth of it
+
+
+class Setup(eqx.Module):
+    """Everything that stays as it is. surface: with a leading axis of conditions; length: of the metric."""
+
+    shape: Shape
+    hand: Hand
+    surface: LimitSurface
+    prior: Prior
+    length: Float[Array, ""]
+
+    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes 3"]:
+        """Predicted less measured final pose: x, y, length * theta, m.
+
+        A push depends on some twenty numbers of its own condition, whatever the size of z: its derivatives by those are
+        worked out at once, and everything by z is a product of matrices.
+        """
+        theta = self.prior.physical(z)._asdict()
+        names = self.prior.layout.names
+        # the center is in the surface
+        free = ["surface"] if "center" in names else []
+        free = [name for name in theta if name in (*names, *free) and name != "center"]
+        return _residuals({name: theta[name] for name in free}, Physical(**theta), self, pushes)
+
+    def linearised(self, z: Float[Array, "size"], pushes: Pushes) -> tuple[Array, Array]:
+        """Residuals, and their derivatives by z: (conditions, pushes, 3, size)."""
+        value, slope = jax.linearize(lambda z: self.residuals(z, pushes), z)
+        return value, jnp.moveaxis(jax.vmap(slope)(jnp.eye(len(z), dtype=z.dtype)), 0, -1)
+
+
+def trajectories(theta: Physical, surface: LimitSurface, shape: Shape, hand: Hand, pushes: Pushes) -> Trajectory:
+    """Predicted pushes, with axes (conditions, pushes); theta and surface with a leading axis of conditions."""
+    over_pushes = jax.vmap(_push, in_axes=(None, None, None, 0, 0))
+    over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0, 0))
+    return over_all(theta, surface, (shape, hand), pushes.start, pushes.path)
+
+
+class _Own(NamedTuple):
+    """What belongs to one push; the surface to its condition."""
+
+    surface: LimitSurface
+    start: Array
+    path: Array
+    end: Array
+
+
+def _residual(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Shape, Hand, Array]):
+    shape, hand, length = fixed
+    push = _push(rest._replace(**varied), own.surface, (shape, hand), own.start, own.path)
+    off = push.pose[-1] - own.end
+    residual = off.at[2].mul(length)
+    return residual, residual
+
+
+@jax.custom_jvp
+def _residuals(varied: dict[str, Array], rest: Physical, setup: Setup, pushes: Pushes) -> Array:
+    return _each(lambda *args: _residual(*args)[0], varied, rest, setup, pushes)
+
+
+@_residuals.defjvp
+def _residuals_jvp(primals, tangents):
+    # forward, also by a quartic's fifteen coefficients: half the time and the compilation of three reverse sweeps
+    slopes, value = _each(jax.jacfwd(_residual, has_aux=True), *primals)
+
+    def along(slope: Array, direction: Array) -> Array:
+        """(conditions, pushes, 3, *own shape) by (conditions, *own shape)"""
+        return jnp.einsum("cnri,ci->cnr", slope.reshape(*value.shape, -1), direction.reshape(len(direction), -1))
+
+    parts = [along(slopes[name], tangents[0][name]) for name in slopes]
+    return value, jnp.sum(jnp.stack(parts), axis=0)
+
+
+def _each(function, varied: dict[str, Array], rest: Physical, setup: Setup, pushes: Pushes):
+    fixed = (setup.shape, setup.hand, setup.length)
+    own = _Own(setup.surface, pushes.start, pushes.path, pushes.end)
+    each: Any = _Own(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
+    over_pushes = jax.vmap(function, in_axes=(None, None, each, None))
+    return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(varied, rest, own, fixed)
+
+
+def _push(theta: Physical, surface: LimitSurface, body: tuple[Shape, Hand], start: Array, path: Array) -> Trajectory:
+    shape, hand = smaller(*body, theta.inset)
+    field = "coefficients" if surface.degree == 4 else "A"
+    surface = eqx.tree_at(lambda s: getattr(s, field), surface, theta.surface)
+    path = moved(path, theta.end, theta.lag, theta.offset)
+    return rollout(Slider(shape, surface), hand, path, pose=start, friction=theta.friction)
+
+
+def smaller(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
+    """The outline of a polygon moved inwards; of other shapes the fingers, which must be as large at least."""
+    if isinstance(shape, Polygon):
+        return shape.inset(inset), hand
+    fingers = tuple(
+        eqx.tree_at(lambda f: f.radius, finger, finger.radius - inset) if isinstance(finger, RoundFinger) else finger
+        for finger in hand.fingers
+    )
+    return shape, eqx.tree_at(lambda h: h.fingers, hand, fingers)
+
+
+def moved(path: Array, end: Array, lag: Array, offset: Array) -> Array:
+    """The hand's path as it really was, from what was logged: its configurations at other lengths along it, and where
+    that is past an end, straight on. Local directions of a recording are no good for that: they are mostly rounding."""
+    hop = jnp.diff(path[:, :2], axis=0)
+    squared = jnp.sum(hop**2, axis=1)
+    size = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    arc = jnp.concatenate([jnp.zeros(1, path.dtype), jnp.cumsum(size)])
+    whole = arc[-1]
+    at = arc * (1 + end / jnp.where(whole > 0, whole, 1.0)) - lag
+    inside = jnp.clip(at, 0, whole)
+    there = jnp.stack([jnp.interp(inside, arc, column) for column in path.T], axis=1)
+    part = max(len(path) // STRAIGHT, 1)
+    beyond, before = jnp.maximum(at - whole, 0), jnp.minimum(at, 0)
+    there = there + beyond[:, None] * _slope(path, arc, -1 - part, -1)[None]
+    there = there + before[:, None] * _slope(path, arc, 0, part)[None]
+    return there.at[:, :2].add(offset[None])
+
+
+def _slope(path: Array, arc: Array, one: int, other: int) -> Float[Array, "dof"]:
+    """Per length of the way between two rows; zero if there is none."""
+    apart = arc[other] - arc[one]
+    return jnp.where(apart > 0, (path[other] - path[one]) / jnp.where(apart > 0, apart, 1.0), 0.0)

@@ -1,0 +1,81 @@
+"""Recorded pushes as arrays: what identification learns from."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped
+from pushjax.hands import resample
+
+STEPS = 50
+
+
+class Pushes(eqx.Module):
+    """Pushes of one slider by one hand; with a leading axis, of several conditions.
+
+    start, end: (pushes, 3), the slider's pose before and after, world, m and rad; the end angle is the one that the
+    slider really turned to. path: (pushes, steps + 1, dof), the hand's, world, as in `rollout`. weight: (pushes,), how
+    much each counts; zero leaves it out.
+
+    Raises ValueError for arrays of the wrong shape, not finite, or a negative weight.
+    """
+
+    start: Float[Array, "*conditions pushes 3"]
+    path: Float[Array, "*conditions pushes steps+1 dof"]
+    end: Float[Array, "*conditions pushes 3"]
+    weight: Float[Array, "*conditions pushes"]
+
+    def __init__(self, start: Numeric, path: Numeric, end: Numeric, weight: Numeric | None = None):
+        dtype = common_dtype(start, path, end)
+        self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
+        if self.start.ndim not in (2, 3):
+            raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
+        many = self.start.shape[:-1]
+        shaped("start", self.start, (*many, 3))
+        shaped("end", self.end, (*many, 3))
+        shaped("path", self.path, (*many, "steps + 1", "dof"))
+        if self.path.shape[-2] < 2:
+            raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
+        self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
+        shaped("weight", self.weight, many)
+        for name in ("start", "path", "end", "weight"):
+            finite(name, getattr(self, name))
+        non_negative("weight", self.weight)
+
+    @staticmethod
+    def of(log: Any, steps: int = STEPS) -> "Pushes":
+        """The usable pushes of a log of single-finger pushes (`pushjax.datasets.PushLog`), their paths in `steps`."""
+        start, end = (np.stack([getattr(push, name) for push in log.pushes]) for name in ("pose_start", "pose_end"))
+        return Pushes(start, np.stack([resample(push.tip, steps) for push in log.pushes]), end)
+
+    @staticmethod
+    def conditions(several: Sequence["Pushes"]) -> "Pushes":
+        """Several conditions side by side; where one has fewer pushes, pushes of no weight fill it up."""
+        if not several:
+            raise ValueError("several: expected at least one condition's pushes; got none")
+        most = max(one.weight.shape[0] for one in several)
+        for name in ("start", "path"):
+            shapes = {getattr(one, name).shape[1:] for one in several}
+            if len(shapes) > 1:
+                raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
+
+        def filled(name: str) -> Array:
+            rows = []
+            for one in several:
+                value = getattr(one, name)
+                rest = most - value.shape[0]
+                last = jnp.broadcast_to(value[:1], (rest, *value.shape[1:]))
+                rows.append(jnp.concatenate([value, 0 * last if name == "weight" else last]))
+            return jnp.stack(rows)
+
+        return Pushes(*(filled(name) for name in ("start", "path", "end", "weight")))
+
+    def weighted(self, weight: Numeric) -> "Pushes":
+        """The same pushes with other weights (pushes,): a part to learn from, a bootstrap sample."""
+        value = as_float(weight, self.weight.dtype)
+        shaped("weight", value, self.weight.shape)
+        return eqx.tree_at(lambda p: p.weight, self, value)
