@@ -90,6 +90,8 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     assert np.degrees(angles(found.surface, real).max()) < 0.01
     assert found.surface.is_convex()
     assert float(jnp.abs(found.residual).max()) < 1e-6
+    again = found.predict(pushes, pj.Slider(square, expected), hand).pose[:, -1] - pushes.end
+    np.testing.assert_allclose(found.residual, again * jnp.stack([1.0, 1.0, expected.length])[None], atol=1e-12)
     # what it says it found explains other pushes of the same slider
     starts, paths = planned(np.random.default_rng(3), 50)
     ends = pushed(pj.Slider(square, real), hand, MU, jnp.asarray(starts), jnp.asarray(paths))
@@ -99,7 +101,7 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     np.testing.assert_allclose(predicted.pose[:, -1], others.end, atol=2e-6)
 
 
-def test_noise_and_outliers(pushes, square, expected, real, hand):
+def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     """Half a millimetre of noise is found to be that; intervals hold what is true; three pushes that are nonsense do
     not matter."""
     rng = np.random.default_rng(4)
@@ -114,6 +116,28 @@ def test_noise_and_outliers(pushes, square, expected, real, hand):
     assert low < narrow[0] < found.friction < narrow[1] < high
     assert set(found.interval()) == {"friction", "center"}
     assert np.degrees(np.median(angles(found.surface, real))) < 3
+    # pushes tell of friction only where the finger slides, and of the surface everywhere
+    told = np.asarray(found.told_by("friction"))
+    assert told.sum() == pytest.approx(1)
+    assert np.sum(told < 1e-9) > 5
+    assert np.all(np.asarray(found.told_by("surface")) > 0)
+    determined = found.determined
+    assert set(determined) == set(found.labels)
+    assert determined["friction"] > 0.99
+    assert min(determined.values()) < 0.5 < max(determined.values())
+    # to a file, and back to the same bits
+    found.save(tmp_path / "found.json")
+    again = pj.Identified.load(tmp_path / "found.json")
+    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(found), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    assert jax.tree.structure(again) == jax.tree.structure(found)
+    np.testing.assert_array_equal(again.surface.coefficients, found.surface.coefficients)
+    (tmp_path / "other.json").write_text('{"format": "pushjax limit surface"}')
+    with pytest.raises(ValueError, match="does not hold what pushjax identified: its format is another"):
+        pj.Identified.load(tmp_path / "other.json")
+    with pytest.raises(ValueError, match="name must be one of friction, surface, center; got 'inset'"):
+        found.told_by("inset")
     noise[:3] += [0.02, -0.02, 0.3]
     wild = pj.identify(pj.Pushes(pushes.start, pushes.path, pushes.end + noise), slider, hand, UNKNOWNS)
     assert abs(float(wild.friction) - float(found.friction)) < high - low
@@ -151,7 +175,9 @@ def test_conditions_share_the_calibration(square, hand):
     surface = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pj.Ellipsoid(np.eye(3), length))
     setup = Setup(square, hand, surface, Prior.of(unknowns, surface, jnp.asarray(0.25)), jnp.asarray(0.05))
     z, h = jnp.asarray([-1.0, 0.3, 0.2, -0.4]), 1e-6
-    value, slopes = eqx.filter_jit(setup.linearised)(z, many)
+    local = eqx.filter_jit(setup.local)(z, many)
+    value, slopes = local.value, setup.slopes(z, local)
+    np.testing.assert_array_equal(setup.expanded(z, local), value)
     residuals = eqx.filter_jit(setup.residuals)
     np.testing.assert_allclose(value, residuals(z, many), atol=1e-15)
     for k in range(4):

@@ -76,9 +76,11 @@ def identify(
     found, prior = _identify(
         several, slider.shape, hand, surface, unknowns, mu, metric, first, robust=robust, known=sigma is not None
     )
-    residual = found.residual[0] if single else found.residual
+    residual, information = jax.tree.map(lambda leaf: leaf[0] if single else leaf, (found.residual, found.information))
     status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
-    return Identified(found.z, found.precision, prior, found.sigma, residual, metric, found.steps, status, single)
+    return Identified(
+        found.z, found.precision, prior, found.sigma, residual, information, metric, found.steps, status, single
+    )
 
 
 @eqx.filter_jit

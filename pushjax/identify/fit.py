@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax.identify.minimise import least_squares
-from pushjax.identify.model import Setup
+from pushjax.identify.model import Local, Setup
 from pushjax.identify.pushes import Pushes
 
 MAX_STEPS = 60
@@ -22,6 +22,7 @@ class Fit(NamedTuple):
     sigma: Float[Array, ""]
     precision: Float[Array, "size size"]
     residual: Float[Array, "conditions pushes 3"]
+    information: Float[Array, "conditions pushes size"]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
@@ -52,14 +53,17 @@ def fit(setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float 
         z, sigma, steps, _ = carry
 
         def loss(z):
-            return whitened(setup.residuals(z, pushes), pushes.weight, sigma, robust), flat * z
+            local = setup.local(z, pushes)
+            left = whitened(setup.expanded(z, local), pushes.weight, sigma, robust)
+            return (left, flat * z), local
 
         found = least_squares(loss, z, MAX_STEPS, tolerance)
-        residual, precision, determined = around(setup, pushes, found.z, sigma, robust)
+        residual = found.beside.value
+        precision, each, determined = around(setup, pushes, found.z, found.beside, sigma, robust)
         count = trust(residual, pushes.weight, sigma, robust)
         left = jnp.sum(count[..., None] * residual**2)
         free = jnp.maximum(3 * jnp.sum(count) - determined, 3.0)
-        fit = Fit(found.z, sigma, precision, residual, steps + found.steps, found.converged)
+        fit = Fit(found.z, sigma, precision, residual, each, steps + found.steps, found.converged)
         return (found.z, jnp.maximum(jnp.sqrt(left / free), LEAST), fit.steps, found.converged), fit
 
     carry = (start, sigma, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
@@ -68,11 +72,12 @@ def fit(setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float 
     return jax.tree.map(lambda leaf: leaf[-1], fits)
 
 
-def around(setup: Setup, pushes: Pushes, z: Array, sigma: Array, robust: float | None):
-    """Residuals, the precision matrix of z, and how many numbers of it the pushes determine."""
-    residual, slopes = setup.linearised(z, pushes)
-    count = trust(residual, pushes.weight, sigma, robust)
+def around(setup: Setup, pushes: Pushes, z: Array, local: Local, sigma: Array, robust: float | None):
+    """The precision matrix of z, what each push adds to its diagonal, and how many numbers the pushes determine."""
+    slopes = setup.slopes(z, local)
+    count = trust(local.value, pushes.weight, sigma, robust)
     information = jnp.einsum("cn,cnri,cnrj->ij", count, slopes, slopes) / sigma**2
     flat = jnp.asarray(setup.prior.layout.flat_prior, z.dtype)
     precision = information + jnp.diag(jnp.maximum(flat, TINY))
-    return residual, precision, jnp.trace(jnp.linalg.solve(precision, information))
+    each = count[..., None] * jnp.sum(slopes**2, axis=2) / sigma**2
+    return precision, each, jnp.trace(jnp.linalg.solve(precision, information))

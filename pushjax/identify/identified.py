@@ -1,10 +1,12 @@
 """What was found, and how well it is known."""
 
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
@@ -15,14 +17,17 @@ from pushjax.identify.unknowns import Physical, Prior
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
 from pushjax.rollout import Slider, Trajectory
 
+LOGISTIC_VARIANCE = np.pi**2 / 3
+
 
 class Identified(eqx.Module):
     """The most probable values of what was unknown, with a normal distribution about them (Laplace's).
 
     z: (size,), those values as `prior` writes them; precision: (size, size), the inverse of their covariance. prior:
     what turns them into physics. sigma: m, the standard deviation of each of x, y and length * theta of a measured
-    final pose about its prediction. residual: (..., pushes, 3), predicted less measured, in those, m. length: m, the
-    metric's. steps: of the optimiser. status: MOVING, or NOT_CONVERGED.
+    final pose about its prediction. residual: (..., pushes, 3), predicted less measured, in those, m. information:
+    (..., pushes, size), what each push adds to the diagonal of the precision. length: m, the metric's. steps: of the
+    optimiser. status: MOVING, or NOT_CONVERGED.
 
     All properties have a leading axis of conditions if the pushes had one; what conditions share is repeated.
     """
@@ -32,6 +37,7 @@ class Identified(eqx.Module):
     prior: Prior
     sigma: Float[Array, ""]
     residual: Float[Array, "*conditions pushes 3"]
+    information: Float[Array, "*conditions pushes size"]
     length: Float[Array, ""]
     steps: Int[Array, ""]
     status: Int[Array, ""]
@@ -61,6 +67,37 @@ class Identified(eqx.Module):
     def labels(self) -> tuple[str, ...]:
         """A name for each number of z."""
         return self.prior.layout.labels
+
+    @property
+    def determined(self) -> dict[str, float]:
+        """Of each number of z, by its label, how much of what was not known before is known now: 1 less its variance
+        over that of the prior (of a friction: evenly spread over its range). Near zero: the pushes do not tell."""
+        before = np.where(self.prior.layout.flat_prior > 0, 1.0, LOGISTIC_VARIANCE)
+        share = 1 - np.diagonal(np.asarray(self.covariance, float)) / before
+        return dict(zip(self.labels, np.clip(share, 0, 1).tolist(), strict=True))
+
+    def told_by(self, name: str) -> Float[Array, "*conditions pushes"]:
+        """Each push's share of what all pushes tell about `name` (friction, surface, ...)."""
+        if name not in self.prior.layout.names:
+            raise ValueError(f"name must be one of {', '.join(self.prior.layout.names)}; got {name!r}")
+        index = self.prior.layout.index[:, self.prior.layout.local[name]]
+        places = np.unique(index)
+        each = jnp.sum(self.information[..., places], axis=-1)
+        total = jnp.sum(each)
+        return each / jnp.where(total > 0, total, 1.0)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a JSON file that `load` reads back to the same bits."""
+        from pushjax.identify.files import save
+
+        save(self, path)
+
+    @staticmethod
+    def load(path: str | Path) -> "Identified":
+        """Read what `save` wrote. Raises ValueError for a file that holds something else."""
+        from pushjax.identify.files import load
+
+        return load(path)
 
     def draws(self, key: PRNGKeyArray, n: int) -> Physical:
         """`n` values from the distribution, each as likely as the next; fields as in `physical`, with (n,) in front."""

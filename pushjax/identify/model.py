@@ -27,22 +27,52 @@ class Setup(eqx.Module):
     length: Float[Array, ""]
 
     def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes 3"]:
-        """Predicted less measured final pose: x, y, length * theta, m.
+        """Predicted less measured final pose: x, y, length * theta, m."""
+        return _each(lambda *args: _residual(*args)[0], *self._split(z), self, pushes)
 
-        A push depends on some twenty numbers of its own condition, whatever the size of z: its derivatives by those are
-        worked out at once, and everything by z is a product of matrices.
+    def local(self, z: Float[Array, "size"], pushes: Pushes) -> "Local":
+        """Residuals, and their derivatives by what a push depends on itself: some twenty numbers of its own condition,
+        whatever the size of z. Constants, to every derivative.
+
+        Forward, also by a quartic's fifteen coefficients: half the time and the compilation of three reverse sweeps.
         """
+        varied, rest = self._split(jax.lax.stop_gradient(z))
+        slopes, value = _each(jax.jacfwd(_residual, has_aux=True), varied, rest, self, pushes)
+        return Local(value, slopes, varied)
+
+    def expanded(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes 3"]:
+        """Residuals to first order about where `local` was worked out: there, with their derivatives by z, which cost
+        products of matrices only."""
+        varied, _ = self._split(z)
+
+        def along(name: str) -> Array:
+            """(conditions, pushes, 3, *own shape) by (conditions, *own shape)"""
+            off = varied[name] - local.varied[name]
+            return jnp.einsum(
+                "cnri,ci->cnr", local.slopes[name].reshape(*local.value.shape, -1), off.reshape(len(off), -1)
+            )
+
+        return local.value + jnp.sum(jnp.stack([along(name) for name in varied]), axis=0)
+
+    def slopes(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes 3 size"]:
+        return jax.jacfwd(lambda z: self.expanded(z, local))(z)
+
+    def _split(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Physical]:
+        """What is varied of everything that pushes depend on, and all of it."""
         theta = self.prior.physical(z)._asdict()
         names = self.prior.layout.names
         # the center is in the surface
         free = ["surface"] if "center" in names else []
         free = [name for name in theta if name in (*names, *free) and name != "center"]
-        return _residuals({name: theta[name] for name in free}, Physical(**theta), self, pushes)
+        return {name: theta[name] for name in free}, Physical(**theta)
 
-    def linearised(self, z: Float[Array, "size"], pushes: Pushes) -> tuple[Array, Array]:
-        """Residuals, and their derivatives by z: (conditions, pushes, 3, size)."""
-        value, slope = jax.linearize(lambda z: self.residuals(z, pushes), z)
-        return value, jnp.moveaxis(jax.vmap(slope)(jnp.eye(len(z), dtype=z.dtype)), 0, -1)
+
+class Local(NamedTuple):
+    """value: (conditions, pushes, 3), slopes: (conditions, pushes, 3, ...) by each of `varied`, (conditions, ...)."""
+
+    value: Float[Array, "conditions pushes 3"]
+    slopes: dict[str, Array]
+    varied: dict[str, Array]
 
 
 def trajectories(theta: Physical, surface: LimitSurface, shape: Shape, hand: Hand, pushes: Pushes) -> Trajectory:
@@ -67,24 +97,6 @@ def _residual(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[
     off = push.pose[-1] - own.end
     residual = off.at[2].mul(length)
     return residual, residual
-
-
-@jax.custom_jvp
-def _residuals(varied: dict[str, Array], rest: Physical, setup: Setup, pushes: Pushes) -> Array:
-    return _each(lambda *args: _residual(*args)[0], varied, rest, setup, pushes)
-
-
-@_residuals.defjvp
-def _residuals_jvp(primals, tangents):
-    # forward, also by a quartic's fifteen coefficients: half the time and the compilation of three reverse sweeps
-    slopes, value = _each(jax.jacfwd(_residual, has_aux=True), *primals)
-
-    def along(slope: Array, direction: Array) -> Array:
-        """(conditions, pushes, 3, *own shape) by (conditions, *own shape)"""
-        return jnp.einsum("cnri,ci->cnr", slope.reshape(*value.shape, -1), direction.reshape(len(direction), -1))
-
-    parts = [along(slopes[name], tangents[0][name]) for name in slopes]
-    return value, jnp.sum(jnp.stack(parts), axis=0)
 
 
 def _each(function, varied: dict[str, Array], rest: Physical, setup: Setup, pushes: Pushes):

@@ -1,0 +1,65 @@
+"""What was identified, in files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pushjax.identify.identified import Identified
+from pushjax.identify.unknowns import Layout, Mean, Prior, Unknowns
+
+FORMAT, VERSION = "pushjax identified", 1
+SPREADS = ("dof", "center", "inset", "end", "lag", "offset")
+ARRAYS = ("z", "precision", "sigma", "residual", "information", "length")
+
+
+def save(found: Identified, path: str | Path) -> None:
+    unknowns, mean = found.prior.unknowns, found.prior.mean
+    record: dict[str, Any] = {"format": FORMAT, "version": VERSION, "dtype": str(found.z.dtype), "single": found.single}
+    record |= {"steps": int(found.steps), "status": int(found.status), "labels": found.labels}
+    # repr of a float64 is exact, and a float32 is a float64
+    record |= {name: _plain(getattr(found, name)) for name in ARRAYS}
+    record["unknowns"] = {name: _plain(getattr(unknowns, name)) for name in ("friction", *SPREADS)}
+    record["shared"] = unknowns.shared
+    record["known_friction"] = _plain(found.prior.friction)
+    record["mean"] = {name: _plain(getattr(mean, name)) for name in ("lower", "spread", "length")}
+    # for who reads the file: not read back
+    record["estimates"] = {name: _plain(value) for name, value in found.physical._asdict().items()}
+    Path(path).write_text(json.dumps(record, indent=1) + "\n")
+
+
+def load(path: str | Path) -> Identified:
+    try:
+        record = json.loads(Path(path).read_text())
+        if record["format"] != FORMAT:
+            raise ValueError("its format is another")
+        if record["version"] != VERSION:
+            raise ValueError(f"version {record['version']!r} of the format; this program reads {VERSION}")
+        dtype = jax.dtypes.canonicalize_dtype(record["dtype"])  # float64 needs x64 to be on; else float32
+
+        def array(value: Any) -> Any:
+            return None if value is None else jnp.asarray(value, dtype)
+
+        known = {name: array(value) for name, value in record["unknowns"].items()}
+        unknowns = Unknowns(known.pop("friction"), **known, shared=tuple(record["shared"]))
+        mean = Mean(**{name: array(value) for name, value in record["mean"].items()})
+        terms, conditions = mean.lower.shape[1], mean.lower.shape[0]
+        layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
+        prior = Prior(unknowns, jnp.asarray(record["known_friction"], dtype), mean, layout)
+        z, precision, sigma, residual, information, length = (array(record[name]) for name in ARRAYS)
+        if z.shape != (layout.size,) or precision.shape != (layout.size, layout.size):
+            raise ValueError(f"its z has shape {z.shape}; what it says was unknown has ({layout.size},)")
+        steps, status = jnp.asarray(record["steps"], jnp.int32), jnp.asarray(record["status"], jnp.int8)
+        return Identified(
+            z, precision, prior, sigma, residual, information, length, steps, status, bool(record["single"])
+        )
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} does not hold what pushjax identified: {what}") from error
+
+
+def _plain(value: Any) -> Any:
+    return None if value is None else np.asarray(value, np.float64).tolist()
