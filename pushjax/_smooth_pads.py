@@ -42,7 +42,7 @@ def seen_by(edges: tuple[Edge, ...], outline: Outline, center: Vec2, angle: Vec2
         normal, length = jax.tree.map(lambda entry: jnp.full_like(height, entry), (normal, edge.length))
         return Seen(facing.real, facing.point, normal, local, rel.dot(edge.along), length, height)
 
-    # edge by edge, written out, the program was three times as large
+    # all edges at once: written out edge by edge, a jaw's program took much longer to trace and to compile
     stacked = jax.tree.map(lambda *entries: jnp.stack(entries), *edges)
     return jax.tree.map(jnp.ravel, jax.vmap(facing_one)(stacked))
 

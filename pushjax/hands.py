@@ -171,12 +171,21 @@ def resample(path: Numeric, steps: int) -> Float[Array, "{steps}+1 dof"]:
     """
     _check_steps(steps)
     p = checked_path(path, None)
-    squared = jnp.sum(jnp.diff(p, axis=0) ** 2, axis=1)
+    arc = arc_length(p)
+    return at_lengths(p, arc, jnp.arange(steps + 1, dtype=p.dtype) / steps * arc[-1])
+
+
+def arc_length(points: Float[Array, "points n"]) -> Float[Array, "points"]:
+    """From the first point to each, straight from point to point."""
+    squared = jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1)
     moves = squared > 0  # a root's derivative is infinite where a recording pauses
     hops = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
-    arc = jnp.concatenate([jnp.zeros(1, p.dtype), jnp.cumsum(hops)])
-    at = jnp.arange(steps + 1, dtype=p.dtype) / steps * arc[-1]
-    return jnp.stack([jnp.interp(at, arc, column) for column in p.T], axis=1)
+    return jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(hops)])
+
+
+def at_lengths(path: Array, arc: Float[Array, "points"], at: Float[Array, "k"]) -> Float[Array, "k dof"]:
+    """The path at other lengths than those of its points."""
+    return jnp.stack([jnp.interp(at, arc, column) for column in path.T], axis=1)
 
 
 def _check_steps(steps: int) -> None:

@@ -98,6 +98,10 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     others = pj.Pushes(starts, paths, ends)
     predicted = found.predict(others, pj.Slider(square, expected), hand)
     assert not predicted.failed.any()
+    # one push of them, by hand
+    slider, finger, path = found.applied(pj.Slider(square, expected), hand, jnp.asarray(paths[0]))
+    alone = pj.rollout(slider, finger, path, pose=jnp.asarray(starts[0]), friction=found.friction)
+    np.testing.assert_allclose(alone.pose, predicted.pose[0], atol=1e-12)
     np.testing.assert_allclose(predicted.pose[:, -1], others.end, atol=2e-6)
 
 
@@ -164,6 +168,8 @@ def test_conditions_share_the_calibration(square, hand):
     found = pj.identify(many, pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, unknowns, sigma=1e-5)
     assert found.labels == ("friction[0]", "friction[1]", "inset", "end")
     np.testing.assert_allclose(found.friction, mu, rtol=1e-3)
+    with pytest.raises(ValueError, match="applied is for what was found of one condition"):
+        found.applied(pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, many.path[0, 0])
     np.testing.assert_allclose(found.physical.inset, [inset, inset], atol=2e-6)
     np.testing.assert_allclose(found.physical.end, [end, end], atol=2e-6)
     # what fills up the shorter condition has no say

@@ -47,6 +47,9 @@ def identify(
     Works under `vmap`, of many objects at once, and `jit`; not under `grad`.
 
     Raises ValueError for arrays of the wrong shape, values that are not finite or out of range.
+
+    Source: goes beyond Zhou et al. 2017, section VI, where the friction alone is found, on a grid; sigma is that of
+    the evidence (MacKay 1992).
     """
     unknowns = Unknowns() if unknowns is None else unknowns
     dtype = common_dtype(pushes, slider, hand)

@@ -4,10 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pushjax._files import read_record
 from pushjax.identify.identified import Identified
 from pushjax.identify.unknowns import Layout, Mean, Prior, Unknowns
 
@@ -32,33 +32,24 @@ def save(found: Identified, path: str | Path) -> None:
 
 
 def load(path: str | Path) -> Identified:
-    try:
-        record = json.loads(Path(path).read_text())
-        if record["format"] != FORMAT:
-            raise ValueError("its format is another")
-        if record["version"] != VERSION:
-            raise ValueError(f"version {record['version']!r} of the format; this program reads {VERSION}")
-        dtype = jax.dtypes.canonicalize_dtype(record["dtype"])  # float64 needs x64 to be on; else float32
+    return read_record(path, "what pushjax identified", FORMAT, VERSION, _identified)
 
-        def array(value: Any) -> Any:
-            return None if value is None else jnp.asarray(value, dtype)
 
-        known = {name: array(value) for name, value in record["unknowns"].items()}
-        unknowns = Unknowns(known.pop("friction"), **known, shared=tuple(record["shared"]))
-        mean = Mean(**{name: array(value) for name, value in record["mean"].items()})
-        terms, conditions = mean.lower.shape[1], mean.lower.shape[0]
-        layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
-        prior = Prior(unknowns, jnp.asarray(record["known_friction"], dtype), mean, layout)
-        z, precision, sigma, residual, information, length = (array(record[name]) for name in ARRAYS)
-        if z.shape != (layout.size,) or precision.shape != (layout.size, layout.size):
-            raise ValueError(f"its z has shape {z.shape}; what it says was unknown has ({layout.size},)")
-        steps, status = jnp.asarray(record["steps"], jnp.int32), jnp.asarray(record["status"], jnp.int8)
-        return Identified(
-            z, precision, prior, sigma, residual, information, length, steps, status, bool(record["single"])
-        )
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} does not hold what pushjax identified: {what}") from error
+def _identified(record: dict[str, Any], dtype: Any) -> Identified:
+    def array(value: Any) -> Any:
+        return None if value is None else jnp.asarray(value, dtype)
+
+    known = {name: array(value) for name, value in record["unknowns"].items()}
+    unknowns = Unknowns(known.pop("friction"), **known, shared=tuple(record["shared"]))
+    mean = Mean(**{name: array(value) for name, value in record["mean"].items()})
+    conditions, terms = mean.lower.shape[:2]
+    layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
+    prior = Prior(unknowns, array(record["known_friction"]), mean, layout)
+    z, precision, sigma, residual, information, length = (array(record[name]) for name in ARRAYS)
+    if z.shape != (layout.size,) or precision.shape != (layout.size, layout.size):
+        raise ValueError(f"its z has shape {z.shape}; what it says was unknown has ({layout.size},)")
+    steps, status = jnp.asarray(record["steps"], jnp.int32), jnp.asarray(record["status"], jnp.int8)
+    return Identified(z, precision, prior, sigma, residual, information, length, steps, status, bool(record["single"]))
 
 
 def _plain(value: Any) -> Any:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax.identify.minimise import least_squares
-from pushjax.identify.model import Local, Setup
+from pushjax.identify.model import Setup
 from pushjax.identify.pushes import Pushes
 
 MAX_STEPS = 60
@@ -50,7 +50,7 @@ def fit(setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float 
     tolerance = 1e-6 if start.dtype == jnp.float64 else 1e-4
 
     def round_(carry, tolerance):
-        z, sigma, steps, _ = carry
+        z, sigma, steps = carry
 
         def loss(z):
             local = setup.local(z, pushes)
@@ -58,26 +58,19 @@ def fit(setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float 
             return (left, flat * z), local
 
         found = least_squares(loss, z, MAX_STEPS, tolerance)
-        residual = found.beside.value
-        precision, each, determined = around(setup, pushes, found.z, found.beside, sigma, robust)
+        residual, slopes, steps = found.beside.value, setup.slopes(found.z, found.beside), steps + found.steps
         count = trust(residual, pushes.weight, sigma, robust)
-        left = jnp.sum(count[..., None] * residual**2)
+        information = jnp.einsum("cn,cnri,cnrj->ij", count, slopes, slopes) / sigma**2
+        precision = information + jnp.diag(jnp.maximum(flat, TINY))
+        each = count[..., None] * jnp.sum(slopes**2, axis=2) / sigma**2
+        fit = Fit(found.z, sigma, precision, residual, each, steps, found.converged)
+        # as many numbers as the pushes determine are no longer free to scatter
+        determined = jnp.trace(jnp.linalg.solve(precision, information))
         free = jnp.maximum(3 * jnp.sum(count) - determined, 3.0)
-        fit = Fit(found.z, sigma, precision, residual, each, steps + found.steps, found.converged)
-        return (found.z, jnp.maximum(jnp.sqrt(left / free), LEAST), fit.steps, found.converged), fit
+        left = jnp.sqrt(jnp.sum(count[..., None] * residual**2) / free)
+        return (found.z, jnp.maximum(left, LEAST), steps), fit
 
-    carry = (start, sigma, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
     tolerances = [tolerance] if known else [*[EARLY] * (ROUNDS - 1), tolerance]
+    carry = (start, sigma, jnp.zeros((), jnp.int32))
     _, fits = jax.lax.scan(round_, carry, jnp.asarray(tolerances, start.dtype))
     return jax.tree.map(lambda leaf: leaf[-1], fits)
-
-
-def around(setup: Setup, pushes: Pushes, z: Array, local: Local, sigma: Array, robust: float | None):
-    """The precision matrix of z, what each push adds to its diagonal, and how many numbers the pushes determine."""
-    slopes = setup.slopes(z, local)
-    count = trust(local.value, pushes.weight, sigma, robust)
-    information = jnp.einsum("cn,cnri,cnrj->ij", count, slopes, slopes) / sigma**2
-    flat = jnp.asarray(setup.prior.layout.flat_prior, z.dtype)
-    precision = information + jnp.diag(jnp.maximum(flat, TINY))
-    each = count[..., None] * jnp.sum(slopes**2, axis=2) / sigma**2
-    return precision, each, jnp.trace(jnp.linalg.solve(precision, information))

@@ -122,9 +122,12 @@ class Identified(eqx.Module):
         return {name: (getattr(low, name), getattr(high, name)) for name in names}
 
     def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
-        """Slider, hand and path as they really are, to roll out with: for one condition. path: (steps + 1, dof)."""
+        """Slider, hand and path as they really are, to roll out with. path: (steps + 1, dof).
+
+        Raises ValueError for what was found of several conditions.
+        """
         if not self.single:
-            raise ValueError("applied: found of several conditions; take one of them first, with `condition`")
+            raise ValueError("applied is for what was found of one condition; of several there is `predict`")
         own = self.physical
         shape, hand = smaller(slider.shape, hand, own.inset)
         return Slider(shape, self.surface), hand, moved(path, own.end, own.lag, own.offset)

@@ -23,7 +23,7 @@ def least_squares(
     """Levenberg and Marquardt's method. residuals: gives arrays, whose squares are added up, and whatever it likes.
 
     Steps grow tenfold where three quarters of what was promised is reached: the library's own choice, nearly all of it,
-    is for smooth functions; where contacts change their mode it keeps them small, and takes three times as many.
+    is for smooth functions; where contacts change their mode it keeps them small, and takes up to half as many again.
     """
     solver = eqx.tree_at(
         lambda s: s.search,

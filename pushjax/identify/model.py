@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax.hands import Hand, RoundFinger
+from pushjax.hands import Hand, RoundFinger, arc_length, at_lengths
 from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical, Prior
 from pushjax.limit_surface import LimitSurface
@@ -59,12 +59,9 @@ class Setup(eqx.Module):
 
     def _split(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Physical]:
         """What is varied of everything that pushes depend on, and all of it."""
-        theta = self.prior.physical(z)._asdict()
-        names = self.prior.layout.names
-        # the center is in the surface
-        free = ["surface"] if "center" in names else []
-        free = [name for name in theta if name in (*names, *free) and name != "center"]
-        return {name: theta[name] for name in free}, Physical(**theta)
+        theta = self.prior.physical(z)
+        free = {"surface" if name == "center" else name for name in self.prior.layout.names}
+        return {name: value for name, value in theta._asdict().items() if name in free}, theta
 
 
 class Local(NamedTuple):
@@ -129,14 +126,10 @@ def smaller(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
 def moved(path: Array, end: Array, lag: Array, offset: Array) -> Array:
     """The hand's path as it really was, from what was logged: its configurations at other lengths along it, and where
     that is past an end, straight on. Local directions of a recording are no good for that: they are mostly rounding."""
-    hop = jnp.diff(path[:, :2], axis=0)
-    squared = jnp.sum(hop**2, axis=1)
-    size = jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
-    arc = jnp.concatenate([jnp.zeros(1, path.dtype), jnp.cumsum(size)])
+    arc = arc_length(path[:, :2])
     whole = arc[-1]
     at = arc * (1 + end / jnp.where(whole > 0, whole, 1.0)) - lag
-    inside = jnp.clip(at, 0, whole)
-    there = jnp.stack([jnp.interp(inside, arc, column) for column in path.T], axis=1)
+    there = at_lengths(path, arc, jnp.clip(at, 0, whole))
     part = max(len(path) // STRAIGHT, 1)
     beyond, before = jnp.maximum(at - whole, 0), jnp.minimum(at, 0)
     there = there + beyond[:, None] * _slope(path, arc, -1 - part, -1)[None]

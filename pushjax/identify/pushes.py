@@ -68,8 +68,8 @@ class Pushes(eqx.Module):
             for one in several:
                 value = getattr(one, name)
                 rest = most - value.shape[0]
-                last = jnp.broadcast_to(value[:1], (rest, *value.shape[1:]))
-                rows.append(jnp.concatenate([value, 0 * last if name == "weight" else last]))
+                again = jnp.broadcast_to(value[:1], (rest, *value.shape[1:]))
+                rows.append(jnp.concatenate([value, 0 * again if name == "weight" else again]))
             return jnp.stack(rows)
 
         return Pushes(*(filled(name) for name in ("start", "path", "end", "weight")))

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from pushjax._checks import Numeric, as_float, concrete, finite, positive
 from pushjax.friction_model import dof_of_terms
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
-from pushjax.limit_surface.sums import TERMS, split, squared_quadratics
+from pushjax.limit_surface.sums import TERMS, split, squared_quadratics, triangles
 
 NAMES = ("friction", "surface", "center", "inset", "end", "lag", "offset")
 SIZES = {"friction": 1, "center": 2, "inset": 1, "end": 1, "lag": 1, "offset": 2}
@@ -222,7 +222,6 @@ class Prior(eqx.Module):
 def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mean: Mean) -> Physical:
     """One condition's: z (local,), `friction` where that is known, and `mean` of this condition."""
     part: dict[str, Any] = {name: z[where] for name, where in layout.local.items()}
-    zero = jnp.zeros((), z.dtype)
     mu = friction
     if unknowns.friction is not None:
         low, high = unknowns.friction.astype(z.dtype)
@@ -230,9 +229,13 @@ def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mea
     lower = mean.lower
     if "surface" in part:
         lower = lower + mean.spread * lower @ _perturbation(part["surface"].reshape(-1, 6))
-    center = jnp.zeros(2, z.dtype)
-    if unknowns.center is not None:
-        center = unknowns.center.astype(z.dtype) * part["center"]
+
+    def scaled(name: str) -> Array:
+        spread = getattr(unknowns, name)
+        return jnp.zeros(SIZES[name], z.dtype) if spread is None else spread.astype(z.dtype) * part[name]
+
+    center, offset = scaled("center"), scaled("offset")
+    if "center" in part:
         cx, cy = center / mean.length
         one = jnp.ones_like(cx)
         row = jnp.stack([cy, -cx, one])
@@ -240,16 +243,11 @@ def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mea
         lower = shift.T[None] @ lower
     forms = lower @ jnp.swapaxes(lower, 1, 2)
     surface = squared_quadratics(forms) if lower.shape[0] > 1 else forms[0]
-
-    def scaled(name: str) -> Array:
-        spread = getattr(unknowns, name)
-        return zero if spread is None else spread.astype(z.dtype) * part[name][0]
-
-    offset = jnp.zeros(2, z.dtype) if unknowns.offset is None else unknowns.offset.astype(z.dtype) * part["offset"]
-    return Physical(mu, surface, center, scaled("inset"), scaled("end"), scaled("lag"), offset)
+    inset, end, lag = (scaled(name)[0] for name in ("inset", "end", "lag"))
+    return Physical(mu, surface, center, inset, end, lag, offset)
 
 
 def _perturbation(e: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
     rows, columns = np.tril_indices(3)
     size = np.where(rows == columns, np.sqrt(0.5), 1.0)
-    return jnp.zeros((e.shape[0], 3, 3), e.dtype).at[:, rows, columns].set(e * jnp.asarray(size, e.dtype)[None])
+    return triangles(e * jnp.asarray(size, e.dtype)[None])

@@ -2,12 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pushjax._files import read_record
 from pushjax.limit_surface._base import LimitSurface
 from pushjax.limit_surface.ellipsoid import Ellipsoid
 from pushjax.limit_surface.quartic import Quartic
@@ -31,23 +31,16 @@ def save_surface(surface: LimitSurface, path: str | Path) -> None:
 
 
 def load_surface(path: str | Path, kind: type[S]) -> S:
-    try:
-        record = json.loads(Path(path).read_text())
-        if record["format"] != FORMAT:
-            raise ValueError("its format is another")
-        if record["version"] != VERSION:
-            raise ValueError(f"version {record['version']!r} of the format; this program reads {VERSION}")
-        dtype = jax.dtypes.canonicalize_dtype(record["dtype"])  # float64 needs x64 to be on; else float32
-        length = jnp.asarray(record["length"], dtype)
-        if record["kind"] == "ellipsoid":
-            surface: LimitSurface = Ellipsoid(jnp.asarray(record["A"], dtype), length)
-        elif record["kind"] == "quartic":
-            surface = Quartic(jnp.asarray(record["coefficients"], dtype), length)
-        else:
-            raise ValueError(f"{record['kind']!r} is no kind of surface")
-    except (ValueError, KeyError, TypeError) as error:
-        what = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} does not hold a limit surface saved by pushjax: {what}") from error
+    surface = read_record(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface)
     if not isinstance(surface, kind):
         raise ValueError(f"{path} holds a {type(surface).__name__}, not a {kind.__name__}")
     return surface
+
+
+def _surface(record: dict[str, Any], dtype: Any) -> LimitSurface:
+    length = jnp.asarray(record["length"], dtype)
+    if record["kind"] == "ellipsoid":
+        return Ellipsoid(jnp.asarray(record["A"], dtype), length)
+    if record["kind"] == "quartic":
+        return Quartic(jnp.asarray(record["coefficients"], dtype), length)
+    raise ValueError(f"{record['kind']!r} is no kind of surface")

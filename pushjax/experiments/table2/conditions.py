@@ -1,10 +1,10 @@
 """The eight conditions, the paper's figures for them, and where the robot's finger really was."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
@@ -61,16 +61,10 @@ def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
 
 
 def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
-    paths = [np.asarray(pj.resample(_path(log, push, geometry), steps)) for push in log.pushes]
-    start, end = (np.stack([getattr(push, name) for push in log.pushes]) for name in ("pose_start", "pose_end"))
-    dtype = jnp.result_type(float)
-    return pj.Pushes(start.astype(dtype), np.stack(paths).astype(dtype), end.astype(dtype))
-
-
-def _path(log: PushLog, push, geometry: Geometry) -> np.ndarray:
-    if not geometry.commanded_end:
-        return push.tip
-    return np.vstack([push.tip, np.asarray(log.commanded_tip_end(push))[None]])
+    if geometry.commanded_end:
+        ended = (replace(push, tip=np.vstack([push.tip, log.commanded_tip_end(push)])) for push in log.pushes)
+        log = replace(log, pushes=tuple(ended))
+    return pj.Pushes.of(log, steps)
 
 
 def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:

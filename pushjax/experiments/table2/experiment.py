@@ -20,7 +20,6 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets import PushLog
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
     CONDITIONS,
@@ -35,6 +34,7 @@ from pushjax.experiments.table2.conditions import (
     SURFACES,
     ideal_surface,
     load,
+    recorded,
     training,
 )
 from pushjax.experiments.table2.methods import FRICTIONS, Predicted
@@ -60,6 +60,8 @@ def run(
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(methods.TRAIN_SHARE)}; got {unknown or 'none'}")
     logs = [load(folder / "three_point_push", *condition) for condition in CONDITIONS]
+    where = GEOMETRIES[geometry]
+    pushes = [recorded(log, where, steps) for log in logs]
     done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(CONDITIONS) for name in method)
 
     def step() -> None:
@@ -74,35 +76,36 @@ def run(
         for name in method:
             rngs = [np.random.default_rng(seed + k) for k in range(len(logs))]
             train = [training(log, methods.TRAIN_SHARE[name], rng) for log, rng in zip(logs, rngs, strict=True)]
-            found = _predicted(name, model, logs, surfaces, train, geometry, steps, step)
+            found = _predicted(name, model, logs, pushes, surfaces, train, where, step)
             for k, (surface, target) in enumerate(CONDITIONS):
                 labels = {"surface": surface, "object": target, "model": model, "method": name}
                 paper = {"paper_mm": PAPER_MM[surface, model][OBJECTS.index(target)]}
-                cells.append(labels | _cell(logs[k], found[k], train[k], rngs[k]) | paper)
+                cells.append(labels | _cell(pushes[k], logs[k].length, found[k], train[k], rngs[k]) | paper)
     means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
-    settings |= GEOMETRIES[geometry]._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
+    settings |= where._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
     return envelope("table2", settings, cells=cells, means=means, pictures=pictures)
 
 
-def _predicted(name, model, logs, surfaces, train, geometry, steps, done) -> list[Predicted]:
-    where = GEOMETRIES[geometry]
+def _predicted(name, model, logs, pushes, surfaces, train, where, done) -> list[Predicted]:
     if name == "identified":
-        return methods.identified(logs, surfaces, train, where, steps, done)
+        return methods.identified(logs, pushes, surfaces, train, where, done)
     found = []
-    for log, surface, mine in zip(logs, surfaces, train, strict=True):
+    for log, mine, surface, split in zip(logs, pushes, surfaces, train, strict=True):
         if name == "ideal":
-            found.append(methods.ideal(log, surface, mine, where, steps))
+            found.append(methods.ideal(log, mine, surface, split, where))
         else:
-            found.append(methods.wrench_twist(log, surface.length, model, mine, where, steps))
+            found.append(methods.wrench_twist(log, mine, surface.length, model, split, where))
         done()
     return found
 
 
-def _cell(log: PushLog, found: Predicted, train: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+def _cell(
+    pushes: pj.Pushes, length: float, found: Predicted, train: np.ndarray, rng: np.random.Generator
+) -> dict[str, Any]:
     """What the pushes that were not learned from say, over all splits."""
-    still = 1e3 * np.array([float(pj.deviation(p.pose_start, p.pose_end, log.length)) for p in log.pushes])
+    still = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)
     test = ~train
     means = [error[mine].mean() for error, mine in zip(found.errors, test, strict=True)]
     times = test.sum(axis=0)

@@ -6,6 +6,7 @@ wrench_twist  the surface fitted to the forces measured on the way, the friction
 identified    friction, surface and how far the hand really went from the final poses alone: `pushjax.identify`.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -30,34 +31,40 @@ class Predicted(NamedTuple):
     failed: int
 
 
-def ideal(log: PushLog, surface: pj.LimitSurface, train: np.ndarray, geometry: Geometry, steps: int) -> Predicted:
-    errors, failed = _on_grid(log, surface, geometry, steps)
+def ideal(
+    log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, train: np.ndarray, geometry: Geometry
+) -> Predicted:
+    errors, failed = _on_grid(log, pushes, surface, geometry)
     return _best(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
 
 
 def wrench_twist(
-    log: PushLog, length: jax.Array, model: str, train: np.ndarray, geometry: Geometry, steps: int
+    log: PushLog, pushes: pj.Pushes, length: jax.Array, model: str, train: np.ndarray, geometry: Geometry
 ) -> Predicted:
     """length: of the surfaces, m."""
     wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in log.wrench_twist_pairs())
     errors, failed = [], 0
     for mine in train:
         surface = pj.fit_limit_surface(wrench[mine], twist[mine], length, degree=MODELS[model])
-        each, wrong = _on_grid(log, surface, geometry, steps)
+        each, wrong = _on_grid(log, pushes, surface, geometry)
         errors.append(each)
         failed += int(wrong.sum())
     return _best(np.stack(errors), train, np.asarray(failed))
 
 
 def identified(
-    logs: list[PushLog], surfaces: list[pj.LimitSurface], train: list[np.ndarray], geometry: Geometry, steps: int, done
+    logs: list[PushLog],
+    recordings: list[pj.Pushes],
+    surfaces: list[pj.LimitSurface],
+    train: list[np.ndarray],
+    geometry: Geometry,
+    done: Callable[[], None],
 ) -> list[Predicted]:
     """All conditions at once: they share the robot, whose geometry is not taken as given. `done` is called after each
     split."""
-    pushes, fine = (
-        pj.Pushes.conditions([recorded(log, geometry, count) for log in logs])
-        for count in (min(steps, IDENTIFY_STEPS), steps)
-    )
+    fine = pj.Pushes.conditions(recordings)
+    steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
+    pushes = pj.Pushes.conditions([recorded(log, geometry, steps) for log in logs])
     slider = pj.Slider(outline(logs[0], geometry), jax.tree.map(lambda *each: jnp.stack(each), *surfaces))
     unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, inset=INSET, end=END)
     hand, length = pj.Hand.finger(geometry.radius), logs[0].length
@@ -78,9 +85,10 @@ def identified(
     ]
 
 
-def _on_grid(log: PushLog, surface: pj.LimitSurface, geometry: Geometry, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def _on_grid(
+    log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, geometry: Geometry
+) -> tuple[np.ndarray, np.ndarray]:
     """Deviation in mm of every push at every friction, (frictions, pushes), and how many steps failed of each."""
-    pushes = recorded(log, geometry, steps)
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
     final, failed = _final_poses(slider, hand, pushes.path, pushes.start, jnp.asarray(FRICTIONS, pushes.path.dtype))

@@ -1,0 +1,28 @@
+"""JSON files that this package wrote, read back."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+
+T = TypeVar("T")
+
+
+def read_record(path: str | Path, what: str, form: str, version: int, build: Callable[[dict[str, Any], Any], T]) -> T:
+    """What `build` makes of the record in a file and of its floating dtype; `form`: the record's format.
+
+    Raises ValueError, which says that the file does not hold `what`, for anything else.
+    """
+    try:
+        record = json.loads(Path(path).read_text())
+        if record["format"] != form:
+            raise ValueError("its format is another")
+        if record["version"] != version:
+            raise ValueError(f"version {record['version']!r} of the format; this program reads {version}")
+        # float64 needs x64 to be on; else float32
+        return build(record, jax.dtypes.canonicalize_dtype(record["dtype"]))
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        wrong = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} does not hold {what}: {wrong}") from error
