@@ -1,6 +1,7 @@
 """Curated `.npz` archives: read whole, with one clear error for whatever is wrong with the file."""
 
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -30,7 +31,8 @@ def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
     except OSError as error:
         reason = error.strerror or error
         raise LogError(path, f"expected an .npz archive, but cannot read the file: {reason}") from error
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    # a damaged archive may ask for a method of compression that does not exist, or for all the memory there is
+    except (ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise LogError(path, f"expected an .npz archive of {holds}, found something else: {error}") from error
 
 

@@ -10,6 +10,7 @@ without looking for wraps and so turns some pushes the long way round; here the 
 way.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 
@@ -59,6 +60,15 @@ class LogError(ValueError):
 
 def _rebuild_error(path: str, message: str, push: int | None, line: int | None) -> LogError:
     return LogError(path, message, push=push, line=line)
+
+
+def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> LogError:
+    """Of a file without a usable push: the first problem, and how many more there are."""
+    if not problems:
+        return LogError(path, "expected at least one push, found none")
+    first = problems[0]
+    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+    return LogError(path, f"no usable push: {first.message}{more}", push=first.push, line=first.line)
 
 
 @dataclass(frozen=True, eq=False)

@@ -158,7 +158,7 @@ def _count(lines: list[str], at: int, what: str) -> int:
     try:
         count = int(lines[at])
     except ValueError:
-        raise Fault(f"expected the number of {what}, found {_quote(lines[at])}", at + 1) from None
+        raise Fault(f"expected the number of {what}, found {quoted(lines[at])}", at + 1) from None
     if not 0 <= count <= MOST_SAMPLES:
         raise Fault(f"expected the number of {what} (0 to {MOST_SAMPLES}), found {count}", at + 1)
     return count
@@ -185,13 +185,13 @@ def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str)
         if len(tokens) != columns:
             # The last line of the file with too little on it was cut off while it was written.
             cut = at + row == len(lines) - 1 and len(tokens) < columns
-            found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {_quote(line)}"
+            found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {quoted(line)}"
             return Fault(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
         for token in tokens:
             try:
                 value = float(token)
             except ValueError:
-                return Fault(f"expected a number ({where}), found {_quote(token)}", at + row + 1)
+                return Fault(f"expected a number ({where}), found {quoted(token)}", at + row + 1)
             if not np.isfinite(value):
                 return Fault(f"expected finite numbers ({where}), found {token}", at + row + 1)
             if abs(value) >= LARGEST_NUMBER:
@@ -200,7 +200,7 @@ def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str)
     return Fault(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
 
 
-def _quote(text: str) -> str:
+def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 

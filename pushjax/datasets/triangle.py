@@ -5,7 +5,6 @@ published toolbox, except that quaternions are normalised here (they have three 
 never turn the long way.
 """
 
-from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from pushjax.datasets.pushes import (
     contact_onset,
     continuous_angle,
     force_filter,
+    nothing_usable,
     rotation,
     wrap_angle,
 )
@@ -76,7 +76,7 @@ def load_triangle_log(
                 raise problem
             problems.append(problem)
     if not pushes:
-        raise _nothing_usable(file, problems)
+        raise nothing_usable(file, problems)
     return PushLog(
         pushes=tuple(pushes),
         problems=tuple(problems),
@@ -99,14 +99,6 @@ def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> t
         known = np.array(points, dtype=np.float64).reshape(-1, 2)
         name = arrangement if arrangement is not None else setup.UNKNOWN
     return name, known
-
-
-def _nothing_usable(path: Path, problems: Sequence[LogError]) -> LogError:
-    if not problems:
-        return LogError(path, "expected at least one push, found none")
-    first = problems[0]
-    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
-    return LogError(path, f"no usable push: {first.message}{more}", push=first.push, line=first.line)
 
 
 def _usable_push(record: Record) -> Push:

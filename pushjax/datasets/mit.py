@@ -1,0 +1,139 @@
+"""Logs of the MIT pushing data set, and of others in its layout: one push per file, three streams of their own rates.
+
+Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016. A row of a stream is a time
+(s) and three numbers: the tip's x, y (m) and angle, the object's x, y, theta (m, rad), the wrench fx, fy (N), torque;
+all in the world. The wrench is the reaction on the tip, so the force on the object is minus it. The tip is round: its
+angle says nothing.
+
+Some of the object's stamps fall behind the one before, by up to 7 ms, while those of tip and wrench never do. The poses
+are sorted by their stamps, as in the curated archives; at 0.1 m/s that moves a sample by less than a millimetre.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pushjax.datasets._archive import Arrays, check_shapes, floats, read_archive
+from pushjax.datasets.clocks import Stream, aligned
+from pushjax.datasets.pushes import Floats, LogError
+from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recordings, gathered
+
+STREAMS = ("tip_pose", "object_pose", "ft_wrench")
+COLUMNS = 4
+# Arrays of the curated archives, stream by stream: those of times, and those of values with as many columns.
+ARRAYS = {"tip_t": ("tip_xy", 2), "object_t": ("object_pose", 3), "ft_t": ("ft_wrench", 3)}
+_ABOUT = ("vertices_body", "rho", "tip_radius")
+
+
+def load_mit_json(path: Path) -> Recordings:
+    """Reads a `.json` of the data set: an object with the lists of rows `tip_pose`, `object_pose`, `ft_wrench`.
+
+    Raises LogError if the file is none, or its push cannot be used.
+    """
+    try:
+        record = json.loads(path.read_bytes())
+    except OSError as error:
+        raise LogError(path, f"expected a JSON log, but cannot read the file: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise LogError(path, f"expected a JSON log of a push, found something else: {error}") from error
+    if not isinstance(record, dict):
+        raise LogError(path, f"expected a JSON object with {', '.join(STREAMS)}, found a {type(record).__name__}")
+    return _one_push(path, _tables(path, record, _numbers))
+
+
+def load_mit_hdf5(path: Path) -> Recordings:
+    """Reads an HDF5 file with the datasets `tip_pose`, `object_pose` and `ft_wrench`, each (n, 4).
+
+    Raises LogError if the file is none, its push cannot be used, or h5py is not installed.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        message = "expected the package h5py, which reads HDF5, found none: pip install 'pushjax[hdf5]'"
+        raise LogError(path, message) from error
+    library: Any = h5py  # it has no types
+    try:
+        with library.File(path, "r") as file:
+            # Names alone: a file may hold much else, camera images for instance.
+            record = {name: file[name] for name in file if isinstance(file[name], library.Dataset)}
+            return _one_push(path, _tables(path, record, lambda rows: np.asarray(rows[()], dtype=np.float64)))
+    except LogError:
+        raise
+    except (OSError, RuntimeError, KeyError) as error:
+        raise LogError(path, f"expected an HDF5 log of a push, but cannot read the file: {error}") from error
+
+
+def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
+    """Reads a file of the `mit_push_full` folder, which holds the arrays `names`, with what it knows of the object.
+
+    Raises LogError if an array lacks, has the wrong shape or no numbers, or if the push cannot be used.
+    """
+    values = [name for name, _ in ARRAYS.values()]
+    data = read_archive(path, [*ARRAYS, *values, *(name for name in _ABOUT if name in names)], "a push")
+    _check_arrays(path, data)
+    numbers = {name: floats(array) for name, array in data.items()}
+    tables = [np.column_stack([numbers[time], numbers[name]]) for time, (name, _) in ARRAYS.items()]
+    vertices, length, radius = (numbers.get(name) for name in _ABOUT)
+    return replace(
+        _one_push(path, tables),
+        vertices=vertices,
+        length=None if length is None else float(length),
+        tip_radius=None if radius is None else float(radius),
+    )
+
+
+def _check_arrays(path: Path, data: Arrays) -> None:
+    shapes: dict[str, tuple[int, ...]] = {}
+    for time, (values, columns) in ARRAYS.items():
+        count = data[time].size
+        shapes |= {time: (count,), values: (count, columns)}
+    corners = len(data["vertices_body"]) if "vertices_body" in data and data["vertices_body"].ndim else 0
+    about: dict[str, tuple[int, ...]] = {"vertices_body": (corners, 2), "rho": (), "tip_radius": ()}
+    check_shapes(path, data, shapes | {name: shape for name, shape in about.items() if name in data})
+    for name, array in data.items():
+        if array.dtype.kind not in "fiu":
+            raise LogError(path, f"expected numbers in {name}, found {array.dtype}")
+        if name in about and not np.isfinite(array).all():
+            raise LogError(path, f"expected finite numbers in {name}, found NaN or infinity")
+
+
+def _numbers(rows: Any) -> Floats:
+    """Of what JSON gives for a stream. Raises ValueError, which names the first row that is something else."""
+    if not isinstance(rows, list):
+        raise ValueError(f"a {type(rows).__name__}")
+    for at, row in enumerate(rows):
+        if not isinstance(row, list) or len(row) != COLUMNS:
+            raise ValueError(f"row {at} is {str(row)[:60]}")
+    return np.array(rows, dtype=np.float64).reshape(-1, COLUMNS)
+
+
+def _tables(path: Path, record: Mapping[str, Any], numbers: Callable[[Any], Floats]) -> list[Floats]:
+    """The streams of a record, each (n, 4). Raises LogError for one that lacks or is something else."""
+    missing = [name for name in STREAMS if name not in record]
+    if missing:
+        there = ", ".join(list(record)[:10]) or "nothing"
+        raise LogError(path, f"expected {', '.join(STREAMS)}; found no {', '.join(missing)}, but {there}")
+    tables = []
+    for name in STREAMS:
+        wanted = f"expected {name} to have rows of {COLUMNS} numbers, a time and three values"
+        try:
+            table = numbers(record[name])
+        except (ValueError, TypeError, OverflowError) as error:
+            raise LogError(path, f"{wanted}; found something else: {error}") from error
+        if table.ndim != 2 or table.shape[1] != COLUMNS:
+            raise LogError(path, f"{wanted}; found shape {table.shape}")
+        tables.append(table)
+    return tables
+
+
+def _one_push(path: Path, tables: list[Floats]) -> Recordings:
+    """Of the streams tip, object and wrench, each with its times in the first column."""
+    tip, body, wrench = tables
+    hand = Stream(STREAMS[0], HAND[:2], tip[:, 0], tip[:, 1:3])
+    pose = Stream(STREAMS[1], OBJECT, body[:, 0], body[:, 1:])
+    force = Stream(STREAMS[2], FORCE, wrench[:, 0], -wrench[:, 1:3])
+    return gathered(path, [aligned(path, hand, pose, force)])
