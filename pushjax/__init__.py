@@ -13,6 +13,7 @@ from pushjax.identify import Identified as Identified
 from pushjax.identify import Pushes as Pushes
 from pushjax.identify import Unknowns as Unknowns
 from pushjax.identify import identify as identify
+from pushjax.identify import identify_noise as identify_noise
 from pushjax.limit_surface import Ellipsoid as Ellipsoid
 from pushjax.limit_surface import InverseMap as InverseMap
 from pushjax.limit_surface import LimitSurface as LimitSurface

@@ -1,8 +1,8 @@
-"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax bench CASE`."""
+"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax identify LOG…`, `pushjax bench CASE`."""
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -73,6 +73,54 @@ class Reproduce(Common):
 
 
 @dataclass
+class Identify(Common):
+    """Find friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
+
+    Logs are CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units, world; blank where
+    the object was not seen), NPZ with start, path, end, MIT pushing data (JSON, HDF5), or triangle logs (text).
+    """
+
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Files of recorded pushes."""
+    shape: str | None = None
+    """The object: rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04, regular:6x0.05 (m), or a CSV file of vertices.
+    Default: what the logs tell."""
+    hand: str = "finger"
+    """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
+    radius: float | None = None
+    """Of the fingers, m. Default: what the logs tell."""
+    support: str | None = None
+    """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
+    Default: what the logs tell, else uniform."""
+    surface: Literal["quartic", "ellipsoid"] = "quartic"
+    """Kind of limit surface."""
+    dof: float = 50.0
+    """How well it is known beforehand: degrees of freedom; fewer, less well."""
+    friction: tuple[float, float] = (0.0, 1.0)
+    """Lowest and highest that the fingers' friction may be."""
+    center: float | None = None
+    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next four)."""
+    inset: float | None = None
+    """Find by how much the outline is smaller."""
+    end: float | None = None
+    """Find how far the hand went on after its path ends."""
+    lag: float | None = None
+    """Find how far the hand was behind where its path says."""
+    offset: float | None = None
+    """Find how far the hand's coordinates are off those of the object."""
+    separate: bool = False
+    """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
+    steps: int = 50
+    """Steps of each push."""
+    parts: int = 1
+    """After how many equal parts of a push the object's pose counts, where it was seen on the way."""
+    forces: bool = False
+    """Learn from measured forces too; needs parts."""
+    noise: bool = False
+    """Find by how much friction scatters, too."""
+
+
+@dataclass
 class Bench(Common):
     """Measure: how exact, how fast.
 
@@ -94,6 +142,7 @@ class Bench(Common):
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+    | Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 Progress = Callable[[int, int], None]
@@ -159,6 +208,17 @@ def _reproduce(command: Reproduce, progress: Progress) -> Result:
     return record, f"{text}\nwrote {write_page(record, text, command.out / f'{name}.html')}"
 
 
+def _identify(command: Identify, progress: Progress) -> Result:
+    from pushjax.experiments import identify_logs
+    from pushjax.page import write_page
+
+    names = [field.name for field in fields(identify_logs.Options)]
+    options = identify_logs.Options(**{name: getattr(command, name) for name in names})
+    record = identify_logs.run(list(command.logs), options, command.seed, command.out, progress)
+    text = identify_logs.summary(record)
+    return record, f"{text}\nwrote {write_page(record, text, command.out / 'identify.html')}"
+
+
 def _bench(command: Bench, progress: Progress) -> Result:
     import jax
 
@@ -194,6 +254,8 @@ def main(arguments: list[str] | None = None) -> None:
         with progress_bar(visible=not isinstance(command, Demo)) as progress:
             if isinstance(command, Reproduce):
                 record, text = _reproduce(command, progress)
+            elif isinstance(command, Identify):
+                record, text = _identify(command, progress)
             elif isinstance(command, Bench):
                 record, text = _bench(command, progress)
             else:

@@ -58,6 +58,10 @@ class RandomSurface(eqx.Module):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         """One surface. Batches come from `vmap` over keys."""
 
+    @abstractmethod
+    def with_dof(self, dof: Array) -> "RandomSurface":
+        """Around the same mean, but with so many degrees of freedom: what `around` has worked out is not again."""
+
 
 class FrictionModel(eqx.Module):
     """How uncertain friction is: the limit surface's, and that between the fingers and the slider.
@@ -144,6 +148,9 @@ class _Certain(RandomSurface):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         return SurfaceSample(self.mean, jnp.zeros_like(self.mean.length))
 
+    def with_dof(self, dof: Array) -> "_Certain":
+        return self
+
 
 class _WishartEllipsoid(RandomSurface):
     """factor: L, with L L' = A."""
@@ -155,6 +162,9 @@ class _WishartEllipsoid(RandomSurface):
     @staticmethod
     def of(mean: Ellipsoid, dof: Array) -> "_WishartEllipsoid":
         return _WishartEllipsoid(mean, Cholesky.of(lower_of(mean.A)).lower, dof)
+
+    def with_dof(self, dof: Array) -> "_WishartEllipsoid":
+        return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         drawn = wishart(key, self.factor, self.dof)
@@ -188,6 +198,9 @@ class _GramQuartic(RandomSurface):
         loading = size * jnp.where(least > 0, LOADING * least, least)
         within = gram.plus(-loading, Gram.identity(loading)).symmetric
         return _GramQuartic(mean, gram, loading, Cholesky.of(within).lower, dof)
+
+    def with_dof(self, dof: Array) -> "_GramQuartic":
+        return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         identity = Gram.identity(self.loading)
@@ -231,6 +244,9 @@ class _TermsQuartic(RandomSurface):
                 "the sampler 'gram' takes every convex quartic"
             )
         return _TermsQuartic(mean, terms.lower, dof_of_terms(terms.lower, dof))
+
+    def with_dof(self, dof: Array) -> "_TermsQuartic":
+        return eqx.tree_at(lambda s: s.dof, self, dof_of_terms(self.lower, dof))
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         def term(lower: Array, key: PRNGKeyArray) -> Array:

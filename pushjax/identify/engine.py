@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
 from pushjax.hands import Hand
-from pushjax.identify.fit import Fit, fit, whitened
+from pushjax.identify.fit import ROUNDS, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
 from pushjax.identify.model import Setup
 from pushjax.identify.pushes import Pushes
@@ -17,6 +17,7 @@ from pushjax.status import Status
 
 ROBUST = 2.0
 SIGMA = 0.002  # m, where the search for it begins
+DIRECTION = 0.3  # the same, of directions of motion
 FRICTIONS = 9  # from which the search begins
 
 
@@ -76,23 +77,46 @@ def identify(
         positive(name, value)
     if robust is not None:
         positive("robust", robust)
-    found, prior = _identify(
-        several, slider.shape, hand, surface, unknowns, mu, metric, first, robust=robust, known=sigma is not None
-    )
-    residual, information = jax.tree.map(lambda leaf: leaf[0] if single else leaf, (found.residual, found.information))
+    prior = _prior(unknowns, surface, mu)
+    setup = Setup(slider.shape, hand, surface, prior, metric)
+    start = prior.start
+    pairs = several.wrench.shape[-2] > 0
+    known = jnp.array([sigma is not None, not pairs])
+    sigmas = jnp.stack([first, jnp.asarray(DIRECTION, dtype)])
+    rounds = jnp.asarray(1 if sigma is not None and not pairs else ROUNDS)
+    found = program(setup, several, start, jnp.asarray(True), sigmas, known, Held.none(start), rounds, robust=robust)
     status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
+    last = 3 * len(several.rows)
+    residual = found.residual[..., last - 3 : last] * len(several.rows) ** 0.5
+    residual, information = jax.tree.map(lambda leaf: leaf[0] if single else leaf, (residual, found.information))
+    direction = found.sigma[1] if pairs else jnp.zeros_like(metric)
     return Identified(
-        found.z, found.precision, prior, found.sigma, residual, information, metric, found.steps, status, single
+        found.z,
+        found.precision,
+        prior,
+        found.sigma[0],
+        direction,
+        residual,
+        information,
+        found.loss,
+        metric,
+        found.steps,
+        status,
+        single,
+        robust,
     )
+
+
+_prior = eqx.filter_jit(Prior.of)
 
 
 @eqx.filter_jit
-def _identify(
-    pushes, shape, hand, surface, unknowns, friction, length, sigma, *, robust: float | None, known: bool
-) -> tuple[Fit, Prior]:
-    prior = Prior.of(unknowns, surface, friction)
-    setup = Setup(shape, hand, surface, prior, length)
-    return fit(setup, pushes, _best_start(setup, pushes, sigma, robust), sigma, robust, known), prior
+def program(
+    setup: Setup, pushes: Pushes, start, fresh, sigma, known, held: Held, rounds, *, robust: float | None
+) -> Fit:
+    """One compiled program for everything that is fitted. fresh: look for a better start than `start`."""
+    start = jax.lax.cond(fresh, lambda: _best_start(setup, pushes, sigma, robust), lambda: start)
+    return fit(setup, pushes, start, sigma, robust, known, held, rounds)
 
 
 def _best_start(setup: Setup, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
@@ -105,7 +129,7 @@ def _best_start(setup: Setup, pushes: Pushes, sigma: Array, robust: float | None
     places = layout.index[:, layout.local["friction"]][:, 0]
 
     def losses(value: Array) -> Array:
-        left = whitened(setup.residuals(z.at[places].set(value), pushes), pushes.weight, sigma, robust)
+        left = whitened(setup.residuals(z.at[places].set(value), pushes), pushes, sigma, robust)
         return jnp.sum(left**2, axis=(1, 2))
 
     loss = jax.lax.map(losses, tried)

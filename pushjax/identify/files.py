@@ -13,12 +13,13 @@ from pushjax.identify.unknowns import Layout, Mean, Prior, Unknowns
 
 FORMAT, VERSION = "pushjax identified", 1
 SPREADS = ("dof", "center", "inset", "end", "lag", "offset")
-ARRAYS = ("z", "precision", "sigma", "residual", "information", "length")
+ARRAYS = ("z", "precision", "sigma", "direction", "residual", "information", "loss", "length")
 
 
 def save(found: Identified, path: str | Path) -> None:
     unknowns, mean = found.prior.unknowns, found.prior.mean
     record: dict[str, Any] = {"format": FORMAT, "version": VERSION, "dtype": str(found.z.dtype), "single": found.single}
+    record["robust"] = found.robust
     record |= {"steps": int(found.steps), "status": int(found.status), "labels": found.labels}
     # repr of a float64 is exact, and a float32 is a float64
     record |= {name: _plain(getattr(found, name)) for name in ARRAYS}
@@ -45,11 +46,17 @@ def _identified(record: dict[str, Any], dtype: Any) -> Identified:
     conditions, terms = mean.lower.shape[:2]
     layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
     prior = Prior(unknowns, array(record["known_friction"]), mean, layout)
-    z, precision, sigma, residual, information, length = (array(record[name]) for name in ARRAYS)
-    if z.shape != (layout.size,) or precision.shape != (layout.size, layout.size):
-        raise ValueError(f"its z has shape {z.shape}; what it says was unknown has ({layout.size},)")
-    steps, status = jnp.asarray(record["steps"], jnp.int32), jnp.asarray(record["status"], jnp.int8)
-    return Identified(z, precision, prior, sigma, residual, information, length, steps, status, bool(record["single"]))
+    arrays = {name: array(record[name]) for name in ARRAYS}
+    if arrays["z"].shape != (layout.size,) or arrays["precision"].shape != (layout.size, layout.size):
+        raise ValueError(f"its z has shape {arrays['z'].shape}; what it says was unknown has ({layout.size},)")
+    return Identified(
+        **arrays,
+        prior=prior,
+        steps=jnp.asarray(record["steps"], jnp.int32),
+        status=jnp.asarray(record["status"], jnp.int8),
+        single=bool(record["single"]),
+        robust=record["robust"],
+    )
 
 
 def _plain(value: Any) -> Any:

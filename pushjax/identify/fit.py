@@ -18,25 +18,64 @@ LEAST = 1e-6  # m, that sigma may be: less, nothing is measured
 
 
 class Fit(NamedTuple):
+    """sigma: (2,), of poses (m) and of directions of motion. residual: (..., rows), of both. loss: the sum of
+    squares."""
+
     z: Float[Array, "size"]
-    sigma: Float[Array, ""]
+    sigma: Float[Array, "2"]
     precision: Float[Array, "size size"]
-    residual: Float[Array, "conditions pushes 3"]
+    residual: Float[Array, "conditions pushes rows"]
     information: Float[Array, "conditions pushes size"]
+    loss: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
-def whitened(residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
+class Held(NamedTuple):
+    """Numbers of z that are not free: which (size,), and what they are."""
+
+    which: Bool[Array, "size"]
+    value: Float[Array, "size"]
+
+    @staticmethod
+    def none(start: Array) -> "Held":
+        return Held(jnp.zeros(start.shape, bool), start)
+
+    def on(self, z: Array) -> Array:
+        return jnp.where(self.which, self.value, z)
+
+
+class Counts(NamedTuple):
+    """How much the poses of a push count, and how much its pairs."""
+
+    poses: Float[Array, "conditions pushes"]
+    pairs: Float[Array, "conditions pushes"]
+
+    @staticmethod
+    def of(pushes: Pushes) -> "Counts":
+        there = jnp.any(pushes.wrench != 0, axis=-1) & jnp.any(pushes.twist != 0, axis=-1)
+        return Counts(pushes.weight, jnp.where(jnp.any(there, axis=-1), pushes.weight, 0.0))
+
+
+def _parts(residual: Array, pushes: Pushes) -> tuple[Array, Array]:
+    """Poses and pairs."""
+    poses = 3 * len(pushes.rows)
+    return residual[..., :poses], residual[..., poses:]
+
+
+def whitened(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
     """Residuals whose squares add up to the loss: pseudo-Huber's of each push's, from `robust` sigma on."""
-    r = residual / sigma
-    if robust is not None:
-        squared = jnp.sum(r**2, axis=-1, keepdims=True)
-        r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
-    return r * jnp.sqrt(weight)[..., None]
+    whole = []
+    for k, (r, weight) in enumerate(zip(_parts(residual, pushes), Counts.of(pushes), strict=True)):
+        r = r / sigma[k]
+        if robust is not None:
+            squared = jnp.sum(r**2, axis=-1, keepdims=True)
+            r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
+        whole.append(r * jnp.sqrt(weight)[..., None])
+    return jnp.concatenate(whole, axis=-1)
 
 
-def trust(residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
+def _trust(residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
     """How much a push counts in the end."""
     if robust is None:
         return weight
@@ -44,33 +83,55 @@ def trust(residual: Array, weight: Array, sigma: Array, robust: float | None) ->
     return weight / jnp.sqrt(1 + squared / robust**2)
 
 
-def fit(setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float | None, known: bool = False) -> Fit:
-    """The most probable z and, unless sigma is `known`, the size of what is left over: in turns."""
+def fit(
+    setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float | None, known: Array, held: Held, rounds
+) -> Fit:
+    """The most probable z, but for what is `held`, and the size of what is left over, in turns. known: (2,), whether
+    `sigma` is. rounds: how many turns, one where all of it is known; may be traced."""
     flat = jnp.asarray(setup.prior.layout.flat_prior, start.dtype)
-    tolerance = 1e-6 if start.dtype == jnp.float64 else 1e-4
+    last = 1e-6 if start.dtype == jnp.float64 else 1e-4
 
-    def round_(carry, tolerance):
-        z, sigma, steps = carry
+    def round_(index, before: Fit) -> Fit:
+        sigma = before.sigma
 
         def loss(z):
+            z = held.on(z)
             local = setup.local(z, pushes)
-            left = whitened(setup.expanded(z, local), pushes.weight, sigma, robust)
-            return (left, flat * z), local
+            return (whitened(setup.expanded(z, local), pushes, sigma, robust), flat * z), local
 
-        found = least_squares(loss, z, MAX_STEPS, tolerance)
-        residual, slopes, steps = found.beside.value, setup.slopes(found.z, found.beside), steps + found.steps
-        count = trust(residual, pushes.weight, sigma, robust)
-        information = jnp.einsum("cn,cnri,cnrj->ij", count, slopes, slopes) / sigma**2
-        precision = information + jnp.diag(jnp.maximum(flat, TINY))
-        each = count[..., None] * jnp.sum(slopes**2, axis=2) / sigma**2
-        fit = Fit(found.z, sigma, precision, residual, each, steps, found.converged)
-        # as many numbers as the pushes determine are no longer free to scatter
-        determined = jnp.trace(jnp.linalg.solve(precision, information))
-        free = jnp.maximum(3 * jnp.sum(count) - determined, 3.0)
-        left = jnp.sqrt(jnp.sum(count[..., None] * residual**2) / free)
-        return (found.z, jnp.maximum(left, LEAST), steps), fit
+        tolerance = jnp.where(index < rounds - 1, EARLY, last).astype(start.dtype)
+        found = least_squares(loss, before.z, MAX_STEPS, tolerance)
+        z, residual = held.on(found.z), found.beside.value
+        slopes = setup.slopes(z, found.beside)
+        information, each, left = [], jnp.zeros_like(before.information), []
+        parts = zip(
+            _parts(residual, pushes), _parts(jnp.moveaxis(slopes, 3, 0), pushes), Counts.of(pushes), strict=True
+        )
+        for k, (r, slope, weight) in enumerate(parts):
+            count = _trust(r, weight, sigma[k], robust)
+            scaled = slope * (jnp.sqrt(count) / sigma[k])[None, ..., None]
+            information.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
+            each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
+            left.append((jnp.sum(count), jnp.sum(count[..., None] * r**2)))
+        precision = sum(information) + jnp.diag(jnp.maximum(flat, TINY))
+        again = [
+            # as many numbers as the pushes determine are no longer free to scatter
+            jnp.sqrt(squares / jnp.maximum(3 * count - jnp.trace(jnp.linalg.solve(precision, own)), 3.0))
+            for own, (count, squares) in zip(information, left, strict=True)
+        ]
+        total = jnp.sum(whitened(residual, pushes, sigma, robust) ** 2) + jnp.sum((flat * z) ** 2)
+        steps = before.steps + found.steps
+        measured = jnp.where(known, sigma, jnp.maximum(jnp.stack(again), LEAST))
+        # the last round's sigma is the one that it fitted with
+        sigma = jnp.where(index < rounds - 1, measured, sigma)
+        return Fit(z, sigma, precision, residual, each, total, steps, found.converged)
 
-    tolerances = [tolerance] if known else [*[EARLY] * (ROUNDS - 1), tolerance]
-    carry = (start, sigma, jnp.zeros((), jnp.int32))
-    _, fits = jax.lax.scan(round_, carry, jnp.asarray(tolerances, start.dtype))
-    return jax.tree.map(lambda leaf: leaf[-1], fits)
+    many = pushes.weight.shape
+    rows = 3 * len(pushes.rows) + 3 * pushes.wrench.shape[-2]
+    size = len(start)
+    precision, residual, information, loss = (
+        jnp.zeros(shape, start.dtype) for shape in ((size, size), (*many, rows), (*many, size), ())
+    )
+    nothing, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    first = Fit(held.on(start), sigma, precision, residual, information, loss, nothing, no)
+    return jax.lax.fori_loop(0, rounds, round_, first)

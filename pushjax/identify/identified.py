@@ -25,9 +25,11 @@ class Identified(eqx.Module):
 
     z: (size,), those values as `prior` writes them; precision: (size, size), the inverse of their covariance. prior:
     what turns them into physics. sigma: m, the standard deviation of each of x, y and length * theta of a measured
-    final pose about its prediction. residual: (..., pushes, 3), predicted less measured, in those, m. information:
-    (..., pushes, size), what each push adds to the diagonal of the precision. length: m, the metric's. steps: of the
-    optimiser. status: MOVING, or NOT_CONVERGED.
+    pose about its prediction; direction: that of each part of a unit vector along the motion under a measured wrench,
+    zero if there was none. residual: (..., pushes, 3), predicted less measured final pose, in x, y, length * theta, m.
+    information: (..., pushes, size), what each push adds to the diagonal of the precision. loss: what was minimised,
+    twice the negative logarithm of the posterior's density, up to a constant. length: m, the metric's. steps: of the
+    optimiser. status: MOVING, or NOT_CONVERGED. robust: as `identify` was told.
 
     All properties have a leading axis of conditions if the pushes had one; what conditions share is repeated.
     """
@@ -36,12 +38,15 @@ class Identified(eqx.Module):
     precision: Float[Array, "size size"]
     prior: Prior
     sigma: Float[Array, ""]
+    direction: Float[Array, ""]
     residual: Float[Array, "*conditions pushes 3"]
     information: Float[Array, "*conditions pushes size"]
+    loss: Float[Array, ""]
     length: Float[Array, ""]
     steps: Int[Array, ""]
     status: Int[Array, ""]
     single: bool = eqx.field(static=True)
+    robust: float | None = eqx.field(static=True)
 
     @property
     def physical(self) -> Physical:

@@ -1,10 +1,12 @@
-"""Predicted final poses, and their derivatives by what is to be found."""
+"""Predicted poses and directions of motion, and their derivatives by what is to be found."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax.hands import Hand, RoundFinger, arc_length, at_lengths
@@ -26,9 +28,11 @@ class Setup(eqx.Module):
     prior: Prior
     length: Float[Array, ""]
 
-    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes 3"]:
-        """Predicted less measured final pose: x, y, length * theta, m."""
-        return _each(lambda *args: _residual(*args)[0], *self._split(z), self, pushes)
+    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes rows"]:
+        """Predicted less measured poses: x, y, length * theta, m; and predicted less measured directions of motion
+        under the wrenches. Each kind is divided by the root of how many there are of it."""
+        varied, rest = self._split(z)
+        return jnp.concatenate([each[0] for each in self._kinds(lambda f: f, varied, rest, pushes)], axis=-1)
 
     def local(self, z: Float[Array, "size"], pushes: Pushes) -> "Local":
         """Residuals, and their derivatives by what a push depends on itself: some twenty numbers of its own condition,
@@ -37,16 +41,32 @@ class Setup(eqx.Module):
         Forward, also by a quartic's fifteen coefficients: half the time and the compilation of three reverse sweeps.
         """
         varied, rest = self._split(jax.lax.stop_gradient(z))
-        slopes, value = _each(jax.jacfwd(_residual, has_aux=True), varied, rest, self, pushes)
+        kinds = self._kinds(lambda f: jax.jacfwd(f, has_aux=True), varied, rest, pushes)
+        slopes, value = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=2), *kinds)
         return Local(value, slopes, varied)
 
-    def expanded(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes 3"]:
+    def _kinds(self, of: Callable, varied: dict[str, Array], rest: Physical, pushes: Pushes) -> list:
+        """`of` the residuals (value, value), for each kind, over all conditions and pushes."""
+        rows = tuple(pushes.rows.tolist())
+        fixed = (self.shape, self.hand, self.length)
+        own = _Own(self.surface, pushes.start, pushes.path, pushes.poses)
+
+        def off(varied, rest, own, fixed):
+            return _off(varied, rest, own, fixed, rows)
+
+        kinds = [_each(of(off), varied, rest, own, fixed)]
+        if pushes.wrench.shape[-2]:
+            pairs = _Pairs(self.surface, pushes.wrench, pushes.twist)
+            kinds.append(_each(of(_astray), varied, rest, pairs, ()))
+        return kinds
+
+    def expanded(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes rows"]:
         """Residuals to first order about where `local` was worked out: there, with their derivatives by z, which cost
         products of matrices only."""
         varied, _ = self._split(z)
 
         def along(name: str) -> Array:
-            """(conditions, pushes, 3, *own shape) by (conditions, *own shape)"""
+            """(conditions, pushes, rows, *own shape) by (conditions, *own shape)"""
             off = varied[name] - local.varied[name]
             return jnp.einsum(
                 "cnri,ci->cnr", local.slopes[name].reshape(*local.value.shape, -1), off.reshape(len(off), -1)
@@ -54,7 +74,7 @@ class Setup(eqx.Module):
 
         return local.value + jnp.sum(jnp.stack([along(name) for name in varied]), axis=0)
 
-    def slopes(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes 3 size"]:
+    def slopes(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes rows size"]:
         return jax.jacfwd(lambda z: self.expanded(z, local))(z)
 
     def _split(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Physical]:
@@ -65,16 +85,17 @@ class Setup(eqx.Module):
 
 
 class Local(NamedTuple):
-    """value: (conditions, pushes, 3), slopes: (conditions, pushes, 3, ...) by each of `varied`, (conditions, ...)."""
+    """value: (conditions, pushes, rows), slopes: (conditions, pushes, rows, ...) by each of `varied`,
+    (conditions, ...)."""
 
-    value: Float[Array, "conditions pushes 3"]
+    value: Float[Array, "conditions pushes rows"]
     slopes: dict[str, Array]
     varied: dict[str, Array]
 
 
 def trajectories(theta: Physical, surface: LimitSurface, shape: Shape, hand: Hand, pushes: Pushes) -> Trajectory:
     """Predicted pushes, with axes (conditions, pushes); theta and surface with a leading axis of conditions."""
-    over_pushes = jax.vmap(_push, in_axes=(None, None, None, 0, 0))
+    over_pushes = jax.vmap(push, in_axes=(None, None, None, 0, 0))
     over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0, 0))
     return over_all(theta, surface, (shape, hand), pushes.start, pushes.path)
 
@@ -85,29 +106,62 @@ class _Own(NamedTuple):
     surface: LimitSurface
     start: Array
     path: Array
-    end: Array
+    poses: Array
 
 
-def _residual(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Shape, Hand, Array]):
+class _Pairs(NamedTuple):
+    """Wrenches and motions of one push; the surface belongs to its condition."""
+
+    surface: LimitSurface
+    wrench: Array
+    twist: Array
+
+
+def _off(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Shape, Hand, Array], rows: tuple[int, ...]):
     shape, hand, length = fixed
-    push = _push(rest._replace(**varied), own.surface, (shape, hand), own.start, own.path)
-    off = push.pose[-1] - own.end
-    residual = off.at[2].mul(length)
+    predicted = push(rest._replace(**varied), own.surface, (shape, hand), own.start, own.path)
+    off = predicted.pose[np.array(rows)] - own.poses
+    residual = off.at[:, 2].mul(length).reshape(-1) / float(np.sqrt(len(rows)))
     return residual, residual
 
 
-def _each(function, varied: dict[str, Array], rest: Physical, setup: Setup, pushes: Pushes):
-    fixed = (setup.shape, setup.hand, setup.length)
-    own = _Own(setup.surface, pushes.start, pushes.path, pushes.end)
-    each: Any = _Own(None, 0, 0, 0)  # pyright: ignore[reportArgumentType]
+def _astray(varied: dict[str, Array], rest: Physical, own: _Pairs, fixed: tuple[()]):
+    """Of directions in (vx, vy, length * omega): wrenches may be of any scale, and motions of any size."""
+    theta = rest._replace(**varied)
+    surface = with_coefficients(own.surface, theta.surface)
+    metric = jnp.stack([jnp.ones_like(surface.length)] * 2 + [surface.length])
+
+    def direction(v: Array) -> Array:
+        squared = jnp.sum(v**2, axis=-1, keepdims=True)
+        return jnp.where(squared > 0, v / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+
+    there = jnp.any(own.wrench != 0, axis=1) & jnp.any(own.twist != 0, axis=1)
+    wrench = jnp.where(there[:, None], direction(own.wrench / metric[None]), 1.0)
+    predicted = jax.vmap(surface.twist)(wrench * metric[None])
+    astray = direction(predicted * metric[None]) - direction(own.twist * metric[None])
+    residual = jnp.where(there[:, None], astray, 0.0).reshape(-1)
+    residual = residual / jnp.sqrt(jnp.maximum(jnp.sum(there), 1).astype(residual.dtype))
+    return residual, residual
+
+
+def _each(function: Callable, varied: dict[str, Array], rest: Physical, own: "_Own | _Pairs", fixed: tuple):
+    each: Any = own._replace(**{name: None if name == "surface" else 0 for name in own._fields})
     over_pushes = jax.vmap(function, in_axes=(None, None, each, None))
     return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(varied, rest, own, fixed)
 
 
-def _push(theta: Physical, surface: LimitSurface, body: tuple[Shape, Hand], start: Array, path: Array) -> Trajectory:
+def coefficients_of(surface: LimitSurface) -> Array:
+    return getattr(surface, "coefficients" if surface.degree == 4 else "A")
+
+
+def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurface:
+    return eqx.tree_at(coefficients_of, surface, coefficients)
+
+
+def push(theta: Physical, surface: LimitSurface, body: tuple[Shape, Hand], start: Array, path: Array) -> Trajectory:
+    """One push. surface: of which only the coefficients are those of `theta`. path: as logged."""
     shape, hand = smaller(*body, theta.inset)
-    field = "coefficients" if surface.degree == 4 else "A"
-    surface = eqx.tree_at(lambda s: getattr(s, field), surface, theta.surface)
+    surface = with_coefficients(surface, theta.surface)
     path = moved(path, theta.end, theta.lag, theta.offset)
     return rollout(Slider(shape, surface), hand, path, pose=start, friction=theta.friction)
 

@@ -12,6 +12,7 @@ from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negativ
 from pushjax.hands import resample
 
 STEPS = 50
+ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist")
 
 
 class Pushes(eqx.Module):
@@ -21,6 +22,11 @@ class Pushes(eqx.Module):
     slider really turned to. path: (pushes, steps + 1, dof), the hand's, world, as in `rollout`. weight: (pushes,), how
     much each counts; zero leaves it out.
 
+    What else may have been recorded. along: (pushes, k, 3), the slider's pose on the way, after the path's steps
+    `rows`: at equal parts of it. wrench, twist: (pushes, p, 3), wrenches on the slider and the motion that it made
+    under each, both in the body frame about its origin, of any scale; where either is zero there is none. All poses of
+    a push together count as much as one, for they are off together; and so do all its pairs.
+
     Raises ValueError for arrays of the wrong shape, not finite, or a negative weight.
     """
 
@@ -28,23 +34,56 @@ class Pushes(eqx.Module):
     path: Float[Array, "*conditions pushes steps+1 dof"]
     end: Float[Array, "*conditions pushes 3"]
     weight: Float[Array, "*conditions pushes"]
+    along: Float[Array, "*conditions pushes seen 3"]
+    wrench: Float[Array, "*conditions pushes pairs 3"]
+    twist: Float[Array, "*conditions pushes pairs 3"]
 
-    def __init__(self, start: Numeric, path: Numeric, end: Numeric, weight: Numeric | None = None):
+    def __init__(
+        self,
+        start: Numeric,
+        path: Numeric,
+        end: Numeric,
+        weight: Numeric | None = None,
+        *,
+        along: Numeric | None = None,
+        wrench: Numeric | None = None,
+        twist: Numeric | None = None,
+    ):
         dtype = common_dtype(start, path, end)
         self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
         if self.start.ndim not in (2, 3):
             raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
         many = self.start.shape[:-1]
-        shaped("start", self.start, (*many, 3))
+        none = jnp.zeros((*many, 0, 3), dtype)
+        self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
+        self.along, self.wrench, self.twist = (
+            none if value is None else as_float(value, dtype) for value in (along, wrench, twist)
+        )
         shaped("end", self.end, (*many, 3))
         shaped("path", self.path, (*many, "steps + 1", "dof"))
-        if self.path.shape[-2] < 2:
-            raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
-        self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
         shaped("weight", self.weight, many)
-        for name in ("start", "path", "end", "weight"):
+        shaped("along", self.along, (*many, "k", 3))
+        shaped("wrench", self.wrench, (*many, "p", 3))
+        shaped("twist", self.twist, self.wrench.shape)
+        steps, seen = self.path.shape[-2] - 1, self.along.shape[-2]
+        if steps < 1:
+            raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
+        if seen >= steps:
+            raise ValueError(f"along has {seen} poses on the way; between {steps} steps there are {steps - 1}")
+        for name in ARRAYS:
             finite(name, getattr(self, name))
         non_negative("weight", self.weight)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(k + 1,): the steps of the path after which the slider was seen; the last is the end."""
+        parts = self.along.shape[-2] + 1
+        return np.round(np.arange(1, parts + 1) / parts * (self.path.shape[-2] - 1)).astype(int)
+
+    @property
+    def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
+        """Every pose seen after the start, the last one included."""
+        return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
 
     @staticmethod
     def of(log: Any, steps: int = STEPS) -> "Pushes":
@@ -58,7 +97,7 @@ class Pushes(eqx.Module):
         if not several:
             raise ValueError("several: expected at least one condition's pushes; got none")
         most = max(one.weight.shape[0] for one in several)
-        for name in ("start", "path"):
+        for name in ARRAYS:
             shapes = {getattr(one, name).shape[1:] for one in several}
             if len(shapes) > 1:
                 raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
@@ -72,7 +111,7 @@ class Pushes(eqx.Module):
                 rows.append(jnp.concatenate([value, 0 * again if name == "weight" else again]))
             return jnp.stack(rows)
 
-        return Pushes(*(filled(name) for name in ("start", "path", "end", "weight")))
+        return Pushes(**{name: filled(name) for name in ARRAYS})
 
     def weighted(self, weight: Numeric) -> "Pushes":
         """The same pushes with other weights (pushes,): a part to learn from, a bootstrap sample."""

@@ -1,0 +1,201 @@
+"""From logs of pushes to friction, limit surface and calibration, with intervals, and a report.
+
+What cannot be learned from is left out, counted and named. Several logs are pushes of one object under one friction,
+unless they are `separate`: then each has its own, and they share how the set-up is off.
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets import LogError, Recordings, load_recordings
+from pushjax.experiments.identify_logs import setting
+from pushjax.experiments.identify_logs.findings import Findings, parameters, predictions
+from pushjax.identify.noise import Noise, identify_noise
+from pushjax.identify.recorded import recorded
+from pushjax.identify.screening import screened
+from pushjax.identify.uncertainty import Profile, profile, scalars
+from pushjax.report import envelope
+
+FEWEST = 3  # pushes: fewer tell nothing about how far off they are
+LEVEL = 0.9
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is known and what is to be found, as the command line has it; None: as the logs say, or not to be found."""
+
+    shape: str | None = None
+    hand: str = "finger"
+    radius: float | None = None
+    support: str | None = None
+    surface: str = "quartic"
+    dof: float = 50.0
+    friction: tuple[float, float] = (0.0, 1.0)
+    center: float | None = None
+    inset: float | None = None
+    end: float | None = None
+    lag: float | None = None
+    offset: float | None = None
+    separate: bool = False
+    steps: int = 50
+    parts: int = 1
+    forces: bool = False
+    noise: bool = False
+
+
+def run(
+    logs: list[Path],
+    options: Options,
+    seed: int = 0,
+    out: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """Raises LogError for a log that cannot be used, ValueError for options that do not fit."""
+    findings = find(logs, options, seed, progress)
+    found = findings.found
+    pictures, saved = [], None
+    if out is not None:
+        from pushjax.experiments.identify_logs.picture import draw
+
+        pictures = draw(findings, out)
+        saved = out / "identified.json"
+        found.save(saved)
+    own = {name: value for name, value in asdict(options).items() if value is not None}
+    noise = None if findings.noise is None else _noise(findings.noise)
+    return envelope(
+        "identify",
+        {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | own,
+        rows=parameters(findings, LEVEL),
+        sigma_mm=1e3 * float(found.sigma),
+        direction=float(found.direction),
+        converged=int(found.status) == pj.Status.MOVING,
+        steps=int(found.steps),
+        **predictions(findings),
+        noise=noise,
+        problems=[str(problem) for problem in findings.problems],
+        identified=None if saved is None else str(saved),
+        pictures=pictures,
+    )
+
+
+def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int, int], None]) -> Findings:
+    if not logs:
+        raise ValueError("LOG: expected at least one file of recorded pushes; got none")
+    recordings, useless = _each(logs, load_recordings)
+    shape = setting.shape_of(options.shape, recordings)
+    hand = setting.hand_of(options.hand, options.radius, recordings)
+    for one in recordings:
+        columns = one.pushes[0].hand.shape[1]
+        if columns != hand.dof:
+            raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
+    recordings, no_better = _each(recordings, lambda one: screened(one, shape, hand))
+    problems = (*useless, *no_better, *(problem for one in recordings for problem in one.problems))
+    count = sum(len(one.pushes) for one in recordings)
+    if count < FEWEST:
+        why = f"; the first problem: {problems[0]}" if problems else ""
+        raise ValueError(f"expected at least {FEWEST} usable pushes; found {count} in {len(logs)} logs{why}")
+    pushes, slider = _conditions(recordings, shape, options, seed)
+    unknowns = pj.Unknowns(
+        options.friction,
+        dof=options.dof,
+        center=options.center,
+        inset=options.inset,
+        end=options.end,
+        lag=options.lag,
+        offset=options.offset,
+    )
+    found = pj.identify(pushes, slider, hand, unknowns)
+    labels = list(scalars(found))
+    total = len(labels) + 1
+    progress(1, total)
+    profiles: list[Profile] = []
+    for label in labels:
+        profiles.append(profile(found, pushes, slider, hand, label))
+        progress(1 + len(profiles), total)
+    noise = None
+    if options.noise:
+        noise = identify_noise(jax.random.key(seed), found, pushes, slider, hand, progress=progress)
+    lengths = [one.length for one in recordings if one.length is not None]
+    length = lengths[0] if lengths else float(found.length)
+    return Findings(problems, slider, hand, pushes, found, tuple(profiles), noise, length)
+
+
+def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
+    """What is made of every item, and the errors of those of which nothing is: raised only if it is so of all."""
+    good, bad = [], []
+    for item in items:
+        try:
+            good.append(of(item))
+        except LogError as error:
+            bad.append(error)
+    if not good:
+        raise bad[0]
+    return good, bad
+
+
+def _conditions(recordings: list[Recordings], shape, options: Options, seed: int) -> tuple[pj.Pushes, pj.Slider]:
+    """Every log a condition, or all logs one."""
+    degree = {"quartic": 4, "ellipsoid": 2}[options.surface]
+    seen = all(push.seen[1:-1].any() for one in recordings for push in one.pushes)
+    parts = options.parts if seen else 1
+    each = [recorded(one, options.steps, parts, shape if options.forces else None) for one in recordings]
+
+    def expected(one: Recordings) -> pj.LimitSurface:
+        return setting.expected_surface(setting.support_of(options.support, shape, one), degree, seed)
+
+    if options.separate and len(each) > 1:
+        several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(expected(one) for one in recordings))
+        return pj.Pushes.conditions(each), pj.Slider(shape, several)
+    whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *each)
+    return whole, pj.Slider(shape, expected(recordings[0]))
+
+
+def _noise(noise: Noise) -> dict[str, Any]:
+    return {
+        "dof": float(noise.dof),
+        "friction": np.asarray(noise.friction),
+        "offset_mm": 1e3 * float(noise.offset),
+        "sigma_mm": 1e3 * float(noise.sigma),
+        "score_mm": 1e3 * float(noise.score),
+    }
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints: a line for each number found."""
+    problems, level = record["problems"], record["settings"]["level"]
+    lines = [f"{record['pushes']} pushes used, {len(problems)} problems."]
+    lines += [f"  {problem}" for problem in problems[:10]]
+    if len(problems) > 10:
+        lines.append(f"  and {len(problems) - 10} more (see the JSON)")
+    lines += ["", f"{'':14}{'estimate':>10}{f'{level:.0%} interval':>20}{'profile':>20}{'determined':>12}"]
+    for row in record["rows"]:
+        normal, exact = (f"{row[name][0]:.3g} to {row[name][1]:.3g}" for name in ("interval", "profile"))
+        name = row["label"] + (f" / {row['unit']}" if row["unit"] else "")
+        lines.append(f"{name:14}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
+    lines += [
+        f"limit surface: {record['surface_determined']:.1f} of its {record['surface_numbers']} numbers determined",
+        "",
+        f"deviation of predicted final poses: {record['mean_mm']:.2f} mm in the mean, {record['worst_mm']:.2f} at "
+        f"worst; before, {record['expected_mm']:.2f}; the objects moved {record['no_motion_mm']:.1f}",
+        f"sigma: {record['sigma_mm']:.3g} mm; " + ("converged" if record["converged"] else "NOT converged"),
+    ]
+    if record["noise"] is not None:
+        noise = record["noise"]
+        friction = np.array2string(np.asarray(noise["friction"]), precision=3)
+        lines.append(
+            f"noise: dof {noise['dof']:.0f}, friction {friction}, hand off by {noise['offset_mm']:.2f} mm, poses by "
+            f"{noise['sigma_mm']:.2f} mm; energy score {noise['score_mm']:.2f} mm"
+        )
+    if record["failed_steps"]:
+        lines.append(f"{record['failed_steps']} steps of the predicted pushes failed (see the JSON)")
+    lines += [f"drew {path}" for path in record["pictures"]]
+    if record["identified"] is not None:
+        lines.append(f"wrote {record['identified']}, for pushjax.Identified.load")
+    return "\n".join(lines)

@@ -1,0 +1,90 @@
+"""The report's pictures: predicted over measured pushes, what is left over, and the profiles."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from pushjax import plot
+from pushjax.experiments.identify_logs.findings import Findings, unit
+
+SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
+
+
+def draw(findings: Findings, out: Path) -> list[str]:
+    with plt.rc_context(plot.STYLE):
+        return [str(picture(findings, out)) for picture in (_pushes, _residuals, _profiles)]
+
+
+def _pushes(findings: Findings, out: Path) -> Path:
+    final, _ = findings.final()
+    off = findings.deviation_mm(final)
+    order = np.argsort(off)
+    start, end, path = (findings.rows(getattr(findings.pushes, name)) for name in ("start", "end", "path"))
+    figure, axes = plt.subplots(1, len(SHOWN), figsize=(3.6 * len(SHOWN), 3.8), layout="constrained")
+    for panel, (word, share) in zip(axes, SHOWN, strict=True):
+        push = order[round(share * (len(order) - 1))]
+        shape, hand = findings.slider.shape, findings.hand
+        for pose, color, dash, label in (
+            (start[push], plot.BETWEEN, "-", "start"),
+            (end[push], plot.START, "-", "measured end"),
+            (final[push], plot.BLUE, "--", "predicted end"),
+        ):
+            plot.outline(panel, shape, pose, color, 1.5, linestyle=dash, label=label)
+        fingers = np.asarray(hand.poses(jnp.asarray(path[push])))
+        for k in range(fingers.shape[1]):
+            label = "fingers' paths, as logged" if k == 0 else None
+            panel.plot(*(1e3 * fingers[:, k, :2]).T, color=plot.ORANGE, lw=1.2, label=label)
+        plot.hand_at(panel, hand, fingers[-1], plot.ORANGE, 1.2)
+        panel.set(title=f"{word}: {off[push]:.2f} mm", xlabel="x / mm", ylabel="y / mm")
+        panel.set_aspect("equal", adjustable="datalim")
+    plot.legend_below(figure, axes[0], columns=4)
+    return plot.save(figure, out / "identify_pushes.png")
+
+
+def _residuals(findings: Findings, out: Path) -> Path:
+    residual = 1e3 * findings.rows(findings.found.residual)
+    sigma = 1e3 * float(findings.found.sigma)
+    figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.8), layout="constrained")
+    for panel, (a, b), names in (
+        (axes[0], (0, 1), ("x / mm", "y / mm")),
+        (axes[1], (0, 2), ("x / mm", "length · angle / mm")),
+    ):
+        panel.plot(residual[:, a], residual[:, b], "o", color=plot.BLUE, ms=4, alpha=0.7)
+        turn = np.linspace(0, 2 * np.pi, 100)
+        for many, dash in ((1, "-"), (2, "--")):
+            panel.plot(many * sigma * np.cos(turn), many * sigma * np.sin(turn), dash, color=plot.BETWEEN, zorder=0)
+        panel.set(xlabel=f"predicted less measured {names[0]}", ylabel=f"predicted less measured {names[1]}")
+        panel.set_aspect("equal", adjustable="datalim")
+    axes[0].set_title(f"rings: one and two sigma, {sigma:.2g} mm")
+    final, _ = findings.final()
+    still = findings.deviation_mm(findings.rows(findings.pushes.start))
+    for values, color, dash, label in (
+        (findings.deviation_mm(final), plot.BLUE, "-", "predicted"),
+        (still, plot.BETWEEN, "--", "no motion"),
+    ):
+        order = np.sort(values)
+        share = 100 * np.arange(1, len(order) + 1) / len(order)
+        axes[2].step(order, share, dash, color=color, where="post", label=label)
+    axes[2].set(xscale="log", ylim=(0, 100), xlabel="deviation of the final pose / mm", ylabel="pushes below / %")
+    axes[2].legend(loc="upper left")
+    return plot.save(figure, out / "identify_residuals.png")
+
+
+def _profiles(findings: Findings, out: Path) -> Path:
+    profiles = findings.profiles
+    columns = min(len(profiles), 4)
+    rows = -(-len(profiles) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(3.4 * columns, 3.0 * rows), layout="constrained", squeeze=False)
+    for panel in axes.flat[len(profiles) :]:
+        panel.set_visible(False)
+    for panel, each in zip(axes.flat, profiles, strict=False):
+        name, scale = unit(each.label)
+        panel.plot(scale * each.value, each.rise, "-", color=plot.BLUE, label="all else at its best")
+        panel.plot(scale * each.value, each.normal, "--", color=plot.ORANGE, label="normal")
+        panel.axhline(1.3528, color=plot.BETWEEN, lw=0.8)
+        panel.set(xlabel=each.label + (f" / {name}" if name else ""), ylim=(0, 5))
+    axes[0, 0].set_ylabel("rise of the negative log posterior")
+    plot.legend_below(figure, axes[0, 0], columns=2)
+    return plot.save(figure, out / "identify_profiles.png")

@@ -1,0 +1,296 @@
+"""From log files to parameters: what is used, what is left out and why, and what the report says."""
+
+import csv
+import json
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax import cli
+from pushjax.datasets import LogError, load_recordings
+from pushjax.identify import bootstrap, profile, profile_interval, recorded, screened
+
+WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
+COLUMNS = ("push", "hand_x", "hand_y", "object_x", "object_y", "object_theta", "force_x", "force_y")
+INSET, NOISE = 0.001, 5e-5
+
+
+@pytest.fixture(scope="module")
+def block():
+    return pj.Polygon.rectangle(WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def surface(block):
+    return pj.fit_limit_surface(*pj.Support.uniform(block, 100).wrench_twist_pairs(jax.random.key(0), 400), degree=2)
+
+
+@pytest.fixture(scope="module")
+def rollouts(block, surface):
+    """Pushes of a block that is a millimetre smaller than it is said to be."""
+    rng = np.random.default_rng(0)
+    side = rng.uniform(-0.6, 0.6, 16) * WIDTH / 2
+    start = np.stack([rng.uniform(-0.1, 0.1, 16), rng.uniform(-0.1, 0.1, 16), rng.uniform(-3, 3, 16)], axis=1)
+    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+    turn = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
+    begin = np.stack([side, np.full(16, -HEIGHT / 2 - RADIUS - 0.001)], axis=1)
+    along = np.stack([rng.uniform(-0.4, 0.4, 16), np.ones(16)], axis=1)
+    local = begin[:, None] + np.linspace(0, 0.03, STEPS + 1)[None, :, None] * along[:, None]
+    path = start[:, None, :2] + np.einsum("nij,nsj->nsi", turn, local)
+    slider, hand = pj.Slider(block.inset(INSET), surface), pj.Hand.finger(RADIUS)
+    push = jax.jit(jax.vmap(lambda start, path: pj.rollout(slider, hand, path, pose=start, friction=MU)))
+    done = push(jnp.asarray(start), jnp.asarray(path))
+    # the force in the body frame halfway, as the world has it
+    middle = np.asarray((done.pose[:, 1:] + done.pose[:, :-1]) / 2)[..., 2]
+    f = np.asarray(done.wrench)[..., :2]
+    c, s = np.cos(middle), np.sin(middle)
+    force = np.stack([c * f[..., 0] - s * f[..., 1], s * f[..., 0] + c * f[..., 1]], axis=-1)
+    return path, np.asarray(done.pose), np.concatenate([force[:, :1], force], axis=1)
+
+
+def write(path, pushes):
+    with path.open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(COLUMNS)
+        for name, hand, pose, force in pushes:
+            for row in zip(hand, pose, force, strict=True):
+                out.writerow([name, *(repr(float(x)) for part in row for x in part)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(rollouts, tmp_path_factory):
+    """Sixteen good pushes, and five that are not."""
+    path, pose, force = rollouts
+    pose = pose + NOISE * np.random.default_rng(1).normal(size=pose.shape) / [1, 1, 0.03]
+    pushes = [(str(k), path[k], pose[k], force[k]) for k in range(16)]
+    lost, away, still, jump, degrees = (pose[0].copy() for _ in range(5))
+    lost[-1] = np.nan
+    degrees[:, 2] = 57.3 * degrees[:, 2] + np.linspace(0, 100, STEPS + 1)
+    jump[-1, 0] += 1.0
+    pushes.append(("millimetres", 1e3 * path[0], pose[0], force[0]))
+    pushes.append(("away", path[0] + [0.3, 0.0], np.repeat(away[:1], STEPS + 1, axis=0), force[0]))
+    pushes.append(("still", np.repeat(path[0][:1], STEPS + 1, axis=0), still, force[0]))
+    pushes.append(("jump", path[0], jump, force[0]))
+    pushes.append(("degrees", path[0], degrees, force[0]))
+    pushes.append(("lost", path[0], lost, force[0]))
+    return write(tmp_path_factory.mktemp("logs") / "pushes.csv", pushes)
+
+
+def arguments(log, out):
+    given = ["--shape", f"rectangle:{WIDTH}x{HEIGHT}", "--radius", str(RADIUS), "--surface", "ellipsoid"]
+    given += [
+        "--steps",
+        str(STEPS),
+        "--parts",
+        "3",
+        "--inset",
+        "0.002",
+        "--out",
+        str(out),
+        "--json",
+        str(out / "id.json"),
+    ]
+    return ["identify", str(log), *given]
+
+
+@pytest.fixture(scope="module")
+def report(log, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    cli.main(arguments(log, out))
+    return out, json.loads((out / "id.json").read_text())
+
+
+def test_a_csv_tells_friction_and_inset(report):
+    out, record = report
+    assert (record["experiment"], record["pushes"], record["failed_steps"]) == ("identify", 16, 0)
+    friction, inset = record["rows"]
+    assert (friction["label"], inset["label"], inset["unit"]) == ("friction", "inset", "mm")
+    for row, truth in ((friction, MU), (inset, 1e3 * INSET)):
+        low, high = row["interval"]
+        assert low < row["estimate"] < high
+        assert abs(row["estimate"] - truth) < 2 * (high - low)
+        assert row["profile"][0] <= row["estimate"] <= row["profile"][1]
+        assert row["determined"] > 0.9
+    assert abs(friction["estimate"] - MU) < 0.01
+    assert abs(inset["estimate"] - 1e3 * INSET) < 0.1
+    assert 0.3 * NOISE < 1e-3 * record["sigma_mm"] < 2 * NOISE
+    assert record["mean_mm"] < 0.2 < record["expected_mm"]
+    for name in ("identify_pushes.png", "identify_residuals.png", "identify_profiles.png", "identify.html"):
+        assert (out / name).stat().st_size > 5000
+    assert pj.Identified.load(record["identified"]).friction.shape == ()
+
+
+def test_what_cannot_be_used_is_named_and_counted(report):
+    _, record = report
+    reasons = (
+        "in millimetres?",
+        "never touches",
+        "expected at least 0.0001 m",
+        "tracker jumped",
+        "in degrees?",
+        "to be seen in the last",
+    )
+    assert len(record["problems"]) == len(reasons)
+    for index, reason in enumerate(reasons):
+        found = [problem for problem in record["problems"] if reason in problem]
+        assert len(found) == 1, reason
+        assert f"push {16 + index}" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"--shape": None}, "the logs do not tell the object's outline"),
+        ({"--radius": None}, "--radius"),
+        ({"--shape": "rectangle:100x60"}, "is it in millimetres?"),
+        ({"--shape": "square:0.1"}, "--shape: square:0.1"),
+        ({"--shape": "disk:a"}, "got 'disk:a'"),
+        ({"--hand": "two_fingers"}, "the hand has 2 numbers; a hand two_fingers has 4"),
+        ({"--support": "middle"}, "--support: expected uniform, rim, or points"),
+        ({"--friction": ["0.5", "0.2"]}, "friction must be (lowest, highest)"),
+        ({"--inset": "-1"}, "inset"),
+        ({"--parts": "12"}, "parts must be at least 1, and fewer than the 12 steps"),
+    ],
+)
+def test_bad_options_end_with_one_line(log, tmp_path, capsys, changed, message):
+    given = arguments(log, tmp_path)
+    for option, value in changed.items():
+        if option in given:
+            at = given.index(option)
+            del given[at : at + 2]
+        if value is not None:
+            given += [option, *(value if isinstance(value, list) else [value])]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(given)
+    assert ended.value.code == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("pushjax: ")
+    assert error.count("\n") == 1
+
+
+def test_too_few_pushes(rollouts, tmp_path, capsys):
+    path, pose, force = rollouts
+    few = write(tmp_path / "few.csv", [(str(k), path[k], pose[k], force[k]) for k in range(2)])
+    with pytest.raises(SystemExit):
+        cli.main(arguments(few, tmp_path))
+    assert "at least 3 usable pushes; found 2" in capsys.readouterr().err
+
+
+def test_screening_of_nothing_usable(log, block):
+    recordings = load_recordings(log)
+    bad = replace(recordings, pushes=recordings.pushes[16:18])
+    with pytest.raises(LogError, match=r"no usable push: .*and 1 more"):
+        screened(bad, block, pj.Hand.finger(RADIUS))
+
+
+def test_recordings_as_arrays(log, block, rollouts, surface):
+    """Poses at equal parts of the path, and wrenches that tell the surface."""
+    path, pose, _ = rollouts
+    recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
+    pushes = recorded(recordings, STEPS, 3, block.inset(INSET))
+    assert pushes.along.shape == (16, 2, 3)
+    np.testing.assert_allclose(pushes.path, path, atol=1e-12)
+    np.testing.assert_array_equal(pushes.rows, [4, 8, 12])
+    np.testing.assert_allclose(pushes.poses, pose[:, [4, 8, 12]], atol=10 * NOISE / 0.03)
+    there = np.any(np.asarray(pushes.wrench) != 0, axis=-1)
+    assert there.mean() > 0.8
+    metric = np.array([1, 1, float(surface.length)])
+    one = np.asarray(jax.vmap(jax.vmap(surface.twist))(pushes.wrench))[there] * metric
+    other = np.asarray(pushes.twist)[there] * metric
+    cosine = np.sum(one * other, axis=-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.median(angle) < 5
+    alone = recorded(recordings, STEPS)
+    assert alone.along.shape == (16, 0, 3)
+    assert alone.wrench.shape == (16, 0, 3)
+
+
+def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
+    """The pushes count for nothing in the poses' part: a surface that is not known is found from forces."""
+    recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
+    pushes = recorded(recordings, STEPS, 3, block.inset(INSET))
+    wrong = pj.Ellipsoid(np.asarray(surface.A) * np.outer([1, 1, 1.7], [1, 1, 1.7]), surface.length)
+    slider, hand = pj.Slider(block, wrong), pj.Hand.finger(RADIUS)
+    unknowns = pj.Unknowns((0.0, 1.0), dof=5, inset=0.002)
+    with_forces = pj.identify(pushes, slider, hand, unknowns)
+    without = pj.identify(recorded(recordings, STEPS, 3), slider, hand, unknowns)
+    assert float(with_forces.direction) < 0.1
+    assert float(without.direction) == 0
+    shape = with_forces.surface.A / with_forces.surface.A[0, 0]
+    np.testing.assert_allclose(np.diagonal(shape), np.diagonal(surface.A / surface.A[0, 0]), rtol=0.1)
+    assert abs(float(with_forces.friction) - MU) < 0.02
+    known, unknown = (
+        np.mean([v for k, v in f.determined.items() if k.startswith("surface")]) for f in (with_forces, without)
+    )
+    assert known > unknown
+
+
+@pytest.fixture(scope="module")
+def few(log, block):
+    recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
+    return recorded(recordings, STEPS)
+
+
+@pytest.fixture(scope="module")
+def found(few, block, surface):
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), dof=None, inset=0.002), sigma=NOISE)
+
+
+def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    friction = profile(found, few, slider, hand, "friction", points=3)
+    assert friction.rise.min() == 0
+    at = np.argmin(np.abs(friction.normal))
+    assert friction.rise[at] < 1e-3
+    assert friction.value[at] == pytest.approx(float(found.friction), abs=1e-9)
+    # little noise: nearly normal
+    np.testing.assert_allclose(friction.rise, friction.normal, rtol=0.3, atol=0.05)
+    low, high = profile_interval(friction, 0.9)
+    expected = [float(end) for end in found.interval(0.9)["friction"]]
+    np.testing.assert_allclose([low, high], expected, atol=0.3 * (expected[1] - expected[0]))
+    with pytest.raises(ValueError, match="label must be one of friction, inset"):
+        profile(found, few, slider, hand, "surface.0")
+
+
+def test_bootstrap(few, found, block, surface):
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    estimates, z = bootstrap(jax.random.key(0), found, few, slider, hand, 40)
+    again, _ = bootstrap(jax.random.key(0), found, few, slider, hand, 40)
+    np.testing.assert_array_equal(estimates.friction, again.friction)
+    assert z.shape == (40, 2)
+    laplace = np.sqrt(np.diagonal(found.covariance))
+    assert np.all(np.abs(np.log(z.std(axis=0) / laplace)) < np.log(2.5))
+    assert np.all(np.abs(z.mean(axis=0) - found.z) < 2 * laplace)
+
+
+def test_noise(few, found, block, surface):
+    """Pushes drawn from a noise that is known: likelier under what is found than at the start, and like the truth."""
+    from pushjax.identify.noise import Noise, Values
+
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    friction = found.friction + 0.15 * jnp.array([[-1.0, 1.0]])
+    truth = Values(jnp.array(15.0), friction, jnp.array(3e-4), jnp.array(4e-4), jnp.array(4.0))
+    known = Noise(found, truth, jnp.array(0.0), jnp.zeros(1), "terms")
+    many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
+    drawn = known.predict(jax.random.key(1), many, slider, hand, 2)
+    assert drawn.shape == (80, 2, 3)
+    again = known.predict(jax.random.key(1), many, slider, hand, 2)
+    np.testing.assert_array_equal(drawn, again)
+    seen = pj.Pushes(many.start, many.path, drawn[:, 0])
+    noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=60)
+    assert noise.history.shape == (60,)
+    assert noise.score > noise.history[:5].mean() + 0.05
+    assert np.isfinite(noise.history).all()
+    assert 0.5 < float(noise.sigma / truth.sigma) < 1.6
+    assert 9 < float(noise.dof) < 60
+    assert noise.friction.shape == (2,)
+    assert noise.model.friction.shape == (2,)
+    with pytest.raises(ValueError, match="samples must be at least 2"):
+        pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)
