@@ -180,8 +180,7 @@ def _center(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...]) -> Vec2:
         return contacts[0].point
     total, middle = jnp.zeros_like(forces[0].x), Vec2(*(0 * x for x in contacts[0].point))
     for contact, force in zip(contacts, forces, strict=True):
-        weight = jax.lax.stop_gradient(force.x)
-        total, middle = total + weight, middle + contact.point.scale(weight)
+        total, middle = total + force.x, middle + contact.point.scale(force.x)
     return middle.scale(1 / jnp.where(total > 0, total, 1.0))
 
 

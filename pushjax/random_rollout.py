@@ -85,8 +85,8 @@ def random_rollout(
     """Push the slider along a path under friction drawn from `model` around the slider's surface.
 
     key: of everything random; the rest is as in `rollout`. Differentiable also in the range of the model's friction and
-    in its dof, there so that the mean over keys is right (the draw of one key jumps). Batches come from `vmap` over
-    keys; for large ones `monte_carlo` is faster, and shows progress.
+    in its dof, there so that the mean over keys is right (the draw of one key jumps; of "gram", but for its repairs).
+    Batches come from `vmap` over keys; for large ones `monte_carlo` is faster, and shows progress.
 
     Raises ValueError as `rollout` and `FrictionModel.around` do.
 

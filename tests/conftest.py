@@ -33,6 +33,8 @@ LONG = (
     "contact_derivatives",
     "commands",
     "friction_model",
+    "identify_logs",
+    "derivative_modes",
     "smooth_shapes",
     "single_contact",
     "rollout_gradients",

@@ -12,7 +12,7 @@ import pytest
 import pushjax as pj
 from pushjax import cli
 from pushjax.datasets import LogError, load_recordings
-from pushjax.identify import bootstrap, profile, profile_interval, recorded, screened
+from pushjax.identify import bootstrap, profile_interval, screened
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
 COLUMNS = ("push", "hand_x", "hand_y", "object_x", "object_y", "object_theta", "force_x", "force_y")
@@ -193,7 +193,7 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     """Poses at equal parts of the path, and wrenches that tell the surface."""
     path, pose, _ = rollouts
     recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
-    pushes = recorded(recordings, STEPS, 3, block.inset(INSET))
+    pushes = pj.Pushes.of(recordings, STEPS, parts=3, shape=block.inset(INSET))
     assert pushes.along.shape == (16, 2, 3)
     np.testing.assert_allclose(pushes.path, path, atol=1e-12)
     np.testing.assert_array_equal(pushes.rows, [4, 8, 12])
@@ -206,7 +206,7 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     cosine = np.sum(one * other, axis=-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     assert np.median(angle) < 5
-    alone = recorded(recordings, STEPS)
+    alone = pj.Pushes.of(recordings, STEPS)
     assert alone.along.shape == (16, 0, 3)
     assert alone.wrench.shape == (16, 0, 3)
 
@@ -214,12 +214,12 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
 def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
     """The pushes count for nothing in the poses' part: a surface that is not known is found from forces."""
     recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
-    pushes = recorded(recordings, STEPS, 3, block.inset(INSET))
+    pushes = pj.Pushes.of(recordings, STEPS, parts=3, shape=block.inset(INSET))
     wrong = pj.Ellipsoid(np.asarray(surface.A) * np.outer([1, 1, 1.7], [1, 1, 1.7]), surface.length)
     slider, hand = pj.Slider(block, wrong), pj.Hand.finger(RADIUS)
     unknowns = pj.Unknowns((0.0, 1.0), dof=5, inset=0.002)
     with_forces = pj.identify(pushes, slider, hand, unknowns)
-    without = pj.identify(recorded(recordings, STEPS, 3), slider, hand, unknowns)
+    without = pj.identify(pj.Pushes.of(recordings, STEPS, parts=3), slider, hand, unknowns)
     assert float(with_forces.direction) < 0.1
     assert float(without.direction) == 0
     shape = with_forces.surface.A / with_forces.surface.A[0, 0]
@@ -234,7 +234,7 @@ def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
 @pytest.fixture(scope="module")
 def few(log, block):
     recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
-    return recorded(recordings, STEPS)
+    return pj.Pushes.of(recordings, STEPS)
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +245,7 @@ def found(few, block, surface):
 
 def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
-    friction = profile(found, few, slider, hand, "friction", points=3)
+    friction = found.profile(few, slider, hand, "friction", points=3)
     assert friction.rise.min() == 0
     at = np.argmin(np.abs(friction.normal))
     assert friction.rise[at] < 1e-3
@@ -256,13 +256,13 @@ def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
     expected = [float(end) for end in found.interval(0.9)["friction"]]
     np.testing.assert_allclose([low, high], expected, atol=0.3 * (expected[1] - expected[0]))
     with pytest.raises(ValueError, match="label must be one of friction, inset"):
-        profile(found, few, slider, hand, "surface.0")
+        found.profile(few, slider, hand, "surface.0")
 
 
 def test_bootstrap(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     estimates, z = bootstrap(jax.random.key(0), found, few, slider, hand, 40)
-    again, _ = bootstrap(jax.random.key(0), found, few, slider, hand, 40)
+    again = found.bootstrap(jax.random.key(0), few, slider, hand, 40)
     np.testing.assert_array_equal(estimates.friction, again.friction)
     assert z.shape == (40, 2)
     laplace = np.sqrt(np.diagonal(found.covariance))
@@ -271,7 +271,7 @@ def test_bootstrap(few, found, block, surface):
 
 
 def test_noise(few, found, block, surface):
-    """Pushes drawn from a noise that is known: likelier under what is found than at the start, and like the truth."""
+    """Pushes drawn from a noise that is known: predicted better by what is found than at the start."""
     from pushjax.identify.noise import Noise, Values
 
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
@@ -286,10 +286,10 @@ def test_noise(few, found, block, surface):
     seen = pj.Pushes(many.start, many.path, drawn[:, 0])
     noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=60)
     assert noise.history.shape == (60,)
-    assert noise.score > noise.history[:5].mean() + 0.05
+    assert noise.score < noise.history[:5].mean()
     assert np.isfinite(noise.history).all()
-    assert 0.5 < float(noise.sigma / truth.sigma) < 1.6
-    assert 9 < float(noise.dof) < 60
+    assert 10 < float(noise.dof) < 30
+    assert float(noise.tails) < 10
     assert noise.friction.shape == (2,)
     assert noise.model.friction.shape == (2,)
     with pytest.raises(ValueError, match="samples must be at least 2"):

@@ -31,6 +31,11 @@ def whole():
     return run()
 
 
+def test_under_a_transformation_it_says_what_to_use():
+    with pytest.raises(TypeError, match="use random_rollout"):
+        jax.grad(lambda mu: run(model=pj.FrictionModel(20, mu)).pose.sum())(0.2)
+
+
 def arrays(result) -> dict[str, np.ndarray]:
     return {name: value for name, value in vars(result).items() if isinstance(value, np.ndarray)}
 

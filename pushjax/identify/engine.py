@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
 from pushjax.hands import Hand
-from pushjax.identify.fit import ROUNDS, Fit, Held, fit, whitened
+from pushjax.identify.fit import ROUNDS, Effort, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
 from pushjax.identify.model import Setup
 from pushjax.identify.pushes import Pushes
@@ -83,8 +83,8 @@ def identify(
     pairs = several.wrench.shape[-2] > 0
     known = jnp.array([sigma is not None, not pairs])
     sigmas = jnp.stack([first, jnp.asarray(DIRECTION, dtype)])
-    rounds = jnp.asarray(1 if sigma is not None and not pairs else ROUNDS)
-    found = program(setup, several, start, jnp.asarray(True), sigmas, known, Held.none(start), rounds, robust=robust)
+    effort = Effort.of(dtype, 1 if sigma is not None and not pairs else ROUNDS)
+    found = program(setup, several, start, jnp.asarray(True), sigmas, known, Held.none(start), effort, robust=robust)
     status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
     last = 3 * len(several.rows)
     residual = found.residual[..., last - 3 : last] * len(several.rows) ** 0.5
@@ -112,11 +112,11 @@ _prior = eqx.filter_jit(Prior.of)
 
 @eqx.filter_jit
 def program(
-    setup: Setup, pushes: Pushes, start, fresh, sigma, known, held: Held, rounds, *, robust: float | None
+    setup: Setup, pushes: Pushes, start, fresh, sigma, known, held: Held, effort: Effort, *, robust: float | None
 ) -> Fit:
     """One compiled program for everything that is fitted. fresh: look for a better start than `start`."""
     start = jax.lax.cond(fresh, lambda: _best_start(setup, pushes, sigma, robust), lambda: start)
-    return fit(setup, pushes, start, sigma, robust, known, held, rounds)
+    return fit(setup, pushes, start, sigma, robust, known, held, effort)
 
 
 def _best_start(setup: Setup, pushes: Pushes, sigma: Array, robust: float | None) -> Array:

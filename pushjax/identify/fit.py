@@ -83,13 +83,26 @@ def _trust(residual: Array, weight: Array, sigma: Array, robust: float | None) -
     return weight / jnp.sqrt(1 + squared / robust**2)
 
 
+class Effort(NamedTuple):
+    """rounds: how many turns of z and sigma, one where all of sigma is known. tolerance: of z, in the last."""
+
+    rounds: Int[Array, ""]
+    tolerance: Float[Array, ""]
+
+    @staticmethod
+    def of(dtype, rounds: int, tolerance: float | None = None) -> "Effort":
+        """tolerance: what the type allows, if None."""
+        least = 1e-6 if dtype == jnp.float64 else 1e-4
+        return Effort(jnp.asarray(rounds), jnp.asarray(least if tolerance is None else tolerance, dtype))
+
+
 def fit(
-    setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float | None, known: Array, held: Held, rounds
+    setup: Setup, pushes: Pushes, start: Array, sigma: Array, robust: float | None, known: Array, held: Held, effort
 ) -> Fit:
     """The most probable z, but for what is `held`, and the size of what is left over, in turns. known: (2,), whether
-    `sigma` is. rounds: how many turns, one where all of it is known; may be traced."""
+    `sigma` is. effort: an `Effort`, may be traced."""
     flat = jnp.asarray(setup.prior.layout.flat_prior, start.dtype)
-    last = 1e-6 if start.dtype == jnp.float64 else 1e-4
+    rounds, last = effort
 
     def round_(index, before: Fit) -> Fit:
         sigma = before.sigma

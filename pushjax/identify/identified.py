@@ -1,7 +1,7 @@
 """What was found, and how well it is known."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -16,6 +16,9 @@ from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical, Prior
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
 from pushjax.rollout import Slider, Trajectory
+
+if TYPE_CHECKING:
+    from pushjax.identify.uncertainty import Profile
 
 LOGISTIC_VARIANCE = np.pi**2 / 3
 
@@ -125,6 +128,19 @@ class Identified(eqx.Module):
         low, high = (self._own(self.prior.physical(self.z + sign * reach)) for sign in (-1, 1))
         names = [name for name in self.prior.layout.names if name != "surface"]
         return {name: (getattr(low, name), getattr(high, name)) for name in names}
+
+    def profile(self, pushes: Pushes, slider: Slider, hand: Hand, label: str, **options: Any) -> "Profile":
+        """How much worse all pushes are explained with one of `labels` held: see `uncertainty.profile`."""
+        from pushjax.identify.uncertainty import profile
+
+        return profile(self, pushes, slider, hand, label, **options)
+
+    def bootstrap(self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int) -> Physical:
+        """What would have been found of `n` sets of pushes drawn from these with replacement, with (n,) in front: see
+        `uncertainty.bootstrap`."""
+        from pushjax.identify.uncertainty import bootstrap
+
+        return bootstrap(key, self, pushes, slider, hand, n)[0]
 
     def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
         """Slider, hand and path as they really are, to roll out with. path: (steps + 1, dof).

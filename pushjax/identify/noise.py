@@ -1,18 +1,17 @@
-"""How much pushes scatter about what was found: the noise under which what was recorded is most likely.
+"""How much pushes scatter about what was found: the noise that predicts what was recorded best.
 
-A push meets a limit surface drawn about the one that was found, with `dof` degrees of freedom; a friction, uniform
-about the one found, up to `spread` away from it; and a hand that is off by a normal `offset` in x and in y. Its final
-pose is measured with an error in x, y and length * theta that has Student's distribution in three dimensions, of scale
-`sigma` and with `tails` degrees of freedom: few pushes, but more than a normal distribution would have, slip where no
-model says they do.
+A push meets a limit surface drawn about the one that was found, with `dof` degrees of freedom, and a friction, uniform
+about the one found, up to `spread` away from it. Its hand is off by `offset` in x and in y, and its final pose is
+measured with an error of `sigma` in x, y and length * theta; both are normal but for a factor that they have in common,
+so that together they have Student's distribution with `tails` degrees of freedom: few pushes, but more than a normal
+distribution would have, slip where no model says they do.
 
-So the density of a recorded pose is the mean of Student's over all the poses at which the push might end; with as many
-of those as are drawn, its logarithm is the score that is maximised. It is proper: in the mean nothing scores better
-than the noise that the pushes had, but for how few are drawn. An energy score would do for the other numbers, but
-hardly sees tails.
+The mean energy score of the recorded final poses is minimised: a proper score, so that in the mean no other noise
+scores better than that which the pushes had, and its mean does not depend on how many samples of a push are drawn. (The
+likelihood, from as many samples as one can afford, does: with 64 a push it took tails of 4 for 1.8.)
 
 Draws are smooth functions of the noise, but for one key a draw may jump with dof (Gamma's rejections); derivatives are
-right in the mean. So the score is not maximised for one key, but by Adam's method with a new key for every step.
+right in the mean. So the score is not minimised for one key, but by Adam's method with a new key for every step.
 """
 
 from collections.abc import Callable
@@ -32,9 +31,10 @@ from pushjax.identify.model import coefficients_of, push
 from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical
 from pushjax.rollout import Slider
+from pushjax.scores import energy_score
 from pushjax.shapes import Shape
 
-SAMPLES = 64  # of each push, for each step of the search
+SAMPLES = 32  # of each push, for each step of the search
 STEPS = 80
 CHUNK = 10  # steps between two reports of progress
 RATE, LAST = 0.1, 0.1  # of a logarithm, per step, and what part of it is left at the end
@@ -56,11 +56,10 @@ class Values(NamedTuple):
 class Noise(eqx.Module):
     """How pushes scatter about what was found.
 
-    dof: of the limit surface. friction: (..., 2), the range on which mu is uniform, of each condition. offset: m, the
-    standard deviation of the hand's place against the slider's, in x and in y, from push to push. sigma: m, the scale
-    of the errors of a final pose, in x, y and length * theta, and tails: their degrees of freedom. score: the mean
-    logarithm of the density, per cubic metre of (x, y, length * theta), of the pushes' final poses at the end of the
-    search, and history: (steps,), on the way there.
+    dof: of the limit surface. friction: (..., 2), the range on which mu is uniform, of each condition. offset: m, by
+    how much the hand's place against the slider's is off, in x and in y, from push to push. sigma: m, the same of a
+    measured final pose, in x, y and length * theta. tails: degrees of freedom of both. score: m, the mean
+    energy score of the pushes' final poses at the end of the search, and history: (steps,), on the way there.
     """
 
     found: Identified
@@ -119,7 +118,7 @@ def identify_noise(
     steps: int = STEPS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Noise:
-    """The noise under which the pushes are predicted best, by the logarithmic score.
+    """The noise with which the pushes are predicted best, by the energy score.
 
     found: what `identify` says of these conditions, at best of other pushes: of those that it has learned from, it
     leaves less over. slider, hand: as given there. The middle of the friction's range
@@ -128,8 +127,7 @@ def identify_noise(
 
     Raises ValueError for a number of samples or steps that is too small.
 
-    Source: Zhou et al. 2017, section VII, names the problem; the score is the logarithmic one of Gneiting & Raftery
-    2007, section 4.1.
+    Source: Zhou et al. 2017, section VII, names the problem; Gneiting & Raftery 2007, section 4.3, the score.
     """
     if samples < 2:
         raise ValueError(f"samples must be at least 2; got {samples}")
@@ -142,7 +140,7 @@ def identify_noise(
     for begin in range(0, steps, CHUNK):
         part = keys[begin : begin + CHUNK]
         scatter, state, each, passed = _descend(scatter, state, part, setup, samples, steps)
-        values.append(-each)
+        values.append(each)
         visited.append(passed)
         progress(begin + len(part), steps)
     history = jnp.concatenate(values)
@@ -228,9 +226,9 @@ def _descend(scatter, state, keys, setup: _Setup, samples: int, steps: int):
 
 
 def _score(scatter: _Scatter, key: PRNGKeyArray, setup: _Setup, samples: int) -> tuple[Array, _Scatter]:
-    """The mean negative logarithm of the density, and its derivative.
+    """The mean energy score, and its derivative.
 
-    A pose depends on dof, on its own mu and on offset: its derivatives by these three are worked out forward. The rest
+    A pose depends on dof, its own mu and where its hand is: its derivatives by these are worked out forward. The rest
     is cheap, and differentiated backward through poses that are linear about where they are.
     """
 
@@ -239,50 +237,45 @@ def _score(scatter: _Scatter, key: PRNGKeyArray, setup: _Setup, samples: int) ->
         return chances, drawing.slopes(chances, values)
 
     chances, (poses, slopes) = setup.over_conditions(local, key, setup.values(scatter))
-    before = jax.lax.stop_gradient(_Own.of(setup.values(scatter), chances))
+    before = jax.lax.stop_gradient(_own(setup.values(scatter), chances))
     weight = setup.pushes.weight
 
     def score(scatter: _Scatter) -> Array:
         values = setup.values(scatter)
-        moved = jax.tree.map(lambda now, then: (now - then)[..., None], _Own.of(values, chances), before)
-        linear = poses + sum(slope * by for slope, by in zip(slopes, moved, strict=True))
-        off = linear - setup.pushes.end[..., None, :]
-        each = _log_student(off.at[..., 2].mul(setup.length), values.sigma, values.tails)
-        density = jax.nn.logsumexp(each, axis=-1) - jnp.log(jnp.asarray(samples, each.dtype))
-        return -jnp.sum(weight * density) / jnp.sum(weight)
+        dof, mu = ((now - then)[..., None] for now, then in zip(_own(values, chances), before, strict=True))
+        off = poses + slopes.dof * dof + slopes.mu * mu - setup.pushes.end[..., None, :]
+        errors = jax.vmap(lambda key: _student(key, values.tails))(chances.error.reshape(-1))
+        errors = errors.reshape(*chances.mu.shape, 5)
+        off = off + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
+        off = off + (values.sigma * errors[..., 2:]).at[..., 2].divide(setup.length)
+        each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), setup.length)))(off)
+        return jnp.sum(weight * each) / jnp.sum(weight)
 
     return jax.value_and_grad(score)(scatter)
 
 
-def _log_student(off: Float[Array, "*many 3"], sigma: Array, tails: Array) -> Float[Array, "*many"]:
-    gammas = jax.scipy.special.gammaln((tails + 3) / 2) - jax.scipy.special.gammaln(tails / 2)
-    squared = jnp.sum((off / sigma) ** 2, axis=-1)
-    return gammas - 1.5 * jnp.log(jnp.pi * tails) - 3 * jnp.log(sigma) - (tails + 3) / 2 * jnp.log1p(squared / tails)
-
-
 class _Chances(NamedTuple):
-    """What is drawn of each push, with axes (..., pushes, samples): keys of surfaces and of errors, mu's place in its
-    range, and normal numbers of the hand's place."""
+    """What is drawn of each push, with axes (..., pushes, samples): keys of surfaces and of errors, and mu's place in
+    its range."""
 
     surface: PRNGKeyArray
     error: PRNGKeyArray
     mu: Float[Array, "*conditions pushes n"]
-    aside: Float[Array, "*conditions pushes n 2"]
 
 
-class _Own(NamedTuple):
-    """What a pose depends on, (..., pushes, samples) each; or its derivatives by that, with (3,) behind."""
+def _own(values: Values, chances: _Chances) -> tuple[Array, Array]:
+    """dof and mu, (..., pushes, samples), of one condition, or of all."""
+    low, high = values.friction[..., 0, None, None], values.friction[..., 1, None, None]
+    mu = low + (high - low) * chances.mu
+    return jnp.broadcast_to(values.dof, mu.shape), mu
+
+
+class _Slopes(NamedTuple):
+    """Of poses, by dof and mu (..., 3), and by where the hand is (..., 3, 2)."""
 
     dof: Array
     mu: Array
-    offset: Array
-
-    @staticmethod
-    def of(values: Values, chances: _Chances) -> "_Own":
-        """Of one condition, or of all."""
-        low, high = values.friction[..., 0, None, None], values.friction[..., 1, None, None]
-        mu = low + (high - low) * chances.mu
-        return _Own(jnp.broadcast_to(values.dof, mu.shape), mu, jnp.broadcast_to(values.offset, mu.shape))
+    aside: Array
 
 
 class _Drawing(eqx.Module):
@@ -295,34 +288,35 @@ class _Drawing(eqx.Module):
     hand: Hand
 
     def chances(self, key: PRNGKeyArray, n: int) -> _Chances:
-        first, second, third, fourth = jax.random.split(key, 4)
-        shape, dtype = (len(self.pushes.weight), n), self.pushes.end.dtype
-        mu, aside = jax.random.uniform(third, shape, dtype), jax.random.normal(fourth, (*shape, 2), dtype)
-        return _Chances(jax.random.split(first, shape), jax.random.split(second, shape), mu, aside)
+        first, second, third = jax.random.split(key, 3)
+        shape = (len(self.pushes.weight), n)
+        mu = jax.random.uniform(third, shape, self.pushes.end.dtype)
+        return _Chances(jax.random.split(first, shape), jax.random.split(second, shape), mu)
 
-    def poses(self, chances: _Chances, values: Values) -> Float[Array, "pushes n 3"]:
-        """Final poses, as they really are."""
-        return self._each(self._pose, chances, values)
+    def poses(self, chances: _Chances, values: Values, aside: Float[Array, "pushes n 2"]) -> Array:
+        """Final poses (pushes, n, 3), as they really are."""
+        return self._each(self._pose, chances, values, aside)
 
-    def slopes(self, chances: _Chances, values: Values) -> tuple[Array, _Own]:
-        """Those, and their derivatives by what is their own."""
+    def slopes(self, chances: _Chances, values: Values) -> tuple[Array, _Slopes]:
+        """Those with hands that are not off, and their derivatives."""
 
-        def value(own: _Own, *rest):
+        def value(own, *rest):
             pose = self._pose(own, *rest)
             return pose, pose
 
-        slopes, poses = self._each(jax.jacfwd(value, has_aux=True), chances, values)
-        return poses, slopes
+        nowhere = jnp.zeros((*chances.mu.shape, 2), chances.mu.dtype)
+        slopes, poses = self._each(jax.jacfwd(value, has_aux=True), chances, values, nowhere)
+        return poses, _Slopes(*slopes)
 
-    def _each(self, of: Callable, chances: _Chances, values: Values):
-        over_samples = jax.vmap(of, in_axes=(0, 0, 0, None, None))
-        own = _Own.of(values, chances)
-        return jax.vmap(over_samples)(own, chances.surface, chances.aside, self.pushes.start, self.pushes.path)
+    def _each(self, of: Callable, chances: _Chances, values: Values, aside: Array):
+        over_samples = jax.vmap(of, in_axes=(0, 0, None, None))
+        own = (*_own(values, chances), aside)
+        return jax.vmap(over_samples)(own, chances.surface, self.pushes.start, self.pushes.path)
 
-    def _pose(self, own: _Own, key, aside, start, path) -> Float[Array, "3"]:
-        surface = self.around.with_dof(own.dof).sample(key).surface
-        offset = self.theta.offset + own.offset * aside
-        met = self.theta._replace(friction=own.mu, surface=coefficients_of(surface), offset=offset)
+    def _pose(self, own: tuple[Array, Array, Array], key, start, path) -> Float[Array, "3"]:
+        dof, mu, aside = own
+        surface = self.around.with_dof(dof).sample(key).surface
+        met = self.theta._replace(friction=mu, surface=coefficients_of(surface), offset=self.theta.offset + aside)
         return push(met, surface, (self.shape, self.hand), start, path).pose[-1]
 
 
@@ -330,14 +324,16 @@ class _Drawing(eqx.Module):
 def _predict(key: PRNGKeyArray, setup: _Setup, values: Values, n: int) -> Float[Array, "conditions pushes n 3"]:
     def measured(drawing: _Drawing, key, values: Values):
         chances = drawing.chances(key, n)
-        errors = jax.vmap(jax.vmap(lambda key: _student(key, values)))(chances.error)
-        return drawing.poses(chances, values) + errors.at[..., 2].divide(setup.length)
+        off = jax.vmap(jax.vmap(lambda key: _student(key, values.tails)))(chances.error)
+        errors = (values.sigma * off[..., 2:]).at[..., 2].divide(setup.length)
+        return drawing.poses(chances, values, values.offset * off[..., :2]) + errors
 
     return setup.over_conditions(measured, key, values)
 
 
-def _student(key: PRNGKeyArray, values: Values) -> Float[Array, "3"]:
+def _student(key: PRNGKeyArray, tails: Array) -> Float[Array, "5"]:
+    """Normal numbers with one random factor: two of the hand, three of the pose."""
     first, second = jax.random.split(key)
-    normal = values.sigma * jax.random.normal(first, (3,), values.sigma.dtype)
-    half = values.tails / 2
+    normal = jax.random.normal(first, (5,), tails.dtype)
+    half = tails / 2
     return normal * jnp.sqrt(half / jnp.maximum(jax.random.gamma(second, half, dtype=half.dtype), 1e-6))

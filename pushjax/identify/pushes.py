@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped
-from pushjax.hands import resample
+from pushjax.shapes import Shape
 
 STEPS = 50
 ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist")
@@ -86,10 +86,18 @@ class Pushes(eqx.Module):
         return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
 
     @staticmethod
-    def of(log: Any, steps: int = STEPS) -> "Pushes":
-        """The usable pushes of a log of single-finger pushes (`pushjax.datasets.PushLog`), their paths in `steps`."""
-        start, end = (np.stack([getattr(push, name) for push in log.pushes]) for name in ("pose_start", "pose_end"))
-        return Pushes(start, np.stack([resample(push.tip, steps) for push in log.pushes]), end)
+    def of(log: Any, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
+        """The usable pushes of a log (`pushjax.datasets.PushLog`, or the `Recordings` of `load_recordings`), their
+        paths in `steps`.
+
+        parts: of a push, after each of which the slider's pose counts, if all saw it on the way; else
+        only the end's does. shape: with it, and with forces of a single finger, wrenches count too. Raises ValueError
+        for fewer than one part, or not fewer than steps.
+        """
+        from pushjax.identify.recorded import Recordings, recorded
+
+        recordings = log if isinstance(log, Recordings) else Recordings.of_log(log)
+        return recorded(recordings, steps, parts, shape)
 
     @staticmethod
     def conditions(several: Sequence["Pushes"]) -> "Pushes":

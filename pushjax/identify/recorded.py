@@ -1,7 +1,5 @@
 """From recordings to arrays: paths in equal steps, poses after equal parts of them, wrenches and the motions there."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,6 @@ import numpy as np
 
 from pushjax.datasets.pushes import Floats, rotation
 from pushjax.datasets.recordings import Recording, Recordings
-from pushjax.hands import resample
 from pushjax.identify.pushes import STEPS, Pushes
 from pushjax.shapes import Shape
 
@@ -29,56 +26,57 @@ def recorded(recordings: Recordings, steps: int = STEPS, parts: int = 1, shape: 
     pushes = recordings.pushes
     if any(push.seen[1:-1].sum() < parts - 1 for push in pushes):
         parts = 1
-    path = np.stack([resample(push.hand, steps) for push in pushes])
-    seen = [_seen_after(push, parts, steps) for push in pushes]
-    poses = np.stack([one.pose for one in seen])
-    start, along, end = poses[:, 0], poses[:, 1:-1], poses[:, -1]
-    wrench = twist = None
-    if shape is not None and parts > 1 and all(p.force is not None and p.hand.shape[1] == 2 for p in pushes):
-        pairs = [_pairs(push, one, shape) for push, one in zip(pushes, seen, strict=True)]
-        wrench, twist = (np.stack([pair[k] for pair in pairs]) for k in range(2))
-    return Pushes(start, path, end, along=along, wrench=wrench, twist=twist)
-
-
-class _Seen(NamedTuple):
-    """pose: (parts + 1, 3), the first is the start's. part: (m,), in which part of the push each sample is."""
-
-    pose: Floats
-    part: np.ndarray
-
-
-def _seen_after(push: Recording, parts: int, steps: int) -> _Seen:
-    hop = np.linalg.norm(np.diff(push.hand, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(hop)])
+    arcs = [_arc(push) for push in pushes]
+    path = [_at(push.hand, arc, np.arange(steps + 1) / steps * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)]
     # as the steps of the path are
-    at = np.round(np.arange(parts + 1) / parts * steps) / steps * arc[-1]
-    pose = np.stack([np.interp(at, arc[push.seen], column[push.seen]) for column in push.pose.T], axis=1)
+    shares = np.round(np.arange(parts + 1) / parts * steps) / steps
+    poses = np.stack([_poses(push, arc, shares * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)])
+    pairs: dict[str, Floats] = {}
+    if shape is not None and parts > 1 and all(p.force is not None and p.hand.shape[1] == 2 for p in pushes):
+        which = [np.clip(np.searchsorted(shares * arc[-1], arc, side="right") - 1, 0, parts - 1) for arc in arcs]
+        pairs = _pairs(pushes, poses, which, shape)
+    return Pushes(poses[:, 0], np.stack(path), poses[:, -1], along=poses[:, 1:-1], **pairs)
+
+
+def _arc(push: Recording) -> Floats:
+    """(m,) how far the hand has come, in the configuration's own units."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(push.hand, axis=0), axis=1))])
+
+
+def _at(values: Floats, arc: Floats, at: Floats) -> Floats:
+    return np.stack([np.interp(at, arc, column) for column in values.T], axis=1)
+
+
+def _poses(push: Recording, arc: Floats, at: Floats) -> Floats:
+    pose = _at(push.pose[push.seen], arc[push.seen], at)
     # the slider may be seen to move on after the hand has stopped, by a tracker that lags
     pose[0], pose[-1] = push.pose[0], push.pose[-1]
-    return _Seen(pose, np.clip(np.searchsorted(at, arc, side="right") - 1, 0, parts - 1))
+    return pose
 
 
-def _pairs(push: Recording, seen: _Seen, shape: Shape) -> tuple[Floats, Floats]:
-    """(parts, 3) the mean wrench in each part, and the displacement, both in the body frame; zero where not told."""
-    force = np.asarray(push.force)
-    rows = np.arange(len(push.hand))
-    pose = np.stack([np.interp(rows, rows[push.seen], column[push.seen]) for column in push.pose.T], axis=1)
-    body_from_world = rotation(pose[:, 2]).swapaxes(1, 2)
-    there = np.asarray(np.isfinite(force).all(axis=1))
-    pushed = np.einsum("kij,kj->ki", body_from_world, np.where(there[:, None], force, 0.0))
-    tip = np.einsum("kij,kj->ki", body_from_world, push.hand - pose[:, :2])
-    arm = np.asarray(_feet(shape, jnp.asarray(tip)))
-    strength = np.linalg.norm(pushed, axis=1)
-    strong = there & (strength >= STRONG * strength[there].mean()) if there.any() else there
-    wrench, twist = np.zeros((2, len(seen.pose) - 1, 3))
-    for part, (before, after) in enumerate(zip(seen.pose[:-1], seen.pose[1:], strict=True)):
-        mine = strong & (seen.part == part)
-        moved = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
-        if mine.any() and np.linalg.norm(moved) >= MOVES:
-            f, r = pushed[mine], arm[mine]
-            wrench[part] = *f.mean(axis=0), (r[:, 0] * f[:, 1] - r[:, 1] * f[:, 0]).mean()
-            twist[part] = *moved, after[2] - before[2]
-    return wrench, twist
+def _pairs(pushes: tuple[Recording, ...], poses: Floats, which: list[np.ndarray], shape: Shape) -> dict[str, Floats]:
+    """The mean wrench in each part of each push, and the displacement, both in the body frame; zero where not told.
+    which: the part that each sample is in."""
+    rows = [np.arange(len(push.hand), dtype=float) for push in pushes]
+    every = [_at(push.pose[push.seen], row[push.seen], row) for push, row in zip(pushes, rows, strict=True)]
+    tips = [np.einsum("kji,kj->ki", rotation(q[:, 2]), p.hand - q[:, :2]) for p, q in zip(pushes, every, strict=True)]
+    # all at once: for samples of every number there would be another program
+    feet = np.split(np.asarray(_feet(shape, jnp.asarray(np.concatenate(tips)))), np.cumsum([len(t) for t in tips])[:-1])
+    wrench, twist = np.zeros_like(poses[:, 1:]), np.zeros_like(poses[:, 1:])
+    for k, (push, pose, arm) in enumerate(zip(pushes, every, feet, strict=True)):
+        force = np.asarray(push.force)
+        there = np.isfinite(force[:, 0]) & np.isfinite(force[:, 1])
+        pushed = np.einsum("kji,kj->ki", rotation(pose[:, 2]), np.where(there[:, None], force, 0.0))
+        strength = np.hypot(pushed[:, 0], pushed[:, 1])
+        strong = there & (strength >= STRONG * np.sum(strength) / max(int(there.sum()), 1))
+        for part, (before, after) in enumerate(zip(poses[k, :-1], poses[k, 1:], strict=True)):
+            mine = strong & (which[k] == part)
+            moved = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
+            if mine.any() and np.hypot(*moved) >= MOVES:
+                f, r = pushed[mine], arm[mine]
+                wrench[k, part] = *f.mean(axis=0), (r[:, 0] * f[:, 1] - r[:, 1] * f[:, 0]).mean()
+                twist[k, part] = *moved, after[2] - before[2]
+    return {"wrench": wrench, "twist": twist}
 
 
 @eqx.filter_jit

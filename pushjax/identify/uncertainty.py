@@ -11,14 +11,15 @@ from scipy.stats import norm
 
 from pushjax.hands import Hand
 from pushjax.identify.engine import program
-from pushjax.identify.fit import Held, fit
+from pushjax.identify.fit import Effort, Held, fit
 from pushjax.identify.identified import Identified, surfaces
 from pushjax.identify.model import Setup
 from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical
 from pushjax.rollout import Slider
 
-POINTS, REACH = 7, 3.0  # of a profile, and how many standard deviations it goes to
+POINTS, REACH = 4, 3.0  # of a profile, on either side, and how many standard deviations it goes to
+ENOUGH = 1e-3  # tolerance, of numbers whose prior deviation is one
 
 
 class Profile(NamedTuple):
@@ -59,13 +60,17 @@ def profile(
     apart = np.sort(np.append(apart[apart != 0], 0.0))
     order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]  # outwards, each from the one before
     loss, values = np.zeros(len(apart)), np.zeros(len(apart))
-    z = found.z
+    # where everything else would go, were the posterior normal
+    along = found.covariance[index] / found.covariance[index, index] * deviation
+    z, last = found.z, 0.0
     for k in order:
-        z = found.z if k in (points, points + 1) else z
-        at = found.z.at[index].add(apart[k] * deviation)
-        held = Held(jnp.arange(len(z)) == index, at)
+        if k in (points, points + 1):
+            z, last = found.z, 0.0
+        z, last = z + (apart[k] - last) * along, apart[k]
+        held = Held(jnp.arange(len(z)) == index, z)
         fitted = program(
-            setup, several, z, jnp.asarray(False), _sigma(found), jnp.array([True, True]), held, jnp.asarray(1),
+            setup, several, z, jnp.asarray(False), _sigma(found), jnp.array([True, True]), held,
+            Effort.of(z.dtype, 1, ENOUGH),
             robust=found.robust,
         )  # fmt: skip
         z, loss[k] = fitted.z, float(fitted.loss)
@@ -93,7 +98,7 @@ def bootstrap(
 
 @eqx.filter_jit
 def _refitted(setup: Setup, pushes: Pushes, start, sigma, weights, robust: float | None):
-    held, known, once = Held.none(start), jnp.array([True, True]), jnp.asarray(1)
+    held, known, once = Held.none(start), jnp.array([True, True]), Effort.of(start.dtype, 1, ENOUGH)
 
     def one(weight):
         return fit(setup, pushes.weighted(weight), start, sigma, robust, known, held, once).z

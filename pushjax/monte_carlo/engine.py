@@ -15,7 +15,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
-from pushjax._checks import Numeric
+from pushjax._checks import Numeric, traced
 from pushjax.friction_model import FrictionModel
 from pushjax.hands import Hand
 from pushjax.monte_carlo.checkpoint import Checkpoint, CheckpointError, digest
@@ -64,10 +64,15 @@ def monte_carlo(
 
     Raises ValueError as `rollout` and `FrictionModel.around` do, for n, tile below one, and CheckpointError (a
     ValueError) for a checkpoint of another run, a damaged one or one that cannot be written; what is there is kept.
+    TypeError under `jit`, `vmap` or `grad`, which `random_rollout` is for.
 
     Source: Zhou et al. 2017, sections V and VI.
     """
     begun = time.perf_counter()
+    if traced((key, slider, hand, path, pose, model)):
+        raise TypeError(
+            "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
+        )
     for name, value in (("n", n), ("tile", TILE if tile is None else tile)):
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets import PushLog, load_push_npz, load_triangle_log
+from pushjax.datasets import Push, PushLog, load_push_npz, load_triangle_log
 
 SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4")
 CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
@@ -62,9 +62,13 @@ def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
 
 def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
     if geometry.commanded_end:
-        ended = (replace(push, tip=np.vstack([push.tip, log.commanded_tip_end(push)])) for push in log.pushes)
-        log = replace(log, pushes=tuple(ended))
+        log = replace(log, pushes=tuple(_ended(log, push) for push in log.pushes))
     return pj.Pushes.of(log, steps)
+
+
+def _ended(log: PushLog, push: Push) -> Push:
+    tip = np.vstack([push.tip, log.commanded_tip_end(push)])
+    return replace(push, tip=tip, tip_time=np.append(push.tip_time, push.tip_time[-1]))
 
 
 def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:

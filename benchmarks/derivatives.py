@@ -1,0 +1,474 @@
+"""Derivatives of pushes: what they cost, whether they are those of differences, and where there are none.
+
+    python benchmarks/derivatives.py [PART ...] [--quick] [--json FILE] [--picture FILE]
+
+cost       reverse and forward mode beside the push alone: 200 steps, float32; all in turn in one run
+memory     what reverse mode stores (the compiler's own count), and ways of storing less
+agreement  float64, against central differences, of random pushes: relative error |derivative - difference| /
+           max(1, |difference|), lengths in units of the surface's. Differences of two widths, H and H / 4, are
+           extrapolated, so that neither cutting off (1e-20 of a fifth derivative) nor rounding (1e-10) matters. Judged
+           is where modes, status and, of one finger, the edge or corner touched are the same at every step on both
+           sides; where the error is large anyway it is looked at again with differences of FINE.
+grasps     the same of random grasps
+random     d E[f] by dof and by the range of friction through `random_rollout`, against differences of means
+picture    final angle and derivative along three lines: friction, where a push starts, how a jaw finds it
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _measure import alternate, compiled, header
+
+import pushjax as pj
+from pushjax.report import envelope, write_json
+
+PARTS = ("cost", "memory", "agreement", "grasps", "random", "picture")
+RADIUS, LENGTH = 0.005, 0.035
+H, FINE, TOLERANCE = 1e-5, 1e-7, 1e-5
+EDGE = 1e-9  # sine between a normal and an edge's, below which the edge is touched
+MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
+
+
+def fitted(block: pj.Polygon, dtype: Any) -> pj.Quartic:
+    points = pj.Support.uniform(block, points=64)
+    pairs = points.wrench_twist_pairs(jax.random.key(0), 400)
+    surface: Any = pj.fit_limit_surface(pairs.wrench, pairs.twist, length=LENGTH)
+    return pj.Quartic(jnp.asarray(surface.coefficients, dtype), jnp.asarray(LENGTH, dtype))
+
+
+# --- cost and memory ---
+
+
+class Timed(NamedTuple):
+    """Pushes of 200 steps in float32 and a scalar of each; what it is differentiated by has a leading axis."""
+
+    scalar: Callable
+    inputs: tuple
+
+    def total(self, *inputs):
+        return jnp.sum(jax.vmap(self.scalar)(*inputs))
+
+
+def pushes(fingers: int, batch: int, steps: int, stretch: int | None = None) -> Timed:
+    """stretch: steps after which a pose is kept, and from which the way back is worked out anew."""
+    block, key = pj.Polygon.rectangle(0.09, 0.09), jax.random.key(1)
+    mean = fitted(block, jnp.float32)
+    one, two = jnp.array([-0.06, 0.01]), jnp.array([-0.06, 0.01, 0.0, 0.05])
+    way = jnp.array([0.05, 0.0]) if fingers == 1 else jnp.array([0.05, 0.01, 0.2, 0.0])
+    start = one if fingers == 1 else two
+    hand = pj.Hand.finger(RADIUS) if fingers == 1 else pj.Hand.two_fingers(RADIUS)
+    path = pj.line(start, start + way, steps)
+    k1, k2, k3 = jax.random.split(key, 3)
+    coefficients = mean.coefficients * (1 + 0.01 * jax.random.normal(k1, (batch, 15)))
+    poses = jnp.array([1e-3, 1e-3, 0.05]) * jax.random.normal(k2, (batch, 3))
+    friction = jax.random.uniform(k3, (batch,), minval=0.15, maxval=0.35)
+
+    def scalar(mu, pose, c):
+        slider = pj.Slider(block, pj.Quartic(c, mean.length))
+        if stretch is None:
+            end = pj.rollout(slider, hand, path, pose=pose, friction=mu).pose[-1]
+        else:
+            parts = jnp.arange(steps // stretch)[:, None] * stretch + jnp.arange(stretch + 1)
+            push = jax.checkpoint(lambda at, part: pj.rollout(slider, hand, part, pose=at, friction=mu).pose[-1])
+            end, _ = jax.lax.scan(lambda at, part: (push(at, part), None), pose, path[parts])
+        return jnp.sum((end / jnp.array([LENGTH, LENGTH, 1.0])) ** 2)
+
+    return Timed(scalar, (friction, poses, coefficients))
+
+
+def cost(quick: bool) -> list[dict[str, Any]]:
+    batch, rows = 50 if quick else 2000, []
+    for fingers, target in ((1, 4.0), (2, 6.0)):
+        timed = pushes(fingers, batch, 200)
+
+        def tangent(mu, *others, timed=timed):
+            return jax.jvp(lambda m: timed.total(m, *others), (mu,), (jnp.ones_like(mu),))
+
+        functions = {"push": timed.total, "gradient": jax.grad(timed.total, argnums=(0, 1, 2)), "tangent": tangent}
+        ready = {name: compiled(function, *timed.inputs) for name, function in functions.items()}
+        run_s = alternate({name: (program, timed.inputs) for name, (program, _) in ready.items()}, repeats=7 // fingers)
+        for name, seconds in run_s.items():
+            program, compile_s = ready[name]
+            row: dict[str, Any] = {"fingers": fingers, "batch": batch, "steps": 200, "what": name, "run_s": seconds}
+            row |= {"compile_s": compile_s, "ratio": seconds / run_s["push"], "bytes": stored(program)}
+            rows.append(row | {"target": target if name == "gradient" else None})
+            each = (
+                f"{1e9 * seconds / batch / 200:6.0f} ns and {row['bytes'] / batch / 200:6.1f} bytes per push and step"
+            )
+            print(f"  {fingers} finger(s), {name:8}: compile {compile_s:5.1f} s, run {1e3 * seconds:8.1f} ms,")
+            print(f"     {each}, {row['ratio']:.2f} x the push", flush=True)
+    return rows
+
+
+def stored(program: Any) -> int:
+    """Bytes that the program needs beside what goes in and comes out, as the compiler laid it out."""
+    return program.memory_analysis().temp_size_in_bytes
+
+
+def memory(quick: bool) -> list[dict[str, Any]]:
+    batch, rows = 50 if quick else 2000, []
+    timed, stretched = pushes(1, batch, 200), pushes(1, batch, 200, stretch=20)
+    again = Timed(jax.checkpoint(timed.scalar), timed.inputs)
+
+    def chunks(*inputs):
+        return jnp.sum(jax.lax.map(lambda each: timed.scalar(*each), inputs, batch_size=batch // 10))
+
+    ways = {"as it is": timed.total, "jax.checkpoint of the scalar": again.total}
+    ways |= {"stretches of 20 steps, each in jax.checkpoint": stretched.total, "lax.map, a tenth at once": chunks}
+    ready = {name: compiled(jax.grad(way, argnums=(0, 1, 2)), *timed.inputs) for name, way in ways.items()}
+    run_s = alternate({name: (program, timed.inputs) for name, (program, _) in ready.items()})
+    for name, (program, compile_s) in ready.items():
+        rows.append({"batch": batch, "steps": 200, "way": name, "bytes": stored(program)})
+        rows[-1] |= {"run_s": run_s[name], "compile_s": compile_s}
+        each = f"{rows[-1]['bytes'] / 1e6:7.1f} MB, {rows[-1]['bytes'] / batch / 200:6.1f} bytes per push and step"
+        print(f"  gradient, {name:46}: {each}, {1e3 * run_s[name]:8.1f} ms", flush=True)
+    return rows
+
+
+# --- agreement ---
+
+
+class Case(NamedTuple):
+    """Random pushes. end: from numbers of order one (inputs,) to the final pose, angles and lengths of order one, and
+    whatever must be the same for two of them to be pushes of one kind. inputs: (pushes, inputs). along: named
+    directions in which they are differentiated. size: of a batch. The kind begins with the
+    status of each of the steps."""
+
+    end: Callable
+    inputs: np.ndarray
+    along: dict[str, np.ndarray]
+    size: int
+    steps: int
+
+
+def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
+    """Of every second push the mean, of the others drawn around it; in units of the largest coefficient."""
+    model = pj.FrictionModel(dof=20.0, friction=0.3)
+    drawn: Any = jax.jit(jax.vmap(model.around(mean).sample))(jax.random.split(jax.random.key(3), n)).surface
+    each = np.where(np.arange(n)[:, None] % 2, drawn.coefficients, mean.coefficients)
+    return each / float(jnp.max(mean.coefficients))
+
+
+def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[str, np.ndarray]:
+    """Each of the first inputs by itself; two random ones within each of `drawn`."""
+    rng, found = np.random.default_rng(4), dict(zip(names, np.eye(width), strict=False))
+    for name, where in drawn.items():
+        for k in (1, 2):
+            found[f"{name} {k}"] = np.zeros(width)
+            found[f"{name} {k}"][where] = rng.normal(size=len(range(width)[where]))
+    return found
+
+
+def one_finger(n: int, steps: int = 60) -> Case:
+    """A pentagon each, pushed 60 mm from anywhere towards anywhere inside it; some slip off, some miss."""
+    rng, mean = np.random.default_rng(2), fitted(pj.Polygon.rectangle(0.09, 0.09), float)
+    scale, hand_names = float(jnp.max(mean.coefficients)), ["start x", "start y", "direction", "travel"]
+
+    def end(x):
+        pose, path, vertices = x[2:5] * jnp.array([LENGTH, LENGTH, 1.0]), x[5:9], LENGTH * x[24:].reshape(5, 2)
+        slider = pj.Slider(pj.Polygon(vertices, convex=True), pj.Quartic(scale * x[9:24], mean.length))
+        way = LENGTH * path[3] * jnp.array([jnp.cos(path[2]), jnp.sin(path[2])])
+        path = LENGTH * path[None, :2] + jnp.arange(steps + 1)[:, None] / steps * way[None]
+        run = pj.rollout(slider, pj.Hand.finger(LENGTH * x[1]), path, pose=pose, friction=x[0])
+        return scaled(run), jnp.concatenate([run.status, run.mode[:, 0], touched(run, vertices)])
+
+    corners = 2 * np.pi * (np.arange(5) + rng.uniform(0, 0.6, (n, 5))) / 5
+    vertices = 0.045 / LENGTH * np.stack([np.cos(corners), np.sin(corners)], axis=-1).reshape(n, 10)
+    pose = np.stack([*rng.normal(0, 0.02 / LENGTH, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
+    bearing, aside = rng.uniform(-np.pi, np.pi, n), rng.uniform(-0.045, 0.045, n)
+    away = rng.uniform(0.051, 0.056, n) / LENGTH
+    out = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+    begin = pose[:, :2] + away[:, None] * out
+    to = aside[:, None] / LENGTH * np.stack([-out[:, 1], out[:, 0]], axis=-1) - away[:, None] * out
+    path = [begin, np.arctan2(to[:, 1], to[:, 0])[:, None], np.full((n, 1), 0.06 / LENGTH)]
+    mu, radius = rng.uniform(0.0, 1.0, (n, 1)), rng.uniform(0.002, 0.006, (n, 1)) / LENGTH
+    inputs = np.concatenate([mu, radius, pose, *path, surfaces(mean, n), vertices], axis=1)
+    names = ["friction", "radius", "x", "y", "theta", *hand_names]
+    along = directions(names, 34, {"surface": slice(9, 24), "vertices": slice(24, 34)})
+    return Case(end, inputs, along, 4000, steps)
+
+
+def scaled(run: pj.Trajectory) -> jax.Array:
+    return run.pose[-1] / jnp.array([LENGTH, LENGTH, 1.0], run.pose.dtype)
+
+
+def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
+    """2 k at edge k, 2 k + 1 at the corner after it, -1 at none: told from the normal, which turns the contact's force
+    (normal, tangential) into the wrench's."""
+    (a, b), (x, y) = run.force[:, 0].T, run.wrench[:, :2].T
+    outward = -jnp.stack([x * a + y * b, y * a - x * b], axis=-1)
+    outward = outward / jnp.maximum(jnp.linalg.norm(outward, axis=-1, keepdims=True), 1e-300)
+    side = jnp.roll(vertices, -1, axis=0) - vertices
+    normal = jnp.stack([side[:, 1], -side[:, 0]], axis=-1) / jnp.linalg.norm(side, axis=-1, keepdims=True)
+    sine = normal[None, :, 0] * outward[:, 1:] - normal[None, :, 1] * outward[:, :1]
+    on = (jnp.abs(sine) < EDGE) & (outward @ normal.T > 0)
+    between = (sine > 0) & (jnp.roll(sine, -1, axis=1) < 0)
+    feature = jnp.argmax(jnp.concatenate([on, between & ~jnp.any(on, axis=1, keepdims=True)], axis=1), axis=1)
+    feature = jnp.where(feature < len(vertices), 2 * feature, 2 * (feature - len(vertices)) + 1)
+    return jnp.where(run.force[:, 0, 0] > 0, feature, -1).astype(jnp.int8)
+
+
+def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray], size: int) -> Case:
+    """Pushed or grasped by two fingers. given: friction (2), pose (3), first and last configuration (4)."""
+    mean = fitted(block, float)
+    scale, unit = float(jnp.max(mean.coefficients)), np.array([LENGTH, LENGTH, 1.0, LENGTH])
+
+    def end(x):
+        slider = pj.Slider(block, pj.Quartic(scale * x[13:], mean.length))
+        first, last = x[5:9] * unit, x[9:13] * unit
+        path = first[None] + jnp.arange(steps + 1)[:, None] / steps * (last - first)[None]
+        run = pj.rollout(slider, hand, path, pose=x[2:5] * unit[:3], friction=x[:2])
+        return scaled(run), jnp.concatenate([run.status, run.mode.ravel()])
+
+    n = len(given[0])
+    numbers = [given[0], given[1] / unit[:3], given[2] / unit, given[3] / unit, surfaces(mean, n)]
+    each = [f"{when} {of}" for when in ("first", "last") for of in ("x", "y", "theta", "opening")]
+    names = ["friction 1", "friction 2", "x", "y", "theta", *each]
+    return Case(end, np.concatenate(numbers, axis=1), directions(names, 28, {"surface": slice(13, 28)}), size, steps)
+
+
+def two_fingers(n: int) -> Case:
+    """A square pushed 50 mm by two fingers that turn and close or open on the way."""
+    rng, zero = np.random.default_rng(5), np.zeros(n)
+    pose = np.stack([np.full(n, 0.072), rng.uniform(-0.02, 0.02, n), rng.uniform(-3, 3, n)], axis=-1)
+    first = np.stack([zero, zero, zero, rng.uniform(0.02, 0.06, n)], axis=-1)
+    more = [np.full(n, 0.05), rng.uniform(-0.01, 0.01, n), rng.uniform(-0.3, 0.3, n), rng.uniform(-0.005, 0.005, n)]
+    given = [rng.uniform(0, 0.8, (n, 2)), pose, first, first + np.stack(more, axis=-1)]
+    return of_hand(pj.Hand.two_fingers(RADIUS), pj.Polygon.rectangle(0.09, 0.09), 60, given, 1000)
+
+
+def grasps(jaw: bool, n: int) -> Case:
+    """A 50 x 35 mm rectangle between two fingers, or the pads of a jaw, that close and shift until they hold it."""
+    rng, zero = np.random.default_rng(6), np.zeros(n)
+    pose = np.stack([*rng.uniform(-0.005, 0.005, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
+    hand = pj.Hand.parallel_jaw(0.027, 0.01) if jaw else pj.Hand.two_fingers(RADIUS)
+    wide, narrow = (0.077, 0.031) if jaw else (0.09, 0.041)
+    first = np.stack([zero, zero, zero, np.full(n, wide)], axis=-1)
+    more = [*rng.uniform(-0.003, 0.003, (2, n)), rng.uniform(-0.1, 0.1, n), np.full(n, narrow - wide)]
+    mu = rng.uniform(0.1, 0.6, (n, 1)) * np.ones((1, 2))
+    given = [mu, pose, first, first + np.stack(more, axis=-1)]
+    case = of_hand(hand, pj.Polygon.rectangle(0.05, 0.035), 115, given, 175 if jaw else 350)
+    chosen = ("friction 1", "x", "theta", "last y", "last theta", "last opening", "surface 1")
+    return case._replace(along={name: case.along[name] for name in chosen})
+
+
+class Batched:
+    """A program of so many rows at a time, compiled once."""
+
+    def __init__(self, function: Callable, size: int):
+        self.program, self.size = jax.jit(jax.vmap(function)), size
+
+    def __call__(self, *rows: np.ndarray) -> Any:
+        n, found = len(rows[0]), []
+        for first in range(0, n, self.size):
+            index = np.minimum(np.arange(first, first + self.size), n - 1)
+            out = self.program(*(row[index] for row in rows))
+            found.append(jax.tree.map(np.asarray, out))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *found)
+
+
+class Compared(NamedTuple):
+    """Of every push and direction: whether the two sides are pushes of one kind, the error where they are (else zero),
+    and against finer differences where that was large. finite, status: of every push."""
+
+    same: np.ndarray
+    error: np.ndarray
+    fine: np.ndarray
+    finite: np.ndarray
+    status: np.ndarray
+
+
+def compare(case: Case) -> Compared:
+    ends = Batched(case.end, case.size)
+    backs = Batched(lambda x, weight: jax.vjp(case.end, x, has_aux=True)[1](weight)[0], case.size)
+    x, along = case.inputs, np.stack(list(case.along.values()))
+    (n, width), count = x.shape, len(along)
+    _, kind = ends(x)
+    jacobian = backs(np.repeat(x, 3, axis=0), np.tile(np.eye(3), (n, 1))).reshape(n, 3, width)
+    slope = np.swapaxes(jacobian @ along.T, 1, 2).reshape(-1, 3)
+    push, way = np.repeat(np.arange(n), count), np.tile(along, (n, 1))
+
+    def central(rows: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+        (above, one), (below, other) = (ends(x[push[rows]] + t * way[rows]) for t in (h, -h))
+        base = kind[push[rows]]
+        return (above - below) / (2 * h), np.all((one == base) & (other == base), axis=1)
+
+    def error(rows: np.ndarray, difference: np.ndarray) -> np.ndarray:
+        return np.max(np.abs(slope[rows] - difference) / np.maximum(1, np.abs(difference)), axis=1)
+
+    everything = np.arange(n * count)
+    wide, same = central(everything, H)
+    narrow, _ = central(everything, H / 4)
+    found = np.where(same, error(everything, narrow + (narrow - wide) / 15), 0.0)
+    fine, large = np.zeros(n * count), np.flatnonzero(~(found <= TOLERANCE))
+    if large.size:
+        fine[large] = error(large, central(large, FINE)[0])
+    shape, finite = (n, count), np.isfinite(jacobian).all(axis=(1, 2))
+    return Compared(same.reshape(shape), found.reshape(shape), fine.reshape(shape), finite, kind[:, : case.steps])
+
+
+def agreement(quick: bool) -> list[dict[str, Any]]:
+    few, many = (QUICK, QUICK) if quick else (FEW, MANY)
+    return judged({"one finger, pentagons": one_finger(many), "two fingers push": two_fingers(few)})
+
+
+def grasping(quick: bool) -> list[dict[str, Any]]:
+    few, fewer = (QUICK, QUICK) if quick else (GRASPS, JAWS)
+    return judged({"two fingers grasp": grasps(False, few), "jaw grasps": grasps(True, fewer)})
+
+
+def judged(cases: dict[str, Case]) -> list[dict[str, Any]]:
+    rows = []
+    for name, case in cases.items():
+        found = compare(case)
+        error = found.error[found.same]
+        last, failed = found.status[:, -1], np.isin(found.status, [s for s in pj.Status if s.failed]).any(axis=1)
+        row = {"case": name, "pushes": len(case.inputs), "directions": len(case.along), "finite": found.finite.sum()}
+        row |= {"judged": len(error), "left_out": found.same.size - len(error), "failed": failed.sum()}
+        row |= {"held": np.isin(last, [pj.Status.GRASPED, pj.Status.JAMMED]).sum()}
+        row |= {f"q{100 * q:g}": np.quantile(error, q) for q in (0.5, 0.99, 0.999)} | {"largest": error.max()}
+        row |= {"above": (error > TOLERANCE).sum(), "above_fine": (found.fine > TOLERANCE).sum()}
+        row |= {"largest_fine": np.where(found.error > TOLERANCE, found.fine, found.error).max()}
+        rows.append(row)
+        print(
+            f"  {name}: {row['pushes']} pushes x {row['directions']} directions; {row['finite']} with all derivatives"
+        )
+        print(
+            f"     finite; {row['held']} end held, {row['failed']} with failed steps; {row['left_out']} pairs left out"
+        )
+        print("     " + ", ".join(f"{k} {row[k]:.1e}" for k in ("q50", "q99", "q99.9", "largest")), end="; ")
+        print(
+            f"{row['above']} above {TOLERANCE:g}, {row['above_fine']} by finer differences ({row['largest_fine']:.1e})"
+        )
+    return rows
+
+
+# --- random friction ---
+
+
+def random(quick: bool) -> list[dict[str, Any]]:
+    """Of the square of the README: means of x, theta and of theta's square about 0.4 rad below zero."""
+    block, hand, n, rows = pj.Polygon.rectangle(0.09, 0.09), pj.Hand.finger(RADIUS), 1000 if quick else 20_000, []
+    slider, path = pj.Slider(block, fitted(block, float)), pj.line((-0.06, 0.01), (-0.01, 0.01), 50)
+    names, keys = ["dof", "lowest mu", "highest mu"], jax.random.split(jax.random.key(7), n)
+    raw = np.asarray(jax.random.key_data(keys))
+    programs: dict[str, tuple[Batched, Batched]] = {}
+    samplers: list[tuple[Any, float]] = [("gram", 50.0), ("gram", 20.0), ("gram", 12.0), ("terms", 20.0)]
+    for sampler, dof in samplers:
+
+        def moments(given, key, sampler=sampler):
+            model = pj.FrictionModel(dof=given[0], friction=given[1:], sampler=sampler)
+            key = jax.random.wrap_key_data(key)
+            end = pj.random_rollout(key, slider, hand, path, pose=jnp.zeros(3), model=model).push.pose[-1]
+            return jnp.stack([end[0] / LENGTH, end[2], (end[2] + 0.4) ** 2])
+
+        values, slopes = programs.setdefault(sampler, (Batched(moments, 4000), Batched(jax.jacfwd(moments), 4000)))
+        at, width = np.array([dof, 0.15, 0.35]), np.array([0.05 * dof, 0.002, 0.002])
+        slope = slopes(np.tile(at, (n, 1)), raw)
+        for k, name in enumerate(names):
+            shift = np.eye(3)[k] * width
+            ends = [values(np.tile(at + sign * shift, (n, 1)), raw) for sign in (1, -1)]
+            difference = (ends[0] - ends[1]) / (2 * width[k])
+            mine, theirs = slope[:, :, k].mean(axis=0), difference.mean(axis=0)
+            paired = (slope[:, :, k] - difference).std(axis=0) / np.sqrt(n)
+            rows.append({"sampler": sampler, "dof": dof, "by": name, "derivative": mine, "difference": theirs})
+            rows[-1] |= {"standard_error": paired, "finite": np.isfinite(slope[:, :, k]).all()}
+            text = [
+                f"{a:.3e} / {b:.3e} ± {e:.0e}" for a, b, e in zip(mine, theirs, rows[-1]["standard_error"], strict=True)
+            ]
+            print(f"  {sampler}, dof {dof:g}, by {name:10}: " + "; ".join(text), flush=True)
+    return rows
+
+
+# --- the picture ---
+
+
+def lines(quick: bool) -> list[tuple[str, str, Callable, np.ndarray]]:
+    """Title, axis, final angle (deg) by one number, and its values."""
+    block, jaw = pj.Polygon.rectangle(0.09, 0.09), pj.Hand.parallel_jaw(0.027, 0.01)
+    square = pj.Slider(block, fitted(block, float))
+    small = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), square.surface)
+    unit = jnp.array([jnp.cos(0.35), jnp.sin(0.35)])
+
+    def push(start, way, mu):
+        path = start[None] + jnp.linspace(0, 1, 61)[:, None] * way[None]
+        run = pj.rollout(square, pj.Hand.finger(RADIUS), path, pose=jnp.zeros(3), friction=mu)
+        return jnp.degrees(run.pose[-1, 2])
+
+    def closed(angle):
+        path = pj.line((0.0, 0.0, 0.0, 0.077), (0.0, 0.0, 0.0, 0.031), 230)
+        pose = jnp.stack([0.004, 0.0, jnp.radians(angle)])
+        return jnp.degrees(pj.rollout(small, jaw, path, pose=pose, friction=0.2).pose[-1, 2])
+
+    count = 60 if quick else 2000
+    return [
+        (
+            "one finger",
+            "friction",
+            lambda mu: push(jnp.array([-0.052, 0.005]), 0.05 * unit, mu),
+            np.linspace(0, 0.8, count),
+        ),
+        (
+            "one finger, friction 0.25",
+            "start, mm from the middle",
+            lambda y: push(jnp.stack([-0.052, 1e-3 * y]), 0.05 * unit, 0.25),
+            np.linspace(-60, 60, count),
+        ),
+        ("a jaw closes, friction 0.2", "start angle, deg", closed, np.linspace(0, 90, 60 if quick else 400)),
+    ]
+
+
+def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
+    import matplotlib.pyplot as plt
+
+    from pushjax import plot
+
+    with plt.rc_context(plot.STYLE):
+        figure, axes = plt.subplots(2, 3, figsize=(11, 4.8), sharex="col", layout="constrained")
+        for (title, axis, angle, at), (above, below) in zip(lines(quick), axes.T, strict=True):
+            both = jax.jit(jax.vmap(lambda x, angle=angle: jax.jvp(angle, (x,), (jnp.ones_like(x),))))
+            value, slope = both(jnp.asarray(at))
+            central = np.gradient(np.asarray(value), at)
+            above.plot(at, value, ".", color=plot.START, markersize=1.5)
+            below.plot(at, central, ".", color=plot.BETWEEN, markersize=4, label="difference of neighbours")
+            below.plot(at, slope, ".", color=plot.ORANGE, markersize=1.5, label="jax.jvp")
+            low, high = np.quantile(slope, [0.005, 0.995])
+            below.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
+            above.set_title(title)
+            below.set_xlabel(axis)
+        axes[0, 0].set_ylabel("final angle, deg")
+        axes[1, 0].set_ylabel("its derivative")
+        plot.legend_below(figure, axes[1, 0], columns=2)
+        print(f"  drew {plot.save(figure, to)}")
+    return [{"picture": to}]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--quick", action="store_true", help="small batches: does it run")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--picture", type=Path, default=Path("derivatives.png"))
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
+    print(header())
+    made: dict[str, Callable] = {"cost": cost, "memory": memory, "agreement": agreement}
+    made |= {"grasps": grasping, "random": random}
+    made["picture"] = lambda quick: picture(quick, arguments.picture)
+    rows = {}
+    for part in PARTS:
+        if part in arguments.parts:
+            jax.config.update("jax_enable_x64", part not in ("cost", "memory"))
+            print(f"{part}, {'float64' if part not in ('cost', 'memory') else 'float32'}", flush=True)
+            rows[part] = made[part](arguments.quick)
+    if arguments.json is not None:
+        write_json(envelope("derivatives", {"quick": arguments.quick, "parts": list(rows)}, **rows), arguments.json)
+
+
+if __name__ == "__main__":
+    main()

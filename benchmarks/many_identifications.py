@@ -1,0 +1,184 @@
+"""A thousand identifications in one `vmap`, beside the same one after another by semi-definite programs and a grid.
+
+    python benchmarks/many_identifications.py [--objects 1000] [--pushes 20] [--programs 100]
+
+Objects are squares of 90 mm with ellipsoids (dof 30 about uniform pressure) and frictions (0.1 to 0.5) of their own,
+each pushed 30 mm by a 5 mm finger, in 20 steps. Of every push the final pose is measured (0.3 mm in x, y and
+length * theta) and the mean direction of the wrench and of the motion in each of its halves (3 degrees).
+
+identify  friction and surface from poses and wrenches together, all objects in one `vmap`.
+convex    the surface from the pairs by a semi-definite program (cvxpy, the loss of `fit_limit_surface`), object by
+          object; then the friction from the final poses, on a grid of 21: all objects in one batch.
+
+Both know the same. Compared are final poses of other pushes of the same objects, without noise, the friction, and the
+wrenches of random twists.
+"""
+
+import argparse
+import time
+
+import cvxpy as cp
+import jax
+import jax.numpy as jnp
+import numpy as np
+from _measure import header
+from identification import HALF, RADIUS, planned
+
+import pushjax as pj
+
+PATH_STEPS, GRID, TEST = 20, np.linspace(0.05, 0.65, 21), 10
+POSE_NOISE, ANGLE_NOISE = 3e-4, np.radians(3.0)
+UNKNOWNS = pj.Unknowns((0.0, 1.0), dof=30)
+Arrays = tuple[jax.Array, ...]
+
+
+@jax.jit
+def pushed(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
+    """Of all objects: (objects, pushes)."""
+    square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
+
+    def one(surface, mu, start, path):
+        return pj.rollout(pj.Slider(square, surface), hand, path, pose=start, friction=mu)
+
+    return jax.vmap(jax.vmap(one, in_axes=(None, None, 0, 0)))(surface, friction, starts, paths)
+
+
+def objects(rng: np.random.Generator, mean: pj.LimitSurface, count: int) -> tuple[pj.LimitSurface, jax.Array]:
+    model = pj.FrictionModel(30, (0.1, 0.5))
+    return jax.vmap(lambda key: model.sample(key, mean))(jax.random.split(jax.random.key(int(rng.integers(99))), count))
+
+
+def recorded(rng: np.random.Generator, surface, friction, length: float, count: int, pushes: int) -> pj.Pushes:
+    starts, paths = short(rng, count, pushes)
+    done = pushed(surface, friction, starts, paths)
+    noise = rng.normal(size=(count, pushes, 3)) * POSE_NOISE / [1, 1, length]
+    metric = np.array([1, 1, length])
+    middle = PATH_STEPS // 2
+    wrench, twist = [], []
+    for part in (slice(1, middle), slice(middle, None)):
+        wrench.append(_astray(rng, np.asarray(done.wrench)[:, :, part].mean(axis=2) / metric) * metric)
+        twist.append(_astray(rng, np.asarray(done.twist)[:, :, part].sum(axis=2) * metric) / metric)
+    pairs = (jnp.asarray(np.stack(each, axis=2), jnp.float32) for each in (wrench, twist))
+    wrench, twist = pairs
+    return jax.vmap(lambda s, p, e, w, v: pj.Pushes(s, p, e, wrench=w, twist=v))(
+        starts, paths, done.pose[:, :, -1] + jnp.asarray(noise, jnp.float32), wrench, twist
+    )
+
+
+def short(rng: np.random.Generator, count: int, pushes: int) -> Arrays:
+    starts, paths = planned(rng, (count, pushes))
+    return starts, jax.vmap(jax.vmap(lambda path: pj.line(path[0], path[-1], PATH_STEPS)))(paths)
+
+
+def _astray(rng: np.random.Generator, vectors: np.ndarray) -> np.ndarray:
+    size = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors + ANGLE_NOISE / np.sqrt(2) * size * rng.normal(size=vectors.shape)
+
+
+def programmed(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
+    """The ellipsoid's matrix, by a semi-definite program: the loss of `fit_limit_surface`."""
+    metric = np.array([1, 1, length])
+    there = np.any(wrench != 0, axis=1) & np.any(twist != 0, axis=1)
+    force, motion = wrench[there] / metric, twist[there] * metric
+    force = force / np.linalg.norm(force, axis=1).mean()
+    motion = motion / np.linalg.norm(motion, axis=1, keepdims=True)
+    a, s = cp.Variable((3, 3), PSD=True), cp.Variable(len(force), nonneg=True)
+    astray = cp.sum_squares(2 * force @ a - cp.multiply(cp.reshape(s, (len(force), 1), order="C"), motion))
+    values = cp.sum(cp.multiply(force @ a, force), axis=1)
+    loss = (astray + 2 * cp.sum_squares(values - 1)) / len(force) + 1e-3 * cp.sum_squares(a)
+    cp.Problem(cp.Minimize(loss)).solve(solver=cp.CLARABEL)
+    return np.asarray(a.value)
+
+
+@jax.jit
+def on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
+    """The friction with which final poses are off least, of every object."""
+
+    def off(mu):
+        done = pushed(surface, jnp.full(len(pushes.weight), mu), pushes.start, pushes.path)
+        return jnp.mean(pj.deviation(done.pose[:, :, -1], pushes.end, length), axis=1)
+
+    losses = jax.lax.map(off, jnp.asarray(GRID, jnp.float32))
+    return jnp.asarray(GRID, jnp.float32)[jnp.argmin(losses, axis=0)]
+
+
+def report(name: str, surface, friction, truth, tested: Arrays, length: float) -> None:
+    real, mu, ends = truth
+    done = pushed(surface, friction, *tested)
+    off = 1e3 * np.asarray(pj.deviation(done.pose[:, :, -1], ends, length)).mean(axis=1)
+    angles = np.degrees(np.asarray(angle(surface, real)))
+    wrong = np.abs(np.asarray(friction - mu))
+    print(
+        f"{name}: final poses off by {off.mean():.3f} mm in the mean over objects, {np.quantile(off, 0.95):.3f} in one "
+        f"of twenty; friction by {wrong.mean():.4f}; wrenches by {angles.mean():.2f} degrees",
+        flush=True,
+    )
+
+
+@jax.jit
+def angle(one, other) -> jax.Array:
+    twist = jax.random.normal(jax.random.key(5), (100, 3))
+
+    def of(a, b):
+        metric = jnp.stack([jnp.ones_like(a.length), jnp.ones_like(a.length), 1 / a.length])
+
+        def between(v):
+            p, q = a.wrench(v * metric) * metric, b.wrench(v * metric) * metric
+            cosine = jnp.sum(p * q) / jnp.sqrt(jnp.sum(p**2) * jnp.sum(q**2))
+            return jnp.arccos(jnp.clip(cosine, -1, 1))
+
+        return jnp.mean(jax.vmap(between)(twist))
+
+    return jax.vmap(of)(one, other)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--objects", type=int, default=1000)
+    parser.add_argument("--pushes", type=int, default=20)
+    parser.add_argument("--programs", type=int, default=1000, help="how many of the objects cvxpy fits")
+    given = parser.parse_args()
+    print(header())
+    rng = np.random.default_rng(0)
+    square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
+    mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400), degree=2)
+    length = float(mean.length)
+    real, mu = objects(rng, mean, given.objects)
+    pushes = recorded(rng, real, mu, length, given.objects, given.pushes)
+    tested = short(rng, given.objects, TEST)
+    truth = (real, mu, pushed(real, mu, *tested).pose[:, :, -1])
+    size = jnp.full(given.objects, 0.25)
+    same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (given.objects, *leaf.shape)), mean)
+    report("expected, friction 0.25", same, size, truth, tested, length)
+
+    def identified(pushes):
+        return pj.identify(pushes, pj.Slider(square, mean), hand, UNKNOWNS, robust=None)
+
+    begin = time.perf_counter()
+    program = jax.jit(jax.vmap(identified)).lower(pushes).compile()
+    middle = time.perf_counter()
+    found = jax.block_until_ready(program(pushes))
+    took = time.perf_counter() - middle
+    print(f"identify: {given.objects} objects in {took:.1f} s, {1e3 * took / given.objects:.1f} ms each; compiled in "
+          f"{middle - begin:.0f} s; {int(np.sum(np.asarray(found.status) != 0))} not converged")  # fmt: skip
+    surface = jax.vmap(lambda one: one.surface)(found)
+    report("identify", surface, found.friction, truth, tested, length)
+
+    count = min(given.programs, given.objects)
+    part = jax.tree.map(lambda leaf: leaf[:count], (pushes, truth, tested))
+    wrench, twist = (np.asarray(x, float).reshape(count, -1, 3) for x in (part[0].wrench, part[0].twist))
+    begin = time.perf_counter()
+    matrices = np.stack([programmed(w, v, length) for w, v in zip(wrench, twist, strict=True)])
+    middle = time.perf_counter()
+    convex = jax.vmap(pj.Ellipsoid, in_axes=(0, None))(jnp.asarray(matrices, jnp.float32), mean.length)
+    grid = on_grid.lower(convex, part[0], length).compile()
+    start = time.perf_counter()
+    friction = jax.block_until_ready(grid(convex, part[0], length))
+    took = time.perf_counter() - start
+    print(f"convex: {count} objects in {middle - begin:.1f} s of programs and {took:.1f} s of grid, "
+          f"{1e3 * (middle - begin + took) / count:.1f} ms each")  # fmt: skip
+    report("convex", convex, friction, part[1], part[2], length)
+
+
+if __name__ == "__main__":
+    main()
