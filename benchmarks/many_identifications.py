@@ -162,7 +162,8 @@ def main() -> None:
     print(f"identify: {given.objects} objects in {took:.1f} s, {1e3 * took / given.objects:.1f} ms each; compiled in "
           f"{middle - begin:.0f} s; {int(np.sum(np.asarray(found.status) != 0))} not converged")  # fmt: skip
     surface = jax.vmap(lambda one: one.surface)(found)
-    report("identify", surface, found.friction, truth, tested, length)
+    friction = jax.vmap(lambda one: one.friction)(found)
+    report("identify", surface, friction, truth, tested, length)
 
     count = min(given.programs, given.objects)
     part = jax.tree.map(lambda leaf: leaf[:count], (pushes, truth, tested))
