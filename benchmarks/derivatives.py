@@ -22,23 +22,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _derivative_cases import LENGTH, RADIUS, TOLERANCE, Case, compare, fitted, grasps, one_finger, two_fingers
 from _measure import alternate, compiled, header
 
 import pushjax as pj
 from pushjax.report import envelope, write_json
 
 PARTS = ("cost", "memory", "agreement", "grasps", "random", "picture")
-RADIUS, LENGTH = 0.005, 0.035
-H, FINE, TOLERANCE = 1e-5, 1e-7, 1e-5
-EDGE = 1e-9  # sine between a normal and an edge's, below which the edge is touched
 MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
-
-
-def fitted(block: pj.Polygon, dtype: Any) -> pj.Quartic:
-    points = pj.Support.uniform(block, points=64)
-    pairs = points.wrench_twist_pairs(jax.random.key(0), 400)
-    surface: Any = pj.fit_limit_surface(pairs.wrench, pairs.twist, length=LENGTH)
-    return pj.Quartic(jnp.asarray(surface.coefficients, dtype), jnp.asarray(LENGTH, dtype))
 
 
 # --- cost and memory ---
@@ -131,185 +122,6 @@ def memory(quick: bool) -> list[dict[str, Any]]:
 
 
 # --- agreement ---
-
-
-class Case(NamedTuple):
-    """Random pushes. end: from numbers of order one (inputs,) to the final pose, angles and lengths of order one, and
-    whatever must be the same for two of them to be pushes of one kind. inputs: (pushes, inputs). along: named
-    directions in which they are differentiated. size: of a batch. The kind begins with the
-    status of each of the steps."""
-
-    end: Callable
-    inputs: np.ndarray
-    along: dict[str, np.ndarray]
-    size: int
-    steps: int
-
-
-def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
-    """Of every second push the mean, of the others drawn around it; in units of the largest coefficient."""
-    model = pj.FrictionModel(dof=20.0, friction=0.3)
-    drawn: Any = jax.jit(jax.vmap(model.around(mean).sample))(jax.random.split(jax.random.key(3), n)).surface
-    each = np.where(np.arange(n)[:, None] % 2, drawn.coefficients, mean.coefficients)
-    return each / float(jnp.max(mean.coefficients))
-
-
-def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[str, np.ndarray]:
-    """Each of the first inputs by itself; two random ones within each of `drawn`."""
-    rng, found = np.random.default_rng(4), dict(zip(names, np.eye(width), strict=False))
-    for name, where in drawn.items():
-        for k in (1, 2):
-            found[f"{name} {k}"] = np.zeros(width)
-            found[f"{name} {k}"][where] = rng.normal(size=len(range(width)[where]))
-    return found
-
-
-def one_finger(n: int, steps: int = 60) -> Case:
-    """A pentagon each, pushed 60 mm from anywhere towards anywhere inside it; some slip off, some miss."""
-    rng, mean = np.random.default_rng(2), fitted(pj.Polygon.rectangle(0.09, 0.09), float)
-    scale, hand_names = float(jnp.max(mean.coefficients)), ["start x", "start y", "direction", "travel"]
-
-    def end(x):
-        pose, path, vertices = x[2:5] * jnp.array([LENGTH, LENGTH, 1.0]), x[5:9], LENGTH * x[24:].reshape(5, 2)
-        slider = pj.Slider(pj.Polygon(vertices, convex=True), pj.Quartic(scale * x[9:24], mean.length))
-        way = LENGTH * path[3] * jnp.array([jnp.cos(path[2]), jnp.sin(path[2])])
-        path = LENGTH * path[None, :2] + jnp.arange(steps + 1)[:, None] / steps * way[None]
-        run = pj.rollout(slider, pj.Hand.finger(LENGTH * x[1]), path, pose=pose, friction=x[0])
-        return scaled(run), jnp.concatenate([run.status, run.mode[:, 0], touched(run, vertices)])
-
-    corners = 2 * np.pi * (np.arange(5) + rng.uniform(0, 0.6, (n, 5))) / 5
-    vertices = 0.045 / LENGTH * np.stack([np.cos(corners), np.sin(corners)], axis=-1).reshape(n, 10)
-    pose = np.stack([*rng.normal(0, 0.02 / LENGTH, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
-    bearing, aside = rng.uniform(-np.pi, np.pi, n), rng.uniform(-0.045, 0.045, n)
-    away = rng.uniform(0.051, 0.056, n) / LENGTH
-    out = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
-    begin = pose[:, :2] + away[:, None] * out
-    to = aside[:, None] / LENGTH * np.stack([-out[:, 1], out[:, 0]], axis=-1) - away[:, None] * out
-    path = [begin, np.arctan2(to[:, 1], to[:, 0])[:, None], np.full((n, 1), 0.06 / LENGTH)]
-    mu, radius = rng.uniform(0.0, 1.0, (n, 1)), rng.uniform(0.002, 0.006, (n, 1)) / LENGTH
-    inputs = np.concatenate([mu, radius, pose, *path, surfaces(mean, n), vertices], axis=1)
-    names = ["friction", "radius", "x", "y", "theta", *hand_names]
-    along = directions(names, 34, {"surface": slice(9, 24), "vertices": slice(24, 34)})
-    return Case(end, inputs, along, 4000, steps)
-
-
-def scaled(run: pj.Trajectory) -> jax.Array:
-    return run.pose[-1] / jnp.array([LENGTH, LENGTH, 1.0], run.pose.dtype)
-
-
-def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
-    """2 k at edge k, 2 k + 1 at the corner after it, -1 at none: told from the normal, which turns the contact's force
-    (normal, tangential) into the wrench's."""
-    (a, b), (x, y) = run.force[:, 0].T, run.wrench[:, :2].T
-    outward = -jnp.stack([x * a + y * b, y * a - x * b], axis=-1)
-    outward = outward / jnp.maximum(jnp.linalg.norm(outward, axis=-1, keepdims=True), 1e-300)
-    side = jnp.roll(vertices, -1, axis=0) - vertices
-    normal = jnp.stack([side[:, 1], -side[:, 0]], axis=-1) / jnp.linalg.norm(side, axis=-1, keepdims=True)
-    sine = normal[None, :, 0] * outward[:, 1:] - normal[None, :, 1] * outward[:, :1]
-    on = (jnp.abs(sine) < EDGE) & (outward @ normal.T > 0)
-    between = (sine > 0) & (jnp.roll(sine, -1, axis=1) < 0)
-    feature = jnp.argmax(jnp.concatenate([on, between & ~jnp.any(on, axis=1, keepdims=True)], axis=1), axis=1)
-    feature = jnp.where(feature < len(vertices), 2 * feature, 2 * (feature - len(vertices)) + 1)
-    return jnp.where(run.force[:, 0, 0] > 0, feature, -1).astype(jnp.int8)
-
-
-def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray], size: int) -> Case:
-    """Pushed or grasped by two fingers. given: friction (2), pose (3), first and last configuration (4)."""
-    mean = fitted(block, float)
-    scale, unit = float(jnp.max(mean.coefficients)), np.array([LENGTH, LENGTH, 1.0, LENGTH])
-
-    def end(x):
-        slider = pj.Slider(block, pj.Quartic(scale * x[13:], mean.length))
-        first, last = x[5:9] * unit, x[9:13] * unit
-        path = first[None] + jnp.arange(steps + 1)[:, None] / steps * (last - first)[None]
-        run = pj.rollout(slider, hand, path, pose=x[2:5] * unit[:3], friction=x[:2])
-        return scaled(run), jnp.concatenate([run.status, run.mode.ravel()])
-
-    n = len(given[0])
-    numbers = [given[0], given[1] / unit[:3], given[2] / unit, given[3] / unit, surfaces(mean, n)]
-    each = [f"{when} {of}" for when in ("first", "last") for of in ("x", "y", "theta", "opening")]
-    names = ["friction 1", "friction 2", "x", "y", "theta", *each]
-    return Case(end, np.concatenate(numbers, axis=1), directions(names, 28, {"surface": slice(13, 28)}), size, steps)
-
-
-def two_fingers(n: int) -> Case:
-    """A square pushed 50 mm by two fingers that turn and close or open on the way."""
-    rng, zero = np.random.default_rng(5), np.zeros(n)
-    pose = np.stack([np.full(n, 0.072), rng.uniform(-0.02, 0.02, n), rng.uniform(-3, 3, n)], axis=-1)
-    first = np.stack([zero, zero, zero, rng.uniform(0.02, 0.06, n)], axis=-1)
-    more = [np.full(n, 0.05), rng.uniform(-0.01, 0.01, n), rng.uniform(-0.3, 0.3, n), rng.uniform(-0.005, 0.005, n)]
-    given = [rng.uniform(0, 0.8, (n, 2)), pose, first, first + np.stack(more, axis=-1)]
-    return of_hand(pj.Hand.two_fingers(RADIUS), pj.Polygon.rectangle(0.09, 0.09), 60, given, 1000)
-
-
-def grasps(jaw: bool, n: int) -> Case:
-    """A 50 x 35 mm rectangle between two fingers, or the pads of a jaw, that close and shift until they hold it."""
-    rng, zero = np.random.default_rng(6), np.zeros(n)
-    pose = np.stack([*rng.uniform(-0.005, 0.005, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
-    hand = pj.Hand.parallel_jaw(0.027, 0.01) if jaw else pj.Hand.two_fingers(RADIUS)
-    wide, narrow = (0.077, 0.031) if jaw else (0.09, 0.041)
-    first = np.stack([zero, zero, zero, np.full(n, wide)], axis=-1)
-    more = [*rng.uniform(-0.003, 0.003, (2, n)), rng.uniform(-0.1, 0.1, n), np.full(n, narrow - wide)]
-    mu = rng.uniform(0.1, 0.6, (n, 1)) * np.ones((1, 2))
-    given = [mu, pose, first, first + np.stack(more, axis=-1)]
-    case = of_hand(hand, pj.Polygon.rectangle(0.05, 0.035), 115, given, 175 if jaw else 350)
-    chosen = ("friction 1", "x", "theta", "last y", "last theta", "last opening", "surface 1")
-    return case._replace(along={name: case.along[name] for name in chosen})
-
-
-class Batched:
-    """A program of so many rows at a time, compiled once."""
-
-    def __init__(self, function: Callable, size: int):
-        self.program, self.size = jax.jit(jax.vmap(function)), size
-
-    def __call__(self, *rows: np.ndarray) -> Any:
-        n, found = len(rows[0]), []
-        for first in range(0, n, self.size):
-            index = np.minimum(np.arange(first, first + self.size), n - 1)
-            out = self.program(*(row[index] for row in rows))
-            found.append(jax.tree.map(np.asarray, out))
-        return jax.tree.map(lambda *parts: np.concatenate(parts)[:n], *found)
-
-
-class Compared(NamedTuple):
-    """Of every push and direction: whether the two sides are pushes of one kind, the error where they are (else zero),
-    and against finer differences where that was large. finite, status: of every push."""
-
-    same: np.ndarray
-    error: np.ndarray
-    fine: np.ndarray
-    finite: np.ndarray
-    status: np.ndarray
-
-
-def compare(case: Case) -> Compared:
-    ends = Batched(case.end, case.size)
-    backs = Batched(lambda x, weight: jax.vjp(case.end, x, has_aux=True)[1](weight)[0], case.size)
-    x, along = case.inputs, np.stack(list(case.along.values()))
-    (n, width), count = x.shape, len(along)
-    _, kind = ends(x)
-    jacobian = backs(np.repeat(x, 3, axis=0), np.tile(np.eye(3), (n, 1))).reshape(n, 3, width)
-    slope = np.swapaxes(jacobian @ along.T, 1, 2).reshape(-1, 3)
-    push, way = np.repeat(np.arange(n), count), np.tile(along, (n, 1))
-
-    def central(rows: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
-        (above, one), (below, other) = (ends(x[push[rows]] + t * way[rows]) for t in (h, -h))
-        base = kind[push[rows]]
-        return (above - below) / (2 * h), np.all((one == base) & (other == base), axis=1)
-
-    def error(rows: np.ndarray, difference: np.ndarray) -> np.ndarray:
-        return np.max(np.abs(slope[rows] - difference) / np.maximum(1, np.abs(difference)), axis=1)
-
-    everything = np.arange(n * count)
-    wide, same = central(everything, H)
-    narrow, _ = central(everything, H / 4)
-    found = np.where(same, error(everything, narrow + (narrow - wide) / 15), 0.0)
-    fine, large = np.zeros(n * count), np.flatnonzero(~(found <= TOLERANCE))
-    if large.size:
-        fine[large] = error(large, central(large, FINE)[0])
-    shape, finite = (n, count), np.isfinite(jacobian).all(axis=(1, 2))
-    return Compared(same.reshape(shape), found.reshape(shape), fine.reshape(shape), finite, kind[:, : case.steps])
 
 
 def agreement(quick: bool) -> list[dict[str, Any]]:

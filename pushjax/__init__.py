@@ -10,6 +10,7 @@ from pushjax.hands import line as line
 from pushjax.hands import resample as resample
 from pushjax.hands import through as through
 from pushjax.identify import Identified as Identified
+from pushjax.identify import Noise as Noise
 from pushjax.identify import Pushes as Pushes
 from pushjax.identify import Unknowns as Unknowns
 from pushjax.identify import identify as identify

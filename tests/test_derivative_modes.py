@@ -1,7 +1,6 @@
 """Derivatives mode by mode: what docs/derivatives.md says and no other test looks at."""
 
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -297,18 +296,3 @@ def test_random_pushes_by_dof(random_pushes):
     theirs = theirs.mean(axis=0) * (1 - (h / DOF) ** 2)
     assert np.all(np.abs(mine.mean(axis=0) - theirs) < 4.5 * error)
     assert np.all(mine.mean(axis=0) < -3 * error)
-
-
-def test_monte_carlo_is_not_differentiable():
-    """It gives numbers on the host; under `grad` it says so."""
-    slider, path = pj.Slider(SQUARE, square(4)), pj.line((-0.052, 0.012), (-0.03, 0.004), 12)
-
-    def mean(low: Any):
-        model = pj.FrictionModel(dof=20.0, friction=jnp.stack([low, low + 0.1]))
-        found = pj.monte_carlo(
-            jax.random.key(0), 4, slider, pj.Hand.finger(RADIUS), path, pose=jnp.zeros(3), model=model
-        )
-        return jnp.mean(found.pose[:, 2])
-
-    with pytest.raises(jax.errors.JAXTypeError):
-        jax.grad(mean)(0.1)

@@ -270,14 +270,14 @@ def test_bootstrap(few, found, block, surface):
     assert np.all(np.abs(z.mean(axis=0) - found.z) < 2 * laplace)
 
 
-def test_noise(few, found, block, surface):
+def test_noise(few, found, block, surface, tmp_path):
     """Pushes drawn from a noise that is known: predicted better by what is found than at the start."""
-    from pushjax.identify.noise import Noise, Values
+    from pushjax.identify.noise import Values
 
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.friction + 0.15 * jnp.array([[-1.0, 1.0]])
     truth = Values(jnp.array(15.0), friction, jnp.array(3e-4), jnp.array(4e-4), jnp.array(4.0))
-    known = Noise(found, truth, jnp.array(0.0), jnp.zeros(1), "terms")
+    known = pj.Noise(found, truth, jnp.array(0.0), jnp.zeros(1), "terms")
     many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
     drawn = known.predict(jax.random.key(1), many, slider, hand, 2)
     assert drawn.shape == (80, 2, 3)
@@ -292,5 +292,12 @@ def test_noise(few, found, block, surface):
     assert float(noise.tails) < 10
     assert noise.friction.shape == (2,)
     assert noise.model.friction.shape == (2,)
+    noise.save(tmp_path / "noise.json")
+    loaded = pj.Noise.load(tmp_path / "noise.json")
+    for one, other in zip(jax.tree.leaves(noise), jax.tree.leaves(loaded), strict=True):
+        np.testing.assert_array_equal(one, other)
+    found.save(tmp_path / "found.json")
+    with pytest.raises(ValueError, match="does not hold noise that pushjax identified: its format is another"):
+        pj.Noise.load(tmp_path / "found.json")
     with pytest.raises(ValueError, match="samples must be at least 2"):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)

@@ -15,6 +15,7 @@ right in the mean. So the score is not minimised for one key, but by Adam's meth
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -94,6 +95,19 @@ class Noise(eqx.Module):
         if not self.found.single:
             raise ValueError("model is for what was found of one condition; of several there is `predict`")
         return FrictionModel(self.dof, self.friction, self.sampler)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a JSON file that `load` reads back to the same bits."""
+        from pushjax.identify.files import save_noise
+
+        save_noise(self, path)
+
+    @staticmethod
+    def load(path: str | Path) -> "Noise":
+        """Read what `save` wrote. Raises ValueError for a file that holds something else."""
+        from pushjax.identify.files import load_noise
+
+        return load_noise(path)
 
     def predict(
         self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int

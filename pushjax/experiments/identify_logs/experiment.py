@@ -121,7 +121,11 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         progress(1 + len(profiles), total)
     noise = None
     if options.noise:
-        noise = identify_noise(jax.random.key(seed), found, pushes, slider, hand, progress=progress)
+        # of pushes that were learned from too little is left over: every second about what the others tell
+        odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
+        others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns)
+        second = pushes.weighted(pushes.weight * odd)
+        noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]
     length = lengths[0] if lengths else float(found.length)
     return Findings(problems, slider, hand, pushes, found, tuple(profiles), noise, length)
