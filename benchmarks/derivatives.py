@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _derivative_cases import LENGTH, RADIUS, TOLERANCE, Case, compare, fitted, grasps, one_finger, two_fingers
+from _derivative_cases import LENGTH, RADIUS, TOLERANCE, Batched, Case, compare, fitted, grasps, one_finger, two_fingers
 from _measure import alternate, compiled, header
 
 import pushjax as pj
