@@ -110,7 +110,7 @@ class Identify(Common):
     """Find how far the hand's coordinates are off those of the object."""
     separate: bool = False
     """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
-    steps: int = 50
+    steps: int = 40
     """Steps of each push."""
     parts: int = 1
     """After how many equal parts of a push the object's pose counts, where it was seen on the way."""

@@ -18,7 +18,7 @@ from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical
 from pushjax.rollout import Slider
 
-POINTS, REACH = 4, 3.0  # of a profile, on either side, and how many standard deviations it goes to
+POINTS, REACH = 3, 2.7  # of a profile, on either side, and how many standard deviations it goes to
 ENOUGH = 1e-3  # tolerance, of numbers whose prior deviation is one
 
 

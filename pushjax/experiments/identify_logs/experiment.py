@@ -44,7 +44,7 @@ class Options:
     lag: float | None = None
     offset: float | None = None
     separate: bool = False
-    steps: int = 50
+    steps: int = 40
     parts: int = 1
     forces: bool = False
     noise: bool = False
