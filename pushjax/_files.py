@@ -1,4 +1,4 @@
-"""JSON files that this package wrote, read back."""
+"""Objects in JSON files: written, and read back to the same bits."""
 
 import json
 from collections.abc import Callable
@@ -6,8 +6,20 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
+
+
+def write_record(path: str | Path, form: str, version: int, dtype: Any, record: dict[str, Any]) -> None:
+    """A record and what `read_record` asks for: the form's name and version, the floating dtype."""
+    whole = {"format": form, "version": version, "dtype": str(dtype)} | record
+    Path(path).write_text(json.dumps(whole, indent=1) + "\n")
+
+
+def numbers(value: Any) -> Any:
+    """An array as lists; None as it is. The text of a float64 is exact, and a float32 is a float64."""
+    return None if value is None else np.asarray(value, np.float64).tolist()
 
 
 def read_record(path: str | Path, what: str, form: str, version: int, build: Callable[[dict[str, Any], Any], T]) -> T:

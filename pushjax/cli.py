@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from pushjax.datasets import find_data
+from pushjax.experiments import identify_logs
 
 
 @dataclass
@@ -73,7 +74,7 @@ class Reproduce(Common):
 
 
 @dataclass
-class Identify(Common):
+class Identify(identify_logs.Options, Common):
     """Find friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
 
     Logs are CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units, world; blank where
@@ -82,42 +83,6 @@ class Identify(Common):
 
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Files of recorded pushes."""
-    shape: str | None = None
-    """The object: rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04, regular:6x0.05 (m), or a CSV file of vertices.
-    Default: what the logs tell."""
-    hand: str = "finger"
-    """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
-    radius: float | None = None
-    """Of the fingers, m. Default: what the logs tell."""
-    support: str | None = None
-    """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
-    Default: what the logs tell, else uniform."""
-    surface: Literal["quartic", "ellipsoid"] = "quartic"
-    """Kind of limit surface."""
-    dof: float = 50.0
-    """How well it is known beforehand: degrees of freedom; fewer, less well."""
-    friction: tuple[float, float] = (0.0, 1.0)
-    """Lowest and highest that the fingers' friction may be."""
-    center: float | None = None
-    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next four)."""
-    inset: float | None = None
-    """Find by how much the outline is smaller."""
-    end: float | None = None
-    """Find how far the hand went on after its path ends."""
-    lag: float | None = None
-    """Find how far the hand was behind where its path says."""
-    offset: float | None = None
-    """Find how far the hand's coordinates are off those of the object."""
-    separate: bool = False
-    """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
-    steps: int = 40
-    """Steps of each push."""
-    parts: int = 1
-    """After how many equal parts of a push the object's pose counts, where it was seen on the way."""
-    forces: bool = False
-    """Learn from measured forces too; needs parts."""
-    noise: bool = False
-    """Find by how much friction scatters, too."""
 
 
 @dataclass
@@ -209,12 +174,9 @@ def _reproduce(command: Reproduce, progress: Progress) -> Result:
 
 
 def _identify(command: Identify, progress: Progress) -> Result:
-    from pushjax.experiments import identify_logs
     from pushjax.page import write_page
 
-    names = [field.name for field in fields(identify_logs.Options)]
-    options = identify_logs.Options(**{name: getattr(command, name) for name in names})
-    record = identify_logs.run(list(command.logs), options, command.seed, command.out, progress)
+    record = identify_logs.run(list(command.logs), command, command.seed, command.out, progress)
     text = identify_logs.summary(record)
     return record, f"{text}\nwrote {write_page(record, text, command.out / 'identify.html')}"
 

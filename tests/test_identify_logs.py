@@ -12,6 +12,8 @@ import pytest
 import pushjax as pj
 from pushjax import cli
 from pushjax.datasets import LogError, load_recordings
+from pushjax.experiments.identify_logs import Options
+from pushjax.experiments.identify_logs.experiment import conditions
 from pushjax.identify import bootstrap, profile_interval, screened
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
@@ -211,6 +213,20 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     assert alone.wrench.shape == (16, 0, 3)
 
 
+def test_logs_that_tell_less_than_others(log, block):
+    """Of logs together every one tells as much as the one that tells least."""
+    whole = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
+    unseen = replace(
+        whole, pushes=tuple(replace(p, seen=np.isin(np.arange(STEPS + 1), (0, STEPS))) for p in whole.pushes)
+    )
+    unfelt = replace(whole, pushes=tuple(replace(p, force=None) for p in whole.pushes))
+    options = Options(surface="ellipsoid", steps=STEPS, parts=3, forces=True)
+    for recordings, shapes in (([whole], (2, 3)), ([whole, unseen], (0, 0)), ([unfelt, whole], (2, 0))):
+        pushes, _ = conditions(recordings, block, options, 0)
+        assert pushes.start.shape == (16 * len(recordings), 3)
+        assert (pushes.along.shape[-2], pushes.wrench.shape[-2]) == shapes
+
+
 def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
     """The pushes count for nothing in the poses' part: a surface that is not known is found from forces."""
     recordings = screened(load_recordings(log), block, pj.Hand.finger(RADIUS))
@@ -272,12 +288,10 @@ def test_bootstrap(few, found, block, surface):
 
 def test_noise(few, found, block, surface, tmp_path):
     """Pushes drawn from a noise that is known: predicted better by what is found than at the start."""
-    from pushjax.identify.noise import Values
-
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.friction + 0.15 * jnp.array([[-1.0, 1.0]])
-    truth = Values(jnp.array(15.0), friction, jnp.array(3e-4), jnp.array(4e-4), jnp.array(4.0))
-    known = pj.Noise(found, truth, jnp.array(0.0), jnp.zeros(1), "terms")
+    dof, offset, sigma, tails = (jnp.array(value) for value in (15.0, 3e-4, 4e-4, 4.0))
+    known = pj.Noise(found, dof, friction[0], offset, sigma, tails, jnp.array(0.0), jnp.zeros(1), "terms")
     many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
     drawn = known.predict(jax.random.key(1), many, slider, hand, 2)
     assert drawn.shape == (80, 2, 3)

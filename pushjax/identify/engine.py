@@ -56,7 +56,7 @@ def identify(
     dtype = common_dtype(pushes, slider, hand)
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
     single = pushes.weight.ndim == 1
-    several = jax.tree.map(lambda leaf: leaf[None], pushes) if single else pushes
+    several = pushes.as_conditions()
     conditions = several.weight.shape[0]
     surface = slider.surface
     if surface.length.ndim == 0:

@@ -1,51 +1,42 @@
 """What was identified, and noise, in files."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
-from pushjax._files import read_record
+from pushjax._files import numbers, read_record, write_record
 from pushjax.identify.identified import Identified
-from pushjax.identify.noise import Noise, Values
+from pushjax.identify.noise import Noise
 from pushjax.identify.unknowns import Layout, Mean, Prior, Unknowns
 
 FORMAT, NOISE_FORMAT, VERSION = "pushjax identified", "pushjax noise", 1
 SPREADS = ("dof", "center", "inset", "end", "lag", "offset")
 ARRAYS = ("z", "precision", "sigma", "direction", "residual", "information", "loss", "length")
+NOISE_ARRAYS = ("dof", "friction", "offset", "sigma", "tails", "score", "history")
 
 
 def save(found: Identified, path: str | Path) -> None:
-    _write(_record(found), path)
+    write_record(path, FORMAT, VERSION, found.z.dtype, _record(found))
 
 
 def save_noise(noise: Noise, path: str | Path) -> None:
-    dtype = str(noise.score.dtype)
-    record = {"format": NOISE_FORMAT, "version": VERSION, "dtype": dtype, "sampler": noise.sampler}
-    record["values"] = {name: _plain(value) for name, value in noise.values._asdict().items()}
-    record |= {"score": _plain(noise.score), "history": _plain(noise.history), "found": _record(noise.found)}
-    _write(record, path)
-
-
-def _write(record: dict[str, Any], path: str | Path) -> None:
-    Path(path).write_text(json.dumps(record, indent=1) + "\n")
+    record = {"sampler": noise.sampler, "found": _record(noise.found)}
+    record |= {name: numbers(getattr(noise, name)) for name in NOISE_ARRAYS}
+    write_record(path, NOISE_FORMAT, VERSION, noise.score.dtype, record)
 
 
 def _record(found: Identified) -> dict[str, Any]:
     unknowns, mean = found.prior.unknowns, found.prior.mean
-    record: dict[str, Any] = {"format": FORMAT, "version": VERSION, "dtype": str(found.z.dtype), "single": found.single}
-    record["robust"] = found.robust
+    record: dict[str, Any] = {"single": found.single, "robust": found.robust}
     record |= {"steps": int(found.steps), "status": int(found.status), "labels": found.labels}
-    # repr of a float64 is exact, and a float32 is a float64
-    record |= {name: _plain(getattr(found, name)) for name in ARRAYS}
-    record["unknowns"] = {name: _plain(getattr(unknowns, name)) for name in ("friction", *SPREADS)}
+    record |= {name: numbers(getattr(found, name)) for name in ARRAYS}
+    record["unknowns"] = {name: numbers(getattr(unknowns, name)) for name in ("friction", *SPREADS)}
     record["shared"] = unknowns.shared
-    record["known_friction"] = _plain(found.prior.friction)
-    record["mean"] = {name: _plain(getattr(mean, name)) for name in ("lower", "spread", "length")}
+    record["known_friction"] = numbers(found.prior.friction)
+    record["mean"] = {name: numbers(getattr(mean, name)) for name in ("lower", "spread", "length")}
     # for who reads the file: not read back
-    record["estimates"] = {name: _plain(value) for name, value in found.physical._asdict().items()}
+    record["estimates"] = {name: numbers(value) for name, value in found.physical._asdict().items()}
     return record
 
 
@@ -58,9 +49,8 @@ def load_noise(path: str | Path) -> Noise:
 
 
 def _noise(record: dict[str, Any], dtype: Any) -> Noise:
-    values = Values(**{name: jnp.asarray(value, dtype) for name, value in record["values"].items()})
-    score, history = (jnp.asarray(record[name], dtype) for name in ("score", "history"))
-    return Noise(_identified(record["found"], dtype), values, score, history, record["sampler"])
+    arrays = {name: jnp.asarray(record[name], dtype) for name in NOISE_ARRAYS}
+    return Noise(found=_identified(record["found"], dtype), sampler=record["sampler"], **arrays)
 
 
 def _identified(record: dict[str, Any], dtype: Any) -> Identified:
@@ -84,7 +74,3 @@ def _identified(record: dict[str, Any], dtype: Any) -> Identified:
         single=bool(record["single"]),
         robust=record["robust"],
     )
-
-
-def _plain(value: Any) -> Any:
-    return None if value is None else np.asarray(value, np.float64).tolist()

@@ -53,8 +53,7 @@ class Counts(NamedTuple):
 
     @staticmethod
     def of(pushes: Pushes) -> "Counts":
-        there = jnp.any(pushes.wrench != 0, axis=-1) & jnp.any(pushes.twist != 0, axis=-1)
-        return Counts(pushes.weight, jnp.where(jnp.any(there, axis=-1), pushes.weight, 0.0))
+        return Counts(pushes.weight, jnp.where(jnp.any(pushes.paired, axis=-1), pushes.weight, 0.0))
 
 
 def _parts(residual: Array, pushes: Pushes) -> tuple[Array, Array]:

@@ -157,8 +157,8 @@ class Identified(eqx.Module):
         """These or other pushes, of the same conditions, rolled out; every array with axes (..., pushes) in front.
         slider: its outline counts, hand: as it was said to be."""
         theta = self.prior.physical(self.z)
-        several = pushes if not self.single else jax.tree.map(lambda leaf: leaf[None], pushes)
-        return self._own(_trajectories(theta, surfaces(self.prior, theta), slider.shape, hand, several))
+        each = _trajectories(theta, surfaces(self.prior, theta), slider.shape, hand, pushes.as_conditions())
+        return self._own(each)
 
     def _own(self, several: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[0], several) if self.single else several

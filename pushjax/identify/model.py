@@ -56,7 +56,7 @@ class Setup(eqx.Module):
 
         kinds = [_each(of(off), varied, rest, own, fixed)]
         if pushes.wrench.shape[-2]:
-            pairs = _Pairs(self.surface, pushes.wrench, pushes.twist)
+            pairs = _Pairs(self.surface, pushes.wrench, pushes.twist, pushes.paired)
             kinds.append(_each(of(_astray), varied, rest, pairs, ()))
         return kinds
 
@@ -115,6 +115,7 @@ class _Pairs(NamedTuple):
     surface: LimitSurface
     wrench: Array
     twist: Array
+    there: Array
 
 
 def _off(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Shape, Hand, Array], rows: tuple[int, ...]):
@@ -135,7 +136,7 @@ def _astray(varied: dict[str, Array], rest: Physical, own: _Pairs, fixed: tuple[
         squared = jnp.sum(v**2, axis=-1, keepdims=True)
         return jnp.where(squared > 0, v / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
-    there = jnp.any(own.wrench != 0, axis=1) & jnp.any(own.twist != 0, axis=1)
+    there = own.there
     wrench = jnp.where(there[:, None], direction(own.wrench / metric[None]), 1.0)
     predicted = jax.vmap(surface.twist)(wrench * metric[None])
     astray = direction(predicted * metric[None]) - direction(own.twist * metric[None])

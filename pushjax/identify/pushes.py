@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped
 from pushjax.shapes import Shape
@@ -84,6 +85,15 @@ class Pushes(eqx.Module):
     def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
         """Every pose seen after the start, the last one included."""
         return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
+
+    @property
+    def paired(self) -> Bool[Array, "*conditions pushes pairs"]:
+        """Where there are a wrench and a motion."""
+        return jnp.any(self.wrench != 0, axis=-1) & jnp.any(self.twist != 0, axis=-1)
+
+    def as_conditions(self) -> "Pushes":
+        """With a leading axis of conditions, of one if there is none yet."""
+        return jax.tree.map(lambda leaf: leaf[None], self) if self.weight.ndim == 1 else self
 
     @staticmethod
     def of(log: Any, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":

@@ -1,4 +1,7 @@
-"""From recordings to arrays: paths in equal steps, poses after equal parts of them, wrenches and the motions there."""
+"""From recordings to arrays: paths in equal steps, poses after equal parts of them, wrenches and the motions there.
+
+In numpy, for recordings have as many samples as they have: JAX would compile anew for each.
+"""
 
 import equinox as eqx
 import jax
@@ -24,7 +27,7 @@ def recorded(recordings: Recordings, steps: int = STEPS, parts: int = 1, shape: 
     if not 1 <= parts < max(steps, 2):
         raise ValueError(f"parts must be at least 1, and fewer than the {steps} steps; got {parts}")
     pushes = recordings.pushes
-    if any(push.seen[1:-1].sum() < parts - 1 for push in pushes):
+    if not seen_after(recordings, parts):
         parts = 1
     arcs = [_arc(push) for push in pushes]
     path = [_at(push.hand, arc, np.arange(steps + 1) / steps * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)]
@@ -32,10 +35,20 @@ def recorded(recordings: Recordings, steps: int = STEPS, parts: int = 1, shape: 
     shares = np.round(np.arange(parts + 1) / parts * steps) / steps
     poses = np.stack([_poses(push, arc, shares * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)])
     pairs: dict[str, Floats] = {}
-    if shape is not None and parts > 1 and all(p.force is not None and p.hand.shape[1] == 2 for p in pushes):
+    if shape is not None and parts > 1 and paired(recordings):
         which = [np.clip(np.searchsorted(shares * arc[-1], arc, side="right") - 1, 0, parts - 1) for arc in arcs]
         pairs = _pairs(pushes, poses, which, shape)
     return Pushes(poses[:, 0], np.stack(path), poses[:, -1], along=poses[:, 1:-1], **pairs)
+
+
+def seen_after(recordings: Recordings, parts: int) -> bool:
+    """Whether every push was seen on the way as often as its `parts` ask for."""
+    return all(push.seen[1:-1].sum() >= parts - 1 for push in recordings.pushes)
+
+
+def paired(recordings: Recordings) -> bool:
+    """Whether every push has forces, of a single finger: of several one does not know which felt what."""
+    return all(push.force is not None and push.hand.shape[1] == 2 for push in recordings.pushes)
 
 
 def _arc(push: Recording) -> Floats:

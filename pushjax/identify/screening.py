@@ -1,6 +1,5 @@
 """Which recorded pushes can be learned from, and what is wrong with the others."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
@@ -13,6 +12,7 @@ from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.hands import Hand, RoundFinger
 from pushjax.shapes import Shape
 
+ROWS = 200  # of a path that are looked at: always as many, so that one compiled program does
 SHORTEST = 1e-4  # m, that a hand moves at least
 NEAR = 0.005  # m, as near as a hand comes that touches: trackers and outlines are off by millimetres
 MOVED = 5e-4  # m, more than a tracker's noise
@@ -25,7 +25,7 @@ ROOM = 0.01  # m, that a slider may move farther than its hand, and a tracker be
 def screened(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
     """The recordings whose pushes can be: the rest become problems, each with its push and the reason.
 
-    Raises ValueError if the outline is in another unit, or no push is left.
+    Raises ValueError if the outline is in another unit, LogError (a ValueError too) if no push is left.
     """
     low, high = (np.asarray(corner, float) for corner in shape.bounds)
     size = float(np.max(high - low))
@@ -34,7 +34,7 @@ def screened(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
     kept: list[Recording] = []
     problems: list[LogError] = []
     for push in recordings.pushes:
-        wrong = _wrong(push, size, _gaps(shape, hand, push))
+        wrong = _wrong(push, size, shape, hand)
         if wrong is None:
             kept.append(push)
         else:
@@ -44,7 +44,7 @@ def screened(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
     return replace(recordings, pushes=tuple(kept), problems=(*recordings.problems, *problems))
 
 
-def _wrong(push: Recording, size: float, gaps: Callable[[], np.ndarray]) -> str | None:
+def _wrong(push: Recording, size: float, shape: Shape, hand: Hand) -> str | None:
     """What is wrong with a push, if anything. Comparisons are such that NaN fails."""
     start, end = push.pose[0], push.pose[-1]
     hop = np.linalg.norm(np.diff(push.hand[:, :2], axis=0), axis=1)
@@ -61,7 +61,7 @@ def _wrong(push: Recording, size: float, gaps: Callable[[], np.ndarray]) -> str 
         return f"the hand moves {travel:.2g} m; expected at least {SHORTEST:g} m"
     if not (moved <= travel + size + ROOM):
         return f"the object moves {moved:.4g} m, the hand {travel:.4g} m: the tracker jumped"
-    nearest = gaps()
+    nearest = _gaps(shape, hand, push)
     if nearest.size and not nearest.min() <= NEAR:
         also = f", yet the object moves {moved:.3g} m" if moved > MOVED else ""
         return f"the hand never touches: it stays {nearest.min():.3g} m away from where the object starts{also}"
@@ -70,22 +70,15 @@ def _wrong(push: Recording, size: float, gaps: Callable[[], np.ndarray]) -> str 
     return None
 
 
-def _gaps(shape: Shape, hand: Hand, push: Recording) -> Callable[[], np.ndarray]:
+def _gaps(shape: Shape, hand: Hand, push: Recording) -> np.ndarray:
     """(rows,) m, from the nearest finger to the outline where it starts; empty where a finger is no disc."""
-
-    def gaps() -> np.ndarray:
-        if not all(isinstance(finger, RoundFinger) for finger in hand.fingers):
-            return np.zeros(0)
-        centers = np.asarray(hand.poses(jnp.asarray(push.hand)))[..., :2]
-        body = (centers - push.pose[0, :2]) @ rotation(push.pose[0, 2])
-        rows = np.linspace(0, len(body) - 1, ROWS).round().astype(int)
-        distance = np.asarray(_distances(shape, jnp.asarray(body[rows]).reshape(-1, 2))).reshape(ROWS, -1)
-        return (distance - np.asarray(hand.radius)).min(axis=1)
-
-    return gaps
-
-
-ROWS = 200  # of a path that are looked at: always as many, so that one compiled program does
+    if not all(isinstance(finger, RoundFinger) for finger in hand.fingers):
+        return np.zeros(0)
+    rows = np.linspace(0, len(push.hand) - 1, ROWS).round().astype(int)
+    centers = np.asarray(hand.poses(jnp.asarray(push.hand[rows])))[..., :2]
+    body = (centers - push.pose[0, :2]) @ rotation(push.pose[0, 2])
+    distance = np.asarray(_distances(shape, jnp.asarray(body).reshape(-1, 2))).reshape(ROWS, -1)
+    return (distance - np.asarray(hand.radius)).min(axis=1)
 
 
 @eqx.filter_jit

@@ -56,8 +56,7 @@ def profile(
     index = names[label]
     several, setup = _setup(found, pushes, slider, hand)
     deviation = float(np.sqrt(np.asarray(found.covariance)[index, index]))
-    apart = np.linspace(-reach, reach, 2 * points + 1)
-    apart = np.sort(np.append(apart[apart != 0], 0.0))
+    apart = reach * np.arange(-points, points + 1) / points
     order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]  # outwards, each from the one before
     loss, values = np.zeros(len(apart)), np.zeros(len(apart))
     # where everything else would go, were the posterior normal
@@ -68,11 +67,9 @@ def profile(
             z, last = found.z, 0.0
         z, last = z + (apart[k] - last) * along, apart[k]
         held = Held(jnp.arange(len(z)) == index, z)
-        fitted = program(
-            setup, several, z, jnp.asarray(False), _sigma(found), jnp.array([True, True]), held,
-            Effort.of(z.dtype, 1, ENOUGH),
-            robust=found.robust,
-        )  # fmt: skip
+        effort = Effort.of(z.dtype, 1, ENOUGH)
+        again, known = jnp.asarray(False), jnp.array([True, True])
+        fitted = program(setup, several, z, again, _sigma(found), known, held, effort, robust=found.robust)
         z, loss[k] = fitted.z, float(fitted.loss)
         values[k] = _value(found, fitted.z, label)
     rise = (loss - loss.min()) / 2
@@ -137,9 +134,8 @@ def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float
 def _setup(found: Identified, pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Setup]:
     dtype = found.z.dtype
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
-    several = jax.tree.map(lambda leaf: leaf[None], pushes) if found.single else pushes
     own = surfaces(found.prior, found.prior.physical(found.z))
-    return several, Setup(slider.shape, hand, own, found.prior, found.length)
+    return pushes.as_conditions(), Setup(slider.shape, hand, own, found.prior, found.length)
 
 
 def _sigma(found: Identified) -> Array:

@@ -1,13 +1,11 @@
 """Limit surfaces in files."""
 
-import json
 from pathlib import Path
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
-import numpy as np
 
-from pushjax._files import read_record
+from pushjax._files import numbers, read_record, write_record
 from pushjax.limit_surface._base import LimitSurface
 from pushjax.limit_surface.ellipsoid import Ellipsoid
 from pushjax.limit_surface.quartic import Quartic
@@ -18,16 +16,14 @@ S = TypeVar("S", bound=LimitSurface)
 
 
 def save_surface(surface: LimitSurface, path: str | Path) -> None:
-    record: dict = {"format": FORMAT, "version": VERSION, "dtype": str(surface.length.dtype)}
-    # repr of a float64 is exact, and a float32 is a float64
-    record["length"] = float(surface.length)
+    record: dict[str, Any] = {"length": numbers(surface.length)}
     if isinstance(surface, Ellipsoid):
-        record |= {"kind": "ellipsoid", "A": np.asarray(surface.A, np.float64).tolist()}
+        record |= {"kind": "ellipsoid", "A": numbers(surface.A)}
     elif isinstance(surface, Quartic):
-        record |= {"kind": "quartic", "coefficients": np.asarray(surface.coefficients, np.float64).tolist()}
+        record |= {"kind": "quartic", "coefficients": numbers(surface.coefficients)}
     else:
         raise TypeError(f"surface: cannot save a {type(surface).__name__}; an Ellipsoid or a Quartic can be saved")
-    Path(path).write_text(json.dumps(record, indent=2) + "\n")
+    write_record(path, FORMAT, VERSION, surface.length.dtype, record)
 
 
 def load_surface(path: str | Path, kind: type[S]) -> S:

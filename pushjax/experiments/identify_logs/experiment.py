@@ -5,7 +5,7 @@ unless they are `separate`: then each has its own, and they share how the set-up
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -17,37 +17,15 @@ import pushjax as pj
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.experiments.identify_logs import setting
 from pushjax.experiments.identify_logs.findings import Findings, parameters, predictions
+from pushjax.experiments.identify_logs.setting import Options
 from pushjax.identify.noise import Noise, identify_noise
-from pushjax.identify.recorded import recorded
+from pushjax.identify.recorded import paired, recorded, seen_after
 from pushjax.identify.screening import screened
 from pushjax.identify.uncertainty import Profile, profile, scalars
 from pushjax.report import envelope
 
 FEWEST = 3  # pushes: fewer tell nothing about how far off they are
 LEVEL = 0.9
-
-
-@dataclass(frozen=True)
-class Options:
-    """What is known and what is to be found, as the command line has it; None: as the logs say, or not to be found."""
-
-    shape: str | None = None
-    hand: str = "finger"
-    radius: float | None = None
-    support: str | None = None
-    surface: str = "quartic"
-    dof: float = 50.0
-    friction: tuple[float, float] = (0.0, 1.0)
-    center: float | None = None
-    inset: float | None = None
-    end: float | None = None
-    lag: float | None = None
-    offset: float | None = None
-    separate: bool = False
-    steps: int = 40
-    parts: int = 1
-    forces: bool = False
-    noise: bool = False
 
 
 def run(
@@ -67,7 +45,8 @@ def run(
         pictures = draw(findings, out)
         saved = out / "identified.json"
         found.save(saved)
-    own = {name: value for name, value in asdict(options).items() if value is not None}
+    chosen = {field.name: getattr(options, field.name) for field in fields(Options)}
+    own = {name: value for name, value in chosen.items() if value is not None}
     noise = None if findings.noise is None else _noise(findings.noise)
     return envelope(
         "identify",
@@ -77,6 +56,8 @@ def run(
         direction=float(found.direction),
         converged=int(found.status) == pj.Status.MOVING,
         steps=int(found.steps),
+        poses=len(findings.pushes.rows),
+        wrenches=int(np.sum(np.asarray(findings.pushes.paired))),
         **predictions(findings),
         noise=noise,
         problems=[str(problem) for problem in findings.problems],
@@ -101,7 +82,7 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
     if count < FEWEST:
         why = f"; the first problem: {problems[0]}" if problems else ""
         raise ValueError(f"expected at least {FEWEST} usable pushes; found {count} in {len(logs)} logs{why}")
-    pushes, slider = _conditions(recordings, shape, options, seed)
+    pushes, slider = conditions(recordings, shape, options, seed)
     unknowns = pj.Unknowns(
         options.friction,
         dof=options.dof,
@@ -128,7 +109,8 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]
     length = lengths[0] if lengths else float(found.length)
-    return Findings(problems, slider, hand, pushes, found, tuple(profiles), noise, length)
+    predicted = found.predict(pushes, slider, hand)
+    return Findings(problems, slider, hand, pushes, found, predicted, tuple(profiles), noise, length)
 
 
 def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
@@ -144,12 +126,13 @@ def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings
     return good, bad
 
 
-def _conditions(recordings: list[Recordings], shape, options: Options, seed: int) -> tuple[pj.Pushes, pj.Slider]:
+def conditions(recordings: list[Recordings], shape, options: Options, seed: int) -> tuple[pj.Pushes, pj.Slider]:
     """Every log a condition, or all logs one."""
     degree = {"quartic": 4, "ellipsoid": 2}[options.surface]
-    seen = all(push.seen[1:-1].any() for one in recordings for push in one.pushes)
-    parts = options.parts if seen else 1
-    each = [recorded(one, options.steps, parts, shape if options.forces else None) for one in recordings]
+    # the same of every log, for they become one array
+    parts = options.parts if all(seen_after(one, options.parts) for one in recordings) else 1
+    forces = options.forces and all(paired(one) for one in recordings)
+    each = [recorded(one, options.steps, parts, shape if forces else None) for one in recordings]
 
     def expected(one: Recordings) -> pj.LimitSurface:
         return setting.expected_surface(setting.support_of(options.support, shape, one), degree, seed)
@@ -167,6 +150,7 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "friction": np.asarray(noise.friction),
         "offset_mm": 1e3 * float(noise.offset),
         "sigma_mm": 1e3 * float(noise.sigma),
+        "tails": float(noise.tails),
         "score_mm": 1e3 * float(noise.score),
     }
 
@@ -175,6 +159,11 @@ def summary(record: dict[str, Any]) -> str:
     """What the command prints: a line for each number found."""
     problems, level = record["problems"], record["settings"]["level"]
     lines = [f"{record['pushes']} pushes used, {len(problems)} problems."]
+    chosen = record["settings"]
+    if record["poses"] < chosen["parts"]:
+        lines.append(f"only final poses: not every push was seen {chosen['parts'] - 1} times on the way")
+    if chosen["forces"]:
+        lines.append(f"{record['wrenches']} measured wrenches" + ("" if record["wrenches"] else ": see --parts"))
     lines += [f"  {problem}" for problem in problems[:10]]
     if len(problems) > 10:
         lines.append(f"  and {len(problems) - 10} more (see the JSON)")

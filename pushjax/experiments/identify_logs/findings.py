@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
@@ -21,14 +22,15 @@ class Findings(NamedTuple):
     hand: pj.Hand
     pushes: pj.Pushes
     found: pj.Identified
+    predicted: pj.Trajectory
     profiles: tuple[Profile, ...]
     noise: Noise | None
     length: float
 
-    def final(self) -> tuple[np.ndarray, int]:
-        """Predicted final poses, (pushes, 3), of all conditions in a row, and how many steps failed."""
-        predicted = self.found.predict(self.pushes, self.slider, self.hand)
-        return self.rows(predicted.pose[..., -1, :]), int(np.sum(np.asarray(predicted.failed)))
+    @property
+    def final(self) -> np.ndarray:
+        """Predicted final poses, (pushes, 3), of all conditions in a row."""
+        return self.rows(self.predicted.pose[..., -1, :])
 
     def rows(self, value: Any) -> np.ndarray:
         """(..., pushes, ...) of all conditions in a row, without what only fills them up."""
@@ -72,8 +74,7 @@ def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
 def predictions(findings: Findings) -> dict[str, Any]:
     """How far off the final poses are, in mm: as found, as was expected before, and had nothing moved."""
     found = findings.found
-    final, failed = findings.final()
-    off = findings.deviation_mm(final)
+    off = findings.deviation_mm(findings.final)
     determined = [value for label, value in found.determined.items() if label.startswith("surface")]
     before = findings.rows(_expected(findings))
     return {
@@ -82,7 +83,7 @@ def predictions(findings: Findings) -> dict[str, Any]:
         "worst_mm": float(off.max()),
         "expected_mm": float(findings.deviation_mm(before).mean()),
         "no_motion_mm": float(findings.deviation_mm(findings.rows(findings.pushes.start)).mean()),
-        "failed_steps": failed,
+        "failed_steps": int(findings.rows(findings.predicted.failed).sum()),
         "residual_mm": 1e3 * findings.rows(found.residual),
         "surface_numbers": len(determined),
         "surface_determined": float(sum(determined)),
@@ -94,8 +95,6 @@ def predictions(findings: Findings) -> dict[str, Any]:
 
 def _expected(findings: Findings) -> jax.Array:
     """Final poses as predicted before any push was seen, at the middle of the friction's range."""
-    import equinox as eqx
-
     found = findings.found
     before = eqx.tree_at(lambda one: one.z, found, found.prior.start)
     return before.predict(findings.pushes, findings.slider, findings.hand).pose[..., -1, :]

@@ -18,7 +18,7 @@ def draw(findings: Findings, out: Path) -> list[str]:
 
 
 def _pushes(findings: Findings, out: Path) -> Path:
-    final, _ = findings.final()
+    final = findings.final
     off = findings.deviation_mm(final)
     order = np.argsort(off)
     start, end, path = (findings.rows(getattr(findings.pushes, name)) for name in ("start", "end", "path"))
@@ -58,10 +58,9 @@ def _residuals(findings: Findings, out: Path) -> Path:
         panel.set(xlabel=f"predicted less measured {names[0]}", ylabel=f"predicted less measured {names[1]}")
         panel.set_aspect("equal", adjustable="datalim")
     axes[0].set_title(f"rings: one and two sigma, {sigma:.2g} mm")
-    final, _ = findings.final()
     still = findings.deviation_mm(findings.rows(findings.pushes.start))
     for values, color, dash, label in (
-        (findings.deviation_mm(final), plot.BLUE, "-", "predicted"),
+        (findings.deviation_mm(findings.final), plot.BLUE, "-", "predicted"),
         (still, plot.BETWEEN, "--", "no motion"),
     ):
         order = np.sort(values)

@@ -2,7 +2,9 @@
 
 import csv
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import jax
 import numpy as np
@@ -15,6 +17,48 @@ HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width an
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
 PAIRS = 400
 CELLS = 100  # under a slider whose pressure is known everywhere
+
+
+@dataclass
+class Options:
+    """What is known and what is to be found, as a command line has it."""
+
+    shape: str | None = None
+    """The object: rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04, regular:6x0.05 (m), or a CSV file of vertices.
+    Default: what the logs tell."""
+    hand: str = "finger"
+    """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
+    radius: float | None = None
+    """Of the fingers, m. Default: what the logs tell."""
+    support: str | None = None
+    """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
+    Default: what the logs tell, else uniform."""
+    surface: Literal["quartic", "ellipsoid"] = "quartic"
+    """Kind of limit surface."""
+    dof: float = 50.0
+    """How well it is known beforehand: degrees of freedom; fewer, less well."""
+    friction: tuple[float, float] = (0.0, 1.0)
+    """Lowest and highest that the fingers' friction may be."""
+    center: float | None = None
+    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next four)."""
+    inset: float | None = None
+    """Find by how much the outline is smaller."""
+    end: float | None = None
+    """Find how far the hand went on after its path ends."""
+    lag: float | None = None
+    """Find how far the hand was behind where its path says."""
+    offset: float | None = None
+    """Find how far the hand's coordinates are off those of the object."""
+    separate: bool = False
+    """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
+    steps: int = 40
+    """Steps of each push."""
+    parts: int = 1
+    """After how many equal parts of a push the object's pose counts, where it was seen on the way."""
+    forces: bool = False
+    """Learn from measured forces too; needs parts."""
+    noise: bool = False
+    """Find by how much friction scatters, too."""
 
 
 def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.Disk | pj.Ellipse:

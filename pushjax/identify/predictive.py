@@ -1,0 +1,161 @@
+"""How pushes come out under noise: a limit surface and a friction drawn for each, a hand that is off, an error of
+measurement."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pushjax.friction_model import FrictionModel, RandomSurface, Sampler
+from pushjax.hands import Hand
+from pushjax.identify.identified import Identified, surfaces
+from pushjax.identify.model import coefficients_of, push
+from pushjax.identify.pushes import Pushes
+from pushjax.identify.unknowns import Physical
+from pushjax.rollout import Slider
+from pushjax.shapes import Shape
+
+ANY_DOF = 60.0  # every draw brings its own
+
+
+class Values(NamedTuple):
+    """Of the noise. friction: (conditions, 2), or, of one of them, (2,)."""
+
+    dof: Float[Array, ""]
+    friction: Float[Array, "*conditions 2"]
+    offset: Float[Array, ""]
+    sigma: Float[Array, ""]
+    tails: Float[Array, ""]
+
+    def own(self, chances: "Chances") -> tuple[Array, Array]:
+        """dof and mu, (..., pushes, samples), of one condition, or of all."""
+        low, high = self.friction[..., 0, None, None], self.friction[..., 1, None, None]
+        mu = low + (high - low) * chances.mu
+        return jnp.broadcast_to(self.dof, mu.shape), mu
+
+
+class Chances(NamedTuple):
+    """What is drawn of each push, with axes (..., pushes, samples): keys of surfaces, mu's place in its range, and
+    keys of errors, which `errors` turns into numbers."""
+
+    surface: PRNGKeyArray
+    error: PRNGKeyArray
+    mu: Float[Array, "*conditions pushes n"]
+
+    def errors(self, tails: Array) -> Float[Array, "*conditions pushes n 5"]:
+        """Of the hand, two, and of the pose, three: normal numbers with one random factor, Student's together."""
+
+        def student(key: PRNGKeyArray) -> Float[Array, "5"]:
+            first, second = jax.random.split(key)
+            normal = jax.random.normal(first, (5,), tails.dtype)
+            half = tails / 2
+            return normal * jnp.sqrt(half / jnp.maximum(jax.random.gamma(second, half, dtype=half.dtype), 1e-6))
+
+        each: Callable = student
+        for _ in self.mu.shape:
+            each = jax.vmap(each)
+        return each(self.error)
+
+
+class Slopes(NamedTuple):
+    """Of poses, by dof and mu (..., 3), and by where the hand is (..., 3, 2)."""
+
+    dof: Array
+    mu: Array
+    aside: Array
+
+
+class Drawing(eqx.Module):
+    """Pushes of one condition, under what is drawn."""
+
+    around: RandomSurface
+    theta: Physical
+    pushes: Pushes
+    shape: Shape
+    hand: Hand
+
+    def chances(self, key: PRNGKeyArray, n: int) -> Chances:
+        first, second, third = jax.random.split(key, 3)
+        shape = (len(self.pushes.weight), n)
+        mu = jax.random.uniform(third, shape, self.pushes.end.dtype)
+        return Chances(jax.random.split(first, shape), jax.random.split(second, shape), mu)
+
+    def poses(self, chances: Chances, values: Values, aside: Float[Array, "pushes n 2"]) -> Array:
+        """Final poses (pushes, n, 3), as they really are."""
+        return self._each(self._pose, chances, values, aside)
+
+    def slopes(self, chances: Chances, values: Values) -> tuple[Array, Slopes]:
+        """Those with hands that are not off, and their derivatives."""
+
+        def value(own, *rest):
+            pose = self._pose(own, *rest)
+            return pose, pose
+
+        nowhere = jnp.zeros((*chances.mu.shape, 2), chances.mu.dtype)
+        slopes, poses = self._each(jax.jacfwd(value, has_aux=True), chances, values, nowhere)
+        return poses, Slopes(*slopes)
+
+    def _each(self, of: Callable, chances: Chances, values: Values, aside: Array):
+        over_samples = jax.vmap(of, in_axes=(0, 0, None, None))
+        own = (*values.own(chances), aside)
+        return jax.vmap(over_samples)(own, chances.surface, self.pushes.start, self.pushes.path)
+
+    def _pose(self, own: tuple[Array, Array, Array], key, start, path) -> Float[Array, "3"]:
+        dof, mu, aside = own
+        surface = self.around.with_dof(dof).sample(key).surface
+        met = self.theta._replace(friction=mu, surface=coefficients_of(surface), offset=self.theta.offset + aside)
+        return push(met, surface, (self.shape, self.hand), start, path).pose[-1]
+
+
+class Predictive(eqx.Module):
+    """The pushes of all conditions, and everything about them that no noise changes. around, theta, pushes: with a
+    leading axis of conditions. length: m, makes angles commensurate."""
+
+    around: RandomSurface
+    theta: Physical
+    pushes: Pushes
+    shape: Shape
+    hand: Hand
+    length: Float[Array, ""]
+
+    @staticmethod
+    def of(found: Identified, pushes: Pushes, slider: Slider, hand: Hand, sampler: Sampler) -> "Predictive":
+        theta = found.prior.physical(found.z)
+        each = surfaces(found.prior, theta)
+        model = FrictionModel(ANY_DOF, 0.0, sampler)
+        several = [model.around(jax.tree.map(lambda leaf, k=k: leaf[k], each)) for k in range(len(theta.friction))]
+        around = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
+        pushes, shape, hand = jax.tree.map(
+            lambda leaf: leaf.astype(found.z.dtype), (pushes.as_conditions(), slider.shape, hand)
+        )
+        return Predictive(around, theta, pushes, shape, hand, found.length)
+
+    def over_conditions(self, of: Callable, key: PRNGKeyArray, values: Values):
+        """`of` a drawing, its key and its values, for every condition."""
+
+        def condition(key, around, theta, pushes, friction):
+            drawing = Drawing(around, theta, pushes, self.shape, self.hand)
+            return of(drawing, key, values._replace(friction=friction))
+
+        keys = jax.random.split(key, len(self.theta.friction))
+        return jax.vmap(condition)(keys, self.around, self.theta, self.pushes, values.friction)
+
+    def measurement(self, errors: Float[Array, "... 5"], sigma: Array) -> Float[Array, "... 3"]:
+        """Errors of measured poses, of those in x, y and length * theta."""
+        return (sigma * errors[..., 2:]).at[..., 2].divide(self.length)
+
+
+@eqx.filter_jit
+def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -> Float[Array, "conditions pushes n 3"]:
+    """`n` measured final poses of each push."""
+
+    def measured(drawing: Drawing, key, values: Values):
+        chances = drawing.chances(key, n)
+        errors = chances.errors(values.tails)
+        poses = drawing.poses(chances, values, values.offset * errors[..., :2])
+        return poses + predictive.measurement(errors, values.sigma)
+
+    return predictive.over_conditions(measured, key, values)
