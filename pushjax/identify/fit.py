@@ -126,10 +126,12 @@ def fit(
             each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
             left.append((jnp.sum(count), jnp.sum(count[..., None] * r**2)))
         precision = sum(information) + jnp.diag(jnp.maximum(flat, TINY))
+        # as many numbers as the pushes determine are no longer free to scatter. One solve for both: jaxlib's batched
+        # ones wait for each other forever where two run at once (0.10.1, two cores)
+        shares = jnp.linalg.solve(precision, jnp.concatenate(information, axis=1))
         again = [
-            # as many numbers as the pushes determine are no longer free to scatter
-            jnp.sqrt(squares / jnp.maximum(3 * count - jnp.trace(jnp.linalg.solve(precision, own)), 3.0))
-            for own, (count, squares) in zip(information, left, strict=True)
+            jnp.sqrt(squares / jnp.maximum(3 * count - jnp.trace(share), 3.0))
+            for share, (count, squares) in zip(jnp.split(shares, len(information), axis=1), left, strict=True)
         ]
         total = jnp.sum(whitened(residual, pushes, sigma, robust) ** 2) + jnp.sum((flat * z) ** 2)
         steps = before.steps + found.steps
