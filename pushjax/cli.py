@@ -31,6 +31,7 @@ class Demo(Common):
 
 
 Experiment = Literal[
+    "table1",
     "table2",
     "squeeze",
     "jam",
@@ -47,7 +48,8 @@ Experiment = Literal[
 class Reproduce(Common):
     """Reproduce an experiment of the paper beside the paper's own figures.
 
-    table2: a triangle on three support points, pushed by a robot; predicted against measured final poses.
+    table1: eleven objects on two surfaces, pushed along straight lines. table2: a triangle on three support points,
+    pushed by a robot; predicted against measured final poses.
     squeeze: a parallel jaw closes on a rectangle from four start poses. jam: two fingers that jam, and from what
     friction. two-finger: the triangle pushed by two fingers, predicted against measured. three-finger: the original
     authors' simulated grasps, run again. stochastic-push: a square pushed 2000 times under random friction. capture:
@@ -62,7 +64,12 @@ class Reproduce(Common):
     """table2: nominal (the default), as in the paper; or measured, contact and the push's end as force sensor and robot
     command tell."""
     method: tuple[Literal["ideal", "wrench_twist", "identified"], ...] | None = None
-    """table2: where the limit surface is from: the known support, measured forces, or final poses. Default: all."""
+    """table1, table2: where the limit surface is from: the known support (table2 only), measured forces, or final
+    poses. Default: all."""
+    surface: tuple[Literal["abs", "plywood"], ...] | None = None
+    """table1: on what. Default: both."""
+    object: tuple[str, ...] | None = None
+    """table1: which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter. Default: all."""
     steps: int | None = None
     """Steps of each push or grasp. Default: the experiment's own."""
     n: int | None = None
@@ -123,6 +130,7 @@ def _demo(command: Demo, progress: Progress) -> Result:
 
 RANDOM = ("n", "steps", "dof", "friction")
 TAKES: dict[str, tuple[str, ...]] = {
+    "table1": ("data", "method", "steps", "surface", "object"),
     "table2": ("data", "geometry", "method", "steps"),
     "squeeze": ("steps",),
     "jam": (),
@@ -138,7 +146,7 @@ TAKES: dict[str, tuple[str, ...]] = {
 def _reproduce(command: Reproduce, progress: Progress) -> Result:
     name = command.experiment
     takes, given = TAKES[name], {}
-    for option in ("data", "geometry", "method", *RANDOM):
+    for option in ("data", "geometry", "method", "surface", "object", *RANDOM):
         value = getattr(command, option)
         if value is None:
             continue

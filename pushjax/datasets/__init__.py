@@ -2,6 +2,9 @@
 
 from pushjax.datasets.folder import find_data as find_data
 from pushjax.datasets.load import load_recordings as load_recordings
+from pushjax.datasets.mit_pushes import MitPushes as MitPushes
+from pushjax.datasets.mit_pushes import StraightPushes as StraightPushes
+from pushjax.datasets.mit_pushes import load_mit_pushes_npz as load_mit_pushes_npz
 from pushjax.datasets.pushes import LogError as LogError
 from pushjax.datasets.pushes import Onset as Onset
 from pushjax.datasets.pushes import Push as Push

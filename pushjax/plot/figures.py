@@ -264,11 +264,11 @@ def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float
     axes.plot(*(MM * np.vstack([p, p[:1]])).T, color=color, lw=width, **line)
 
 
-def table_figure(cells: list[dict], title: str) -> Figure:
+def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
     """Mean deviation by condition: ours with its interval, and the paper's, one group of bars a condition."""
     with plt.rc_context(STYLE):
         conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))
-        figure, axes = plt.subplots(figsize=(8.6, 3.8), layout="constrained")
+        figure, axes = plt.subplots(figsize=(width, 3.8), layout="constrained")
         for k, (model, color) in enumerate((("quartic", BLUE), ("ellipsoid", ORANGE))):
             mine = [cell for cell in cells if cell["model"] == model]
             if not mine:
@@ -277,7 +277,7 @@ def table_figure(cells: list[dict], title: str) -> Figure:
             height = [cell["mean_mm"] for cell in mine]
             error = [cell["ci95_bootstrap_mm"] for cell in mine]
             axes.bar(x, height, 0.34, yerr=error, color=color, label=f"{model}, this run", capsize=2, ecolor="0.25")
-            paper = [cell["paper_mm"] for cell in mine]
+            paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in mine]
             axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
         axes.set_xticks(np.arange(len(conditions)), [f"{surface}\n{name}" for surface, name in conditions])
         axes.set(ylabel="mean deviation / mm", title=title)

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets.pushes import rotation
 from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import SPLITS, Prediction, Tested, deviation_mm, per_push
+from pushjax.se2 import compose, inverse
 
 BOOTSTRAPS = 2000
 STUCK = 0.003  # m
@@ -112,10 +112,7 @@ def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
 
 def _object_motion(log: TwoFingerLog) -> np.ndarray:
     """(n, 3): the end poses in the frames of the starts, where repeats of an action are the same push."""
-    moved = log.pose_end - log.pose_start
-    # a row vector times R is R' times it
-    there = np.einsum("ki,kij->kj", moved[:, :2], rotation(log.pose_start[:, 2]))
-    return np.column_stack([there, moved[:, 2]])
+    return np.asarray(compose(inverse(log.pose_start), log.pose_end), float)
 
 
 def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:

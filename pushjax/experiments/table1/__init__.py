@@ -1,0 +1,4 @@
+"""Straight pushes of the MIT data set: `experiment` from `conditions`, `methods` and `repeats`."""
+
+from pushjax.experiments.table1.experiment import run as run
+from pushjax.experiments.table1.experiment import summary as summary

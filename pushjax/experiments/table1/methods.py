@@ -1,0 +1,98 @@
+"""Two ways to predict the pushes that were not learned from: each gives final poses, (pushes, 3), the friction it found
+and how many steps failed.
+
+wrench_twist  the surface fitted to measured forces and motions, the friction by a grid: the paper's.
+identified    friction, surface, centre of pressure and where the robot really was, from final poses, starting from that
+              surface.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments.table1.conditions import MODELS, outline, straight
+
+FRICTIONS = np.linspace(0.0, 0.6, 31)
+IDENTIFY_STEPS = 40  # at most: derivatives are for the fit, whose answer does not change with more
+# Pushes to learn from, and to test with: at most so many, filled up to so many.
+LEARNED, TESTED = 128, 304
+# How far what is not known may be from what it is taken for: the surface (degrees of freedom), the centre of pressure,
+# the outline, and the tip against the world in which the tracker sees the object, m.
+DOF, CENTER, INSET, OFFSET = 20.0, 0.005, 0.001, 0.001
+
+
+class Predicted(NamedTuple):
+    final: np.ndarray
+    friction: float
+    failed: int
+    found: pj.Identified | None
+
+
+class Setting(NamedTuple):
+    """learned, tested: as arrays, filled up; coarse: what was learned from, in few steps. surface: from forces."""
+
+    learned: pj.Pushes
+    coarse: pj.Pushes
+    tested: pj.Pushes
+    shape: pj.Shape
+    hand: pj.Hand
+    surface: pj.LimitSurface
+    length: float
+
+    @staticmethod
+    def of(log: MitPushes, model: str, steps: int) -> "Setting":
+        rows = np.flatnonzero(log.learned & log.whole.valid)
+        dtype = jnp.result_type(float)
+        pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
+        return Setting(
+            straight(log.whole, rows, steps, LEARNED),
+            straight(log.whole, rows, min(steps, IDENTIFY_STEPS), LEARNED),
+            straight(log.middle, np.arange(len(log.middle)), steps, TESTED),
+            outline(log),
+            pj.Hand.finger(log.tip_radius),
+            pj.fit_limit_surface(*pairs, log.length, degree=MODELS[model]),
+            log.length,
+        )
+
+    @property
+    def slider(self) -> pj.Slider:
+        return pj.Slider(self.shape, self.surface)
+
+
+def wrench_twist(setting: Setting) -> Predicted:
+    learned, tested = setting.learned, setting.tested
+    on_grid, _ = _final_poses(setting.slider, setting.hand, learned, jnp.asarray(FRICTIONS, learned.path.dtype))
+    errors = pj.deviation(on_grid, learned.end[None], setting.length)
+    best = FRICTIONS[int(np.argmin(np.asarray(errors @ learned.weight)))]
+    final, failed = _final_poses(setting.slider, setting.hand, tested, jnp.asarray([best], learned.path.dtype))
+    return Predicted(_own(final[0], tested), float(best), int(_own(failed[0], tested).sum()), None)
+
+
+def identified(setting: Setting) -> Predicted:
+    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, inset=INSET, offset=OFFSET)
+    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length)
+    predicted = found.predict(setting.tested, setting.slider, setting.hand)
+    failed = _own(predicted.failed, setting.tested)
+    return Predicted(_own(predicted.pose[:, -1], setting.tested), float(found.friction), int(failed.sum()), found)
+
+
+METHODS = {"wrench_twist": wrench_twist, "identified": identified}
+
+
+def _own(values, pushes: pj.Pushes) -> np.ndarray:
+    """Without what only fills up."""
+    return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]
+
+
+@jax.jit
+def _final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: jax.Array):
+    def one(path, start, friction):
+        push = pj.rollout(slider, hand, path, pose=start, friction=friction)
+        return push.pose[-1], jnp.sum(push.failed)
+
+    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
+    return jax.vmap(over_pushes, in_axes=(None, None, 0))(pushes.path, pushes.start, frictions)
