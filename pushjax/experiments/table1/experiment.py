@@ -17,12 +17,11 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table1.conditions import APART, MODELS, OBJECTS, PAPER_PERCENT, SURFACES, load, paper_mm
 from pushjax.experiments.table1.methods import METHODS, Predicted, Setting
 from pushjax.experiments.table1.repeats import noise_floor_mm
 from pushjax.report import envelope, write_json
-
-BOOTSTRAPS = 2000
 
 
 def run(
@@ -99,12 +98,10 @@ def _cell(log: MitPushes, model: str, method: str, steps: int, seed: int) -> dic
     begin = time.perf_counter()
     predicted = METHODS[method](Setting.of(log, model, steps))
     off = deviation_mm(log, predicted.final)
-    rng = np.random.default_rng(seed)
-    resampled = rng.choice(off, (BOOTSTRAPS, len(off))).mean(axis=1)
     toolbox = deviation_mm(log, log.middle.toolbox[model])
     return {
         "mean_mm": float(off.mean()),
-        "ci95_bootstrap_mm": float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2),
+        "ci95_bootstrap_mm": bootstrapped_ci95(off, np.random.default_rng(seed)),
         "median_mm": float(np.median(off)),
         "worst_mm": float(off.max()),
         "valid_mm": float(off[log.middle.valid].mean()),

@@ -8,12 +8,12 @@ identified    friction, surface, centre of pressure and where the robot really w
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._tables import final_poses
 from pushjax.experiments.table1.conditions import MODELS, outline, straight
 
 FRICTIONS = np.linspace(0.0, 0.6, 31)
@@ -21,8 +21,8 @@ IDENTIFY_STEPS = 40  # at most: derivatives are for the fit, whose answer does n
 # Pushes to learn from, and to test with: at most so many, filled up to so many.
 LEARNED, TESTED = 128, 304
 # How far what is not known may be from what it is taken for: the surface (degrees of freedom), the centre of pressure,
-# the outline, and the tip against the world in which the tracker sees the object, m.
-DOF, CENTER, INSET, OFFSET = 20.0, 0.005, 0.001, 0.001
+# the outline, and the tip against the world in which the tracker sees the object, m. Chosen on abs.
+DOF, CENTER, INSET, OFFSET = 10.0, 0.015, 0.001, 0.001
 
 
 class Predicted(NamedTuple):
@@ -65,10 +65,10 @@ class Setting(NamedTuple):
 
 def wrench_twist(setting: Setting) -> Predicted:
     learned, tested = setting.learned, setting.tested
-    on_grid, _ = _final_poses(setting.slider, setting.hand, learned, jnp.asarray(FRICTIONS, learned.path.dtype))
+    on_grid, _ = final_poses(setting.slider, setting.hand, learned, jnp.asarray(FRICTIONS, learned.path.dtype))
     errors = pj.deviation(on_grid, learned.end[None], setting.length)
     best = FRICTIONS[int(np.argmin(np.asarray(errors @ learned.weight)))]
-    final, failed = _final_poses(setting.slider, setting.hand, tested, jnp.asarray([best], learned.path.dtype))
+    final, failed = final_poses(setting.slider, setting.hand, tested, jnp.asarray([best], learned.path.dtype))
     return Predicted(_own(final[0], tested), float(best), int(_own(failed[0], tested).sum()), None)
 
 
@@ -86,13 +86,3 @@ METHODS = {"wrench_twist": wrench_twist, "identified": identified}
 def _own(values, pushes: pj.Pushes) -> np.ndarray:
     """Without what only fills up."""
     return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]
-
-
-@jax.jit
-def _final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: jax.Array):
-    def one(path, start, friction):
-        push = pj.rollout(slider, hand, path, pose=start, friction=friction)
-        return push.pose[-1], jnp.sum(push.failed)
-
-    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
-    return jax.vmap(over_pushes, in_axes=(None, None, 0))(pushes.path, pushes.start, frictions)

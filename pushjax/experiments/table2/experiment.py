@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
     CONDITIONS,
@@ -39,8 +40,6 @@ from pushjax.experiments.table2.conditions import (
 )
 from pushjax.experiments.table2.methods import FRICTIONS, Predicted
 from pushjax.report import envelope
-
-BOOTSTRAPS = 2000
 
 
 def run(
@@ -110,11 +109,10 @@ def _cell(
     means = [error[mine].mean() for error, mine in zip(found.errors, test, strict=True)]
     times = test.sum(axis=0)
     per_push = (found.errors * test).sum(axis=0)[times > 0] / times[times > 0]
-    resampled = rng.choice(per_push, (BOOTSTRAPS, len(per_push))).mean(axis=1)
     return {
         "mean_mm": float(np.mean(means)),
         "ci95_mm": float(1.96 * np.std(means, ddof=1) / np.sqrt(len(train))),
-        "ci95_bootstrap_mm": float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2),
+        "ci95_bootstrap_mm": bootstrapped_ci95(per_push, rng),
         "no_motion_mm": float(np.mean([still[mine].mean() for mine in test])),
         "worst_mm": float(per_push.max()),
         "friction": float(np.mean(found.friction)),

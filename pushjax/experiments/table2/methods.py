@@ -15,6 +15,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.datasets import PushLog
+from pushjax.experiments._tables import final_poses
 from pushjax.experiments.table2.conditions import MODELS, Geometry, outline, recorded
 
 FRICTIONS = np.linspace(0.0, 0.8, 41)
@@ -91,18 +92,8 @@ def _on_grid(
     """Deviation in mm of every push at every friction, (frictions, pushes), and how many steps failed of each."""
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
-    final, failed = _final_poses(slider, hand, pushes.path, pushes.start, jnp.asarray(FRICTIONS, pushes.path.dtype))
+    final, failed = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
     return 1e3 * np.asarray(pj.deviation(final, pushes.end[None], log.length), np.float64), np.asarray(failed)
-
-
-@jax.jit
-def _final_poses(slider: pj.Slider, hand: pj.Hand, paths, starts, frictions):
-    def one(path, start, friction):
-        push = pj.rollout(slider, hand, path, pose=start, friction=friction)
-        return push.pose[-1], jnp.sum(push.failed)
-
-    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
-    return jax.vmap(over_pushes, in_axes=(None, None, 0))(paths, starts, frictions)
 
 
 def _best(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
