@@ -50,6 +50,12 @@ def shaped(name: str, value: jax.Array, shape: tuple[int | str, ...]) -> None:
         raise ValueError(f"{name} has shape {value.shape}; expected {wanted}")
 
 
+def instance(name: str, value: Any, *kinds: type) -> None:
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name}: expected a {wanted}; got a {type(value).__name__}")
+
+
 def finite(name: str, value: Any) -> None:
     known = concrete(value)
     if known is not None and not np.all(np.isfinite(known)):

@@ -20,7 +20,7 @@ class Common:
     out: Path = Path("pushjax-out")
     """Folder for pictures."""
     json: Path | None = None
-    """File for every figure the command prints."""
+    """File for every figure the command prints. Default: NAME.json in --out; of bench, none."""
     seed: int = 0
     """Seed of everything random."""
 
@@ -231,11 +231,14 @@ def main(arguments: list[str] | None = None) -> None:
             else:
                 record, text = _demo(command, progress)
         print(text)
-        if command.json is not None:
+        json = command.json
+        if json is None and not isinstance(command, Bench):
+            json = command.out / f"{record['experiment']}.json"
+        if json is not None:
             from pushjax.report import write_json
 
-            write_json(record, command.json)
-            print(f"wrote {command.json}")
+            write_json(record, json)
+            print(f"wrote {json}")
     except (ValueError, OSError) as error:
         print(f"pushjax: {error}", file=sys.stderr)
         raise SystemExit(1) from None

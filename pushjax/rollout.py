@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._autodiff import keep_found
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped, traced
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, instance, non_negative, shaped, traced
 from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.advance import Record, advance, columns, deepest, grips_of
 from pushjax.contacts import DEEPEST_OVERLAP, count
@@ -103,9 +103,18 @@ def _world(record: Record, length: Scalar) -> Step:
     )
 
 
+def check_kinds(slider: Slider, hand: Hand) -> None:
+    """Raises TypeError for anything else."""
+    instance("slider", slider, Slider)
+    instance("slider.shape", slider.shape, Shape)
+    instance("slider.surface", slider.surface, LimitSurface)
+    instance("hand", hand, Hand)
+
+
 def arguments(slider: Slider, hand: Hand, pose: Numeric, friction: Numeric, *paths: Numeric, pushes: int | None = None):
     """Everything in one floating dtype, and checked as far as values are known. pushes: that many poses may be given
     in place of one."""
+    check_kinds(slider, hand)
     dtype = common_dtype(slider, hand, pose, friction, *paths)
     start, mu = as_float(pose, dtype), as_float(friction, dtype)
     if pushes is None or start.ndim == 1:

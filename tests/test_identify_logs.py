@@ -13,7 +13,7 @@ import pushjax as pj
 from pushjax import cli
 from pushjax.datasets import LogError, load_recordings
 from pushjax.experiments.identify_logs import Options
-from pushjax.experiments.identify_logs.experiment import conditions
+from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identify import bootstrap, profile_interval, screened
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
@@ -150,12 +150,14 @@ def test_what_cannot_be_used_is_named_and_counted(report):
         ({"--shape": None}, "the logs do not tell the object's outline"),
         ({"--radius": None}, "--radius"),
         ({"--shape": "rectangle:100x60"}, "is it in millimetres?"),
-        ({"--shape": "square:0.1"}, "--shape: square:0.1"),
+        ({"--shape": "square:0.1"}, "or a CSV file of vertices; got 'square:0.1'"),
         ({"--shape": "disk:a"}, "got 'disk:a'"),
         ({"--hand": "two_fingers"}, "the hand has 2 numbers; a hand two_fingers has 4"),
         ({"--support": "middle"}, "--support: expected uniform, rim, or points"),
         ({"--friction": ["0.5", "0.2"]}, "friction must be (lowest, highest)"),
         ({"--inset": "-1"}, "inset"),
+        ({"--steps": "0"}, "steps must be at least 1; got 0"),
+        ({"--forces": [], "--parts": "1"}, "--forces needs --parts"),
         ({"--parts": "12"}, "parts must be at least 1, and fewer than the 12 steps"),
     ],
 )
@@ -182,6 +184,25 @@ def test_too_few_pushes(rollouts, tmp_path, capsys):
     with pytest.raises(SystemExit):
         cli.main(arguments(few, tmp_path))
     assert "at least 3 usable pushes; found 2" in capsys.readouterr().err
+
+
+def test_a_file_in_degrees(rollouts, tmp_path):
+    """Two rows a push, small angles among them: unwrapped, each would look like any other angle."""
+    path, pose, _ = rollouts
+    ends = [0, STEPS]
+    seen = pose[:, ends] * [1, 1, 57.3]
+    seen[3, :, 2] = 5.0, 9.0
+    rows = [(str(k), path[k][ends], seen[k], np.zeros((2, 2))) for k in range(16)]
+    with pytest.raises(LogError, match=r"object_theta is up to .* rad; .*is it in degrees\? \(and 15 more"):
+        load_recordings(write(tmp_path / "degrees.csv", rows))
+
+
+def test_what_explains_nothing_is_called_so():
+    poor = {"mean_mm": 29.0, "expected_mm": 30.0, "no_motion_mm": 40.0}
+    assert "29 mm in the mean, of 40 that the objects moved" in str(_warning(poor))
+    assert "are units, frames" in str(_warning(poor | {"mean_mm": 50.0, "expected_mm": 80.0}))
+    assert _warning(poor | {"mean_mm": 20.0}) is None
+    assert _warning(poor | {"mean_mm": 5.0, "expected_mm": 5.0}) is None
 
 
 def test_screening_of_nothing_usable(log, block):

@@ -650,3 +650,16 @@ def test_first_failure():
     np.testing.assert_array_equal(np.flatnonzero(push.failed), [6, 7])
     batch = jax.jit(jax.vmap(lambda q: rollout(SLIDER, HAND, q, **PUSH)))(np.stack([PATH, path]))
     np.testing.assert_array_equal(batch.first_failure, [-1, 6])
+
+
+def test_what_is_no_slider_or_hand_is_refused():
+    block, surface = Polygon.rectangle(0.1, 0.1), random_surface(jax.random.key(0), condition=3.0)
+    path, slider = line((-0.06, 0), (0, 0), 3), Slider(block, surface)
+    given: Any = {"pose": np.zeros(3), "friction": 0.2}
+    for wrong, message in (
+        ((block, Hand.finger(0.005)), "slider: expected a Slider; got a Polygon"),
+        ((Slider(cast(Any, surface), cast(Any, block)), Hand.finger(0.005)), r"slider\.shape: expected a Shape; got a"),
+        ((slider, "finger"), "hand: expected a Hand; got a str"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            rollout(*cast(Any, wrong), path, **given)

@@ -17,6 +17,11 @@ from pushjax.datasets.records import LARGEST_NUMBER
 HAND = ("hand_x", "hand_y", "hand_theta", "hand_distance")
 OBJECT = ("object_x", "object_y", "object_theta")
 FORCE = ("force_x", "force_y")
+TURNS = 2  # from zero, that an angle in rad is at most: unwrapped, degrees would look like any angle
+
+
+class InDegrees(LogError):
+    """Of a push whose angles cannot be in rad."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +106,10 @@ def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
 def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
     """Recordings of what was made of each push of a file. Raises LogError where nothing is usable."""
     each = list(found)
+    if 2 * sum(isinstance(one, InDegrees) for one in each) > len(each):
+        # the angles of the others are just small
+        message = "the angles of most other pushes of the file cannot be in rad: are all in degrees?"
+        each = [InDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
     problems = tuple(one for one in each if isinstance(one, LogError))
     pushes = tuple(one for one in each if isinstance(one, Recording))
     if not pushes:
@@ -136,6 +145,10 @@ def checked(
     if problem is not None:
         return problem
     seen = np.isfinite(pose[:, 0])
+    largest = float(np.max(np.abs(pose[seen, 2])))
+    if largest > TURNS * 2 * np.pi:
+        message = f"object_theta is up to {largest:.4g} rad; expected at most two turns from zero: is it in degrees?"
+        return InDegrees(path, message, push=index, line=lines[0] if lines else None)
     pose, hand = pose.copy(), hand.copy()
     pose[seen, 2] = np.unwrap(pose[seen, 2])
     if hand.shape[1] > 2:

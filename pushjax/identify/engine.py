@@ -12,7 +12,7 @@ from pushjax.identify.identified import Identified
 from pushjax.identify.model import Setup
 from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Prior, Unknowns
-from pushjax.rollout import Slider
+from pushjax.rollout import Slider, check_kinds
 from pushjax.status import Status
 
 ROBUST = 2.0
@@ -52,6 +52,7 @@ def identify(
     Source: goes beyond Zhou et al. 2017, section VI, where the friction alone is found, on a grid; sigma is that of
     the evidence (MacKay 1992).
     """
+    check_kinds(slider, hand)
     unknowns = Unknowns() if unknowns is None else unknowns
     dtype = common_dtype(pushes, slider, hand)
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))

@@ -24,6 +24,8 @@ def recorded(recordings: Recordings, steps: int = STEPS, parts: int = 1, shape: 
 
     Raises ValueError for fewer than one part, or not fewer than steps.
     """
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1; got {steps}")
     if not 1 <= parts < max(steps, 2):
         raise ValueError(f"parts must be at least 1, and fewer than the {steps} steps; got {parts}")
     pushes = recordings.pushes

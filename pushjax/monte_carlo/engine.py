@@ -81,6 +81,9 @@ def monte_carlo(
     width = int(tile) if tile is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
     on = Devices.of(devices)
+    if on.several:
+        # they connect now, together: after compiling, one may be later than the others wait (30 s)
+        multihost_utils.sync_global_devices("pushjax monte_carlo")
     shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver
     run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), trajectories)
     kept: Checkpoint | None = None

@@ -26,6 +26,8 @@ from pushjax.report import envelope
 
 FEWEST = 3  # pushes: fewer tell nothing about how far off they are
 LEVEL = 0.9
+# Of how far the objects moved, and of what was expected before, that deviations may be before one is warned.
+POOR, NO_BETTER = 0.4, 0.9
 
 
 def run(
@@ -48,6 +50,7 @@ def run(
     chosen = {field.name: getattr(options, field.name) for field in fields(Options)}
     own = {name: value for name, value in chosen.items() if value is not None}
     noise = None if findings.noise is None else _noise(findings.noise)
+    predicted = predictions(findings)
     return envelope(
         "identify",
         {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | own,
@@ -58,7 +61,8 @@ def run(
         steps=int(found.steps),
         poses=len(findings.pushes.rows),
         wrenches=int(np.sum(np.asarray(findings.pushes.paired))),
-        **predictions(findings),
+        **predicted,
+        warning=_warning(predicted),
         noise=noise,
         problems=[str(problem) for problem in findings.problems],
         identified=None if saved is None else str(saved),
@@ -76,6 +80,7 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         columns = one.pushes[0].hand.shape[1]
         if columns != hand.dof:
             raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
+    _check_forces(recordings, options)
     recordings, no_better = _each(recordings, lambda one: screened(one, shape, hand))
     problems = (*useless, *no_better, *(problem for one in recordings for problem in one.problems))
     count = sum(len(one.pushes) for one in recordings)
@@ -113,6 +118,17 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
     return Findings(problems, slider, hand, pushes, found, predicted, tuple(profiles), noise, length)
 
 
+def _check_forces(recordings: list[Recordings], options: Options) -> None:
+    if not options.forces:
+        return
+    if options.parts < 2:
+        needs = "the parts of a push, each of which gives a wrench, to be 2 at least"
+        raise ValueError(f"--forces needs --parts, {needs}; got {options.parts}")
+    for one in recordings:
+        if not paired(one):
+            raise ValueError(f"--forces: {one.source} does not have the forces of a single finger for every push")
+
+
 def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
     """What is made of every item, and the errors of those of which nothing is: raised only if it is so of all."""
     good, bad = [], []
@@ -144,6 +160,17 @@ def conditions(recordings: list[Recordings], shape, options: Options, seed: int)
     return whole, pj.Slider(shape, expected(recordings[0]))
 
 
+def _warning(predicted: dict[str, Any]) -> str | None:
+    """Of a fit that explains next to nothing: whatever it says of friction is worth as little."""
+    mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
+    if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
+        return None
+    return (
+        f"what was found predicts final poses to {mean:.3g} mm in the mean, of {still:.3g} that the objects moved, and "
+        f"to {before:.3g} before: are units, frames, outline and radius right?"
+    )
+
+
 def _noise(noise: Noise) -> dict[str, Any]:
     return {
         "dof": float(noise.dof),
@@ -158,12 +185,15 @@ def _noise(noise: Noise) -> dict[str, Any]:
 def summary(record: dict[str, Any]) -> str:
     """What the command prints: a line for each number found."""
     problems, level = record["problems"], record["settings"]["level"]
-    lines = [f"{record['pushes']} pushes used, {len(problems)} problems."]
+    counted = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    lines = [f"{record['pushes']} pushes used, {counted}."]
     chosen = record["settings"]
+    if record["warning"] is not None:
+        lines.insert(0, f"WARNING: {record['warning']}")
     if record["poses"] < chosen["parts"]:
         lines.append(f"only final poses: not every push was seen {chosen['parts'] - 1} times on the way")
     if chosen["forces"]:
-        lines.append(f"{record['wrenches']} measured wrenches" + ("" if record["wrenches"] else ": see --parts"))
+        lines.append(f"{record['wrenches']} measured wrenches.")
     lines += [f"  {problem}" for problem in problems[:10]]
     if len(problems) > 10:
         lines.append(f"  and {len(problems) - 10} more (see the JSON)")
@@ -175,8 +205,9 @@ def summary(record: dict[str, Any]) -> str:
     lines += [
         f"limit surface: {record['surface_determined']:.1f} of its {record['surface_numbers']} numbers determined",
         "",
-        f"deviation of predicted final poses: {record['mean_mm']:.2f} mm in the mean, {record['worst_mm']:.2f} at "
-        f"worst; before, {record['expected_mm']:.2f}; the objects moved {record['no_motion_mm']:.1f}",
+        f"deviation of predicted final poses: {record['mean_mm']:.2f} mm in the mean, {record['worst_mm']:.2f} mm at "
+        f"worst; as expected before any push, {record['expected_mm']:.2f} mm; the objects moved "
+        f"{record['no_motion_mm']:.1f} mm",
         f"sigma: {record['sigma_mm']:.3g} mm; " + ("converged" if record["converged"] else "NOT converged"),
     ]
     if record["noise"] is not None:
@@ -186,6 +217,7 @@ def summary(record: dict[str, Any]) -> str:
             f"noise: dof {noise['dof']:.0f}, friction {friction}, hand off by {noise['offset_mm']:.2f} mm, poses by "
             f"{noise['sigma_mm']:.2f} mm; energy score {noise['score_mm']:.2f} mm"
         )
+    lines.append("interval: normal; profile: all else at its best; determined: how much of the doubt before is gone.")
     if record["failed_steps"]:
         lines.append(f"{record['failed_steps']} steps of the predicted pushes failed (see the JSON)")
     lines += [f"drew {path}" for path in record["pictures"]]

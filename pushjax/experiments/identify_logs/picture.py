@@ -5,10 +5,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from pushjax import plot
 from pushjax.experiments.identify_logs.findings import Findings, unit
 
+RISE_OF_90 = 1.3528  # half the square of the normal distribution's 95 % quantile
 SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
 
 
@@ -80,10 +82,14 @@ def _profiles(findings: Findings, out: Path) -> Path:
         panel.set_visible(False)
     for panel, each in zip(axes.flat, profiles, strict=False):
         name, scale = unit(each.label)
-        panel.plot(scale * each.value, each.rise, "-", color=plot.BLUE, label="all else at its best")
-        panel.plot(scale * each.value, each.normal, "--", color=plot.ORANGE, label="normal")
-        panel.axhline(1.3528, color=plot.BETWEEN, lw=0.8)
+        apart = np.sign(np.arange(len(each.normal)) - len(each.normal) // 2) * np.sqrt(2 * each.normal)
+        dense = np.linspace(apart[0], apart[-1], 200)
+        value, rise = (PchipInterpolator(apart, y)(dense) for y in (scale * each.value, each.rise))
+        panel.plot(value, rise, "-", color=plot.BLUE, label="all else at its best")
+        panel.plot(scale * each.value, each.rise, "o", color=plot.BLUE, ms=3)
+        panel.plot(value, dense**2 / 2, "--", color=plot.ORANGE, label="normal")
+        panel.axhline(RISE_OF_90, color=plot.BETWEEN, lw=0.8, label="where a 90 % interval ends")
         panel.set(xlabel=each.label + (f" / {name}" if name else ""), ylim=(0, 5))
     axes[0, 0].set_ylabel("rise of the negative log posterior")
-    plot.legend_below(figure, axes[0, 0], columns=2)
+    plot.legend_below(figure, axes[0, 0], columns=3)
     return plot.save(figure, out / "identify_profiles.png")

@@ -70,8 +70,10 @@ def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.
         if any(v.shape != known[0].shape or not np.allclose(v, known[0]) for v in known):
             raise ValueError("the logs are of objects with different outlines: identify them one by one")
         return pj.Polygon(known[0])
-    kind, _, rest = text.partition(":")
+    kind, colon, rest = text.partition(":")
     if kind not in ("rectangle", "disk", "ellipse", "regular"):
+        if colon and not Path(text).exists():
+            raise ValueError(f"--shape: expected {SHAPES}; got {text!r}")
         return pj.Polygon(_vertices(Path(text)))
     wanted = 1 if kind == "disk" else 2
     sizes = _numbers("--shape", text, rest, "x", wanted, SHAPES)
