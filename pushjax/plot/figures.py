@@ -279,7 +279,11 @@ def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
             axes.bar(x, height, 0.34, yerr=error, color=color, label=f"{model}, this run", capsize=2, ecolor="0.25")
             paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in mine]
             axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
-        axes.set_xticks(np.arange(len(conditions)), [f"{surface}\n{name}" for surface, name in conditions])
+        axes.set_xticks(np.arange(len(conditions)), [name for _, name in conditions])
+        surfaces = np.array([surface for surface, _ in conditions])
+        for surface in dict.fromkeys(surfaces.tolist()):
+            middle = float(np.mean(np.flatnonzero(surfaces == surface)))
+            axes.text(middle, -0.15, surface, transform=axes.get_xaxis_transform(), ha="center", va="center")
         axes.set(ylabel="mean deviation / mm", title=title)
-        axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+        axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2))
         return figure
