@@ -145,7 +145,9 @@ def test_experiment(logs, data, monkeypatch, tmp_path):
     assert [cell["method"] for cell in record["cells"]] == ["wrench_twist", "identified"]
     for cell in record["cells"]:
         assert (cell["tested"], cell["learned"], cell["failed_steps"]) == (196, 82, 0)
-        assert cell["no_motion_mm"] == pytest.approx(34.14 / 0.975, abs=0.4)  # the paper's window was a little shorter
+        assert cell["no_motion_mm"] == pytest.approx(
+            conditions.PAPER_NO_MOTION_MM["abs"][0] / 0.975, abs=0.4
+        )  # the paper's window was a little shorter
         assert 0 < cell["friction"] < 0.5
         assert cell["noise_floor_mm"] < cell["mean_mm"] < 1.1 * cell["paper_mm"]
     assert found["mean_mm"] < forces["mean_mm"] + 0.1

@@ -36,6 +36,13 @@ def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
         raise LogError(path, f"expected an .npz archive of {holds}, found something else: {error}") from error
 
 
+def archive_names(path: Path, holds: str) -> frozenset[str]:
+    """Which arrays a file has. Raises LogError as `read_archive` does."""
+    read_archive(path, (), holds)  # says what is wrong with a file that is no archive
+    with np.load(path, allow_pickle=False) as archive:
+        return frozenset(archive.files)
+
+
 def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> int:
     """How many pushes the archive has: the rows of `push_index`, and of all in `shapes` (each row's shape). Raises
     LogError where these differ."""

@@ -4,9 +4,7 @@ from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 
-import numpy as np
-
-from pushjax.datasets._archive import read_archive
+from pushjax.datasets._archive import archive_names
 from pushjax.datasets.mit import load_mit_hdf5, load_mit_json, load_mit_npz
 from pushjax.datasets.plain import LAYOUT, load_csv, load_plain_npz
 from pushjax.datasets.pushes import LogError
@@ -41,10 +39,7 @@ def _load_triangle(path: Path) -> Recordings:
 
 def _load_npz(path: Path) -> Recordings:
     """Reads an archive; the arrays in it tell its kind."""
-    # Reading none of them says what is wrong with a file that is no archive.
-    read_archive(path, (), "pushes")
-    with np.load(path, allow_pickle=False) as archive:
-        names = frozenset(archive.files)
+    names = archive_names(path, "pushes")
     if "path" in names:
         return load_plain_npz(path, names)
     if "tip_offsets" in names:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets._archive import Arrays, check_shapes, floats, read_archive
+from pushjax.datasets._archive import Arrays, archive_names, check_shapes, floats, read_archive
 from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.records import LARGEST_NUMBER
 
@@ -80,7 +80,7 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
     """
     file = Path(path)
     names = [*_ABOUT, *_SHAPE]
-    with_fast = _has(file, "v20_index")
+    with_fast = "v20_index" in archive_names(file, "straight pushes")
     groups = {name: prefix for name, prefix in GROUPS.items() if name != "fast" or with_fast}
     for prefix in groups.values():
         names += [f"{prefix}_{part}" for part in ("index", *_POSES, *_TIPS, "valid")]
@@ -124,12 +124,6 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
         shape=str(data["shape"]),
         source=str(file),
     )
-
-
-def _has(path: Path, name: str) -> bool:
-    read_archive(path, (), "straight pushes")  # says what is wrong with a file that is no archive
-    with np.load(path, allow_pickle=False) as archive:
-        return name in archive.files
 
 
 def _group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
