@@ -17,7 +17,7 @@ import numpy as np
 from _measure import header
 
 import pushjax as pj
-from pushjax.identify.model import trajectories
+from pushjax.identify.model import Body, trajectories
 from pushjax.identify.unknowns import Prior
 
 HALF, RADIUS, TRAVEL, STEPS = 0.045, 0.005, 0.03, 30
@@ -49,7 +49,7 @@ def main() -> None:
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
     several = jax.tree.map(lambda leaf: leaf[None], mean)
-    prior = Prior.of(UNKNOWNS, several, jnp.asarray([0.25]))
+    prior = Prior.of(UNKNOWNS, several, jnp.asarray([0.25]), jnp.zeros(2))
     layout, count = prior.layout, arguments.repetitions
     starts, paths = planned(rng, (count, arguments.pushes))
     truth, mu = rng.normal(size=(count, layout.size)), rng.uniform(0.1, 0.5, count)
@@ -61,7 +61,7 @@ def main() -> None:
     @jax.vmap
     def ends(z, start, path):
         pushes = pj.Pushes(start[None], path[None], start[None])
-        return trajectories(prior.physical(z), several, square, hand, pushes).pose[0, :, -1]
+        return trajectories(prior.physical(z), several, Body(square, hand, prior.origin), pushes).pose[0, :, -1]
 
     noise = 1e-3 * arguments.noise * rng.normal(size=starts.shape) / [1, 1, float(mean.length)]
     seen = ends(truth, starts, paths) + jnp.asarray(noise, jnp.float32)

@@ -51,5 +51,6 @@ from pushjax.status import ContactMode as ContactMode
 from pushjax.status import Status as Status
 from pushjax.support import Support as Support
 from pushjax.support import WrenchTwistPairs as WrenchTwistPairs
+from pushjax.table import Table as Table
 
 __version__ = "0.1.0"

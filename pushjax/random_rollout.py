@@ -68,8 +68,8 @@ def push_under(
 
     if every is None:
         only = drawn(0)
-        return scan(shape, hand, path, pose, solver, lambda step: only)
-    return scan(shape, hand, path, pose, solver, lambda step: drawn(step // every))
+        return scan(shape, hand, path, pose, solver, lambda step, pose: only)
+    return scan(shape, hand, path, pose, solver, lambda step, pose: drawn(step // every))
 
 
 def random_rollout(

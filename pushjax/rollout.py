@@ -20,11 +20,12 @@ from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.advance import Record, advance, columns, deepest, grips_of
 from pushjax.contacts import DEEPEST_OVERLAP, count
 from pushjax.hands import Hand, checked_path
-from pushjax.limit_surface import Form, LimitSurface
+from pushjax.limit_surface import Form, LimitSurface, WarpedForm
 from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
 from pushjax.status import Status
+from pushjax.table import Table
 
 OVERLAPS = 4096  # poses that are looked at together
 
@@ -224,15 +225,16 @@ def rollout(
     pose: Numeric,
     friction: Numeric,
     solver: ContactSolver | StickingSolver | None = None,
+    table: Table | None = None,
 ) -> Trajectory:
     """Push the slider along a path of hand configurations.
 
     path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose:
     (3,), the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,).
-    solver: as in `solve_contacts`. There is no other state: a push goes on with `rollout(..., rest_of_path,
-    pose=push.pose[-1])`.
+    solver: as in `solve_contacts`. table: one whose friction depends on direction or place; None for an even one. There
+    is no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
 
-    Differentiable, forward and reverse, in slider, hand, path, pose and friction. Batches come from `vmap`.
+    Differentiable, forward and reverse, in slider, hand, path, pose, friction and table. Batches come from `vmap`.
 
     Raises ValueError as `step` does, and for a finger that starts inside the slider by more than a fifth of the
     surface's length (less is pushed out in the first step), where it is not traced. Traced values, `status` at every
@@ -243,13 +245,24 @@ def rollout(
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; the header of `advance` has the scheme.
     """
-    return _rollout(*prepared(slider, hand, path, pose, friction), solver)
+    slider, hand, p, start, mu = prepared(slider, hand, path, pose, friction)
+    if table is not None:
+        instance("table", table, Table)
+        table = jax.tree.map(lambda leaf: leaf.astype(start.dtype), table)
+    return _rollout(slider, hand, p, start, mu, solver, table)
 
 
 @eqx.filter_jit
-def _rollout(slider, hand, path, pose, friction, solver) -> Trajectory:
-    grounded = ground(slider.surface, friction)
-    return scan(slider.shape, hand, path, pose, solver, lambda step: grounded)
+def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
+    form, mu = ground(slider.surface, friction)
+    if table is None:
+        return scan(slider.shape, hand, path, pose, solver, lambda step, pose: (form, mu))
+    mu = jnp.where(jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(table))), mu, jnp.nan)
+
+    def on_table(step: Array, pose: Vec3) -> tuple[Form, Array]:
+        return WarpedForm(form, table.warp(pose, form.length)), mu
+
+    return scan(slider.shape, hand, path, pose, solver, on_table)
 
 
 def scan(
@@ -258,16 +271,17 @@ def scan(
     path: Array,
     pose: Array,
     solver: ContactSolver | StickingSolver | None,
-    grounded: Callable[[Array], tuple[Form, Array]],
+    grounded: Callable[[Array, Vec3], tuple[Form, Array]],
 ) -> Trajectory:
-    """The rollout itself. `grounded` gives a step's surface and friction, by its index; all are of one length."""
+    """The rollout itself. `grounded` gives a step's surface and friction, by its index and the pose before it; all are
+    of one length."""
     outline = shape.outline()
     fingers = columns(hand.poses(path))
     one = sum(count(finger, outline) for finger in hand.fingers) == 1  # which cannot jam
 
     def body(carry, along):
         (pose, stopped), (step, ends) = carry, along
-        form, mu = grounded(step)
+        form, mu = grounded(step, pose)
         record = advance(form, outline, grips_of(hand, mu, *ends), solver, pose)
         if not one:
             record, stopped = _frozen(record, pose, stopped)
@@ -281,7 +295,7 @@ def scan(
     body = jax.checkpoint(body, prevent_cse=False, policy=keep_found)
     indices = jnp.arange(len(path) - 1)
     _, records = jax.lax.scan(body, (Vec3.of(pose), jnp.zeros((), jnp.int8)), (indices, ends))
-    steps = _world(records, grounded(indices[0])[0].length)
+    steps = _world(records, grounded(indices[0], Vec3.of(pose))[0].length)
     poses = jnp.concatenate([pose[None], steps.pose])
     stopped = _first(_stops(steps.status))
     reached = jnp.where(stopped >= 0, stopped, len(path) - 1)

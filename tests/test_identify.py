@@ -179,7 +179,8 @@ def test_conditions_share_the_calibration(square, hand):
 
     # derivatives of what is minimised
     surface = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pj.Ellipsoid(np.eye(3), length))
-    setup = Setup(square, hand, surface, Prior.of(unknowns, surface, jnp.asarray(0.25)), jnp.asarray(0.05))
+    prior = Prior.of(unknowns, surface, jnp.asarray(0.25), jnp.zeros(2))
+    setup = Setup(square, hand, surface, prior, jnp.asarray(0.05))
     z, h = jnp.asarray([-1.0, 0.3, 0.2, -0.4]), 1e-6
     local = eqx.filter_jit(setup.local)(z, many)
     value, slopes = local.value, setup.slopes(z, local)

@@ -2,9 +2,16 @@
 
 from pushjax.datasets.folder import find_data as find_data
 from pushjax.datasets.load import load_recordings as load_recordings
+from pushjax.datasets.mit_folder import find_mit_pushes as find_mit_pushes
+from pushjax.datasets.mit_folder import load_mit_folder as load_mit_folder
+from pushjax.datasets.mit_names import PushName as PushName
+from pushjax.datasets.mit_names import parse_push_name as parse_push_name
 from pushjax.datasets.mit_pushes import MitPushes as MitPushes
 from pushjax.datasets.mit_pushes import StraightPushes as StraightPushes
 from pushjax.datasets.mit_pushes import load_mit_pushes_npz as load_mit_pushes_npz
+from pushjax.datasets.mit_shapes import MIT_SHAPES as MIT_SHAPES
+from pushjax.datasets.mit_shapes import MitShape as MitShape
+from pushjax.datasets.mit_shapes import mit_shape as mit_shape
 from pushjax.datasets.pushes import LogError as LogError
 from pushjax.datasets.pushes import Onset as Onset
 from pushjax.datasets.pushes import Push as Push

@@ -32,7 +32,7 @@ class StraightPushes(NamedTuple):
     """k pushes. index: (k,) the push's row in the original file. start, end: (k, 3) m, rad, world, the object's poses;
     the end angle is the one nearest to that of the start. tip_start, tip_end: (k, 2) m, world, the tip's centre.
     valid: (k,) whether the tracker can be believed. toolbox: (k, 3) the end as the original toolbox predicted it, by
-    the name of the limit surface's kind."""
+    the name of the limit surface's kind; empty where it is not known."""
 
     index: NDArray[np.int64]
     start: Floats
@@ -53,7 +53,7 @@ class MitPushes(NamedTuple):
     that the toolbox trained with. middle_of: (middle,) the row in `whole` of the same push. repeats: (r, 2) rows in
     `fast` and in `whole` of the same nominal push. wrench, twist: (m, 3) on the object in its body frame about the body
     origin, of any scale: pairs that the toolbox trained with. vertices: (v, 2) m, body. length: m, which weighs
-    rotation against translation. tip_radius: m. surface, shape: names. source: the file.
+    rotation against translation. tip_radius: m. surface, shape: names. source: the file or folder.
     """
 
     whole: StraightPushes

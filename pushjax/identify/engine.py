@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
-from pushjax.hands import Hand
+from pushjax.hands import Hand, RoundFinger
 from pushjax.identify.fit import ROUNDS, Effort, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
 from pushjax.identify.model import Setup
@@ -18,6 +18,7 @@ from pushjax.status import Status
 ROBUST = 2.0
 SIGMA = 0.002  # m, where the search for it begins
 DIRECTION = 0.3  # the same, of directions of motion
+GAP = 0.002  # m, and of gaps: as wide, so that none is lost too soon
 FRICTIONS = 9  # from which the search begins
 
 
@@ -31,6 +32,7 @@ def identify(
     length: Numeric | None = None,
     robust: float | None = ROBUST,
     sigma: Numeric | None = None,
+    touching: bool = False,
 ) -> Identified:
     """Friction, limit surface and calibration from recorded pushes, with how well they are known.
 
@@ -40,7 +42,10 @@ def identify(
     friction: mu, where it is known. length: m, makes angles commensurate with positions in what is minimised; the
     surface's unless given. sigma: m, by how much each of x, y and length * theta of a final pose is off its prediction,
     as standard deviation; None: found too. robust: pushes that are farther off than so many sigma count less, by
-    pseudo-Huber's loss; None: by least squares.
+    pseudo-Huber's loss; None: by least squares. touching: the hand, a single round finger, touches the slider at the
+    end of most pushes: where it was seen inside the slider, or apart from it, it really was elsewhere. That tells
+    inset, end, lag, offset and marker far better than where pushes end does; how far gaps are off is found too, and
+    pushes whose finger has lost the slider do not matter.
 
     Maximises the posterior: pushes, and the prior that `unknowns` describes, by Levenberg and Marquardt's method, from
     the best of several frictions. Its normal distribution is that of the linearised pushes.
@@ -78,25 +83,31 @@ def identify(
         positive(name, value)
     if robust is not None:
         positive("robust", robust)
-    prior = _prior(unknowns, surface, mu)
-    setup = Setup(slider.shape, hand, surface, prior, metric)
+    for name, asked in (("overlap", unknowns.overlap is not None), ("touching", touching)):
+        if asked and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
+            raise ValueError(f"{name} is for a single round finger; the hand has {len(hand.fingers)} fingers")
+    total = jnp.maximum(jnp.sum(several.weight), 1.0)
+    origin = jnp.einsum("cn,cni->i", several.weight, several.start[..., :2]) / total
+    prior = _prior(unknowns, surface, mu, origin)
+    setup = Setup(slider.shape, hand, surface, prior, metric, touching)
     start = prior.start
     pairs = several.wrench.shape[-2] > 0
-    known = jnp.array([sigma is not None, not pairs])
-    sigmas = jnp.stack([first, jnp.asarray(DIRECTION, dtype)])
-    effort = Effort.of(dtype, 1 if sigma is not None and not pairs else ROUNDS)
+    known = jnp.array([sigma is not None, not pairs, not touching])
+    sigmas = jnp.stack([first, *(jnp.asarray(value, dtype) for value in (DIRECTION, GAP))])
+    effort = Effort.of(dtype, 1 if sigma is not None and not (pairs or touching) else ROUNDS)
     found = program(setup, several, start, jnp.asarray(True), sigmas, known, Held.none(start), effort, robust=robust)
     status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
     last = 3 * len(several.rows)
     residual = found.residual[..., last - 3 : last] * len(several.rows) ** 0.5
     residual, information = jax.tree.map(lambda leaf: leaf[0] if single else leaf, (residual, found.information))
-    direction = found.sigma[1] if pairs else jnp.zeros_like(metric)
+    direction, gap = (jnp.where(asked, found.sigma[k], 0.0) for k, asked in ((1, pairs), (2, touching)))
     return Identified(
         found.z,
         found.precision,
         prior,
         found.sigma[0],
         direction,
+        gap,
         residual,
         information,
         found.loss,
@@ -105,6 +116,7 @@ def identify(
         status,
         single,
         robust,
+        touching,
     )
 
 

@@ -17,12 +17,16 @@ ROUNDS = 6
 LEAST = 1e-6  # m, that sigma may be: less, nothing is measured
 
 
+KINDS = (3, 3, 1)  # numbers that a push tells by its poses, its pairs, its contact
+LOST = 3.0  # sigma: where a gap is farther off, the finger is taken to have lost the slider, and counts for little
+
+
 class Fit(NamedTuple):
-    """sigma: (2,), of poses (m) and of directions of motion. residual: (..., rows), of both. loss: the sum of
-    squares."""
+    """sigma: (3,), of poses (m), of directions of motion, and of gaps (m). residual: (..., rows), of all. loss: the sum
+    of squares."""
 
     z: Float[Array, "size"]
-    sigma: Float[Array, "2"]
+    sigma: Float[Array, "3"]
     precision: Float[Array, "size size"]
     residual: Float[Array, "conditions pushes rows"]
     information: Float[Array, "conditions pushes size"]
@@ -46,40 +50,46 @@ class Held(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """How much the poses of a push count, and how much its pairs."""
+    """How much the poses of a push count, how much its pairs, and how much its contact."""
 
     poses: Float[Array, "conditions pushes"]
     pairs: Float[Array, "conditions pushes"]
+    contact: Float[Array, "conditions pushes"]
 
     @staticmethod
     def of(pushes: Pushes) -> "Counts":
-        return Counts(pushes.weight, jnp.where(jnp.any(pushes.paired, axis=-1), pushes.weight, 0.0))
+        pairs = jnp.where(jnp.any(pushes.paired, axis=-1), pushes.weight, 0.0)
+        return Counts(pushes.weight, pairs, pushes.weight)
 
 
-def _parts(residual: Array, pushes: Pushes) -> tuple[Array, Array]:
-    """Poses and pairs."""
+def _parts(residual: Array, pushes: Pushes) -> tuple[Array, Array, Array]:
+    """Poses, pairs and contacts."""
     poses = 3 * len(pushes.rows)
-    return residual[..., :poses], residual[..., poses:]
+    pairs = poses + 3 * pushes.wrench.shape[-2]
+    return residual[..., :poses], residual[..., poses:pairs], residual[..., pairs:]
 
 
 def whitened(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
-    """Residuals whose squares add up to the loss: pseudo-Huber's of each push's, from `robust` sigma on."""
+    """Residuals whose squares add up to the loss: pseudo-Huber's of each push's, from `robust` sigma on; of a gap that
+    of Geman and McClure, which is bounded: a finger that has gone tells nothing."""
     whole = []
     for k, (r, weight) in enumerate(zip(_parts(residual, pushes), Counts.of(pushes), strict=True)):
         r = r / sigma[k]
-        if robust is not None:
-            squared = jnp.sum(r**2, axis=-1, keepdims=True)
+        squared = jnp.sum(r**2, axis=-1, keepdims=True)
+        if KINDS[k] == 1:
+            r = r / jnp.sqrt(1 + squared / LOST**2)
+        elif robust is not None:
             r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
         whole.append(r * jnp.sqrt(weight)[..., None])
     return jnp.concatenate(whole, axis=-1)
 
 
-def _trust(residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
+def _trust(k: int, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
     """How much a push counts in the end."""
-    if robust is None:
-        return weight
     squared = jnp.sum((residual / sigma) ** 2, axis=-1)
-    return weight / jnp.sqrt(1 + squared / robust**2)
+    if KINDS[k] == 1:
+        return weight / (1 + squared / LOST**2) ** 2
+    return weight if robust is None else weight / jnp.sqrt(1 + squared / robust**2)
 
 
 class Effort(NamedTuple):
@@ -120,7 +130,7 @@ def fit(
             _parts(residual, pushes), _parts(jnp.moveaxis(slopes, 3, 0), pushes), Counts.of(pushes), strict=True
         )
         for k, (r, slope, weight) in enumerate(parts):
-            count = _trust(r, weight, sigma[k], robust)
+            count = _trust(k, r, weight, sigma[k], robust)
             scaled = slope * (jnp.sqrt(count) / sigma[k])[None, ..., None]
             information.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
             each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
@@ -130,8 +140,8 @@ def fit(
         # ones wait for each other forever where two run at once (0.10.1, two cores)
         shares = jnp.linalg.solve(precision, jnp.concatenate(information, axis=1))
         again = [
-            jnp.sqrt(squares / jnp.maximum(3 * count - jnp.trace(share), 3.0))
-            for share, (count, squares) in zip(jnp.split(shares, len(information), axis=1), left, strict=True)
+            jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(share), 3.0))
+            for numbers, share, (count, squares) in zip(KINDS, jnp.split(shares, len(KINDS), axis=1), left, strict=True)
         ]
         total = jnp.sum(whitened(residual, pushes, sigma, robust) ** 2) + jnp.sum((flat * z) ** 2)
         steps = before.steps + found.steps
@@ -141,7 +151,7 @@ def fit(
         return Fit(z, sigma, precision, residual, each, total, steps, found.converged)
 
     many = pushes.weight.shape
-    rows = 3 * len(pushes.rows) + 3 * pushes.wrench.shape[-2]
+    rows = 3 * len(pushes.rows) + 3 * pushes.wrench.shape[-2] + setup.touching
     size = len(start)
     precision, residual, information, loss = (
         jnp.zeros(shape, start.dtype) for shape in ((size, size), (*many, rows), (*many, size), ())

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
 from pushjax.hands import Hand
-from pushjax.identify.model import moved, smaller, trajectories
+from pushjax.identify.model import Body, moved, smaller, trajectories
 from pushjax.identify.pushes import Pushes
 from pushjax.identify.unknowns import Physical, Prior
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
@@ -20,6 +20,7 @@ from pushjax.rollout import Slider, Trajectory
 if TYPE_CHECKING:
     from pushjax.identify.uncertainty import Profile
 
+APPLIED = ("friction", "surface", "center", "inset", "end", "lag", "offset")
 LOGISTIC_VARIANCE = np.pi**2 / 3
 
 
@@ -29,10 +30,11 @@ class Identified(eqx.Module):
     z: (size,), those values as `prior` writes them; precision: (size, size), the inverse of their covariance. prior:
     what turns them into physics. sigma: m, the standard deviation of each of x, y and length * theta of a measured
     pose about its prediction; direction: that of each part of a unit vector along the motion under a measured wrench,
-    zero if there was none. residual: (..., pushes, 3), predicted less measured final pose, in x, y, length * theta, m.
-    information: (..., pushes, size), what each push adds to the diagonal of the precision. loss: what was minimised,
-    twice the negative logarithm of the posterior's density, up to a constant. length: m, the metric's. steps: of the
-    optimiser. status: MOVING, or NOT_CONVERGED. robust: as `identify` was told.
+    zero if there was none; gap: m, that of a gap at a push's end, zero unless `touching`. residual: (..., pushes, 3),
+    predicted less measured final pose, in x, y, length * theta, m. information: (..., pushes, size), what each push
+    adds to the diagonal of the precision. loss: what was minimised, twice the negative logarithm of the posterior's
+    density, up to a constant. length: m, the metric's. steps: of the optimiser. status: MOVING, or NOT_CONVERGED.
+    robust, touching: as `identify` was told.
 
     All properties have a leading axis of conditions if the pushes had one; what conditions share is repeated.
     """
@@ -42,6 +44,7 @@ class Identified(eqx.Module):
     prior: Prior
     sigma: Float[Array, ""]
     direction: Float[Array, ""]
+    gap: Float[Array, ""]
     residual: Float[Array, "*conditions pushes 3"]
     information: Float[Array, "*conditions pushes size"]
     loss: Float[Array, ""]
@@ -50,6 +53,7 @@ class Identified(eqx.Module):
     status: Int[Array, ""]
     single: bool = eqx.field(static=True)
     robust: float | None = eqx.field(static=True)
+    touching: bool = eqx.field(static=True, default=False)
 
     @property
     def physical(self) -> Physical:
@@ -117,8 +121,8 @@ class Identified(eqx.Module):
         return self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
 
     def interval(self, level: float = 0.9) -> dict[str, tuple[Array, Array]]:
-        """The lowest and highest value of friction, center, inset, end, lag and offset, as far as they were unknown,
-        that hold a share `level` of the distribution; arrays like the estimates.
+        """The lowest and highest value of everything that was unknown but the surface, by its name, that
+        hold a share `level` of the distribution; arrays like the estimates.
 
         Each is that of its own number of z, so that a friction stays in its range.
         """
@@ -145,10 +149,14 @@ class Identified(eqx.Module):
     def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
         """Slider, hand and path as they really are, to roll out with. path: (steps + 1, dof).
 
-        Raises ValueError for what was found of several conditions.
+        Raises ValueError for what was found of several conditions, or if something was asked for that
+        these three cannot tell, such as a table.
         """
         if not self.single:
             raise ValueError("applied is for what was found of one condition; of several there is `predict`")
+        more = [name for name in self.prior.layout.names if name not in APPLIED]
+        if more:
+            raise ValueError(f"applied cannot tell of {', '.join(more)}; for what was found of them there is `predict`")
         own = self.physical
         shape, hand = smaller(slider.shape, hand, own.inset)
         return Slider(shape, self.surface), hand, moved(path, own.end, own.lag, own.offset)
@@ -157,7 +165,8 @@ class Identified(eqx.Module):
         """These or other pushes, of the same conditions, rolled out; every array with axes (..., pushes) in front.
         slider: its outline counts, hand: as it was said to be."""
         theta = self.prior.physical(self.z)
-        each = _trajectories(theta, surfaces(self.prior, theta), slider.shape, hand, pushes.as_conditions())
+        body = Body(slider.shape, hand, self.prior.origin)
+        each = _trajectories(theta, surfaces(self.prior, theta), body, pushes.as_conditions())
         return self._own(each)
 
     def _own(self, several: Any) -> Any:

@@ -10,27 +10,32 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax.hands import Hand, RoundFinger, arc_length, at_lengths
-from pushjax.identify.pushes import Pushes
-from pushjax.identify.unknowns import Physical, Prior
+from pushjax.identify.pushes import Given, Pushes
+from pushjax.identify.unknowns import TABLE, Physical, Prior
 from pushjax.limit_surface import LimitSurface
 from pushjax.rollout import Slider, Trajectory, rollout
+from pushjax.se2 import compose, inverse, transform
 from pushjax.shapes import Polygon, Shape
+from pushjax.table import Table
 
 STRAIGHT = 5  # the direction in which a path goes on is that of a fifth of it
 
 
 class Setup(eqx.Module):
-    """Everything that stays as it is. surface: with a leading axis of conditions; length: of the metric."""
+    """Everything that stays as it is. surface: with a leading axis of conditions; length: of the metric. touching: at
+    the end of every push."""
 
     shape: Shape
     hand: Hand
     surface: LimitSurface
     prior: Prior
     length: Float[Array, ""]
+    touching: bool = eqx.field(static=True, default=False)
 
     def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes rows"]:
         """Predicted less measured poses: x, y, length * theta, m; and predicted less measured directions of motion
-        under the wrenches. Each kind is divided by the root of how many there are of it."""
+        under the wrenches. Each kind is divided by the root of how many there are of it. Last the gap between the
+        finger and the slider as it was seen in the end, m."""
         varied, rest = self._split(z)
         return jnp.concatenate([each[0] for each in self._kinds(lambda f: f, varied, rest, pushes)], axis=-1)
 
@@ -48,8 +53,8 @@ class Setup(eqx.Module):
     def _kinds(self, of: Callable, varied: dict[str, Array], rest: Physical, pushes: Pushes) -> list:
         """`of` the residuals (value, value), for each kind, over all conditions and pushes."""
         rows = tuple(pushes.rows.tolist())
-        fixed = (self.shape, self.hand, self.length)
-        own = _Own(self.surface, pushes.start, pushes.path, pushes.poses)
+        fixed = (Body(self.shape, self.hand, self.prior.origin), self.length)
+        own = _Own(self.surface, pushes.given, pushes.poses)
 
         def off(varied, rest, own, fixed):
             return _off(varied, rest, own, fixed, rows)
@@ -58,6 +63,8 @@ class Setup(eqx.Module):
         if pushes.wrench.shape[-2]:
             pairs = _Pairs(self.surface, pushes.wrench, pushes.twist, pushes.paired)
             kinds.append(_each(of(_astray), varied, rest, pairs, ()))
+        if self.touching:
+            kinds.append(_each(of(_gap), varied, rest, own, fixed))
         return kinds
 
     def expanded(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes rows"]:
@@ -93,19 +100,26 @@ class Local(NamedTuple):
     varied: dict[str, Array]
 
 
-def trajectories(theta: Physical, surface: LimitSurface, shape: Shape, hand: Hand, pushes: Pushes) -> Trajectory:
+class Body(NamedTuple):
+    """What touches, and where the table is."""
+
+    shape: Shape
+    hand: Hand
+    origin: Float[Array, "2"]
+
+
+def trajectories(theta: Physical, surface: LimitSurface, body: Body, pushes: Pushes) -> Trajectory:
     """Predicted pushes, with axes (conditions, pushes); theta and surface with a leading axis of conditions."""
-    over_pushes = jax.vmap(push, in_axes=(None, None, None, 0, 0))
-    over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0, 0))
-    return over_all(theta, surface, (shape, hand), pushes.start, pushes.path)
+    over_pushes = jax.vmap(push, in_axes=(None, None, None, 0))
+    over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0))
+    return over_all(theta, surface, body, pushes.given)
 
 
 class _Own(NamedTuple):
     """What belongs to one push; the surface to its condition."""
 
     surface: LimitSurface
-    start: Array
-    path: Array
+    given: Given
     poses: Array
 
 
@@ -118,11 +132,21 @@ class _Pairs(NamedTuple):
     there: Array
 
 
-def _off(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Shape, Hand, Array], rows: tuple[int, ...]):
-    shape, hand, length = fixed
-    predicted = push(rest._replace(**varied), own.surface, (shape, hand), own.start, own.path)
+def _off(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Body, Array], rows: tuple[int, ...]):
+    body, length = fixed
+    predicted = push(rest._replace(**varied), own.surface, body, own.given)
     off = predicted.pose[np.array(rows)] - own.poses
     residual = off.at[:, 2].mul(length).reshape(-1) / float(np.sqrt(len(rows)))
+    return residual, residual
+
+
+def _gap(varied: dict[str, Array], rest: Physical, own: _Own, fixed: tuple[Body, Array]):
+    theta, body = rest._replace(**varied), fixed[0]
+    shape, hand = smaller(body.shape, body.hand, theta.inset)
+    end = own.poses[-1] if theta.marker is None else compose(own.poses[-1], theta.marker)
+    tip = moved(own.given.path, theta.end, theta.lag, theta.offset)[-1]
+    distance, _, radius = nearest(shape, hand, end, tip)
+    residual = (distance - radius)[None]
     return residual, residual
 
 
@@ -146,6 +170,7 @@ def _astray(varied: dict[str, Array], rest: Physical, own: _Pairs, fixed: tuple[
 
 
 def _each(function: Callable, varied: dict[str, Array], rest: Physical, own: "_Own | _Pairs", fixed: tuple):
+    # the surface is its condition's
     each: Any = own._replace(**{name: None if name == "surface" else 0 for name in own._fields})
     over_pushes = jax.vmap(function, in_axes=(None, None, each, None))
     return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(varied, rest, own, fixed)
@@ -159,12 +184,42 @@ def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurfac
     return eqx.tree_at(coefficients_of, surface, coefficients)
 
 
-def push(theta: Physical, surface: LimitSurface, body: tuple[Shape, Hand], start: Array, path: Array) -> Trajectory:
-    """One push. surface: of which only the coefficients are those of `theta`. path: as logged."""
-    shape, hand = smaller(*body, theta.inset)
-    surface = with_coefficients(surface, theta.surface)
-    path = moved(path, theta.end, theta.lag, theta.offset)
-    return rollout(Slider(shape, surface), hand, path, pose=start, friction=theta.friction)
+def push(theta: Physical, surface: LimitSurface, body: Body, given: Given) -> Trajectory:
+    """One push, as it is seen. surface: of which only the coefficients are those of `theta`."""
+    shape, hand = smaller(body.shape, body.hand, theta.inset)
+    slider = Slider(shape, with_coefficients(surface, theta.surface))
+    path = moved(given.path, theta.end, theta.lag, theta.offset)
+    start = given.start if theta.marker is None else compose(given.start, theta.marker)
+    if theta.overlap is not None:
+        path = path.at[:, :2].add(theta.overlap * apart(slider, hand, start, path[0])[None])
+    mu = theta.friction
+    if theta.drift is not None:
+        mu = mu * jnp.exp(theta.drift * given.age)
+    if theta.side is not None:
+        mu = mu * jnp.exp(theta.side[jnp.clip(given.side.astype(int), 0, len(theta.side) - 1)])
+    table = None
+    if not (theta.grain is None and theta.slope is None and theta.curvature is None):
+        known = {name: getattr(theta, name) for name in TABLE if getattr(theta, name) is not None}
+        table = Table(**known, origin=body.origin)
+    pushed = rollout(slider, hand, path, pose=start, friction=mu, table=table)
+    if theta.marker is None:
+        return pushed
+    seen = compose(pushed.pose, inverse(theta.marker)[None])
+    return eqx.tree_at(lambda p: p.pose, pushed, seen)
+
+
+def apart(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
+    """The way, world, m, on which a round finger that overlaps the slider just leaves it."""
+    distance, normal, radius = nearest(slider.shape, hand, start, configuration)
+    return jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)
+
+
+def nearest(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
+    """Of the slider to a single round finger's centre: distance and normal (2,), body; and the finger's radius."""
+    finger = hand.fingers[0]
+    assert isinstance(finger, RoundFinger)  # as `identify` saw to
+    distance, _, normal = shape.closest(transform(inverse(pose), configuration[:2]))
+    return distance, normal, finger.radius
 
 
 def smaller(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:

@@ -12,11 +12,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pushjax.friction_model import FrictionModel, RandomSurface, Sampler
 from pushjax.hands import Hand
 from pushjax.identify.identified import Identified, surfaces
-from pushjax.identify.model import coefficients_of, push
-from pushjax.identify.pushes import Pushes
+from pushjax.identify.model import Body, coefficients_of, push
+from pushjax.identify.pushes import Given, Pushes
 from pushjax.identify.unknowns import Physical
 from pushjax.rollout import Slider
-from pushjax.shapes import Shape
 
 ANY_DOF = 60.0  # every draw brings its own
 
@@ -74,8 +73,7 @@ class Drawing(eqx.Module):
     around: RandomSurface
     theta: Physical
     pushes: Pushes
-    shape: Shape
-    hand: Hand
+    body: Body
 
     def chances(self, key: PRNGKeyArray, n: int) -> Chances:
         first, second, third = jax.random.split(key, 3)
@@ -99,15 +97,15 @@ class Drawing(eqx.Module):
         return poses, Slopes(*slopes)
 
     def _each(self, of: Callable, chances: Chances, values: Values, aside: Array):
-        over_samples = jax.vmap(of, in_axes=(0, 0, None, None))
+        over_samples = jax.vmap(of, in_axes=(0, 0, None))
         own = (*values.own(chances), aside)
-        return jax.vmap(over_samples)(own, chances.surface, self.pushes.start, self.pushes.path)
+        return jax.vmap(over_samples)(own, chances.surface, self.pushes.given)
 
-    def _pose(self, own: tuple[Array, Array, Array], key, start, path) -> Float[Array, "3"]:
+    def _pose(self, own: tuple[Array, Array, Array], key, given: Given) -> Float[Array, "3"]:
         dof, mu, aside = own
         surface = self.around.with_dof(dof).sample(key).surface
         met = self.theta._replace(friction=mu, surface=coefficients_of(surface), offset=self.theta.offset + aside)
-        return push(met, surface, (self.shape, self.hand), start, path).pose[-1]
+        return push(met, surface, self.body, given).pose[-1]
 
 
 class Predictive(eqx.Module):
@@ -117,8 +115,7 @@ class Predictive(eqx.Module):
     around: RandomSurface
     theta: Physical
     pushes: Pushes
-    shape: Shape
-    hand: Hand
+    body: Body
     length: Float[Array, ""]
 
     @staticmethod
@@ -128,16 +125,15 @@ class Predictive(eqx.Module):
         model = FrictionModel(ANY_DOF, 0.0, sampler)
         several = [model.around(jax.tree.map(lambda leaf, k=k: leaf[k], each)) for k in range(len(theta.friction))]
         around = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
-        pushes, shape, hand = jax.tree.map(
-            lambda leaf: leaf.astype(found.z.dtype), (pushes.as_conditions(), slider.shape, hand)
-        )
-        return Predictive(around, theta, pushes, shape, hand, found.length)
+        body = Body(slider.shape, hand, found.prior.origin)
+        pushes, body = jax.tree.map(lambda leaf: leaf.astype(found.z.dtype), (pushes.as_conditions(), body))
+        return Predictive(around, theta, pushes, body, found.length)
 
     def over_conditions(self, of: Callable, key: PRNGKeyArray, values: Values):
         """`of` a drawing, its key and its values, for every condition."""
 
         def condition(key, around, theta, pushes, friction):
-            drawing = Drawing(around, theta, pushes, self.shape, self.hand)
+            drawing = Drawing(around, theta, pushes, self.body)
             return of(drawing, key, values._replace(friction=friction))
 
         keys = jax.random.split(key, len(self.theta.friction))

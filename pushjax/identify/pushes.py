@@ -1,7 +1,7 @@
 """Recorded pushes as arrays: what identification learns from."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,16 @@ from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negativ
 from pushjax.shapes import Shape
 
 STEPS = 50
-ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist")
+ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist", "age", "side")
+
+
+class Given(NamedTuple):
+    """A push before it happens; see `Pushes`."""
+
+    start: Float[Array, "*pushes 3"]
+    path: Float[Array, "*pushes steps+1 dof"]
+    age: Float[Array, "*pushes"]
+    side: Float[Array, "*pushes"]
 
 
 class Pushes(eqx.Module):
@@ -28,7 +37,11 @@ class Pushes(eqx.Module):
     under each, both in the body frame about its origin, of any scale; where either is zero there is none. All poses of
     a push together count as much as one, for they are off together; and so do all its pairs.
 
-    Raises ValueError for arrays of the wrong shape, not finite, or a negative weight.
+    What friction may depend on, if `Unknowns` says so. age: (pushes,), when each push was, from 0 (the first) to 1 (the
+    last). side: (pushes,), which side of the slider was pushed, from 0 on; one that `Unknowns.sides` has not is the
+    last.
+
+    Raises ValueError for arrays of the wrong shape, not finite, or a negative weight or side.
     """
 
     start: Float[Array, "*conditions pushes 3"]
@@ -38,6 +51,8 @@ class Pushes(eqx.Module):
     along: Float[Array, "*conditions pushes seen 3"]
     wrench: Float[Array, "*conditions pushes pairs 3"]
     twist: Float[Array, "*conditions pushes pairs 3"]
+    age: Float[Array, "*conditions pushes"]
+    side: Float[Array, "*conditions pushes"]
 
     def __init__(
         self,
@@ -49,6 +64,8 @@ class Pushes(eqx.Module):
         along: Numeric | None = None,
         wrench: Numeric | None = None,
         twist: Numeric | None = None,
+        age: Numeric | None = None,
+        side: Numeric | None = None,
     ):
         dtype = common_dtype(start, path, end)
         self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
@@ -60,9 +77,14 @@ class Pushes(eqx.Module):
         self.along, self.wrench, self.twist = (
             none if value is None else as_float(value, dtype) for value in (along, wrench, twist)
         )
+        self.age, self.side = (
+            jnp.zeros(many, dtype) if value is None else as_float(value, dtype) for value in (age, side)
+        )
         shaped("end", self.end, (*many, 3))
         shaped("path", self.path, (*many, "steps + 1", "dof"))
         shaped("weight", self.weight, many)
+        shaped("age", self.age, many)
+        shaped("side", self.side, many)
         shaped("along", self.along, (*many, "k", 3))
         shaped("wrench", self.wrench, (*many, "p", 3))
         shaped("twist", self.twist, self.wrench.shape)
@@ -74,6 +96,7 @@ class Pushes(eqx.Module):
         for name in ARRAYS:
             finite(name, getattr(self, name))
         non_negative("weight", self.weight)
+        non_negative("side", self.side)
 
     @property
     def rows(self) -> np.ndarray:
@@ -85,6 +108,11 @@ class Pushes(eqx.Module):
     def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
         """Every pose seen after the start, the last one included."""
         return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
+
+    @property
+    def given(self) -> "Given":
+        """What is known of every push before it."""
+        return Given(self.start, self.path, self.age, self.side)
 
     @property
     def paired(self) -> Bool[Array, "*conditions pushes pairs"]:

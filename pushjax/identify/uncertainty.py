@@ -68,7 +68,7 @@ def profile(
         z, last = z + (apart[k] - last) * along, apart[k]
         held = Held(jnp.arange(len(z)) == index, z)
         effort = Effort.of(z.dtype, 1, ENOUGH)
-        again, known = jnp.asarray(False), jnp.array([True, True])
+        again, known = jnp.asarray(False), jnp.array([True, True, True])
         fitted = program(setup, several, z, again, _sigma(found), known, held, effort, robust=found.robust)
         z, loss[k] = fitted.z, float(fitted.loss)
         values[k] = _value(found, fitted.z, label)
@@ -95,7 +95,7 @@ def bootstrap(
 
 @eqx.filter_jit
 def _refitted(setup: Setup, pushes: Pushes, start, sigma, weights, robust: float | None):
-    held, known, once = Held.none(start), jnp.array([True, True]), Effort.of(start.dtype, 1, ENOUGH)
+    held, known, once = Held.none(start), jnp.array([True, True, True]), Effort.of(start.dtype, 1, ENOUGH)
 
     def one(weight):
         return fit(setup, pushes.weighted(weight), start, sigma, robust, known, held, once).z
@@ -135,11 +135,11 @@ def _setup(found: Identified, pushes: Pushes, slider: Slider, hand: Hand) -> tup
     dtype = found.z.dtype
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
     own = surfaces(found.prior, found.prior.physical(found.z))
-    return pushes.as_conditions(), Setup(slider.shape, hand, own, found.prior, found.length)
+    return pushes.as_conditions(), Setup(slider.shape, hand, own, found.prior, found.length, found.touching)
 
 
 def _sigma(found: Identified) -> Array:
-    return jnp.stack([found.sigma, jnp.where(found.direction > 0, found.direction, 1.0)])
+    return jnp.stack([found.sigma, *(jnp.where(each > 0, each, 1.0) for each in (found.direction, found.gap))])
 
 
 def _value(found: Identified, z: Array, label: str) -> float:

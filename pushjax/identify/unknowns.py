@@ -8,7 +8,7 @@ surface     H(F) = sum_k (F' L_k L_k' F)^(d/2), L_k = L0_k (1 + E_k), L0_k of th
             of variance 1 / m below the diagonal and 1 / (2 m) on it: to first order, for many degrees of freedom m, the
             distribution from which `FrictionModel` draws ("terms"), with the same meaning of dof. Always convex.
 center      where the surface's wrenches turn about: H(fx, fy, tau - c x f).
-inset, end, lag, offset    see `Unknowns`.
+the rest    see `Unknowns`: numbers times their standard deviation.
 """
 
 from typing import Any, NamedTuple
@@ -24,20 +24,31 @@ from pushjax.friction_model import dof_of_terms
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
 from pushjax.limit_surface.sums import TERMS, split, squared_quadratics, triangles
 
-NAMES = ("friction", "surface", "center", "inset", "end", "lag", "offset")
-SIZES = {"friction": 1, "center": 2, "inset": 1, "end": 1, "lag": 1, "offset": 2}
-CALIBRATION = ("inset", "end", "lag", "offset")
+SIZES = {"friction": 1, "center": 2, "inset": 1, "end": 1, "lag": 1, "offset": 2, "marker": 3, "overlap": 1}
+SIZES |= {"grain": 2, "slope": 2, "curvature": 3, "drift": 1}  # a side's is as many as there are
+NAMES = ("friction", "surface", *(name for name in SIZES if name != "friction"), "side")
+SPREADS = tuple(name for name in NAMES if name not in ("friction", "surface"))
+CALIBRATION = ("inset", "end", "lag", "offset", "marker", "overlap")
+TABLE = ("grain", "slope", "curvature")
+SIDES = 4
 
 
 class Unknowns(eqx.Module):
     """What `identify` is to find, each with what is known beforehand; None is known, and stays as it is.
 
     friction: (lowest, highest) that mu may be. dof: how well the limit surface is known: that of a `FrictionModel`
-    whose draws are about as far from the mean as the true surface may be. The rest are standard deviations in m:
+    whose draws are about as far from the mean as the true surface may be. The rest are standard deviations, m where
+    nothing else is said:
+
     center: of the centre of pressure, from where the mean surface has it, x and y. inset: by how much the outline (or a
     finger) is smaller than it is said to be. end: how far the hand went on after its path ends, straight ahead. lag:
     how far the hand was, all along, behind where its path says it is (speed times delay). offset: of the hand against
-    the world in which the slider is seen, x and y.
+    the world in which the slider is seen, x and y. marker: of the slider's frame against the one that is tracked, x and
+    y in the latter, and its angle times the surface's length. overlap: which share (a number) of the overlap that a
+    round finger seems to start with is no overlap: the hand is out by so much, all along; at zero all of it pushes.
+    grain, slope (1/m), curvature (1/m^2): of the table, see `Table`; about the mean of where pushes start. drift: by
+    how much the friction with the hand rose from `Pushes.age` zero to one; side: by how much it differs on each of
+    `sides` sides of the slider, `Pushes.side`; both of its logarithm.
 
     shared: names of those that all conditions have in common.
     """
@@ -49,6 +60,14 @@ class Unknowns(eqx.Module):
     end: Float[Array, ""] | None
     lag: Float[Array, ""] | None
     offset: Float[Array, ""] | None
+    marker: Float[Array, ""] | None
+    overlap: Float[Array, ""] | None
+    grain: Float[Array, ""] | None
+    slope: Float[Array, ""] | None
+    curvature: Float[Array, ""] | None
+    drift: Float[Array, ""] | None
+    side: Float[Array, ""] | None
+    sides: int = eqx.field(static=True)
     shared: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -61,10 +80,20 @@ class Unknowns(eqx.Module):
         end: Numeric | None = None,
         lag: Numeric | None = None,
         offset: Numeric | None = None,
+        marker: Numeric | None = None,
+        overlap: Numeric | None = None,
+        grain: Numeric | None = None,
+        slope: Numeric | None = None,
+        curvature: Numeric | None = None,
+        drift: Numeric | None = None,
+        side: Numeric | None = None,
+        sides: int = SIDES,
         shared: tuple[str, ...] = CALIBRATION,
     ):
         self.friction = None if friction is None else _range(friction)
         spreads = {"dof": dof, "center": center, "inset": inset, "end": end, "lag": lag, "offset": offset}
+        spreads |= {"marker": marker, "overlap": overlap, "grain": grain, "slope": slope, "curvature": curvature}
+        spreads |= {"drift": drift, "side": side}
         for name, value in spreads.items():
             if value is not None:
                 value = as_float(value)
@@ -73,12 +102,15 @@ class Unknowns(eqx.Module):
                 finite(name, value)
                 positive(name, value)
             setattr(self, name, value)
+        if sides < 1:
+            raise ValueError(f"sides must be at least 1; got {sides}")
+        self.sides = sides
         wrong = [name for name in shared if name not in NAMES]
         if wrong:
             raise ValueError(f"shared: {wrong[0]!r} is not one of {', '.join(NAMES)}")
         self.shared = tuple(shared)
         if not self.names:
-            raise ValueError("friction, dof, center, inset, end, lag, offset: all None, nothing is to be found")
+            raise ValueError(f"friction, dof, {', '.join(SPREADS)}: all None, nothing is to be found")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,7 +132,8 @@ def _range(friction: Numeric) -> Array:
 
 class Physical(NamedTuple):
     """What a condition's pushes depend on. surface: coefficients, (15,) of a quartic or (3, 3), about the body's
-    origin. center: of pressure, against that of the mean; the surface has it already."""
+    origin. center: of pressure, against that of the mean; the surface has it already. From marker on: None unless they
+    were asked for."""
 
     friction: Float[Array, ""]
     surface: Float[Array, "..."]
@@ -109,6 +142,13 @@ class Physical(NamedTuple):
     end: Float[Array, ""]
     lag: Float[Array, ""]
     offset: Float[Array, "2"]
+    marker: Float[Array, "3"] | None = None
+    overlap: Float[Array, ""] | None = None
+    grain: Float[Array, "2"] | None = None
+    slope: Float[Array, "2"] | None = None
+    curvature: Float[Array, "3"] | None = None
+    drift: Float[Array, ""] | None = None
+    side: Float[Array, "sides"] | None = None
 
 
 class Layout(eqx.Module):
@@ -121,7 +161,7 @@ class Layout(eqx.Module):
 
     @staticmethod
     def of(unknowns: Unknowns, degree: int, conditions: int) -> "Layout":
-        sizes = SIZES | {"surface": 6 * (TERMS if degree == 4 else 1)}
+        sizes = SIZES | {"surface": 6 * (TERMS if degree == 4 else 1), "side": unknowns.sides}
         names = unknowns.names
         return Layout(names, tuple(sizes[name] for name in names), unknowns.shared, conditions)
 
@@ -193,20 +233,21 @@ def _lower(surface: LimitSurface) -> Array:
 
 class Prior(eqx.Module):
     """What was known beforehand: all that turns z into physics. friction, mean: with a leading axis of conditions;
-    friction: where it is known."""
+    friction: where it is known. origin: (2,), world, m, of what is known of the table."""
 
     unknowns: Unknowns
     friction: Float[Array, "conditions"]
     mean: Mean
+    origin: Float[Array, "2"]
     layout: Layout = eqx.field(static=True)
 
     @staticmethod
-    def of(unknowns: Unknowns, surface: LimitSurface, friction: Array) -> "Prior":
+    def of(unknowns: Unknowns, surface: LimitSurface, friction: Array, origin: Array) -> "Prior":
         """surface: with a leading axis of conditions."""
         conditions = surface.length.shape[0]
         layout = Layout.of(unknowns, surface.degree, conditions)
         known = jnp.broadcast_to(friction, (conditions,)).astype(surface.length.dtype)
-        return Prior(unknowns, known, Mean.of(surface, unknowns.dof), layout)
+        return Prior(unknowns, known, Mean.of(surface, unknowns.dof), origin, layout)
 
     def physical(self, z: Float[Array, "size"]) -> Physical:
         """Of every condition."""
@@ -244,7 +285,11 @@ def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mea
     forms = lower @ jnp.swapaxes(lower, 1, 2)
     surface = squared_quadratics(forms) if lower.shape[0] > 1 else forms[0]
     inset, end, lag = (scaled(name)[0] for name in ("inset", "end", "lag"))
-    return Physical(mu, surface, center, inset, end, lag, offset)
+    more = {name: scaled(name) for name in Physical._fields[7:] if name in part}
+    if "marker" in more:
+        more["marker"] = more["marker"].at[2].divide(mean.length)
+    more |= {name: more[name][0] for name in ("overlap", "drift") if name in more}
+    return Physical(mu, surface, center, inset, end, lag, offset, **more)
 
 
 def _perturbation(e: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:

@@ -10,3 +10,4 @@ from pushjax.limit_surface.ellipsoid import EllipsoidForm as EllipsoidForm
 from pushjax.limit_surface.quartic import MONOMIALS as MONOMIALS
 from pushjax.limit_surface.quartic import Quartic as Quartic
 from pushjax.limit_surface.quartic import QuarticForm as QuarticForm
+from pushjax.limit_surface.warped import WarpedForm as WarpedForm

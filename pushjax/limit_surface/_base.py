@@ -8,7 +8,7 @@ F . grad H = d H and hess H F = (d - 1) grad H.
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import equinox as eqx
 import jax
@@ -60,7 +60,8 @@ class Form(Protocol):
     Forms are pytrees. `length` is the surface's, in m.
     """
 
-    degree: ClassVar[int]
+    @property
+    def degree(self) -> int: ...
 
     @property
     def length(self) -> Scalar: ...

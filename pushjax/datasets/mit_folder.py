@@ -1,0 +1,310 @@
+"""Straight pushes of one object on one surface, from the MIT pushing data set as it is published: a file for each push.
+
+What comes of them has the form of the curated archives (`mit_pushes`), and differs in this. Which pushes are learned
+from is drawn at random. Pushes whose tracker jumps are left out. The angles at 10 and 90 % of the time need not be
+between those at the ends: that rule is of the toolbox, whose angles wrap. Nothing is smoothed, and no other program has
+predicted anything.
+
+Wrench and twist are averages over six equal parts of the time from 10 to 90 %. The finger touches at the place of the
+outline that is nearest to its centre. Parts are left out in which the object rests, or the force brakes it, is weak, or
+cannot be that of a finger pressing there.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pushjax.datasets.mit import load_mit_hdf5, load_mit_json
+from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushName, parse_push_name
+from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, nearest_turn
+from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
+from pushjax.datasets.pushes import Floats, LogError, rotation
+from pushjax.datasets.recordings import interpolated
+
+LEAST = 10  # pushes, of which a few are learned from
+SAME_SPEED = 1e-5  # m/s; names have them in whole mm/s
+# Of the time. Before, the object may not be touched yet; after, the tip may have stopped.
+MIDDLE = (0.1, 0.9)
+PARTS = 6
+# While the tip goes so far, in m, no object that it pushes comes near to moving, in m and rad, by more than this.
+JUMP_PATH, JUMP, JUMP_TURN = 0.005, 0.020, np.deg2rad(30)
+# Parts that tell nothing of friction: m, N. Nor do forces off the contact's normal by more, rad: the tip slides at some
+# 15 deg. In a third of the logs of rect1 on plywood at 100 mm/s, the sensor is off by 1.6 N, touching something or not.
+LEAST_MOTION, LEAST_FORCE, WIDEST_CONE = 0.0002, 0.1, np.deg2rad(30)
+# Of pushes whose tracker can be believed, the rules of the curated archives: m, m, m, rad, and of the median path.
+MOST_GAP, MOST_OVERLAP, MOST_AHEAD, MOST_TURN, LEAST_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
+
+
+def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> list[tuple[PushName, Path]]:
+    """The files of one object's pushes in a folder and those below, sorted by acceleration, speed, side, fraction,
+    angle and repetition.
+
+    Of a push that is there twice, one file: JSON rather than HDF5. Files of other names are passed over. Raises
+    LogError if the folder is missing, or none of its files is of that object on that surface.
+    """
+    return _named(Path(folder), surface, shape)[0]
+
+
+def load_mit_folder(
+    folder: str | PathLike[str],
+    surface: str,
+    shape: str,
+    *,
+    speed: float = 0.010,
+    fast: float = 0.020,
+    train_share: float = 0.3,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[MitPushes, tuple[LogError, ...]]:
+    """Reads the pushes of constant speed, and what is wrong with those left out, an error each.
+
+    folder: of the `.json`, `.h5` or `.hdf5` files of the data set, unpacked; they may be in folders of their own.
+    surface, shape: as in the files' names; shape is one of MIT_SHAPES. speed, fast: m/s, of `whole` and of `fast`;
+    others are not read. train_share: of `whole`, to learn from, drawn with the `seed`; the rest is `middle`.
+    progress: called with how many files are read, of how many.
+
+    `index` counts in `find_mit_pushes`. `repeats` are pushes of the same side, fraction and angle, and of the nearest
+    repetition. `wrench` (N, N m) and `twist` (m, rad) are of valid pushes; `toolbox` is empty.
+
+    Raises LogError as `find_mit_pushes` does, and if fewer than ten pushes at `speed` can be used; ValueError for a
+    shape whose outline is not known, equal speeds, or a share that is not between 0 and 1.
+    """
+    about = mit_shape(shape)
+    if not 0 < train_share < 1:
+        raise ValueError(f"train_share must be between 0 and 1; got {train_share}")
+    if abs(speed - fast) < SAME_SPEED:
+        raise ValueError(f"speed and fast must differ; got {speed} and {fast}")
+    found, misnamed = _named(Path(folder), surface, shape)
+    steady = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
+    read: dict[float, list[_Push]] = {speed: [], fast: []}
+    problems = list(misnamed)
+    wanted = [(at, *each) for each in steady for at in read if abs(each[1].speed - at) < SAME_SPEED]
+    for done, (at, index, name, path) in enumerate(wanted):
+        try:
+            read[at].append(_read(index, name, path))
+        except LogError as error:
+            problems.append(error)
+        progress(done + 1, len(wanted))
+    whole, quick = read[speed], read[fast]
+    if len(whole) < LEAST:
+        raise _too_few(Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), steady, problems)
+    learned = np.zeros(len(whole), bool)
+    count = int(np.clip(round(train_share * len(whole)), 1, len(whole) - 1))
+    learned[np.random.default_rng(seed).permutation(len(whole))[:count]] = True
+    tested = np.flatnonzero(~learned)
+    pushes = _straight(whole, (0.0, 1.0), about)
+    taught = np.flatnonzero(learned & pushes.valid)
+    pairs = np.array([pair for row in taught for pair in _pairs(whole[row], about)]).reshape(-1, 2, 3)
+    log = MitPushes(
+        whole=pushes,
+        middle=_straight([whole[row] for row in tested], MIDDLE, about),
+        fast=_straight(quick, (0.0, 1.0), about),
+        learned=learned,
+        middle_of=tested.astype(np.int64),
+        repeats=_repeats(quick, whole),
+        wrench=pairs[:, 0],
+        twist=pairs[:, 1],
+        vertices=about.vertices,
+        length=about.length,
+        tip_radius=about.tip_radius,
+        surface=surface,
+        shape=shape,
+        source=str(folder),
+    )
+    return log, tuple(problems)
+
+
+class _Push(NamedTuple):
+    """What is known from the first to the last sample at which all of it is. index: among the files. time: (m,) s.
+    tip: (m, 2) m. pose: (m, 3) m, rad. force: (m, 2) N, on the object. All in the world."""
+
+    index: int
+    name: PushName
+    time: Floats
+    tip: Floats
+    pose: Floats
+    force: Floats
+
+    def when(self, shares: Sequence[float] | Floats) -> Floats:
+        """(k,) s, after those shares of the time (k,)."""
+        begin, end = self.time[0], self.time[-1]
+        return np.clip(begin + np.asarray(shares) * (end - begin), begin, end)  # rounding might exceed the end
+
+    def at(self, shares: Sequence[float] | Floats) -> tuple[Floats, Floats]:
+        """(k, 3) poses and (k, 2) places of the tip after those shares of the time (k,)."""
+        when = self.when(shares)
+        return interpolated(when, self.time, self.pose), interpolated(when, self.time, self.tip)
+
+
+def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName, Path]], list[LogError]]:
+    """As `find_mit_pushes`, and an error for each file whose name begins as if it were one of these, but is wrong."""
+    if not folder.is_dir():
+        raise LogError(folder, "expected a folder of the MIT pushing data set, found none")
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (*SUFFIXES, ".zip"))
+    logs = [path for path in files if path.suffix.lower() in SUFFIXES and path.name.startswith(PREFIX)]
+    wrong: list[LogError] = []
+    there: dict[tuple[str, str], set[str]] = {}
+    found: dict[str, tuple[PushName, Path]] = {}
+    for path in sorted(logs, key=lambda path: SUFFIXES.index(path.suffix.lower())):
+        try:
+            name = parse_push_name(path)
+        except LogError as error:
+            if path.name.startswith(f"{PREFIX}{surface}_shape={shape}_"):
+                wrong.append(error)
+            continue
+        there.setdefault((name.surface, name.shape), set()).add(path.stem)
+        if (name.surface, name.shape) == (surface, shape):
+            found.setdefault(path.stem, (name, path))
+    if not found:
+        raise LogError(
+            folder, _nothing(surface, shape, there, [path for path in files if path.suffix.lower() == ".zip"])
+        )
+    return sorted(found.values(), key=_order), wrong
+
+
+def _order(named: tuple[PushName, Path]) -> tuple[float, ...]:
+    _, _, *numbers, repetition = named[0]
+    return (*numbers, -1 if repetition is None else repetition)
+
+
+def _nothing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
+    wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
+    if there:
+        counts = (f"{len(stems)} of {other} on {on}" for (on, other), stems in sorted(there.items()))
+        return f"{wanted}, found {', '.join(counts)}"
+    if zips:
+        return f"{wanted}, found only .zip files ({zips[0].name}, say): unpack them first"
+    return f"{wanted}, found none of the data set"
+
+
+def _too_few(
+    folder: Path, what: str, count: int, steady: list[tuple[int, PushName, Path]], problems: list[LogError]
+) -> LogError:
+    speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in steady})) or "none"
+    message = f"expected at least {LEAST} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
+    if problems:
+        message += f"; {len(problems)} files cannot be used: {Path(problems[0].path).name}: {problems[0].message}"
+    return LogError(folder, message)
+
+
+def _read(index: int, name: PushName, path: Path) -> _Push:
+    """Raises LogError for a file that is damaged, or whose tracker lost the object."""
+    (push,) = (load_mit_json if path.suffix.lower() == ".json" else load_mit_hdf5)(path).pushes
+    assert push.force is not None  # which these files have, as they have the time
+    assert push.time is not None
+    rows = _known(path, push.time, push.seen & np.isfinite(push.force[:, 0]))
+    time, tip, pose = push.time[rows], push.hand[rows], push.pose[rows]
+    _check_no_jump(path, time, tip, pose)
+    return _Push(index, name, time, tip, pose, push.force[rows])
+
+
+def _known(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
+    """From the first to the last sample (m,) that is `known`. Raises LogError if one between is not: the object's, as
+    the force has no gaps."""
+    rows = np.flatnonzero(known)
+    if len(rows) < 2 or time[rows[-1]] == time[rows[0]]:
+        raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
+    lost = rows[0] + np.flatnonzero(~known[rows[0] : rows[-1]])
+    if len(lost):
+        span = f"{time[lost[0]]:.2f} to {time[lost[-1]]:.2f} s"
+        raise LogError(path, f"expected the object to be seen throughout, found it lost from {span}")
+    return slice(rows[0], rows[-1] + 1)
+
+
+def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
+    """Raises LogError where the tracker jumps. Looks at stretches of the path, because a jump is spread over several
+    samples where the tracker was slower than the tip's stamps."""
+    travel = float(np.linalg.norm(tip[-1] - tip[0]))
+    window = len(time) if travel <= JUMP_PATH else max(2, round(len(time) * JUMP_PATH / travel))
+    ranges = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
+    distance, turn = np.hypot(ranges[:, 0], ranges[:, 1]), ranges[:, 2]
+    worst = np.maximum(distance / JUMP, turn / JUMP_TURN)
+    row = int(np.argmax(worst))
+    if worst[row] > 1:
+        found = f"{1e3 * distance[row]:.0f} mm and {np.rad2deg(turn[row]):.0f} deg"
+        limits = f"{1e3 * JUMP:g} mm and {np.rad2deg(JUMP_TURN):.0f} deg"
+        where = f"while the tip goes {1e3 * JUMP_PATH:g} mm"
+        message = f"expected an object that moves by less than {limits} {where}, found {found} from {time[row]:.2f} s"
+        raise LogError(path, f"{message}: the tracker jumps")
+
+
+def _straight(pushes: Sequence[_Push], shares: tuple[float, float], about: MitShape) -> StraightPushes:
+    ends = [push.at(shares) for push in pushes]
+    pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
+    tip = np.array([tip for _, tip in ends]).reshape(-1, 2, 2)
+    start, end = pose[:, 0], pose[:, 1]
+    end[:, 2] = start[:, 2] + nearest_turn(end[:, 2] - start[:, 2])
+    index = np.array([push.index for push in pushes], np.int64)
+    return StraightPushes(index, start, end, tip[:, 0], tip[:, 1], _believable(pose, tip, about), toolbox={})
+
+
+def _believable(pose: Floats, tip: Floats, about: MitShape) -> NDArray[np.bool_]:
+    """(k,) of the poses (k, 2, 3) and places of the tip (k, 2, 2), m, before and after each push."""
+    if not len(pose):
+        return np.zeros(0, bool)
+    before, after = (
+        nearest_on_outline(about.vertices, _in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - about.tip_radius
+        for end in (0, 1)
+    )
+    moved, path = (np.linalg.norm(each[:, 1, :2] - each[:, 0, :2], axis=1) for each in (pose, tip))
+    touching = (np.abs(before) < MOST_GAP) & (after > -MOST_OVERLAP)
+    pushed = (moved - path <= MOST_AHEAD) & (np.abs(pose[:, 1, 2] - pose[:, 0, 2]) < MOST_TURN)
+    return touching & pushed & (path > LEAST_PATH * np.median(path))
+
+
+def _in_body(pose: Floats, vectors: Floats) -> Floats:
+    """(k, 2): world vectors (k, 2) in the body frames of k poses (k, 3)."""
+    return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
+
+
+def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
+    """Wrench (3,) N, N m and displacement (3,) m, rad, of the parts in which the finger pushes: both about the body
+    origin, in the body frame at the part's middle."""
+    tip, force = _in_body(push.pose, push.tip - push.pose[:, :2]), _in_body(push.pose, push.force)
+    distance, contact = nearest_on_outline(about.vertices, tip)
+    inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
+    torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
+    shares = np.linspace(*MIDDLE, 2 * PARTS + 1)
+    poses, _ = push.at(shares)
+    rows = np.searchsorted(push.time, push.when(shares))
+    for part in range(0, 2 * PARTS, 2):
+        within = slice(rows[part], rows[part + 2])
+        if within.start == within.stop:
+            continue
+        to_body = rotation(poses[part + 1, 2]).T
+        moved = poses[part + 2] - poses[part]
+        wrench = np.append(to_body @ push.force[within].mean(axis=0), torque[within].mean())
+        twist = np.append(to_body @ moved[:2], moved[2])
+        motion = np.linalg.norm(twist[:2]) + about.length * abs(twist[2])
+        presses = np.abs(np.arctan2(across[within].mean(), along[within].mean())) < WIDEST_CONE
+        strong = np.linalg.norm(wrench[:2]) >= LEAST_FORCE
+        if presses and strong and motion >= LEAST_MOTION and wrench @ twist > 0:
+            yield wrench, twist
+
+
+def _cross(a: Floats, b: Floats) -> Floats:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def _repeats(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]:
+    rows: dict[tuple[float, ...], list[int]] = {}
+    for row, push in enumerate(whole):
+        rows.setdefault(_action(push), []).append(row)
+    found = []
+    for row, push in enumerate(fast):
+        same = rows.get(_action(push), [])
+        if same:
+            found.append((row, min(same, key=lambda at: abs(_repetition(whole[at]) - _repetition(push)))))
+    return np.array(found, np.int64).reshape(-1, 2)
+
+
+def _action(push: _Push) -> tuple[float, ...]:
+    return push.name.side, push.name.fraction, push.name.angle
+
+
+def _repetition(push: _Push) -> int:
+    return push.name.repetition or 0
