@@ -32,6 +32,8 @@ class Demo(Common):
 
 Experiment = Literal[
     "table1",
+    "table1-causes",
+    "table1-spread",
     "table2",
     "squeeze",
     "jam",
@@ -48,7 +50,8 @@ Experiment = Literal[
 class Reproduce(Common):
     """Reproduce an experiment of the paper beside the paper's own figures.
 
-    table1: eleven objects on two surfaces, pushed along straight lines. table2: a triangle on three support points,
+    table1: eleven objects on two surfaces, pushed along straight lines; table1-causes: where its error comes from;
+    table1-spread: predicted distributions beside a Gaussian process. table2: a triangle on three support points,
     pushed by a robot; predicted against measured final poses.
     squeeze: a parallel jaw closes on a rectangle from four start poses. jam: two fingers that jam, and from what
     friction. two-finger: the triangle pushed by two fingers, predicted against measured. three-finger: the original
@@ -66,10 +69,11 @@ class Reproduce(Common):
     method: tuple[Literal["ideal", "wrench_twist", "identified"], ...] | None = None
     """table1, table2: where the limit surface is from: the known support (table2 only), measured forces, or final
     poses. Default: all."""
-    surface: tuple[Literal["abs", "plywood"], ...] | None = None
-    """table1: on what. Default: both."""
+    surface: tuple[Literal["abs", "plywood", "delrin"], ...] | None = None
+    """table1 and its like: on what; delrin is in the published folders only. Default: abs, plywood."""
     object: tuple[str, ...] | None = None
-    """table1: which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter. Default: all."""
+    """table1 and its like: which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter.
+    Default: all."""
     steps: int | None = None
     """Steps of each push or grasp. Default: the experiment's own."""
     n: int | None = None
@@ -131,6 +135,8 @@ def _demo(command: Demo, progress: Progress) -> Result:
 RANDOM = ("n", "steps", "dof", "friction")
 TAKES: dict[str, tuple[str, ...]] = {
     "table1": ("data", "method", "steps", "surface", "object"),
+    "table1-causes": ("data", "steps", "surface", "object"),
+    "table1-spread": ("data", "steps", "surface", "object"),
     "table2": ("data", "geometry", "method", "steps"),
     "squeeze": ("steps",),
     "jam": (),
@@ -173,7 +179,8 @@ def _reproduce(command: Reproduce, progress: Progress) -> Result:
 
         given["slider"] = name.removeprefix("grasp-")
     else:
-        experiment = import_module(f"pushjax.experiments.{name.replace('-', '_')}")
+        room, _, part = name.partition("-") if name.startswith("table1-") else (name.replace("-", "_"), "", "")
+        experiment = import_module(f"pushjax.experiments.{room}{'.' if part else ''}{part}")
     record = experiment.run(seed=command.seed, out=command.out, **given)
     text = experiment.summary(record)
     from pushjax.page import write_page

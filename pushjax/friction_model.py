@@ -120,7 +120,7 @@ class FrictionModel(eqx.Module):
         if not isinstance(surface, Quartic):
             raise TypeError(f"surface: expected an Ellipsoid or a Quartic; got a {type(surface).__name__}")
         _at_least(dof, 9, "a quartic's Gram matrix")
-        return (_GramQuartic if self.sampler == "gram" else _TermsQuartic).of(surface, dof)
+        return (_GramQuartic if self.sampler == "gram" else TermsQuartic).of(surface, dof)
 
     def sample(self, key: PRNGKeyArray, surface: LimitSurface) -> tuple[LimitSurface, Float[Array, ""]]:
         """A limit surface around `surface`, and mu. For many draws, `vmap` over keys; or `around` once, outside.
@@ -227,7 +227,7 @@ def _certified(coefficients, n, reference):
     return largest_share(coefficients, n, reference, enough=0.0, tolerance=1e-3)
 
 
-class _TermsQuartic(RandomSurface):
+class TermsQuartic(RandomSurface):
     """lower: (terms, 3, 3), the factors of P_k. dof: m, of each."""
 
     mean: Quartic
@@ -235,7 +235,7 @@ class _TermsQuartic(RandomSurface):
     dof: Float[Array, ""]
 
     @staticmethod
-    def of(mean: Quartic, dof: Array) -> "_TermsQuartic":
+    def of(mean: Quartic, dof: Array) -> "TermsQuartic":
         terms = eqx.filter_jit(split)(mean.coefficients)
         error = concrete(terms.error)
         if error is not None and not error < SPLIT_TOLERANCE:
@@ -243,9 +243,14 @@ class _TermsQuartic(RandomSurface):
                 f"surface: the nearest sum of five squared quadratic forms is {error:.1g} of its coefficients away; "
                 "the sampler 'gram' takes every convex quartic"
             )
-        return _TermsQuartic(mean, terms.lower, dof_of_terms(terms.lower, dof))
+        return TermsQuartic(mean, terms.lower, dof_of_terms(terms.lower, dof))
 
-    def with_dof(self, dof: Array) -> "_TermsQuartic":
+    @staticmethod
+    def of_terms(mean: Quartic, lower: Array, dof: Array) -> "TermsQuartic":
+        """Of a mean whose factors are known."""
+        return TermsQuartic(mean, lower, dof_of_terms(lower, dof))
+
+    def with_dof(self, dof: Array) -> "TermsQuartic":
         return eqx.tree_at(lambda s: s.dof, self, dof_of_terms(self.lower, dof))
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:

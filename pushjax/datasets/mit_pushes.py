@@ -9,6 +9,7 @@ Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", I
 Zhou, Bagnell, Mason, RSS 2017.
 """
 
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +29,8 @@ _SHAPE = ("vertices_body", "rho", "tip_radius", "surface", "shape")
 TOOLBOX = {"quartic": "poly4", "ellipsoid": "quadratic"}
 
 
-class StraightPushes(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class StraightPushes:
     """k pushes. index: (k,) the push's row in the original file. start, end: (k, 3) m, rad, world, the object's poses;
     the end angle is the one nearest to that of the start. tip_start, tip_end: (k, 2) m, world, the tip's centre.
     valid: (k,) whether the tracker can be believed. toolbox: (k, 3) the end as the original toolbox predicted it, by

@@ -6,9 +6,10 @@ measured with an error of `sigma` in x, y and length * theta; both are normal bu
 so that together they have Student's distribution with `tails` degrees of freedom: few pushes, but more than a normal
 distribution would have, slip where no model says they do.
 
-The mean energy score of the recorded final poses is minimised: a proper score, so that in the mean no other noise
-scores better than that which the pushes had, and its mean does not depend on how many samples of a push are drawn. (The
-likelihood, from as many samples as one can afford, does: with 64 a push it took tails of 4 for 1.8.)
+The mean score of the recorded final poses is minimised, a proper one, so that in the mean no other noise scores better
+than that which the pushes had. "energy" does not depend in the mean on how many samples of a push are drawn, and hardly
+sees tails. "density" is the negative logarithm of the density, of as many samples as are drawn each with an error of
+measurement: it sees tails first of all, and takes a finite number of samples for a little more of them.
 
 Draws are smooth functions of the noise, but for one key a draw may jump with dof (Gamma's rejections); derivatives are
 right in the mean. So the score is not minimised for one key, but by Adam's method with a new key for every step.
@@ -16,7 +17,7 @@ right in the mean. So the score is not minimised for one key, but by Adam's meth
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -28,11 +29,21 @@ from pushjax._checks import positive
 from pushjax.friction_model import FrictionModel, Sampler
 from pushjax.hands import Hand
 from pushjax.identify.identified import Identified
-from pushjax.identify.predictive import Chances, Drawing, Predictive, Slopes, Values, predict
+from pushjax.identify.predictive import (
+    Chances,
+    Drawing,
+    Predictive,
+    Slopes,
+    Values,
+    log_density,
+    predict,
+    student_density,
+)
 from pushjax.identify.pushes import Pushes
 from pushjax.rollout import Slider
 from pushjax.scores import energy_score
 
+Score = Literal["energy", "density"]
 SAMPLES = 32  # of each push, for each step of the search
 STEPS = 80
 CHUNK = 10  # steps between two reports of progress
@@ -47,8 +58,8 @@ class Noise(eqx.Module):
 
     dof: of the limit surface. friction: (..., 2), the range on which mu is uniform, of each condition. offset: m, by
     how much the hand's place against the slider's is off, in x and in y, from push to push. sigma: m, the same of a
-    measured final pose, in x, y and length * theta. tails: degrees of freedom of both. score: m, the mean
-    energy score of the pushes' final poses at the end of the search, and history: (steps,), on the way there.
+    measured final pose, in x, y and length * theta. tails: degrees of freedom of both. score: the mean score of the
+    pushes' final poses at the end of the search (energy: m), and history: (steps,), on the way there.
     """
 
     found: Identified
@@ -87,9 +98,31 @@ class Noise(eqx.Module):
         """`n` measured final poses of each of these or other pushes, of the same conditions, drawn from what is
         predicted. slider, hand: as `identify` was given them."""
         predictive = Predictive.of(self.found, pushes, slider, hand, self.sampler)
-        friction = self.friction[None] if self.found.single else self.friction
-        drawn = predict(key, predictive, Values(self.dof, friction, self.offset, self.sigma, self.tails), n)
+        drawn = predict(key, predictive, self._values, n)
         return drawn[0] if self.found.single else drawn
+
+    def log_density(
+        self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
+    ) -> Float[Array, "*conditions pushes"]:
+        """The logarithm of what is predicted, per cubic metre of (x, y, length * theta), at the final poses of these or
+        other pushes of the same conditions: the mean of Student's densities about `n` draws, which the error of
+        measurement makes of them. (There, that error and the hand's have no factor in common.)"""
+        predictive = Predictive.of(self.found, pushes, slider, hand, self.sampler)
+        density = log_density(key, predictive, self._values, n)
+        return density[0] if self.found.single else density
+
+    def about(self, found: Identified) -> "Noise":
+        """The same noise about what was found of other pushes, of one condition. Raises ValueError for several."""
+        if not found.single:
+            raise ValueError("found must be of one condition; got several")
+        spread = jnp.max(self.friction[..., 1] - self.found.friction)
+        friction = jnp.stack([jnp.maximum(found.friction - spread, 0), found.friction + spread])
+        return eqx.tree_at(lambda noise: (noise.found, noise.friction), self, (found, friction))
+
+    @property
+    def _values(self) -> Values:
+        friction = self.friction[None] if self.found.single else self.friction
+        return Values(self.dof, friction, self.offset, self.sigma, self.tails)
 
 
 def identify_noise(
@@ -100,20 +133,23 @@ def identify_noise(
     hand: Hand,
     *,
     sampler: Sampler = "terms",
+    score: Score = "energy",
     samples: int = SAMPLES,
     steps: int = STEPS,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Noise:
-    """The noise with which the pushes are predicted best, by the energy score.
+    """The noise with which the pushes are predicted best, by the energy score or by the density.
 
     found: what `identify` says of these conditions, at best of other pushes: of those that it has learned from, it
     leaves less over. slider, hand: as given there. The middle of the friction's range is the friction found; conditions
     share everything else. samples: drawn of each push at every step. progress: called with steps done and of how many.
 
-    Raises ValueError for a number of samples or steps that is too small.
+    Raises ValueError for another score, and for a number of samples or steps that is too small.
 
     Source: Zhou et al. 2017, section VII, names the problem; Gneiting & Raftery 2007, section 4.3, the score.
     """
+    if score not in get_args(Score):
+        raise ValueError(f"score must be one of {', '.join(get_args(Score))}; got {score!r}")
     if samples < 2:
         raise ValueError(f"samples must be at least 2; got {samples}")
     positive("steps", steps)
@@ -123,7 +159,7 @@ def identify_noise(
     keys = jax.random.split(key, steps)
     for begin in range(0, steps, CHUNK):
         part = keys[begin : begin + CHUNK]
-        scatter, state, each, passed = _descend(scatter, state, part, predictive, samples, steps)
+        scatter, state, each, passed = _descend(scatter, state, part, predictive, samples, steps, score)
         values.append(each)
         visited.append(passed)
         progress(begin + len(part), steps)
@@ -133,8 +169,7 @@ def identify_noise(
     best = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), passed).values(predictive.theta.friction)
     if found.single:
         best = best._replace(friction=best.friction[0])
-    score = jnp.mean(history[-last:])
-    return Noise(found, score=score, history=history, sampler=sampler, **best._asdict())
+    return Noise(found, score=jnp.mean(history[-last:]), history=history, sampler=sampler, **best._asdict())
 
 
 def _rule(steps: int) -> optax.GradientTransformation:
@@ -167,22 +202,24 @@ def _first(found: Identified) -> _Scatter:
 
 
 @eqx.filter_jit
-def _descend(scatter, state, keys, predictive: Predictive, samples: int, steps: int):
+def _descend(scatter, state, keys, predictive: Predictive, samples: int, steps: int, score: Score):
     rule = _rule(steps)
 
     def step(carry, key):
         scatter, state = carry
-        score, slope = _score(scatter, key, predictive, samples)
+        value, slope = _score(scatter, key, predictive, samples, score)
         updates, state = rule.update(slope, state)
         scatter = optax.apply_updates(scatter, updates)
-        return (scatter, state), (score, scatter)
+        return (scatter, state), (value, scatter)
 
     (scatter, state), (values, passed) = jax.lax.scan(step, (scatter, state), keys)
     return scatter, state, values, passed
 
 
-def _score(scatter: _Scatter, key: PRNGKeyArray, predictive: Predictive, samples: int) -> tuple[Array, _Scatter]:
-    """The mean energy score, and its derivative.
+def _score(
+    scatter: _Scatter, key: PRNGKeyArray, predictive: Predictive, samples: int, score: Score
+) -> tuple[Array, _Scatter]:
+    """The mean score, and its derivative.
 
     A pose depends on dof, its own mu and where its hand is: its derivatives by these are worked out forward. The rest
     is cheap, and differentiated backward through poses that are linear about where they are.
@@ -197,14 +234,17 @@ def _score(scatter: _Scatter, key: PRNGKeyArray, predictive: Predictive, samples
     chances, (poses, slopes) = predictive.over_conditions(local, key, start)
     before = jax.lax.stop_gradient(start.own(chances))
 
-    def score(scatter: _Scatter) -> Array:
+    def mean(scatter: _Scatter) -> Array:
         values = scatter.values(center)
         dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
         off = poses + slopes.dof * dof + slopes.mu * mu - pushes.end[..., None, :]
         errors = chances.errors(values.tails)
         off = off + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
-        off = off + predictive.measurement(errors, values.sigma)
-        each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
+        if score == "density":
+            each = -student_density(off, values, predictive.length)
+        else:
+            off = off + predictive.measurement(errors, values.sigma)
+            each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
         return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
 
-    return jax.value_and_grad(score)(scatter)
+    return jax.value_and_grad(mean)(scatter)

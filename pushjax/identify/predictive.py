@@ -7,14 +7,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax.friction_model import FrictionModel, RandomSurface, Sampler
+from pushjax.friction_model import FrictionModel, RandomSurface, Sampler, TermsQuartic
 from pushjax.hands import Hand
 from pushjax.identify.identified import Identified, surfaces
 from pushjax.identify.model import Body, coefficients_of, push
 from pushjax.identify.pushes import Given, Pushes
 from pushjax.identify.unknowns import Physical
+from pushjax.limit_surface import Quartic
 from pushjax.rollout import Slider
 
 ANY_DOF = 60.0  # every draw brings its own
@@ -122,8 +124,14 @@ class Predictive(eqx.Module):
     def of(found: Identified, pushes: Pushes, slider: Slider, hand: Hand, sampler: Sampler) -> "Predictive":
         theta = found.prior.physical(found.z)
         each = surfaces(found.prior, theta)
-        model = FrictionModel(ANY_DOF, 0.0, sampler)
-        several = [model.around(jax.tree.map(lambda leaf, k=k: leaf[k], each)) for k in range(len(theta.friction))]
+        model, factors = FrictionModel(ANY_DOF, 0.0, sampler), found.prior.factors(found.z)
+        dof = jnp.asarray(ANY_DOF, found.z.dtype)
+        several: list[RandomSurface] = []
+        for k in range(len(theta.friction)):
+            surface = jax.tree.map(lambda leaf, k=k: leaf[k], each)
+            # no search for the terms of a sum that is known
+            known = sampler == "terms" and isinstance(surface, Quartic)
+            several.append(TermsQuartic.of_terms(surface, factors[k], dof) if known else model.around(surface))
         around = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
         body = Body(slider.shape, hand, found.prior.origin)
         pushes, body = jax.tree.map(lambda leaf: leaf.astype(found.z.dtype), (pushes.as_conditions(), body))
@@ -155,3 +163,28 @@ def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -
         return poses + predictive.measurement(errors, values.sigma)
 
     return predictive.over_conditions(measured, key, values)
+
+
+@eqx.filter_jit
+def log_density(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -> Float[Array, "conditions pushes"]:
+    """Of the recorded final poses: the mean of Student's densities about `n` poses of each push."""
+
+    def density(drawing: Drawing, key, values: Values):
+        chances = drawing.chances(key, n)
+        poses = drawing.poses(chances, values, values.offset * chances.errors(values.tails)[..., :2])
+        return student_density(poses - drawing.pushes.end[:, None], values, predictive.length)
+
+    return predictive.over_conditions(density, key, values)
+
+
+def student_density(
+    off: Float[Array, "*pushes n 3"], values: Values, length: Float[Array, ""]
+) -> Float[Array, "*pushes"]:
+    """The logarithm of the mean, over poses that are off by so much, of the density of an error of measurement."""
+    turn = 2 * jnp.pi
+    angle = off[..., 2] - turn * jax.lax.stop_gradient(jnp.round(off[..., 2] / turn))
+    squared = (off[..., 0] ** 2 + off[..., 1] ** 2 + (length * angle) ** 2) / values.sigma**2
+    nu = values.tails
+    scale = gammaln((nu + 3) / 2) - gammaln(nu / 2) - 1.5 * jnp.log(nu * jnp.pi) - 3 * jnp.log(values.sigma)
+    each = scale - (nu + 3) / 2 * jnp.log1p(squared / nu)
+    return jax.nn.logsumexp(each, axis=-1) - jnp.log(jnp.asarray(off.shape[-2], each.dtype))

@@ -254,38 +254,57 @@ class Prior(eqx.Module):
         each = jax.vmap(lambda *own: _physical(own[0], self.layout, self.unknowns, *own[1:]))
         return each(z[self.layout.index], self.friction, self.mean)
 
+    def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
+        """The L_k, lower triangles, of every condition's surface."""
+        each = jax.vmap(lambda own, mean: _factors(_parts(own, self.layout), self.unknowns, mean))
+        whole = each(z[self.layout.index], self.mean)
+        return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(whole, -1, -2), mode="r"), -1, -2)
+
     @property
     def start(self) -> Float[Array, "size"]:
         """The mean of everything."""
         return jnp.zeros(self.layout.size, self.friction.dtype)
 
 
+def _parts(z: Array, layout: Layout) -> dict[str, Any]:
+    return {name: z[where] for name, where in layout.local.items()}
+
+
+def _scaled(part: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
+    spread = getattr(unknowns, name)
+    return jnp.zeros(SIZES[name], dtype) if spread is None else spread.astype(dtype) * part[name]
+
+
+def _factors(part: dict[str, Any], unknowns: Unknowns, mean: Mean) -> Float[Array, "terms 3 3"]:
+    """Of the surface: P_k = L_k L_k', not triangular any more where there is a centre."""
+    lower = mean.lower
+    if "surface" in part:
+        lower = lower + mean.spread * lower @ _perturbation(part["surface"].reshape(-1, 6))
+    if "center" in part:
+        cx, cy = _scaled(part, unknowns, "center", lower.dtype) / mean.length
+        row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
+        shift = jnp.eye(3, dtype=lower.dtype).at[2].set(row)  # of F: tau about the centre
+        lower = shift.T[None] @ lower
+    return lower
+
+
 def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mean: Mean) -> Physical:
     """One condition's: z (local,), `friction` where that is known, and `mean` of this condition."""
-    part: dict[str, Any] = {name: z[where] for name, where in layout.local.items()}
+    part = _parts(z, layout)
     mu = friction
     if unknowns.friction is not None:
         low, high = unknowns.friction.astype(z.dtype)
         mu = low + (high - low) * jax.nn.sigmoid(part["friction"][0])
-    lower = mean.lower
-    if "surface" in part:
-        lower = lower + mean.spread * lower @ _perturbation(part["surface"].reshape(-1, 6))
-
-    def scaled(name: str) -> Array:
-        spread = getattr(unknowns, name)
-        return jnp.zeros(SIZES[name], z.dtype) if spread is None else spread.astype(z.dtype) * part[name]
-
-    center, offset = scaled("center"), scaled("offset")
-    if "center" in part:
-        cx, cy = center / mean.length
-        one = jnp.ones_like(cx)
-        row = jnp.stack([cy, -cx, one])
-        shift = jnp.eye(3, dtype=z.dtype).at[2].set(row)  # of F: tau about the centre
-        lower = shift.T[None] @ lower
+    lower = _factors(part, unknowns, mean)
     forms = lower @ jnp.swapaxes(lower, 1, 2)
     surface = squared_quadratics(forms) if lower.shape[0] > 1 else forms[0]
+
+    def scaled(name: str) -> Array:
+        return _scaled(part, unknowns, name, z.dtype)
+
+    center, offset = scaled("center"), scaled("offset")
     inset, end, lag = (scaled(name)[0] for name in ("inset", "end", "lag"))
-    more = {name: scaled(name) for name in Physical._fields[7:] if name in part}
+    more = {name: part[name] * getattr(unknowns, name).astype(z.dtype) for name in Physical._fields[7:] if name in part}
     if "marker" in more:
         more["marker"] = more["marker"].at[2].divide(mean.length)
     more |= {name: more[name][0] for name in ("overlap", "drift") if name in more}

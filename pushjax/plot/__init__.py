@@ -1,8 +1,10 @@
-"""Pictures: of single pushes and tables (`figures`), of distributions (`distributions`)."""
+"""Pictures: of single pushes and tables (`figures`), of distributions (`distributions`), of errors (`causes`)."""
 
+from pushjax.plot.causes import causes_figure as causes_figure
 from pushjax.plot.distributions import density_panel as density_panel
 from pushjax.plot.distributions import histogram_panel as histogram_panel
 from pushjax.plot.distributions import pose_panel as pose_panel
+from pushjax.plot.distributions import spread_figure as spread_figure
 from pushjax.plot.distributions import traces as traces
 from pushjax.plot.figures import BETWEEN as BETWEEN
 from pushjax.plot.figures import BLUE as BLUE

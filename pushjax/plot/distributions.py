@@ -6,8 +6,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
-from pushjax.plot.figures import BLUE, END, MM, ORANGE, START
+from pushjax.plot.figures import BLUE, END, GREEN, MM, ORANGE, START, STYLE
 
 TICK = 1.6  # mm, half the length of a pose's tick
 
@@ -46,3 +47,32 @@ def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.n
     axes.plot(*(MM * np.asarray(inside)).T, ".", color=END, ms=2.5)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
     return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)
+
+
+def spread_figure(pooled: dict[str, dict[str, dict[str, Any]]], curve: list[dict[str, Any]]) -> Figure:
+    """Left: how often regions of predicted distributions hold what happened, against how often they should. Right: the
+    mean deviation by how many pushes were learned from. pooled: by kind of push and method, with the shares `inside_50`
+    and `inside_90`; curve: rows of `count`, `physics_mm`, `process_mm`."""
+    with plt.rc_context(STYLE):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 3.8), layout="constrained")
+        methods = {"noise": ("identified noise", BLUE), "normal": ("normal errors", ORANGE)}
+        methods["process"] = ("Gaussian process", GREEN)
+        left.plot([0, 100], [0, 100], color="0.7", lw=0.9, label="as it should be")
+        for group, style in (("middle", "o-"), ("whole", "s--")):
+            for name, (label, color) in methods.items():
+                row = pooled.get(group, {}).get(name)
+                if row is not None:
+                    shares = [0, 100 * row["inside_50"], 100 * row["inside_90"], 100]
+                    left.plot([0, 50, 90, 100], shares, style, color=color, ms=4, lw=1.1, label=f"{label}, {group}")
+        left.set(xlabel="predicted share / %", ylabel="share of the pushes / %", title="Pushes inside a region")
+        left.legend(loc="lower right", fontsize=7.5)
+        counts = [row["count"] for row in curve]
+        for name, label, color in (("physics", "physics", BLUE), ("process", "Gaussian process", GREEN)):
+            right.plot(counts, [row[f"{name}_mm"] for row in curve], "o-", color=color, ms=4, label=label)
+        right.set(xlabel="pushes learned from", ylabel="mean deviation / mm", ylim=(0, None))
+        right.set_title("Few pushes, and many")
+        if counts:
+            right.set_xscale("log", base=2)
+            right.set_xticks(counts, [str(count) for count in counts])
+        right.legend(loc="upper right")
+        return figure

@@ -1,39 +1,69 @@
 """The objects and surfaces, the paper's figures for them, and the pushes as arrays.
 
-Delrin is in the paper, but not in these data.
+The curated archives hold two surfaces; the published folders a third, delrin.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.datasets.mit_folder import load_mit_folder
 from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, load_mit_pushes_npz
+from pushjax.datasets.mit_shapes import nearest_on_outline
+from pushjax.datasets.pushes import Floats, rotation
 
+ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")
 OBJECTS = ("rect1", "rect2", "rect3", "tri1", "tri3", "ellip1", "ellip2", "ellip3", "hex", "butter", "tri2")
+ALL_SURFACES = ("delrin", *SURFACES)  # the first is not in the archives
 APART = ("tri2",)  # not in the paper, whose tracker lost it: in no mean
 MODELS = {"quartic": 4, "ellipsoid": 2}
-CONTROLS = 24  # of the butterfly's outline: 0.03 mm from its 636 vertices
+# Corners that all polygons are filled up to, where their edges go straight on: one compiled program does for all.
+CORNERS = 6
+BUTTERFLY = 64  # corners; 0.3 mm at most from its 636 vertices. As a spline it takes three times as long to compile
+SIDES = 6  # at most; of outlines without corners, quadrants
+
+LEARNED_SHARE = 0.2  # the paper's, of pushes that come without a split
 
 # Mean deviation in mm, Zhou et al. 2017, table 1; and the mean over conditions of deviation over no-motion, percent,
 # delrin included.
 PAPER_MM = {
+    ("delrin", "quartic"): (8.28, 5.37, 6.10, 9.71, 7.54, 7.68, 8.90, 7.35, 6.38, 4.83),
+    ("delrin", "ellipsoid"): (8.60, 5.92, 8.20, 9.90, 8.18, 6.85, 6.29, 8.08, 6.42, 5.97),
     ("abs", "quartic"): (5.86, 7.48, 3.59, 7.13, 5.17, 8.45, 9.18, 5.93, 7.56, 3.94),
     ("abs", "ellipsoid"): (6.07, 6.74, 6.19, 8.00, 7.17, 6.66, 7.69, 5.78, 8.19, 5.39),
     ("plywood", "quartic"): (6.86, 6.86, 5.93, 4.61, 7.21, 4.39, 4.99, 5.72, 8.41, 4.72),
     ("plywood", "ellipsoid"): (6.20, 7.22, 6.88, 5.96, 9.43, 4.42, 5.84, 6.46, 8.85, 6.05),
 }
 PAPER_NO_MOTION_MM = {
+    "delrin": (35.48, 40.53, 35.98, 36.91, 34.66, 32.18, 38.05, 33.37, 33.55, 34.09),
     "abs": (34.14, 39.74, 33.98, 35.43, 32.37, 32.68, 33.53, 32.45, 33.23, 33.53),
     "plywood": (31.86, 33.22, 32.94, 32.81, 33.78, 27.24, 28.23, 33.29, 32.77, 34.10),
 }
 PAPER_PERCENT = {"quartic": 20.05, "ellipsoid": 21.39}
 
 
-def load(folder: Path, surface: str, name: str) -> MitPushes:
-    return load_mit_pushes_npz(folder / f"{surface}_{name}.npz")
+def chosen(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
+    """The surfaces. Raises ValueError for surfaces or objects that there are not."""
+    surface = SURFACES if surface is None else surface
+    for name, given, allowed in (("surface", surface, ALL_SURFACES), ("object", object, OBJECTS)):
+        unknown = [one for one in given if one not in allowed]
+        if unknown or not given:
+            raise ValueError(f"{name} must be one or more of {', '.join(allowed)}; got {unknown or 'none'}")
+    if "delrin" in surface and (folder / ARCHIVES).is_dir():
+        raise ValueError(f"surface: {folder / ARCHIVES} has no pushes on delrin; the published data set has")
+    return tuple(surface)
+
+
+def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
+    """From the curated archives in `mit_push`, if it is there; else from the files of the published data set. seed: of
+    which pushes are learned from, where the data do not say."""
+    if (folder / ARCHIVES).is_dir():
+        return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
+    return load_mit_folder(folder, surface, name, train_share=LEARNED_SHARE, seed=seed)[0]
 
 
 def paper_mm(surface: str, name: str, model: str) -> float | None:
@@ -46,18 +76,46 @@ def outline(log: MitPushes) -> pj.Shape:
         inverse_squares = np.linalg.lstsq(log.vertices**2, np.ones(len(log.vertices)), rcond=None)[0]
         return pj.Ellipse(*(1 / np.sqrt(inverse_squares)))
     if log.shape == "butter":
-        return pj.Curve.fit(log.vertices, CONTROLS)
-    return pj.Polygon(log.vertices)
+        return pj.Polygon(log.vertices[np.arange(BUTTERFLY) * len(log.vertices) // BUTTERFLY])
+    return pj.Polygon(_filled(log.vertices))
 
 
-def straight(pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
-    """Those of some rows, filled up to a `batch` with pushes of no weight, so that one compiled program does for all
-    objects of a kind."""
-    start, end, begin, stop = (part[rows] for part in (pushes.start, pushes.end, pushes.tip_start, pushes.tip_end))
-    share = np.linspace(0, 1, steps + 1)[None, :, None]
-    path = begin[:, None] + share * (stop - begin)[:, None]
-    rest = batch - len(start)
+def _filled(vertices: Floats) -> Floats:
+    """With the longest edges halved until there are `CORNERS` vertices."""
+    while len(vertices) < CORNERS:
+        after = np.roll(vertices, -1, axis=0)
+        longest = int(np.argmax(np.linalg.norm(after - vertices, axis=1)))
+        vertices = np.insert(vertices, longest + 1, (vertices[longest] + after[longest]) / 2, axis=0)
+    return vertices
+
+
+def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
+    """(pushes,): which edge the tip is nearest to at the start; of outlines with many, which quadrant."""
+    tip = np.einsum("nji,nj->ni", rotation(pushes.start[:, 2]), pushes.tip_start - pushes.start[:, :2])
+    vertices = log.vertices
+    if len(vertices) > SIDES:
+        return (np.arctan2(tip[:, 1], tip[:, 0]) // (np.pi / 2)).astype(int) % 4
+    edges = [np.stack([one, other]) for one, other in zip(vertices, np.roll(vertices, -1, axis=0), strict=True)]
+    return np.argmin([np.abs(nearest_on_outline(edge, tip)[0]) for edge in edges], axis=0)
+
+
+def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
+    """Those of some rows, with their sides and how late they come in the file, filled up to a `batch` with pushes of no
+    weight, so that one compiled program does for all objects of a kind."""
+    path = lines(pushes, rows, steps)
+    age = pushes.index / max(int(log.whole.index.max()), 1)
+    parts = pushes.start[rows], path, pushes.end[rows], age[rows], sides(log, pushes)[rows]
+    rest = batch - len(rows)
+    if rest < 0:
+        raise ValueError(f"batch must be at least {len(rows)}; got {batch}")
     dtype = jnp.result_type(float)
-    filled = (np.concatenate([part, np.repeat(part[:1], rest, axis=0)]) for part in (start, path, end))
-    start, path, end = (jnp.asarray(part, dtype) for part in filled)
-    return pj.Pushes(start, path, end, (np.arange(batch) < batch - rest).astype(float))
+    start, path, end, age, side = (
+        jnp.asarray(np.concatenate([part, np.repeat(part[:1], rest, axis=0)]), dtype) for part in parts
+    )
+    return pj.Pushes(start, path, end, (np.arange(batch) < len(rows)).astype(float), age=age, side=side)
+
+
+def lines(pushes: StraightPushes, rows: np.ndarray, steps: int) -> Floats:
+    """(rows, steps + 1, 2): the tips' paths."""
+    begin, stop = pushes.tip_start[rows], pushes.tip_end[rows]
+    return begin[:, None] + np.linspace(0, 1, steps + 1)[None, :, None] * (stop - begin)[:, None]

@@ -2,8 +2,8 @@
 and how many steps failed.
 
 wrench_twist  the surface fitted to measured forces and motions, the friction by a grid: the paper's.
-identified    friction, surface, centre of pressure and where the robot really was, from final poses, starting from that
-              surface.
+identified    friction, surface, centre of pressure, and where tip and object really were, from final poses, in which
+              the two touch, starting from that surface.
 """
 
 from typing import NamedTuple
@@ -17,12 +17,13 @@ from pushjax.experiments._tables import final_poses
 from pushjax.experiments.table1.conditions import MODELS, outline, straight
 
 FRICTIONS = np.linspace(0.0, 0.6, 31)
-IDENTIFY_STEPS = 40  # at most: derivatives are for the fit, whose answer does not change with more
+IDENTIFY_STEPS = 25  # at most: derivatives are for the fit, whose answer does not change with more
 # Pushes to learn from, and to test with: at most so many, filled up to so many.
 LEARNED, TESTED = 128, 304
 # How far what is not known may be from what it is taken for: the surface (degrees of freedom), the centre of pressure,
-# the outline, and the tip against the world in which the tracker sees the object, m. Chosen on abs.
-DOF, CENTER, INSET, OFFSET = 10.0, 0.015, 0.001, 0.001
+# the outline, the tip against the world in which the tracker sees the object, and the object against what is tracked,
+# m. Chosen on abs.
+DOF, CENTER, INSET, OFFSET, MARKER = 10.0, 0.015, 0.001, 0.002, 0.001
 
 
 class Predicted(NamedTuple):
@@ -49,9 +50,9 @@ class Setting(NamedTuple):
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
         return Setting(
-            straight(log.whole, rows, steps, LEARNED),
-            straight(log.whole, rows, min(steps, IDENTIFY_STEPS), LEARNED),
-            straight(log.middle, np.arange(len(log.middle)), steps, TESTED),
+            straight(log, log.whole, rows, steps, LEARNED),
+            straight(log, log.whole, rows, min(steps, IDENTIFY_STEPS), LEARNED),
+            straight(log, log.middle, np.arange(len(log.middle)), steps, TESTED),
             outline(log),
             pj.Hand.finger(log.tip_radius),
             pj.fit_limit_surface(*pairs, log.length, degree=MODELS[model]),
@@ -69,20 +70,20 @@ def wrench_twist(setting: Setting) -> Predicted:
     errors = pj.deviation(on_grid, learned.end[None], setting.length)
     best = FRICTIONS[int(np.argmin(np.asarray(errors @ learned.weight)))]
     final, failed = final_poses(setting.slider, setting.hand, tested, jnp.asarray([best], learned.path.dtype))
-    return Predicted(_own(final[0], tested), float(best), int(_own(failed[0], tested).sum()), None)
+    return Predicted(own(final[0], tested), float(best), int(own(failed[0], tested).sum()), None)
 
 
 def identified(setting: Setting) -> Predicted:
-    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, inset=INSET, offset=OFFSET)
-    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length)
+    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, inset=INSET, offset=OFFSET, marker=MARKER)
+    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
     predicted = found.predict(setting.tested, setting.slider, setting.hand)
-    failed = _own(predicted.failed, setting.tested)
-    return Predicted(_own(predicted.pose[:, -1], setting.tested), float(found.friction), int(failed.sum()), found)
+    failed = own(predicted.failed, setting.tested)
+    return Predicted(own(predicted.pose[:, -1], setting.tested), float(found.friction), int(failed.sum()), found)
 
 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}
 
 
-def _own(values, pushes: pj.Pushes) -> np.ndarray:
+def own(values, pushes: pj.Pushes) -> np.ndarray:
     """Without what only fills up."""
     return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]

@@ -1,0 +1,185 @@
+"""Where the error of the predicted pushes comes from: what each cause explains, one by one.
+
+Friction, limit surface and centre of pressure are identified from the pushes to learn from, and with them one cause at
+a time; what counts is how much better the pushes are predicted that nothing was learned from. Then the same beside the
+calibration, where tip, object and outline really were: that much is kept for table 1.
+
+All is one program: a cause that is switched off has a prior that leaves it no room.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+import pushjax as pj
+from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._kept import Kept
+from pushjax.experiments.table1.conditions import APART, OBJECTS, SIDES, chosen, load
+from pushjax.experiments.table1.experiment import deviation_mm
+from pushjax.experiments.table1.methods import CENTER, DOF, INSET, MARKER, OFFSET, Setting, own
+from pushjax.experiments.table1.repeats import noise_floor_mm
+from pushjax.report import envelope
+
+STEPS = 50
+# Each with the standard deviations that it may have, as in `Unknowns`.
+CAUSES: dict[str, dict[str, float]] = {
+    "tip offset": {"offset": OFFSET},
+    "object frame": {"marker": MARKER},
+    "outline": {"inset": INSET},
+    "stream lag": {"lag": 0.001},
+    "initial overlap": {"overlap": 1.0},
+    "anisotropic friction": {"grain": 0.1},
+    "friction over the table": {"slope": 1.0, "curvature": 10.0},
+    "drift": {"drift": 0.3},
+    "friction by side": {"side": 0.3},
+}
+CALIBRATION = ("tip offset", "object frame", "outline")
+NOTHING, CALIBRATED = "nothing", "calibration"
+NO_ROOM = 1e-6
+
+
+def runs() -> dict[str, tuple[str, ...]]:
+    """Every run, and its causes."""
+    rest = [name for name in CAUSES if name not in CALIBRATION]
+    alone = {name: (name,) for name in CAUSES}
+    beside = {f"{CALIBRATED} + {name}": (*CALIBRATION, name) for name in rest}
+    return {NOTHING: (), CALIBRATED: CALIBRATION} | alone | beside
+
+
+def run(
+    folder: Path,
+    seed: int = 0,
+    out: Path | None = None,
+    steps: int = STEPS,
+    surface: Sequence[str] | None = None,
+    object: Sequence[str] = OBJECTS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """A cell for each surface, object and run: `mean_mm` of the tested pushes, `change_mm` against the run without any
+    of its causes (or, beside the calibration, without the last), with half a 95 % interval; and what was found.
+
+    folder, surface, object: as of table 1. With `out`, every cell is kept there as soon as it is known. Raises as table
+    1 does.
+    """
+    surface = chosen(folder, surface, object)
+    settings = {"seed": seed, "steps": steps, "version": pj.__version__}
+    kept = Kept(None if out is None else out / "table1-causes-cells.json", settings)
+    cells, total = [], len(surface) * len(object) * len(runs())
+    for log in (load(folder, on, target, seed) for on in surface for target in object):
+        floor, setting = noise_floor_mm(log), None
+        for name, causes in runs().items():
+            labels = {"surface": log.surface, "object": log.shape, "run": name}
+            cell = kept.find(labels)
+            if cell is None:
+                begin = time.perf_counter()
+                setting = Setting.of(log, "quartic", steps) if setting is None else setting
+                found = _cell(log, setting, causes) | {"noise_floor_mm": floor}
+                cell = kept.add(labels | found | {"run_s": time.perf_counter() - begin})
+            cells.append(cell)
+            progress(len(cells), total)
+    shares = {name: _share(cells, name) for name in runs()}
+    surfaces = {name: _deviations([cell for cell in cells if cell["surface"] == name]) for name in surface}
+    pictures = [] if out is None else [_draw(shares, surfaces, out)]
+    kept.forget()
+    settings |= {"surfaces": list(surface), "objects": list(object)}
+    return envelope("table1-causes", settings, cells=cells, shares=shares, surfaces=surfaces, pictures=pictures)
+
+
+def _cell(log: MitPushes, setting: Setting, causes: tuple[str, ...]) -> dict[str, Any]:
+    found = identified(setting, causes)
+    predicted = found.predict(setting.tested, setting.slider, setting.hand)
+    off = deviation_mm(log, own(predicted.pose[:, -1], setting.tested))
+    physical = found.physical._asdict()
+    return {
+        "mean_mm": float(off.mean()),
+        "each_mm": off,
+        "friction": float(found.friction),
+        "sigma_mm": 1e3 * float(found.sigma),
+        "found": {name: np.asarray(physical[name], float) for cause in causes for name in CAUSES[cause]},
+        "failed_steps": int(own(predicted.failed, setting.tested).sum()),
+    }
+
+
+def identified(setting: Setting, causes: tuple[str, ...]) -> pj.Identified:
+    spreads: dict[str, Any] = {name: NO_ROOM for each in CAUSES.values() for name in each}
+    spreads |= {name: value for cause in causes for name, value in CAUSES[cause].items()}
+    # Pushes are learned from whole, from the touch on: of an overlap there they tell nothing. All of it is left out.
+    spreads["overlap"] = NO_ROOM
+    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, sides=SIDES, **spreads)
+    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
+    if "initial overlap" not in causes:
+        return found
+    one = np.asarray(1.0, found.z.dtype)
+    found = eqx.tree_at(lambda f: f.prior.unknowns.overlap, found, jax.numpy.asarray(one))
+    return eqx.tree_at(lambda f: f.z, found, found.z.at[found.labels.index("overlap")].set(one))
+
+
+def _without(name: str) -> str:
+    return CALIBRATED if name.startswith(f"{CALIBRATED} + ") else NOTHING
+
+
+def _share(cells: list[dict], name: str) -> dict[str, float]:
+    """Of a run, over the paper's objects: the mean, its change, and which share of the error without it that is."""
+
+    def each(run: str) -> dict[tuple[str, str], np.ndarray]:
+        mine = (cell for cell in cells if cell["run"] == run and cell["object"] not in APART)
+        return {(cell["surface"], cell["object"]): np.asarray(cell["each_mm"]) for cell in mine}
+
+    mine, without = each(name), each(_without(name))
+    if not mine:
+        return {}
+    changes = [mine[key] - without[key] for key in mine]
+    mean, change = (float(np.mean([values.mean() for values in several])) for several in (mine.values(), changes))
+    interval = 1.96 * np.sqrt(np.sum([values.var(ddof=1) / len(values) for values in changes])) / len(changes)
+    share = -change / (mean - change)
+    return {"mean_mm": mean, "change_mm": change, "ci95_mm": float(interval), "percent": 100 * share}
+
+
+def _deviations(cells: list[dict]) -> dict[str, float | None]:
+    """On one surface: without any cause and calibrated; and of the objects that were pushed twice, calibrated and the
+    noise."""
+    mine = [cell for cell in cells if cell["object"] not in APART]
+    floors = [cell["noise_floor_mm"] for cell in mine if cell["run"] == NOTHING and cell["noise_floor_mm"] is not None]
+    found: dict[str, float | None] = {
+        name: float(np.mean([cell["mean_mm"] for cell in mine if cell["run"] == name])) if mine else None
+        for name in (NOTHING, CALIBRATED)
+    }
+    twice = [cell["mean_mm"] for cell in mine if cell["run"] == CALIBRATED and cell["noise_floor_mm"] is not None]
+    found["twice"] = float(np.mean(twice)) if twice else None
+    return found | {"noise": float(np.mean(floors)) if floors else None}
+
+
+def _draw(shares: dict[str, dict[str, float]], surfaces: dict[str, dict[str, float | None]], out: Path) -> str:
+    from pushjax import plot
+
+    alone = {name: shares[name] for name in (*CAUSES, CALIBRATED) if shares[name]}
+    beside = {name: shares.get(f"{CALIBRATED} + {name}", {}) for name in CAUSES}
+    figure = plot.causes_figure(alone, {name: each for name, each in beside.items() if each}, surfaces)
+    return str(plot.save(figure, out / "table1_causes.png"))
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    shares = record["shares"]
+    lines = ["Mean deviation of the tested pushes in mm; what it changes, and which share of the error that is.", ""]
+    for name, each in shares.items():
+        if not each:
+            continue
+        change = f"{each['change_mm']:+7.3f} +- {each['ci95_mm']:.3f}  {each['percent']:+5.1f} %"
+        change = "" if name == NOTHING else change
+        lines.append(f"{name:40}{each['mean_mm']:6.2f}  {change}")
+    for name, each in record["surfaces"].items():
+        if each["noise"] is not None:
+            left = f"calibrated {each['twice']:.2f} mm, noise {each['noise']:.2f} mm"
+            lines += ["", f"On {name}, of the objects that were pushed twice: {left}."]
+    failed = sum(cell["failed_steps"] for cell in record["cells"])
+    if failed:
+        lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
+    lines += ["", "Intervals (95 %) are of the pushes; objects are as they are. tri2 is in no mean."]
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)

@@ -1,0 +1,217 @@
+"""Predicted distributions of the pushes that nothing was learned from, beside what one would take else.
+
+noise     what `identify_noise` finds: of each part of the pushes to learn from, about what the rest tells; then about
+          what all of them tell.
+normal    the same point prediction, with a normal distribution of its errors on those parts.
+process   a Gaussian process of the same pushes. It knows nothing of how far a push goes, so it is asked for whole
+          pushes only, as it has learned from.
+
+How many pushes each needs: `curve`, of point predictions and of one normal distribution about them.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.stats import multivariate_normal
+
+import pushjax as pj
+from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._kept import Kept
+from pushjax.experiments._predicted import LEVELS, Scored, errors, normal_draws, scored
+from pushjax.experiments.table1 import gaussian_process
+from pushjax.experiments.table1.conditions import APART, OBJECTS, chosen, load, straight
+from pushjax.experiments.table1.methods import CENTER, DOF, INSET, LEARNED, MARKER, OFFSET, TESTED, Setting, own
+from pushjax.report import envelope
+
+STEPS = 25
+FOLDS, FOLD = 3, 48  # parts, and pushes in each at most
+DRAWS = 200
+COUNTS = (10, 20, 40, 80, 128)  # pushes to learn from
+CURVE_TESTS = 0.3  # share of all whole pushes
+UNKNOWNS: dict[str, Any] = {"dof": DOF, "center": CENTER, "inset": INSET, "offset": OFFSET, "marker": MARKER}
+
+
+def run(
+    folder: Path,
+    seed: int = 0,
+    out: Path | None = None,
+    steps: int = STEPS,
+    surface: Sequence[str] | None = None,
+    object: Sequence[str] = OBJECTS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, Any]:
+    """A cell for each surface and object: of each method and push the energy score (mm), the logarithm of the density
+    (per cubic metre of x, y, length * theta), and whether the regions of 50 and 90 % hold what happened; for `middle`,
+    the pushes that table 1 tests, and for `whole`, the same pushes from beginning to end.
+
+    folder, surface, object: as of table 1. Raises as it does, and ValueError without scikit-learn.
+    """
+    surface = chosen(folder, surface, object)
+    settings = {"seed": seed, "steps": steps, "version": pj.__version__}
+    kept = Kept(None if out is None else out / "table1-spread-cells.json", settings)
+    cells, total = [], len(surface) * len(object)
+    for log in (load(folder, on, target, seed) for on in surface for target in object):
+        labels = {"surface": log.surface, "object": log.shape}
+        cell = kept.find(labels)
+        if cell is None:
+            begin = time.perf_counter()
+            found = _cell(log, Setting.of(log, "quartic", steps), steps, seed)
+            cell = kept.add(labels | found | {"run_s": time.perf_counter() - begin})
+        cells.append(cell)
+        progress(len(cells), total)
+    paper = [cell for cell in cells if cell["object"] not in APART]
+    pooled = {group: _pooled([cell[group] for cell in paper]) for group in ("middle", "whole") if paper}
+    curve = _mean_curve([cell["curve"] for cell in paper])
+    pictures = [] if out is None or not paper else [_draw(pooled, curve, out)]
+    kept.forget()
+    settings |= {"surfaces": list(surface), "objects": list(object)}
+    return envelope("table1-spread", settings, cells=cells, pooled=pooled, curve=curve, pictures=pictures)
+
+
+def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    slider, hand, length = setting.slider, setting.hand, setting.length
+    rows = rng.permutation(np.flatnonzero(log.learned & log.whole.valid))
+    parts = np.array_split(rows, FOLDS)
+    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, LEARNED) for part in parts]
+    held = pj.Pushes.conditions([straight(log, log.whole, part, steps, FOLD) for part in parts])
+    # each part's own, as if they were of different objects
+    apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
+    of_rest = pj.identify(pj.Pushes.conditions(rest), slider, hand, apart, length=length, touching=True)
+    first, *keys = jax.random.split(jax.random.key(seed), 5)
+    noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
+    found = _identified(setting.coarse, setting)
+    off = own(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
+    predicted = noise.about(found)
+    process = gaussian_process.learn(log.whole, rows, length)
+    groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
+    cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
+    cell["noise"] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
+    cell["noise"]["spread"] = float(predicted.friction[1] - found.friction)
+    for k, (group, pushes) in enumerate(groups.items()):
+        ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
+        draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
+        density = own(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
+        methods = {"noise": scored(draws, ends, length)._replace(density=density)}
+        point = own(_ends(found, pushes, setting), pushes)
+        seen = errors(point, ends, start)
+        scale = np.array([1, 1, length])
+        normal: Any = multivariate_normal  # its types want a number
+        density = normal((off * scale).mean(axis=0), np.cov((off * scale).T)).logpdf(seen * scale)
+        about = normal_draws(rng, point, start, off, DRAWS)
+        methods["normal"] = scored(about, ends, length)._replace(density=density)
+        if group == "whole":
+            theirs = gaussian_process.predict(process, log.whole, log.middle_of)
+            about, density = theirs.draws(rng, DRAWS), theirs.log_density(log.whole.end[log.middle_of])
+            methods["process"] = scored(about, ends, length)._replace(density=density)
+            cell["process_mm"] = _deviation_mm(theirs.poses(), ends, length)
+        cell[group] = {name: _per_push(each) for name, each in methods.items()}
+        cell[f"{group}_mm"] = _deviation_mm(point, ends, length)
+    cell["curve"] = _curve(log, setting, steps, rng)
+    return cell
+
+
+def _identified(pushes: pj.Pushes, setting: Setting) -> pj.Identified:
+    unknowns = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
+    return pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
+
+
+def _ends(found: pj.Identified, pushes: pj.Pushes, setting: Setting) -> np.ndarray:
+    return np.asarray(found.predict(pushes, setting.slider, setting.hand).pose[..., -1, :], np.float64)
+
+
+def _deviation_mm(predicted: np.ndarray, ends: np.ndarray, length: float) -> float:
+    return float(1e3 * np.mean(np.asarray(pj.deviation(predicted, ends, length), np.float64)))
+
+
+def _per_push(each: Scored) -> dict[str, Any]:
+    inside = {f"inside_{100 * level:g}": each.inside[:, k] for k, level in enumerate(LEVELS)}
+    return {"energy_mm": 1e3 * each.energy, "log_density": each.density} | inside
+
+
+def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Physics and Gaussian process from few pushes and from many, of the same: whole ones, in any order."""
+    rows = rng.permutation(np.flatnonzero(log.whole.valid))
+    tests = np.sort(rows[: min(round(CURVE_TESTS * len(rows)), TESTED)])
+    rest, length, found = rows[len(tests) :], setting.length, []
+    tested = straight(log, log.whole, tests, steps, TESTED)
+    ends = log.whole.end[tests]
+    for count in (count for count in COUNTS if count <= len(rest)):
+        learned = straight(log, log.whole, rest[:count], steps, LEARNED)
+        physics = _identified(learned, setting)
+        point = own(_ends(physics, tested, setting), tested)
+        sigma = float(physics.sigma) / np.array([1, 1, length])
+        about = point[:, None] + rng.normal(size=(len(tests), DRAWS, 3)) * sigma
+        process = gaussian_process.predict(gaussian_process.learn(log.whole, rest[:count], length), log.whole, tests)
+        row: dict[str, Any] = {"count": count}
+        for name, mean, draws in (("physics", point, about), ("process", process.poses(), process.draws(rng, DRAWS))):
+            energy = 1e3 * float(scored(draws, ends, length).energy.mean())
+            row |= {f"{name}_mm": _deviation_mm(mean, ends, length), f"{name}_energy_mm": energy}
+        found.append(row)
+    return found
+
+
+def _pooled(cells: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Of all pushes: means; standard errors of the shares; and against `noise`, pairs of the same push."""
+    found: dict[str, dict[str, Any]] = {}
+    ours = {name: np.concatenate([cell["noise"][name] for cell in cells]) for name in ("energy_mm", "log_density")}
+    for method in cells[0]:
+        pool = {name: np.concatenate([cell[method][name] for cell in cells]) for name in cells[0][method]}
+        count = len(pool["energy_mm"])
+        row: dict[str, Any] = {name: float(values.mean()) for name, values in pool.items()} | {"pushes": count}
+        for level in LEVELS:
+            row[f"error_{100 * level:g}"] = float(np.sqrt(level * (1 - level) / count))
+        for name, values in ours.items():
+            less = values - pool[name]
+            row[f"noise_less_{name}"] = [float(less.mean()), float(less.std(ddof=1) / np.sqrt(count))]
+        found[method] = row
+    return found
+
+
+def _mean_curve(curves: list[list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Over objects, for counts that all have."""
+    rows = []
+    for count in COUNTS:
+        mine = [row for curve in curves for row in curve if row["count"] == count]
+        if mine and len(mine) == len(curves):
+            rows.append({name: float(np.mean([row[name] for row in mine])) for name in mine[0]} | {"count": count})
+    return rows
+
+
+def _draw(pooled: dict[str, dict[str, dict[str, Any]]], curve: list[dict[str, Any]], out: Path) -> str:
+    from pushjax import plot
+
+    return str(plot.save(plot.spread_figure(pooled, curve), out / "table1_spread.png"))
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    lines = []
+    for group, methods in record["pooled"].items():
+        title = {"middle": "The pushes of table 1", "whole": "The same pushes, whole"}[group]
+        lines += [f"{title}: {methods['noise']['pushes']} that nothing was learned from.", ""]
+        lines.append(f"{'':9}{'energy score':>14}{'log density':>13}{'in 50 %':>9}{'in 90 %':>9}")
+        for name, row in methods.items():
+            shares = "".join(f"{100 * row[f'inside_{level}']:7.1f} %" for level in ("50", "90"))
+            lines.append(f"{name:9}{row['energy_mm']:11.3f} mm{row['log_density']:13.2f}{shares}")
+        for name, row in methods.items():
+            if name != "noise":
+                energy, density = row["noise_less_energy_mm"], row["noise_less_log_density"]
+                lines.append(
+                    f"noise less {name}: energy score {energy[0]:+.3f} +- {energy[1]:.3f} mm, log density "
+                    f"{density[0]:+.2f} +- {density[1]:.2f}"
+                )
+        row = methods["noise"]
+        lines += [f"standard errors of the shares: {100 * row['error_50']:.1f} and {100 * row['error_90']:.1f} %", ""]
+    if record["curve"]:
+        lines.append(f"{'learned from':14}{'physics':>14}{'process':>14}   mean deviation (energy score), mm")
+        for row in record["curve"]:
+            each = (f"{row[f'{name}_mm']:6.2f} ({row[f'{name}_energy_mm']:.2f})" for name in ("physics", "process"))
+            lines.append(f"{row['count']:6.0f} pushes {''.join(f'{entry:>14}' for entry in each)}")
+    lines += ["", "tri2 is in no mean: the tracker lost it."]
+    lines += [f"drew {path}" for path in record["pictures"]]
+    return "\n".join(lines)
