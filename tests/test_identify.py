@@ -9,6 +9,7 @@ import pytest
 import pushjax as pj
 from pushjax.identify.model import Setup, moved
 from pushjax.identify.unknowns import Layout, Prior
+from pushjax.se2 import compose, inverse
 
 HALF, RADIUS, TRAVEL, STEPS = 0.045, 0.005, 0.03, 15
 MU = 0.3
@@ -266,3 +267,59 @@ def test_bad_arguments(pushes, square, expected, hand):
             pj.identify(pushes, slider, hand, **arguments)
     with pytest.raises(ValueError, match="path has 2 columns"):
         pj.identify(pushes, slider, pj.Hand.two_fingers(0.002))
+
+
+def test_touching_tells_where_things_are(square, real, expected, hand, tmp_path):
+    """Pushes that end somewhere else by millimetres, seen from the side by a fifth of one: where tip and slider are is
+    told by their touching. Fingers that have lost the slider do not matter."""
+    rng = np.random.default_rng(8)
+    starts, paths = planned(rng, 60)
+    offset, marker = np.array([0.0012, -0.0008]), np.array([-0.0006, 0.0009, 0.01])
+    slider = pj.Slider(square, real)
+
+    @jax.jit
+    @jax.vmap
+    def ends(start, path):
+        run = pj.rollout(slider, hand, path + offset[None], pose=compose(start, marker), friction=MU)
+        return run.pose[-1]
+
+    really = np.array(ends(jnp.asarray(starts), jnp.asarray(paths)))
+    # 3 mm along the side that is touched, a turn about the contact, 0.1 mm across
+    for k, pose in enumerate(really):
+        tip = paths[k, -1] + offset
+        _, point, normal = square.closest(pj.se2.transform(pj.se2.inverse(pose), tip))
+        tangent = np.array([-normal[1], normal[0]])
+        rest = 0.02 - abs(float(point @ tangent))  # it stays on its side
+        shift = np.clip(0.003 * rng.normal(), -max(rest, 0), max(rest, 0)) * tangent + 1e-4 * rng.normal() * normal
+        really[k] = compose(pose, np.array([*shift, 0.0]))
+    really[:4, :2] += 0.02  # lost
+    seen = compose(really, inverse(marker))
+    pushes = pj.Pushes(starts, paths, seen)
+    unknowns = pj.Unknowns((0.0, 1.0), dof=50, inset=1e-3, offset=2e-3, marker=1e-3)
+    mean = pj.Slider(square, expected)
+    blind = pj.identify(pushes, mean, hand, unknowns)
+    found = pj.identify(pushes, mean, hand, unknowns, touching=True)
+    assert float(blind.gap) == 0
+    assert 0.5e-4 < float(found.gap) < 3e-4
+
+    def off(one):
+        own = one.physical
+        return np.linalg.norm([*(own.offset - offset), *(own.marker[:2] - marker[:2])])
+
+    assert off(found) < 2.5e-4
+    assert off(found) < off(blind) / 2
+    low, high = found.interval(0.99)["offset"]
+    assert np.all((low < offset) & (offset < high))
+    found.save(tmp_path / "found.json")
+    again = pj.Identified.load(tmp_path / "found.json")
+    assert jax.tree.structure(again) == jax.tree.structure(found)
+    np.testing.assert_array_equal(again.gap, found.gap)
+    # its profile and bootstrap know of it too
+    profile = found.profile(pushes, mean, hand, "offset.0", points=1)
+    assert profile.rise[1] < profile.rise[0]
+    drawn = found.bootstrap(jax.random.key(0), pushes, mean, hand, 4)
+    assert np.all(np.linalg.norm(np.asarray(drawn.offset) - offset, axis=1) < 5e-4)
+    two = pj.Hand.two_fingers(RADIUS)
+    wide = pj.Pushes(starts, jnp.zeros((*paths.shape[:2], two.dof)), starts)
+    with pytest.raises(ValueError, match="touching is for a single round finger; the hand has 2 fingers"):
+        pj.identify(wide, mean, two, touching=True)

@@ -3,11 +3,14 @@
 import csv
 import json
 from dataclasses import replace
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_t
 
 import pushjax as pj
 from pushjax import cli
@@ -334,5 +337,50 @@ def test_noise(few, found, block, surface, tmp_path):
     found.save(tmp_path / "found.json")
     with pytest.raises(ValueError, match="does not hold noise that pushjax identified: its format is another"):
         pj.Noise.load(tmp_path / "found.json")
+    likelihood: Any = "likelihood"
+    with pytest.raises(ValueError, match="score must be one of energy, density; got 'likelihood'"):
+        pj.identify_noise(jax.random.key(2), found, seen, slider, hand, score=likelihood)
     with pytest.raises(ValueError, match="samples must be at least 2"):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)
+
+
+def test_density(few, found, block, surface):
+    """Of predicted poses: where surface and friction are certain, Student's about the one pose there is; and the noise
+    that makes it largest is near that of the pushes."""
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    sigma, tails = 4e-4, 4.0
+    sure = jnp.stack([found.friction, found.friction])
+    numbers = (jnp.array(value) for value in (1e9, 1e-9, sigma, tails))
+    dof, offset, spread, nu = numbers
+    known = pj.Noise(found, dof, sure, offset, spread, nu, jnp.array(0.0), jnp.zeros(1), "terms")
+    ends = found.predict(few, slider, hand).pose[:, -1]
+    off = 1e-3 * np.random.default_rng(0).normal(size=ends.shape) / [1, 1, float(found.length)]
+    off[:, 2] += 2 * np.pi * np.arange(len(off))  # turns do not count
+    density = known.log_density(jax.random.key(0), pj.Pushes(few.start, few.path, ends + off), slider, hand, 3)
+    apart = off * [1, 1, float(found.length)]
+    apart[:, 2] = float(found.length) * (off[:, 2] - 2 * np.pi * np.arange(len(off)))
+    expected = multivariate_t(np.zeros(3), sigma**2 * np.eye(3), tails).logpdf(apart)
+    np.testing.assert_allclose(density, expected, atol=0.05)
+    # about what others tell
+    other = eqx.tree_at(lambda f: f.z, found, found.z + 0.1)
+    moved = eqx.tree_at(lambda noise: noise.friction, known, sure + jnp.array([-0.05, 0.05]))
+    again = moved.about(other)
+    np.testing.assert_allclose(again.friction, other.friction + jnp.array([-0.05, 0.05]), atol=1e-12)
+    np.testing.assert_array_equal(again.found.z, other.z)
+    # found again
+    friction = found.friction + 0.1 * jnp.array([-1.0, 1.0])
+    values = (jnp.array(30.0), friction, jnp.array(2e-4))
+    truth = eqx.tree_at(lambda noise: (noise.dof, noise.friction, noise.offset), known, values)
+    many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
+    seen = pj.Pushes(many.start, many.path, truth.predict(jax.random.key(1), many, slider, hand, 1)[:, 0])
+    noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=60, score="density")
+    assert noise.score < noise.history[:5].mean()
+    assert 0.5 * sigma < float(noise.sigma) < 2 * sigma
+    # of other pushes of the truth, what was found makes little less of them than the truth does
+    fresh = truth.predict(jax.random.key(3), many, slider, hand, 1)[:, 0]
+    other = pj.Pushes(many.start, many.path, fresh)
+    best, ours, first = (
+        float(jnp.mean(one.log_density(jax.random.key(4), other, slider, hand, 64))) for one in (truth, noise, known)
+    )
+    assert first + 1 < best
+    assert best - 0.3 < ours

@@ -1,15 +1,19 @@
 """Straight pushes of the MIT data set: the loader, the outlines, the noise floor, and the experiment."""
 
+import functools
 import json
 
 import jax
 import numpy as np
 import pytest
+from scipy.stats import norm
 
+import pushjax as pj
 from pushjax import cli
 from pushjax.datasets import LogError, load_mit_pushes_npz
+from pushjax.datasets.mit_pushes import StraightPushes
 from pushjax.experiments import table1
-from pushjax.experiments.table1 import conditions, experiment, methods
+from pushjax.experiments.table1 import causes, conditions, experiment, gaussian_process, methods, spread
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
 # Of the published toolbox: mm, quartic, mean over all tested pushes of ten objects, of which the archives hold 70 %.
@@ -86,7 +90,7 @@ def logs(data):
     if not (data / "mit_push").is_dir():
         pytest.skip(f"no {data / 'mit_push'}")
     each = [(surface, name) for surface in conditions.SURFACES for name in conditions.OBJECTS]
-    return {key: conditions.load(data / "mit_push", *key) for key in each}
+    return {key: conditions.load(data, *key) for key in each}
 
 
 def test_real_archives(logs):
@@ -108,12 +112,44 @@ def test_real_archives(logs):
 
 
 def test_outlines(logs):
-    """Ellipses and the butterfly pass where their many vertices are; so does every polygon."""
-    for name, most in (("ellip1", 2e-5), ("ellip3", 2e-5), ("butter", 2e-4), ("hex", 1e-9)):
+    """Ellipses pass where their many vertices are, polygons with edges halved too; the butterfly, whose corners are a
+    tenth of its vertices, near them."""
+    for name, most in (("ellip1", 2e-5), ("ellip3", 2e-5), ("butter", 3.5e-4), ("hex", 1e-9), ("tri1", 1e-9)):
         log = logs["abs", name]
         distance = jax.vmap(conditions.outline(log).signed_distance)(log.vertices)
         assert np.max(np.abs(distance)) < most
     assert not conditions.outline(logs["abs", "butter"]).convex
+    for name in ("rect1", "tri2", "hex"):
+        filled = conditions.outline(logs["abs", name])
+        assert isinstance(filled, pj.Polygon)
+        assert filled.convex
+        assert filled.vertices.shape == (6, 2)
+        inside, plain = filled.inset(0.003), pj.Polygon(logs["abs", name].vertices).inset(0.003)
+        points = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 2))
+        np.testing.assert_allclose(
+            jax.vmap(inside.signed_distance)(points), jax.vmap(plain.signed_distance)(points), atol=1e-12
+        )
+
+
+def test_sides(logs):
+    """Four of a rectangle, about equally often; quadrants of an ellipse; a tip is nearest to its side."""
+    for name, many in (("rect1", 4), ("tri1", 3), ("hex", 6), ("ellip2", 4), ("butter", 4)):
+        log = logs["abs", name]
+        side = conditions.sides(log, log.whole)
+        counts = np.bincount(side, minlength=many)
+        assert len(counts) == many
+        assert counts.min() > len(side) / many / 3
+    rect = logs["abs", "rect1"]
+    side = conditions.sides(rect, rect.whole)
+    start = rect.whole.start
+    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+    away = rect.whole.tip_start - start[:, :2]
+    local = np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
+    middle = (rect.vertices + np.roll(rect.vertices, -1, axis=0)) / 2
+    outward = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    reach = np.max(local @ outward.T - np.sum(middle * outward, axis=1)[None], axis=1)
+    mine = np.sum(local * outward[side], axis=1) - np.sum(middle * outward, axis=1)[side]
+    np.testing.assert_allclose(mine, reach, atol=1e-3)  # but for corners, where two are as near
 
 
 def test_noise_floor(logs):
@@ -128,9 +164,13 @@ def test_noise_floor(logs):
 def test_filled_up(logs):
     log = logs["abs", "tri1"]
     rows = np.flatnonzero(log.learned)
-    pushes = conditions.straight(log.whole, rows, 10, 128)
+    pushes = conditions.straight(log, log.whole, rows, 10, 128)
     assert pushes.path.shape == (128, 11, 2)
     assert float(pushes.weight.sum()) == len(rows)
+    assert 0 <= float(pushes.age.min()) < 0.2 < 0.8 < float(pushes.age.max()) <= 1
+    np.testing.assert_array_equal(pushes.side[: len(rows)], conditions.sides(log, log.whole)[rows])
+    with pytest.raises(ValueError, match=f"batch must be at least {len(rows)}; got 3"):
+        conditions.straight(log, log.whole, rows, 10, 3)
     np.testing.assert_allclose(pushes.path[: len(rows), -1], log.whole.tip_end[rows])
     np.testing.assert_allclose(pushes.path[3, 5], (log.whole.tip_start[rows[3]] + log.whole.tip_end[rows[3]]) / 2)
 
@@ -185,6 +225,7 @@ def test_an_interrupted_run_goes_on(logs, data, monkeypatch, tmp_path):
     [
         (["--object", "rect9"], "object must be one or more of rect1"),
         (["--method", "ideal"], "method must be one or more of wrench_twist, identified; got ['ideal']"),
+        (["--surface", "delrin"], "has no pushes on delrin; the published data set has"),
     ],
 )
 def test_bad_choices(data, arguments, message, capsys, tmp_path):
@@ -194,8 +235,109 @@ def test_bad_choices(data, arguments, message, capsys, tmp_path):
     assert message in capsys.readouterr().err
 
 
+def test_causes(logs, data, monkeypatch, tmp_path):
+    """Of one object, ellipsoids: where the tip really was matters; an overlap is explained by that."""
+    monkeypatch.setattr(methods, "MODELS", {"quartic": 2})
+    some = {name: causes.CAUSES[name] for name in ("tip offset", "initial overlap")}
+    monkeypatch.setattr(causes, "CAUSES", some)
+    monkeypatch.setattr(causes, "CALIBRATION", ("tip offset",))
+    given = ["--surface", "abs", "--object", "rect1", "--steps", "20", "--data", str(data), "--out", str(tmp_path)]
+    cli.main(["reproduce", "table1-causes", *given])
+    record = json.loads((tmp_path / "table1-causes.json").read_text())
+    names = ["nothing", "calibration", "tip offset", "initial overlap", "calibration + initial overlap"]
+    assert [cell["run"] for cell in record["cells"]] == names
+    shares = record["shares"]
+    assert shares["nothing"]["change_mm"] == 0
+    assert shares["tip offset"] == shares["calibration"]
+    assert shares["calibration"]["change_mm"] < -shares["calibration"]["ci95_mm"] < 0
+    assert shares["initial overlap"]["change_mm"] < 0
+    assert abs(shares["calibration + initial overlap"]["change_mm"]) < 0.1
+    found = record["cells"][1]
+    assert len(found["each_mm"]) == 196
+    assert 0.5e-3 < np.linalg.norm(found["found"]["offset"]) < 2e-3
+    assert record["cells"][3]["found"]["overlap"] == 1
+    assert record["surfaces"]["abs"]["noise"] < record["surfaces"]["abs"]["calibration"]
+    assert (tmp_path / "table1_causes.png").stat().st_size > 5000
+    assert not (tmp_path / "table1-causes-cells.json").exists()
+
+
+def test_spread(logs, data, monkeypatch, tmp_path):
+    """Of one object, ellipsoids, and a short search: better than normal errors, far better than data alone."""
+    monkeypatch.setattr(methods, "MODELS", {"quartic": 2})
+    monkeypatch.setattr(spread, "COUNTS", (20,))
+    monkeypatch.setattr(spread, "DRAWS", 60)
+    monkeypatch.setattr(pj, "identify_noise", functools.partial(pj.identify_noise, steps=20, samples=8))
+    given = ["--surface", "abs", "--object", "rect1", "--steps", "15", "--data", str(data), "--out", str(tmp_path)]
+    cli.main(["reproduce", "table1-spread", *given])
+    record = json.loads((tmp_path / "table1-spread.json").read_text())
+    for group, methods_there in (("middle", ["noise", "normal"]), ("whole", ["noise", "normal", "process"])):
+        pooled = record["pooled"][group]
+        assert list(pooled) == methods_there
+        for row in pooled.values():
+            assert row["pushes"] == 196
+            assert 0 <= row["inside_50"] < row["inside_90"] <= 1
+        energy, error = pooled["normal"]["noise_less_energy_mm"]
+        assert energy < -2 * error
+        density, error = pooled["normal"]["noise_less_log_density"]
+        assert density > 2 * error
+    assert record["pooled"]["whole"]["process"]["noise_less_energy_mm"][0] < -1
+    (row,) = record["curve"]
+    assert row["physics_mm"] < row["process_mm"] / 2
+    assert (tmp_path / "table1_spread.png").stat().st_size > 5000
+
+
+def test_gaussian_process():
+    """Of a law that it can learn: means, densities of the poses, draws that scatter as it says."""
+    rng = np.random.default_rng(0)
+    n, length = 60, 0.05
+    start = np.column_stack([rng.uniform(-0.2, 0.2, (n, 2)), rng.uniform(-3, 3, n)])
+    place, way = rng.uniform(-0.05, 0.05, n), rng.uniform(-0.3, 0.3, n)
+    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
+
+    def world(x, y):
+        return np.stack([c * x - s * y, s * x + c * y], axis=1)
+
+    tip = start[:, :2] + world(np.full(n, -0.05), place)
+    direction = world(np.cos(way), np.sin(way))
+    end = start + np.column_stack([0.04 * direction, -8 * place])
+    none = np.zeros(n, bool)
+    pushes = StraightPushes(np.arange(n), start, end, tip, tip + 0.05 * direction, ~none, {})
+    learned = gaussian_process.learn(pushes, np.arange(40), length)
+    tests = np.arange(40, n)
+    found = gaussian_process.predict(learned, pushes, tests)
+    assert 1e3 * np.mean(np.asarray(pj.deviation(found.poses(), end[tests], length))) < 0.5
+    assert found.mean.shape == found.deviation.shape == (20, 3)
+    np.testing.assert_allclose(found.mean[:, 0], 0.04, atol=1e-3)
+    at_mean = norm.logpdf(0, scale=found.deviation).sum(axis=1)
+    np.testing.assert_allclose(found.log_density(found.poses()), at_mean, atol=1e-6)
+    draws = found.draws(np.random.default_rng(1), 4000)
+    assert draws.shape == (20, 4000, 3)
+    np.testing.assert_allclose(length * draws[..., 2].std(axis=1), found.deviation[:, 2], rtol=0.1)
+
+
+def test_pictures():
+    """Every bar and curve is there, with its label and unit."""
+    from pushjax import plot
+
+    change = {"change_mm": -0.3, "ci95_mm": 0.1}
+    surfaces = {"abs": {"nothing": 5.8, "calibration": 5.3, "noise": None}}
+    left, right = plot.causes_figure({"tip offset": change, "drift": change}, {"drift": change}, surfaces).axes
+    assert [label.get_text() for label in left.get_yticklabels()] == ["tip offset", "drift"]
+    assert [text.get_text() for text in left.get_legend().get_texts()] == ["alone", "beside the calibration"]
+    assert "mm" in left.get_xlabel()
+    assert sorted(text.get_text() for text in right.texts) == ["5.30", "5.80"]
+    shares = {"inside_50": 0.6, "inside_90": 0.9}
+    curve = [{"count": n, "physics_mm": 5.0, "process_mm": 30.0 - n} for n in (10, 20)]
+    left, right = plot.spread_figure({"middle": {"noise": shares, "normal": shares}}, curve).axes
+    labels = [text.get_text() for text in left.get_legend().get_texts()]
+    assert labels == ["as it should be", "identified noise, middle", "normal errors, middle"]
+    np.testing.assert_array_equal(left.lines[1].get_ydata(), [0, 60, 90, 100])
+    np.testing.assert_array_equal(right.lines[1].get_ydata(), [20, 10])
+    assert "mm" in right.get_ylabel()
+
+
 def test_folder_without_the_pushes(tmp_path):
-    with pytest.raises(LogError, match="cannot read"):
+    with pytest.raises(LogError, match="expected"):
         table1.run(tmp_path, surface=("abs",), object=("rect1",))
-    with pytest.raises(ValueError, match="surface must be one or more of abs, plywood; got none"):
+    with pytest.raises(ValueError, match="surface must be one or more of delrin, abs, plywood; got none"):
         table1.run(tmp_path, surface=())
