@@ -149,7 +149,9 @@ def test_sides(logs):
     outward = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     reach = np.max(local @ outward.T - np.sum(middle * outward, axis=1)[None], axis=1)
     mine = np.sum(local * outward[side], axis=1) - np.sum(middle * outward, axis=1)[side]
-    np.testing.assert_allclose(mine, reach, atol=1e-3)  # but for corners, where two are as near
+    beside = np.abs(mine - reach) > 1e-3  # a corner, of which both sides are as near
+    assert beside.mean() < 0.05
+    assert np.all(reach[beside] < 0.007)
 
 
 def test_noise_floor(logs):
@@ -299,7 +301,7 @@ def test_gaussian_process():
 
     tip = start[:, :2] + world(np.full(n, -0.05), place)
     direction = world(np.cos(way), np.sin(way))
-    end = start + np.column_stack([0.04 * direction, -8 * place])
+    end = start + np.column_stack([0.04 * direction, -8 * place]) + 1e-4 * rng.normal(size=(n, 3)) / [1, 1, length]
     none = np.zeros(n, bool)
     pushes = StraightPushes(np.arange(n), start, end, tip, tip + 0.05 * direction, ~none, {})
     learned = gaussian_process.learn(pushes, np.arange(40), length)
