@@ -23,10 +23,10 @@ from _measure import header
 
 import pushjax as pj
 from pushjax.datasets.two_finger import load_two_finger_npz
+from pushjax.experiments._predicted import LEVELS, errors, normal_draws, scored
 from pushjax.experiments.table2 import conditions, methods
 from pushjax.experiments.two_finger import predictions
 
-LEVELS = (0.5, 0.9)
 PARTS = (0.4, 0.7)  # where the second and the third begin
 DRAWS = 500
 
@@ -96,34 +96,15 @@ def chosen(case: Case, rows: list[np.ndarray]) -> pj.Pushes:
     return pj.Pushes.conditions(filled)
 
 
-def turned(poses: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = c * poses[..., 0] - s * poses[..., 1], s * poses[..., 0] + c * poses[..., 1]
-    return np.stack([x, y, poses[..., 2]], axis=-1)
-
-
 def normal_errors(found: pj.Identified, case: Case, learned: pj.Pushes, tested: pj.Pushes, rng) -> np.ndarray:
     """Draws from the best point prediction, with its errors' normal distribution: (conditions, pushes, n, 3)."""
 
     def point(pushes):
         return np.asarray(found.predict(pushes, case.slider, case.hand).pose[..., -1, :], float)
 
-    off = turned(np.asarray(learned.end, float) - point(learned), -np.asarray(learned.start, float)[..., 2])
+    off = errors(point(learned), np.asarray(learned.end, float), np.asarray(learned.start, float))
     off = off[np.asarray(learned.weight) > 0]
-    start, middle = np.asarray(tested.start, float), point(tested)
-    drawn = rng.multivariate_normal(off.mean(axis=0), np.cov(off.T), (*start.shape[:2], DRAWS))
-    return middle[:, :, None] + turned(drawn, start[..., 2][..., None])
-
-
-@jax.jit
-def scores(draws, ends, length):
-    """Energy score (m), log density, and whether each level's region holds the pose: of many pushes."""
-
-    def one(drawn, end):
-        inside = pj.coverage(drawn, end[None], length, LEVELS)
-        return pj.energy_score(drawn, end, length), pj.log_density(drawn, end, length), inside
-
-    return jax.lax.map(lambda args: one(*args), (draws, ends), batch_size=16)
+    return normal_draws(rng, point(tested), np.asarray(tested.start, float), off, DRAWS)
 
 
 def run(case: Case, seed: int, say) -> list[dict]:
@@ -145,8 +126,7 @@ def run(case: Case, seed: int, say) -> list[dict]:
     normal = normal_errors(found, case, learned, tested, rng)
     rows = []
     there = np.asarray(tested.weight) > 0
-    ends = jnp.asarray(tested.end)[there]
-    each = [scores(jnp.asarray(d[there], ends.dtype), ends, case.length) for d in (ours, normal)]
+    each = [scored(draws[there], np.asarray(tested.end)[there], case.length) for draws in (ours, normal)]
     names = [(c, int(row)) for c, mine in enumerate(third) for row in mine]
     for k, name in enumerate(names):
         row = {"condition": name[0], "push": name[1], "seed": seed}
