@@ -2,7 +2,7 @@
 
 Friction, limit surface and centre of pressure are identified from the pushes to learn from, and with them one cause at
 a time; what counts is how much better the pushes are predicted that nothing was learned from. Then the same beside the
-calibration, where tip, object and outline really were: that much is kept for table 1.
+calibration, where tip, object and outline really were. Table 1 keeps that, and the overlap.
 
 All is one program: a cause that is switched off has a prior that leaves it no room.
 """
@@ -12,8 +12,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
 import pushjax as pj
@@ -21,7 +19,7 @@ from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments._kept import Kept
 from pushjax.experiments.table1.conditions import APART, OBJECTS, SIDES, chosen, load
 from pushjax.experiments.table1.experiment import deviation_mm
-from pushjax.experiments.table1.methods import CENTER, DOF, INSET, MARKER, OFFSET, Setting, own
+from pushjax.experiments.table1.methods import CENTER, DOF, INSET, MARKER, NO_ROOM, OFFSET, Setting, fitted, own
 from pushjax.experiments.table1.repeats import noise_floor_mm
 from pushjax.report import envelope
 
@@ -40,7 +38,6 @@ CAUSES: dict[str, dict[str, float]] = {
 }
 CALIBRATION = ("tip offset", "object frame", "outline")
 NOTHING, CALIBRATED = "nothing", "calibration"
-NO_ROOM = 1e-6
 
 
 def runs() -> dict[str, tuple[str, ...]]:
@@ -108,15 +105,9 @@ def _cell(log: MitPushes, setting: Setting, causes: tuple[str, ...]) -> dict[str
 def identified(setting: Setting, causes: tuple[str, ...]) -> pj.Identified:
     spreads: dict[str, Any] = {name: NO_ROOM for each in CAUSES.values() for name in each}
     spreads |= {name: value for cause in causes for name, value in CAUSES[cause].items()}
-    # Pushes are learned from whole, from the touch on: of an overlap there they tell nothing. All of it is left out.
     spreads["overlap"] = NO_ROOM
     unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, sides=SIDES, **spreads)
-    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
-    if "initial overlap" not in causes:
-        return found
-    one = np.asarray(1.0, found.z.dtype)
-    found = eqx.tree_at(lambda f: f.prior.unknowns.overlap, found, jax.numpy.asarray(one))
-    return eqx.tree_at(lambda f: f.z, found, found.z.at[found.labels.index("overlap")].set(one))
+    return fitted(setting.coarse, setting, unknowns, overlap=0.0 if "initial overlap" in causes else 1.0)
 
 
 def _without(name: str) -> str:

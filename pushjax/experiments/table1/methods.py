@@ -3,11 +3,12 @@ and how many steps failed.
 
 wrench_twist  the surface fitted to measured forces and motions, the friction by a grid: the paper's.
 identified    friction, surface, centre of pressure, and where tip and object really were, from final poses, in which
-              the two touch, starting from that surface.
+              the two touch, starting from that surface. What overlap is left at the start is taken to be none.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,6 +25,15 @@ LEARNED, TESTED = 128, 304
 # the outline, the tip against the world in which the tracker sees the object, and the object against what is tracked,
 # m. Chosen on abs.
 DOF, CENTER, INSET, OFFSET, MARKER = 10.0, 0.015, 0.001, 0.002, 0.001
+NO_ROOM = 1e-6  # for what is not to be found
+UNKNOWNS: dict[str, Any] = {
+    "dof": DOF,
+    "center": CENTER,
+    "inset": INSET,
+    "offset": OFFSET,
+    "marker": MARKER,
+    "overlap": NO_ROOM,
+}
 
 
 class Predicted(NamedTuple):
@@ -74,11 +84,19 @@ def wrench_twist(setting: Setting) -> Predicted:
 
 
 def identified(setting: Setting) -> Predicted:
-    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, inset=INSET, offset=OFFSET, marker=MARKER)
-    found = pj.identify(setting.coarse, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
+    found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
     predicted = found.predict(setting.tested, setting.slider, setting.hand)
     failed = own(predicted.failed, setting.tested)
     return Predicted(own(predicted.pose[:, -1], setting.tested), float(found.friction), int(failed.sum()), found)
+
+
+def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: float = 0.0) -> pj.Identified:
+    """What the pushes tell, if the finger touches at the end of most. overlap: the share of it, at the start, that
+    pushes. Pushes to learn from are whole, from the touch on, and tell nothing of it: it is said, not found."""
+    found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
+    places = jnp.asarray([label.startswith("overlap") for label in found.labels])
+    none = jnp.where(places, 1 - overlap, found.z).astype(found.z.dtype)
+    return eqx.tree_at(lambda f: (f.z, f.prior.unknowns.overlap), found, (none, jnp.ones_like(found.sigma)))
 
 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}

@@ -24,7 +24,7 @@ from pushjax.experiments._kept import Kept
 from pushjax.experiments._predicted import LEVELS, Scored, errors, normal_draws, scored
 from pushjax.experiments.table1 import gaussian_process
 from pushjax.experiments.table1.conditions import APART, OBJECTS, chosen, load, straight
-from pushjax.experiments.table1.methods import CENTER, DOF, INSET, LEARNED, MARKER, OFFSET, TESTED, Setting, own
+from pushjax.experiments.table1.methods import LEARNED, TESTED, UNKNOWNS, Setting, fitted, own
 from pushjax.report import envelope
 
 STEPS = 25
@@ -32,7 +32,6 @@ FOLDS, FOLD = 3, 48  # parts, and pushes in each at most
 DRAWS = 200
 COUNTS = (10, 20, 40, 80, 128)  # pushes to learn from
 CURVE_TESTS = 0.3  # share of all whole pushes
-UNKNOWNS: dict[str, Any] = {"dof": DOF, "center": CENTER, "inset": INSET, "offset": OFFSET, "marker": MARKER}
 
 
 def run(
@@ -81,10 +80,11 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     held = pj.Pushes.conditions([straight(log, log.whole, part, steps, FOLD) for part in parts])
     # each part's own, as if they were of different objects
     apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
-    of_rest = pj.identify(pj.Pushes.conditions(rest), slider, hand, apart, length=length, touching=True)
+    of_rest = fitted(pj.Pushes.conditions(rest), setting, apart)
     first, *keys = jax.random.split(jax.random.key(seed), 5)
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
-    found = _identified(setting.coarse, setting)
+    every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
+    found = fitted(setting.coarse, setting, every)
     off = own(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
     predicted = noise.about(found)
     process = gaussian_process.learn(log.whole, rows, length)
@@ -115,11 +115,6 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     return cell
 
 
-def _identified(pushes: pj.Pushes, setting: Setting) -> pj.Identified:
-    unknowns = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
-    return pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
-
-
 def _ends(found: pj.Identified, pushes: pj.Pushes, setting: Setting) -> np.ndarray:
     return np.asarray(found.predict(pushes, setting.slider, setting.hand).pose[..., -1, :], np.float64)
 
@@ -142,7 +137,7 @@ def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generato
     ends = log.whole.end[tests]
     for count in (count for count in COUNTS if count <= len(rest)):
         learned = straight(log, log.whole, rest[:count], steps, LEARNED)
-        physics = _identified(learned, setting)
+        physics = fitted(learned, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
         point = own(_ends(physics, tested, setting), tested)
         sigma = float(physics.sigma) / np.array([1, 1, length])
         about = point[:, None] + rng.normal(size=(len(tests), DRAWS, 3)) * sigma
