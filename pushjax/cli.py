@@ -148,6 +148,9 @@ TAKES: dict[str, tuple[str, ...]] = {
     "grasp-butterfly": RANDOM,
 }
 
+# Experiments that share a room with another.
+INSIDE = {"table1-causes": "table1.causes", "table1-spread": "table1.spread"}
+
 
 def _reproduce(command: Reproduce, progress: Progress) -> Result:
     name = command.experiment
@@ -179,8 +182,7 @@ def _reproduce(command: Reproduce, progress: Progress) -> Result:
 
         given["slider"] = name.removeprefix("grasp-")
     else:
-        room, _, part = name.partition("-") if name.startswith("table1-") else (name.replace("-", "_"), "", "")
-        experiment = import_module(f"pushjax.experiments.{room}{'.' if part else ''}{part}")
+        experiment = import_module(f"pushjax.experiments.{INSIDE.get(name, name.replace('-', '_'))}")
     record = experiment.run(seed=command.seed, out=command.out, **given)
     text = experiment.summary(record)
     from pushjax.page import write_page

@@ -60,8 +60,8 @@ class Table(eqx.Module):
         squared = a * a + b * b
         small = squared < NEAR_ZERO
         r = jnp.sqrt(jnp.where(small, 1.0, squared))
-        even = jnp.where(small, 1 + squared / 2, jnp.cosh(r))
-        odd = jnp.where(small, 1 + squared / 6, jnp.sinh(r) / r)
+        even = jnp.where(small, 1 + squared / 2 * (1 + squared / 12 * (1 + squared / 30)), jnp.cosh(r))
+        odd = jnp.where(small, 1 + squared / 6 * (1 + squared / 20 * (1 + squared / 42)), jnp.sinh(r) / r)
         sx, sy = entries(self.slope)
         xx, yy, xy = entries(self.curvature)
         ox, oy = entries(self.origin)

@@ -288,6 +288,13 @@ def test_spread(logs, data, monkeypatch, tmp_path):
     assert (tmp_path / "table1_spread.png").stat().st_size > 5000
 
 
+def test_files_left_out_are_named(tmp_path, monkeypatch):
+    problem = LogError(tmp_path / "a.json", "the tracker jumps")
+    monkeypatch.setattr(conditions, "load_mit_folder", lambda *given, **options: ("log", (problem, problem)))
+    with pytest.warns(UserWarning, match=r"2 files of hex on delrin are left out, the first: .*a\.json.*tracker jumps"):
+        assert conditions.load(tmp_path, "delrin", "hex") == "log"
+
+
 def test_gaussian_process():
     """Of a law that it can learn: means, densities of the poses, draws that scatter as it says."""
     rng = np.random.default_rng(0)

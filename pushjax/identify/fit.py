@@ -15,9 +15,8 @@ EARLY = 0.01  # tolerance, while sigma is still looked for
 TINY = 1e-6  # the prior of a friction, so that the precision has an inverse where no push tells of it
 ROUNDS = 6
 LEAST = 1e-6  # m, that sigma may be: less, nothing is measured
-
-
 KINDS = (3, 3, 1)  # numbers that a push tells by its poses, its pairs, its contact
+CONTACT = 2  # which of them
 LOST = 3.0  # sigma: where a gap is farther off, the finger is taken to have lost the slider, and counts for little
 
 
@@ -76,7 +75,7 @@ def whitened(residual: Array, pushes: Pushes, sigma: Array, robust: float | None
     for k, (r, weight) in enumerate(zip(_parts(residual, pushes), Counts.of(pushes), strict=True)):
         r = r / sigma[k]
         squared = jnp.sum(r**2, axis=-1, keepdims=True)
-        if KINDS[k] == 1:
+        if k == CONTACT:
             r = r / jnp.sqrt(1 + squared / LOST**2)
         elif robust is not None:
             r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
@@ -87,7 +86,7 @@ def whitened(residual: Array, pushes: Pushes, sigma: Array, robust: float | None
 def _trust(k: int, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
     """How much a push counts in the end."""
     squared = jnp.sum((residual / sigma) ** 2, axis=-1)
-    if KINDS[k] == 1:
+    if k == CONTACT:
         return weight / (1 + squared / LOST**2) ** 2
     return weight if robust is None else weight / jnp.sqrt(1 + squared / robust**2)
 

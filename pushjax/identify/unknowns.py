@@ -271,6 +271,7 @@ def _parts(z: Array, layout: Layout) -> dict[str, Any]:
 
 
 def _scaled(part: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
+    """Numbers of z times their standard deviation; zeros for what is known."""
     spread = getattr(unknowns, name)
     return jnp.zeros(SIZES[name], dtype) if spread is None else spread.astype(dtype) * part[name]
 
@@ -304,7 +305,8 @@ def _physical(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mea
 
     center, offset = scaled("center"), scaled("offset")
     inset, end, lag = (scaled(name)[0] for name in ("inset", "end", "lag"))
-    more = {name: part[name] * getattr(unknowns, name).astype(z.dtype) for name in Physical._fields[7:] if name in part}
+    asked = [name for name in Physical._field_defaults if name in part]
+    more = {name: _scaled(part, unknowns, name, z.dtype) for name in asked}
     if "marker" in more:
         more["marker"] = more["marker"].at[2].divide(mean.length)
     more |= {name: more[name][0] for name in ("overlap", "drift") if name in more}

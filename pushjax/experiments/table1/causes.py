@@ -105,7 +105,7 @@ def _cell(log: MitPushes, setting: Setting, causes: tuple[str, ...]) -> dict[str
 def identified(setting: Setting, causes: tuple[str, ...]) -> pj.Identified:
     spreads: dict[str, Any] = {name: NO_ROOM for each in CAUSES.values() for name in each}
     spreads |= {name: value for cause in causes for name, value in CAUSES[cause].items()}
-    spreads["overlap"] = NO_ROOM
+    spreads["overlap"] = NO_ROOM  # said, not found
     unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, sides=SIDES, **spreads)
     return fitted(setting.coarse, setting, unknowns, overlap=0.0 if "initial overlap" in causes else 1.0)
 

@@ -3,6 +3,7 @@
 The curated archives hold two surfaces; the published folders a third, delrin.
 """
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -60,10 +61,14 @@ def chosen(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -
 
 def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
     """From the curated archives in `mit_push`, if it is there; else from the files of the published data set. seed: of
-    which pushes are learned from, where the data do not say."""
+    which pushes are learned from, where the data do not say. Warns of files that are left out."""
     if (folder / ARCHIVES).is_dir():
         return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
-    return load_mit_folder(folder, surface, name, train_share=LEARNED_SHARE, seed=seed)[0]
+    log, problems = load_mit_folder(folder, surface, name, train_share=LEARNED_SHARE, seed=seed)
+    if problems:
+        what = f"{len(problems)} files of {name} on {surface} are left out"
+        warnings.warn(f"{what}, the first: {problems[0]}", stacklevel=2)
+    return log
 
 
 def paper_mm(surface: str, name: str, model: str) -> float | None:
