@@ -130,9 +130,9 @@ def run(case: Case, seed: int, say) -> list[dict]:
     names = [(c, int(row)) for c, mine in enumerate(third) for row in mine]
     for k, name in enumerate(names):
         row = {"condition": name[0], "push": name[1], "seed": seed}
-        for label, (energy, density, inside) in zip(("noise", "normal"), each, strict=True):
-            row |= {f"{label}_energy_mm": 1e3 * float(energy[k]), f"{label}_log_density": float(density[k])}
-            row |= {f"{label}_{level}": float(inside[k, i]) for i, level in enumerate(LEVELS)}
+        for label, score in zip(("noise", "normal"), each, strict=True):
+            row |= {f"{label}_energy_mm": 1e3 * float(score.energy[k]), f"{label}_log_density": float(score.density[k])}
+            row |= {f"{label}_{level}": float(score.inside[k, i]) for i, level in enumerate(LEVELS)}
         rows.append(row)
     return rows
 

@@ -133,7 +133,7 @@ def advance(
         first = share == 0
         each, fresh, picked, holds = [], [], [], jnp.ones((), bool)
         for k, grip in enumerate(grips):
-            at = grip.seen(there, begin + rest * share)
+            at = settle(grip.seen(there, begin + rest * share), pose.x)
             touches = settle(places(grip.finger, outline, at, form.length), pose.x)
             mine = tuple(
                 jnp.where(first, new, old)

@@ -96,23 +96,34 @@ class Identify(identify_logs.Options, Common):
     """Files of recorded pushes."""
 
 
+BenchCase = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling", "numerics", "contacts"]
+
+
 @dataclass
 class Bench(Common):
-    """Measure: how exact, how fast.
+    """Measure how exact and how fast: pushes, gradients, grasps, contact problems, random surfaces.
 
-    contacts: random problems of one to eight contacts, every answer checked by an independent solver.
+    push, ellipsoid, gradient: of a square, 50 mm, in as few steps as 0.1 mm takes. grasp: two fingers close on it.
+    solve: random contact problems. sampling: random surfaces. numerics: float32 beside float64. contacts: every answer
+    of random contact problems checked by an independent solver (alone; takes an hour).
     """
 
-    case: Annotated[Literal["contacts"], tyro.conf.Positional] = "contacts"
-    """Which."""
-    dtype: Literal["float32", "float64"] = "float64"
-    """Floating type."""
-    scale: float = 1.0
-    """How many problems, of 100 000 for up to four contacts and 10 000 for more."""
-    starts: int = 50
-    """Starts of the independent solver on every problem that was called jammed."""
-    contacts: tuple[int, ...] = (1, 2, 3, 4, 5, 6, 7, 8)
-    """Of how many contacts."""
+    case: Annotated[tuple[BenchCase, ...], tyro.conf.Positional] = ()
+    """Which. Default: all but numerics and contacts."""
+    dtype: tuple[Literal["float32", "float64"], ...] | None = None
+    """Floating types. Default: both; contacts: float64."""
+    batch: tuple[int, ...] | None = None
+    """How many at once. Default: 2000."""
+    peers: bool = False
+    """The same push by MuJoCo and MJX beside it: pip install 'pushjax[bench]'."""
+    baseline: Path | None = None
+    """A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did there."""
+    scale: float | None = None
+    """contacts, numerics: how many problems, of 100 000 (contacts: 10 000 for more than four)."""
+    starts: int | None = None
+    """contacts: starts of the independent solver on every problem that was called jammed. Default: 50."""
+    contacts: tuple[int, ...] | None = None
+    """contacts: of how many. Default: one to eight."""
 
 
 Command = (
@@ -199,20 +210,56 @@ def _identify(command: Identify, progress: Progress) -> Result:
 
 
 def _bench(command: Bench, progress: Progress) -> Result:
-    import jax
-
-    from pushjax.experiments import bench_contacts
     from pushjax.report import write_json
 
-    jax.config.update("jax_enable_x64", command.dtype == "float64")  # of this process, which is the command's own
+    alone = [name for name in ("contacts", "numerics") if name in command.case]
+    if alone and len(command.case) > 1:
+        raise ValueError(f"{alone[0]} is measured alone; got {' '.join(command.case)}")
+    kind = alone[0] if alone else "the others"
+    given = {name: getattr(command, name) for name in BENCH_TAKES["contacts"] | BENCH_TAKES["the others"]}
+    given = {name: value for name, value in given.items() if value not in (None, False)}
+    for name in given:
+        if name not in BENCH_TAKES[kind]:
+            others = ", ".join(other for other, takes in BENCH_TAKES.items() if name in takes)
+            raise ValueError(f"--{name} is for {others}; got it with {' '.join(command.case) or 'no case'}")
 
     def keep(so_far: dict[str, Any]) -> None:
         if command.json is not None:
             write_json(so_far, command.json)
 
-    scale, starts, contacts = command.scale, command.starts, command.contacts
-    record = bench_contacts.run(command.seed, scale, starts, contacts, progress, keep)
-    return record, bench_contacts.summary(record)
+    if kind == "contacts":
+        return _bench_contacts(command.seed, given, progress, keep)
+    if kind == "numerics":
+        from pushjax.bench import numerics
+
+        record = numerics.run(seed=command.seed, progress=progress, **given)
+        return record, numerics.summary(record)
+    from pushjax.bench import run as bench
+
+    if command.case:
+        given["case"] = command.case
+    record = bench.run(seed=command.seed, progress=progress, keep=keep, **given)
+    return record, bench.summary(record)
+
+
+BENCH_TAKES = {
+    "contacts": {"dtype", "scale", "starts", "contacts"},
+    "numerics": {"scale"},
+    "the others": {"dtype", "batch", "peers", "baseline"},
+}
+
+
+def _bench_contacts(seed: int, given: dict[str, Any], progress: Progress, keep: Callable) -> Result:
+    import jax
+
+    from pushjax.bench import contacts
+
+    dtypes = given.pop("dtype", ("float64",))
+    if len(dtypes) != 1:
+        raise ValueError(f"--dtype: contacts takes one; got {len(dtypes)}")
+    jax.config.update("jax_enable_x64", dtypes[0] == "float64")  # of this process, which is the command's own
+    record = contacts.run(seed, progress=progress, keep=keep, **given)
+    return record, contacts.summary(record)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -248,6 +295,8 @@ def main(arguments: list[str] | None = None) -> None:
 
             write_json(record, json)
             print(f"wrote {json}")
+        if record.get("slower"):
+            raise ValueError(f"slower than {command.baseline}: see above")  # pyright: ignore[reportAttributeAccessIssue]
     except (ValueError, OSError) as error:
         print(f"pushjax: {error}", file=sys.stderr)
         raise SystemExit(1) from None

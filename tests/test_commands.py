@@ -127,7 +127,7 @@ def test_jam(tmp_path, capsys):
 
 def test_bench_contacts(monkeypatch):
     """Two thousand problems of two contacts, judged by the independent solver."""
-    from pushjax.experiments import bench_contacts
+    from pushjax.bench import contacts as bench_contacts
 
     monkeypatch.setattr(bench_contacts, "MODELS", {"quartic": 4})
     kept = []

@@ -7,7 +7,7 @@ import pytest
 from contact_batches import BATCH, MOST, problems
 
 import pushjax as pj
-from pushjax.experiments import bench_contacts
+from pushjax.bench import contacts as bench_contacts
 from pushjax.verify import ProblemBatch, violations
 
 # Of a clean answer, relative: conditions, and the twist against the recorded one

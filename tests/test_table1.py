@@ -13,6 +13,7 @@ from pushjax import cli
 from pushjax.datasets import LogError, load_mit_pushes_npz
 from pushjax.datasets.mit_pushes import StraightPushes
 from pushjax.experiments import table1
+from pushjax.experiments._predicted import Scored, scored
 from pushjax.experiments.table1 import causes, conditions, experiment, gaussian_process, methods, spread
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
@@ -272,12 +273,18 @@ def test_spread(logs, data, monkeypatch, tmp_path):
     given = ["--surface", "abs", "--object", "rect1", "--steps", "15", "--data", str(data), "--out", str(tmp_path)]
     cli.main(["reproduce", "table1-spread", *given])
     record = json.loads((tmp_path / "table1-spread.json").read_text())
-    for group, methods_there in (("middle", ["noise", "normal"]), ("whole", ["noise", "normal", "process"])):
+    for group, methods_there in (
+        ("middle", ["noise", "calibrated", "normal"]),
+        ("whole", ["noise", "calibrated", "normal", "process"]),
+    ):
         pooled = record["pooled"][group]
         assert list(pooled) == methods_there
         for row in pooled.values():
             assert row["pushes"] == 196
             assert 0 <= row["inside_50"] < row["inside_90"] <= 1
+        # the same draws, regions that are not too wide in the middle
+        assert pooled["calibrated"]["energy_mm"] == pooled["noise"]["energy_mm"]
+        assert abs(pooled["calibrated"]["inside_50"] - 0.5) < 0.12
         energy, error = pooled["normal"]["noise_less_energy_mm"]
         assert energy < -2 * error
         density, error = pooled["normal"]["noise_less_log_density"]
@@ -286,6 +293,19 @@ def test_spread(logs, data, monkeypatch, tmp_path):
     (row,) = record["curve"]
     assert row["physics_mm"] < row["process_mm"] / 2
     assert (tmp_path / "table1_spread.png").stat().st_size > 5000
+
+
+def test_calibrated_levels_hold_their_share():
+    """Of errors half as wide as predicted, many fall inside; regions of levels seen elsewhere hold their share."""
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(1, 400, 3)) * np.array([1e-3, 1e-3, 0.02])
+    ends = 0.5 * rng.normal(size=(400, 3)) * np.array([1e-3, 1e-3, 0.02])
+    each = scored(np.broadcast_to(draws, (400, 400, 3)), ends, 0.05)
+    np.testing.assert_array_equal(each.inside, each.level[:, None] <= np.array([0.5, 0.9]))
+    seen, rest = each._replace(level=each.level[:200]), Scored(*(part[200:] for part in each))
+    assert rest.inside[:, 0].mean() > 0.85
+    shares = rest.calibrated(seen.level).inside.mean(axis=0)
+    assert np.all(np.abs(shares - [0.5, 0.9]) < 3 * np.sqrt([0.25 / 100, 0.09 / 100]))
 
 
 def test_files_left_out_are_named(tmp_path, monkeypatch):

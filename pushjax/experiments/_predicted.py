@@ -9,16 +9,25 @@ import numpy as np
 import pushjax as pj
 
 LEVELS = (0.5, 0.9)
+FINE = tuple(np.linspace(0.005, 0.995, 199).tolist())  # levels, with those of `LEVELS` among them
 TOGETHER = 16  # pushes
 
 
 class Scored(NamedTuple):
-    """Of each push. energy: m. density: its logarithm. inside: (pushes, 2), whether the region of highest density of
-    each of `LEVELS` holds what happened."""
+    """Of each push. energy: m. density: its logarithm. level: of the smallest region of highest density that holds what
+    happened, to half a hundredth. inside: (pushes, 2), whether the regions of `LEVELS` do."""
 
     energy: np.ndarray
     density: np.ndarray
+    level: np.ndarray
     inside: np.ndarray
+
+    def calibrated(self, seen: np.ndarray) -> "Scored":
+        """With regions of other levels: those that held a share `LEVELS` of what happened in other pushes, whose levels
+        these are (split conformal prediction)."""
+        count = len(seen)
+        shares = [min(1.0, level * (count + 1) / count) for level in LEVELS]
+        return self._replace(inside=self.level[:, None] <= np.quantile(seen, shares)[None])
 
 
 def scored(draws: np.ndarray, ends: np.ndarray, length: float) -> Scored:
@@ -31,8 +40,10 @@ def scored(draws: np.ndarray, ends: np.ndarray, length: float) -> Scored:
 @jax.jit
 def _scores(draws, ends, length):
     def one(drawn, end):
-        inside = pj.coverage(drawn, end[None], length, LEVELS)
-        return pj.energy_score(drawn, end, length), pj.log_density(drawn, end, length), inside
+        inside = pj.coverage(drawn, end[None], length, FINE)
+        level = 1 - jnp.sum(inside) / (len(FINE) + 1)
+        both = jnp.stack([inside[FINE.index(min(FINE, key=lambda f, share=share: abs(f - share)))] for share in LEVELS])
+        return pj.energy_score(drawn, end, length), pj.log_density(drawn, end, length), level, both
 
     return jax.lax.map(lambda args: one(*args), (draws, ends), batch_size=TOGETHER)
 

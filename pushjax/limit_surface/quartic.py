@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from pushjax._checks import Numeric, as_float, concrete, finite, shaped
-from pushjax._vec import Scalar, Vec3, entries
+from pushjax._vec import Scalar, Vec3, entries, settle
 from pushjax.limit_surface._base import (
     InverseMap,
     LimitSurface,
@@ -88,14 +88,46 @@ class QuarticForm(_QuarticFields):
         )
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        ga, gb, hb = self.gradient(a), self.gradient(b), self.hessian(a).times(b)
-        return (
-            a.dot(ga) / 4,
-            b.dot(ga),
-            b.dot(hb) / 2,
-            a.dot(gb),
-            b.dot(gb) / 4,
+        """H = xx A + yy B + zz C with A, B, C linear in the six squares and products of F's entries; along a + s b all
+        of these are quadratic in s. A third of the arithmetic of gradients and a Hessian at both ends."""
+        ends = (_products(a, a), _products(a, b, twice=True), _products(b, b))
+        rows = settle(tuple((m[:3], self._factors(m)) for m in ends), a.x)
+        squares, factors = ([row[k] for row in rows] for k in range(2))
+        return tuple(
+            sum(
+                (
+                    q * f
+                    for k in range(3)
+                    for n in range(3)
+                    if k + n == power
+                    for q, f in zip(squares[k], factors[n], strict=True)
+                ),
+                jnp.zeros_like(a.x),
+            )
+            for power in range(5)
         )
+
+    def _factors(self, m: "tuple[Scalar, ...]") -> tuple[Scalar, Scalar, Scalar]:
+        c, (xx, yy, zz, xy, xz, yz) = self.c, m
+        return (
+            c[0] * xx + c[3] * xy + c[4] * xz + c[9] * yy + c[10] * zz + c[12] * yz,
+            c[1] * yy + c[5] * xy + c[6] * yz + c[11] * zz + c[13] * xz,
+            c[2] * zz + c[7] * xz + c[8] * yz + c[14] * xy,
+        )
+
+
+def _products(a: Vec3, b: Vec3, twice: bool = False) -> tuple[Scalar, ...]:
+    """xx, yy, zz, xy, xz, yz of a and b; twice: of both orders, summed."""
+    if not twice:
+        return a.x * b.x, a.y * b.y, a.z * b.z, a.x * b.y, a.x * b.z, a.y * b.z
+    return (
+        2 * (a.x * b.x),
+        2 * (a.y * b.y),
+        2 * (a.z * b.z),
+        a.x * b.y + a.y * b.x,
+        a.x * b.z + a.z * b.x,
+        a.y * b.z + a.z * b.y,
+    )
 
 
 class Quartic(LimitSurface):

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from pushjax.plot.figures import BLUE, END, GREEN, MM, ORANGE, START, STYLE
+from pushjax.plot.figures import BLUE, END, GREEN, MM, ORANGE, PURPLE, START, STYLE
 
 TICK = 1.6  # mm, half the length of a pose's tick
 
@@ -56,7 +56,7 @@ def spread_figure(pooled: dict[str, dict[str, dict[str, Any]]], curve: list[dict
     with plt.rc_context(STYLE):
         figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 3.8), layout="constrained")
         methods = {"noise": ("identified noise", BLUE), "normal": ("normal errors", ORANGE)}
-        methods["process"] = ("Gaussian process", GREEN)
+        methods |= {"process": ("Gaussian process", GREEN), "calibrated": ("calibrated levels", PURPLE)}
         left.plot([0, 100], [0, 100], color="0.7", lw=0.9, label="as it should be")
         for group, style in (("middle", "o-"), ("whole", "s--")):
             for name, (label, color) in methods.items():

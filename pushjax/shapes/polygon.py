@@ -69,7 +69,7 @@ class PolygonOutline(Outline):
         best, best_squared, marks = self.edges[0], None, []
         for edge in self.edges:
             *_, diff = edge.foot(x)
-            squared = diff.dot(diff)
+            squared = settle(diff.dot(diff), x.x)
             if best_squared is None:
                 best_squared = squared
                 marks = [jnp.ones_like(squared, bool)]
@@ -151,7 +151,7 @@ def _seen_over(edge: Edge, x: Vec2) -> Closest:
     sign follows the bisector (outside a convex vertex, inside a reflex one), which stays right for vertices that are
     almost straight.
     """
-    s, clipped, diff = edge.foot(x)
+    s, clipped, diff = settle(edge.foot(x), x.x)
     over_edge = (s > 0) & (s < edge.length)
     bisector = select(s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y))
     squared = diff.dot(diff)

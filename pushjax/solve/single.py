@@ -54,7 +54,8 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     left, right = settle((left, right & ~left), v.x)
     slides = left | right
 
-    stuck = solver(curve, v, mu)
+    # what slides needs no root; with no room to search it also does not hold up those that do
+    stuck = solver(curve, v, jnp.where(slides, 0.0, mu))
     s = jnp.where(left, mu, jnp.where(right, -mu, stuck.ratio))
     g = curve.motion(s)
     g2 = g.dot(g)

@@ -2,6 +2,8 @@
 
 noise     what `identify_noise` finds: of each part of the pushes to learn from, about what the rest tells; then about
           what all of them tell.
+calibrated  the same, but regions of the levels that held their share of those parts: what happens is nearer to the
+          middle than the noise says, at the same tails.
 normal    the same point prediction, with a normal distribution of its errors on those parts.
 process   a Gaussian process of the same pushes. It knows nothing of how far a push goes, so it is asked for whole
           pushes only, as it has learned from.
@@ -81,13 +83,15 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     # each part's own, as if they were of different objects
     apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
     of_rest = fitted(pj.Pushes.conditions(rest), setting, apart)
-    first, *keys = jax.random.split(jax.random.key(seed), 5)
+    first, *keys = jax.random.split(jax.random.key(seed), 6)
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
     every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
     found = fitted(setting.coarse, setting, every)
     off = own(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
     predicted = noise.about(found)
     process = gaussian_process.learn(log.whole, rows, length)
+    first, *keys = keys
+    there = scored(own(noise.predict(first, held, slider, hand, DRAWS), held), own(held.end, held), length)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     cell["noise"] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
@@ -97,6 +101,7 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
         draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
         density = own(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
         methods = {"noise": scored(draws, ends, length)._replace(density=density)}
+        methods["calibrated"] = methods["noise"].calibrated(there.level)
         point = own(_ends(found, pushes, setting), pushes)
         seen = errors(point, ends, start)
         scale = np.array([1, 1, length])
@@ -194,7 +199,7 @@ def summary(record: dict[str, Any]) -> str:
             shares = "".join(f"{100 * row[f'inside_{level}']:7.1f} %" for level in ("50", "90"))
             lines.append(f"{name:9}{row['energy_mm']:11.3f} mm{row['log_density']:13.2f}{shares}")
         for name, row in methods.items():
-            if name != "noise":
+            if name not in ("noise", "calibrated"):  # the same draws
                 energy, density = row["noise_less_energy_mm"], row["noise_less_log_density"]
                 lines.append(
                     f"noise less {name}: energy score {energy[0]:+.3f} +- {energy[1]:.3f} mm, log density "

@@ -1,0 +1,123 @@
+"""Timing: compile time apart, medians after warm-up, in turns with what is compared; and the machine's own ceilings.
+
+Machines are shared and their clocks change: only ratios of what ran in turns in one process mean anything. So every
+timing goes with a reference kernel, a chain of fused multiply-adds (FMA), run in the same turns.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+REPEATS = 7
+LEAST_S = 0.03  # of a turn
+CHAINS, LINKS, LANES, ROUNDS = 8, 16, 4096, 200  # the FMA kernel: in the first-level cache, and compute-bound
+COPIED = 1 << 24  # numbers: beyond any cache
+
+
+class Program(NamedTuple):
+    """A compiled program with its arguments. flops, bytes: the compiler's own count, of one run, where it gives one (of
+    a loop's body it counts one round)."""
+
+    call: Callable
+    args: tuple
+    compile_s: float
+    flops: float | None
+    bytes: float | None
+
+    def run(self) -> Any:
+        return jax.block_until_ready(self.call(*self.args))
+
+
+class Timing(NamedTuple):
+    """Seconds of one run: median, and the range of the middle half. processor: the median of what all threads of the
+    process took of processors, which a machine's other programs change least."""
+
+    median: float
+    low: float
+    high: float
+    processor: float
+
+
+def compiled(function: Callable, *args: Any) -> Program:
+    """`jit(function)` for these arguments, traced and compiled anew: no cache of compiled programs is asked."""
+    cache = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        begin = time.perf_counter()
+        call = jax.jit(function).lower(*args).compile()
+        compile_s = time.perf_counter() - begin
+    finally:
+        jax.config.update("jax_enable_compilation_cache", cache)
+    costs = call.cost_analysis() or {}
+    costs = costs[0] if isinstance(costs, list) else costs
+    return Program(call, args, compile_s, costs.get("flops"), costs.get("bytes accessed"))
+
+
+def alternate(programs: dict[str, Callable[[], Any]], repeats: int = REPEATS) -> dict[str, Timing]:
+    """Time each, run in turns, so that a slow spell of the machine meets all of them; a short one several times in a
+    turn. The first turn warms up."""
+    counts = {name: max(1, round(LEAST_S / _seconds(run)[0])) for name, run in programs.items()}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in programs}
+    for _ in range(repeats):
+        for name, run in programs.items():
+            times[name].append(_seconds(run, counts[name]))
+    found = {}
+    for name, both in times.items():
+        wall, processor = np.array(both).T
+        low, median, high = (float(q) for q in np.quantile(wall, (0.25, 0.5, 0.75)))
+        found[name] = Timing(median, low, high, float(np.median(processor)))
+    return found
+
+
+def _seconds(run: Callable[[], Any], count: int = 1) -> tuple[float, float]:
+    """Wall and processor time of a run; the first of all runs is not counted."""
+    run()
+    begin, busy = time.perf_counter(), time.process_time()
+    for _ in range(count):
+        run()
+    return (time.perf_counter() - begin) / count, (time.process_time() - busy) / count
+
+
+class Ceiling(NamedTuple):
+    """The machine's own kernels: FMA as fast as it computes, `copied` as fast as it moves what fits no cache."""
+
+    multiply_add: Program
+    flops: float
+    copied: Program
+    bytes: float
+
+
+def ceiling(dtype: str) -> Ceiling:
+    """Both kernels, in `dtype`, written as the library is: JAX on batches, compiled by XLA."""
+    kind = jnp.dtype(dtype)
+
+    def multiply_add(x):
+        def round_(_, chains):
+            for _ in range(LINKS):
+                chains = [chain * 0.999 + 0.001 for chain in chains]
+            # each round one array: several would be several loops over the lanes
+            total = chains[0]
+            for chain in chains[1:]:
+                total = total + chain
+            return [total * (0.1 + 0.01 * k) for k in range(CHAINS)]
+
+        return jax.lax.fori_loop(0, ROUNDS, lambda k, x: round_(k, [x * (1 + 0.01 * j) for j in range(CHAINS)])[0], x)
+
+    lanes = jnp.linspace(0.5, 1.5, LANES, dtype=kind)
+    many = jnp.ones(COPIED, kind)
+    flops = LANES * ROUNDS * CHAINS * (2.0 * LINKS + 2)
+    return Ceiling(
+        compiled(multiply_add, lanes), flops, compiled(lambda x: x * 1.000001, many), 2.0 * COPIED * kind.itemsize
+    )
+
+
+def rates(top: Ceiling, timings: dict[str, Timing]) -> dict[str, float]:
+    """Ceilings in GFLOP/s and GB/s of one processor, from timings under the names "multiply_add" and "copied"."""
+    return {
+        "multiply_add_gflops": top.flops / timings["multiply_add"].processor / 1e9,
+        "copy_gbytes": top.bytes / timings["copied"].processor / 1e9,
+    }

@@ -1,0 +1,114 @@
+"""float32 beside float64: how far apart the same pushes end, and how often their contacts' modes differ."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pushjax.bench import tasks
+from pushjax.report import envelope
+
+PUSHES, CHUNK = 100_000, 5000
+MODELS = ("quartic", "ellipsoid")
+STEPS = (8, 50, 200)
+LEVELS = (0.5, 0.99, 1.0)
+
+
+def run(
+    scale: float = 1.0, seed: int = 0, progress: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, Any]:
+    """A row for each surface and number of steps: of 100 000 pushes (times `scale`) with random places, directions and
+    frictions, quantiles of the distance of the two final poses (mm; angles times the surface's length), the share of
+    steps whose mode differs, how many steps failed, and whether the same call gives the same bits again.
+
+    Raises ValueError for a scale that leaves no push.
+    """
+    pushes = round(scale * PUSHES)
+    if pushes < 1:
+        raise ValueError(f"scale must leave one push of {PUSHES} at least; got {scale}")
+    with_x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_enable_x64", True)
+    todo = [(model, steps) for model in MODELS for steps in STEPS]
+    rows = []
+    try:
+        for done, (model, steps) in enumerate(todo):
+            rows.append(_row(model, steps, pushes, seed))
+            progress(done + 1, len(todo))
+        largest = {
+            f"{model}, {kind}": {str(allowed): _steps(model, kind, allowed) for allowed in (1.0, 0.1, 0.01)}
+            for model in MODELS
+            for kind in ("float32", "float64")
+        }
+    finally:
+        jax.config.update("jax_enable_x64", with_x64)
+    return envelope("numerics", {"pushes": pushes, "seed": seed}, rows=rows, steps_for_mm=largest)
+
+
+def _steps(model: str, dtype: str, allowed_mm: float) -> int | None:
+    try:
+        return tasks.fewest_steps(tasks.errors(model, dtype), allowed_mm)
+    except ValueError:
+        return None
+
+
+def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
+    apart, flips, failed, same = [], 0, 0, True
+    length = float(tasks.square(model).surface.length)
+    kinds = {dtype: tasks.task(model, dtype) for dtype in ("float32", "float64")}
+    for chunk in range(-(-pushes // CHUNK)):
+        rng = np.random.default_rng((seed, steps, chunk))
+        offset = rng.uniform(-tasks.REACH, tasks.REACH, CHUNK).astype(np.float32)
+        angle = rng.uniform(-tasks.STEEPEST, tasks.STEEPEST, CHUNK).astype(np.float32)
+        friction = rng.uniform(0.15, 0.35, CHUNK).astype(np.float32)
+        # float64 is given what float32 can hold: what differs is the arithmetic
+        path = tasks.paths(jnp.asarray(offset), jnp.asarray(angle), steps)
+        found = {d: _pushed(here, path.astype(d), jnp.asarray(friction, d)) for d, here in kinds.items()}
+        one, two = (tuple(np.asarray(part) for part in found[d]) for d in ("float32", "float64"))
+        off = one[0].astype(float) - two[0]
+        here = min(CHUNK, pushes - chunk * CHUNK)
+        apart.append(1e3 * np.maximum(np.hypot(off[:, 0], off[:, 1]), length * np.abs(off[:, 2]))[:here])
+        flips += int((one[1] != two[1])[:here].sum())
+        failed += int(one[2][:here].sum() + two[2][:here].sum())
+        if not chunk:
+            again = _pushed(kinds["float32"], path, jnp.asarray(friction))
+            same &= all(np.array_equal(a, b) for a, b in zip(one, map(np.asarray, again), strict=True))
+    quantiles = np.quantile(np.concatenate(apart), LEVELS)
+    return {
+        "model": model,
+        "steps": steps,
+        "pushes": pushes,
+        "median_mm": float(quantiles[0]),
+        "p99_mm": float(quantiles[1]),
+        "worst_mm": float(quantiles[2]),
+        "mode_flips": flips / (pushes * steps),
+        "failed_steps": failed,
+        "same_bits_again": same,
+    }
+
+
+@jax.jit
+def _pushed(here: tasks.Task, path: jax.Array, friction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def one(path, friction):
+        push = here.push(path, friction)
+        return push.pose[-1], push.mode[:, 0], jnp.sum(push.failed)
+
+    return jax.vmap(one)(path, friction)
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What the command prints."""
+    lines = [
+        f"float32 beside float64, {record['settings']['pushes']} pushes of 50 mm:",
+        f"{'surface':11}{'steps':>6}{'median':>13}{'99 %':>13}{'worst':>13}{'mode flips':>12}{'failed':>8}  same bits",
+    ]
+    for row in record["rows"]:
+        lines.append(
+            f"{row['model']:11}{row['steps']:6}{row['median_mm']:10.1e} mm{row['p99_mm']:10.1e} mm"
+            f"{row['worst_mm']:10.1e} mm{row['mode_flips']:12.1e}{row['failed_steps']:8}  {row['same_bits_again']}"
+        )
+    lines.append("fewest steps for a final pose within")
+    for name, steps in record["steps_for_mm"].items():
+        lines.append(f"  {name:20}" + "".join(f"  {mm} mm: {n or 'more than 64'}" for mm, n in steps.items()))
+    return "\n".join(lines)

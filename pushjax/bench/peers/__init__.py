@@ -1,0 +1,1 @@
+"""Other programs that answer the same question, at their best settings."""

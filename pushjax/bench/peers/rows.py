@@ -1,0 +1,108 @@
+"""The same push by MuJoCo and MJX, each at its largest step within 0.1 mm of its own converged answer."""
+
+import time
+from typing import Any
+
+import numpy as np
+
+from pushjax.bench import tasks
+from pushjax.bench.peers import mjx, mujoco
+from pushjax.bench.peers.scene import Scene, Settings
+
+HALF = tasks.SIDE / 2
+SUPPORTS = {
+    "three": ((-0.03, -0.02), (0.03, -0.02), (0.0, 0.03)),
+    "four": ((-HALF, -HALF), (HALF, -HALF), (HALF, HALF), (-HALF, HALF)),
+}
+STICKS = (0.004, 0.01)  # m off the middle of the side
+TIMED, BATCH = 40, 64
+
+
+def rows() -> list[dict[str, Any]]:
+    """Of MuJoCo on three supports and on four, and of MJX on four: seconds of processor per push, and how far a finger
+    that sticks slips."""
+    found = [_mujoco(name) for name in SUPPORTS]
+    return [*found, _mjx("four", found[-1])]
+
+
+def _mujoco(name: str) -> dict[str, Any]:
+    scene, settings = Scene(SUPPORTS[name]), Settings()
+    timestep, table = mujoco.largest_step(scene, settings, 1e-3 * tasks.ALLOWED_MM)
+    at = next(row for row in table if row.timestep == timestep)
+    busy = time.process_time()
+    mujoco.timed(scene, settings, timestep, TIMED)
+    return {
+        "peer": "mujoco",
+        "supports": name,
+        "timestep_s": timestep,
+        "error_mm": at.error_mm,
+        "processor_s_per_push": (time.process_time() - busy) / TIMED,
+        "slip_um": _slip_um(mujoco.push(scene, settings, timestep, *_sticking(scene))),
+        "by_timestep": [row._asdict() for row in table],
+    }
+
+
+def _mjx(name: str, converged: dict[str, Any]) -> dict[str, Any]:
+    """Its error is that of the fan against MuJoCo's at a tenth of the step."""
+    scene = Scene(SUPPORTS[name])
+    starts, ends = mujoco.fan(scene)
+    many_starts, many_ends = (np.resize(part, (BATCH, 2)) for part in (starts, ends))
+    batch = mjx.Batch(scene, mjx.SETTINGS, mjx.TIMESTEP, many_starts, many_ends)
+    pose = batch.pushed().pose[: len(starts)]
+    busy = time.process_time()
+    batch.pushed()
+    busy = time.process_time() - busy
+    exact = mujoco.push(scene, mjx.SETTINGS, mjx.TIMESTEP / 10, starts, ends).pose
+    return {
+        "peer": "mjx",
+        "supports": name,
+        "timestep_s": mjx.TIMESTEP,
+        "error_mm": float(np.max(mujoco.error_mm(pose, exact))),
+        "processor_s_per_push": busy / BATCH,
+        "compile_s": batch.compile_seconds,
+        "batch": BATCH,
+        "dtype": "float64",
+        "slip_um": None,
+        "by_timestep": [],
+    }
+
+
+def _sticking(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    starts = np.array([[-scene.side / 2 - scene.tip_radius, y] for y in STICKS])
+    return starts, starts + np.array([scene.travel, 0.0])
+
+
+def _slip_um(pushed: mujoco.Pushed) -> list[float]:
+    return (1e6 * np.abs(pushed.slip)).tolist()
+
+
+def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
+    """Write into the rows of quartic pushes how many times as many of them a processor does, beside the faster of
+    MuJoCo's; and how far theirs and ours slip."""
+    best = min((peer for peer in peers if peer["peer"] == "mujoco"), key=lambda peer: peer["processor_s_per_push"])
+    for row in rows:
+        if row["case"] == "push_quartic":
+            row["peer"] = "mujoco"
+            row["peer_ratio"] = best["processor_s_per_push"] * row["batch"] / row["processor_s"]
+            row["slip_um"] = tasks.slip_um(row["dtype"], STICKS)
+
+
+def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
+    """What the command prints."""
+    lines = ["", f"the same push, each within {tasks.ALLOWED_MM} mm of its own converged answer:"]
+    for peer in peers:
+        slip = "" if peer["slip_um"] is None else f", slip {' and '.join(f'{x:.1f}' for x in peer['slip_um'])} um"
+        lines.append(
+            f"  {peer['peer']}, {peer['supports']} supports: {1e3 * peer['timestep_s']:.3g} ms steps "
+            f"({peer['error_mm']:.3f} mm), {1e3 * peer['processor_s_per_push']:.2f} ms of a processor{slip}"
+        )
+    for row in rows:
+        if row["peer_ratio"] is not None:
+            slip = " and ".join(f"{x:.1g}" for x in row["slip_um"])
+            each = 1e6 * row["processor_s"] / row["batch"]
+            lines.append(
+                f"  pushjax, {row['dtype']}, batch {row['batch']}: {row['steps']:.3g} steps "
+                f"({row['pose_error_mm']:.3f} mm), {each:.2f} us of a processor, "
+                f"1/{row['peer_ratio']:.0f} of {row['peer']}'s; slip {slip} um"
+            )
+    return lines

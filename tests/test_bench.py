@@ -1,0 +1,168 @@
+"""What `pushjax bench` says of speed and accuracy; nothing here depends on how long anything takes."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax import cli
+from pushjax.bench import cases, measure, needed, numerics, run, tasks
+
+
+def counted(offset, angle, steps, **options):
+    here = tasks.task("quartic", "float64")
+    path = np.asarray(tasks.paths(jnp.array([offset]), jnp.array([angle]), steps)[0])
+    vertices = [tuple(map(float, v)) for v in here.slider.shape.vertices]
+    surface = here.slider.surface
+    task = needed.Push(
+        vertices, [float(c) for c in surface.coefficients], float(surface.length), tasks.RADIUS, 0.25, **options
+    )
+    return needed.push(task, [tuple(map(float, q)) for q in path], (0.0, 0.0, 0.0)), here.push(jnp.asarray(path))
+
+
+@pytest.mark.parametrize(
+    ("offset", "angle", "modes"),
+    [(0.01, 0.0, {1}), (0.03, 0.2, {1, 2, 3}), (0.02, -0.5, {3}), (-0.01, 0.6, {2})],
+)
+def test_what_is_counted_is_the_push(offset, angle, modes):
+    (pose, flops), push = counted(offset, angle, 20)
+    assert set(np.asarray(push.mode[:, 0]).tolist()) == modes
+    np.testing.assert_allclose(pose, push.pose[-1], rtol=0, atol=1e-14)
+    # some seven hundred of a step that slides, twelve hundred of one that sticks
+    assert 500 < flops / 20 < 1500
+
+
+def test_counted_by_hand():
+    needed.Counted.done = 0
+    x = needed.Counted(3.0)
+    assert (x * 2 + 1) / 4 - x == -1.25
+    assert needed.Counted.done == 4
+    assert float(2 - x) == -1
+    assert float(-x) == -3
+    assert needed.Counted.done == 5
+
+
+def test_a_loose_root_needs_less():
+    exact, loose = (counted(0.01, 0.0, 4, tolerance=t)[0][1] for t in (1e-12, 1e-3))
+    assert loose < exact
+
+
+def test_errors_fall_with_the_square_of_the_step():
+    by_steps = tasks.errors("quartic", "float64")
+    assert by_steps[8] < tasks.ALLOWED_MM < by_steps[5]
+    assert tasks.fewest_steps(by_steps) in (6, 8)
+    assert by_steps[64] < by_steps[16] / 10
+    single = tasks.errors("quartic", "float32")
+    assert single[16] == pytest.approx(by_steps[16], abs=2e-3)
+    with pytest.raises(ValueError, match="within 1e-09 mm"):
+        tasks.fewest_steps(by_steps, 1e-9)
+
+
+def test_no_slip_where_it_sticks():
+    """A tip that sticks rolls as the side turns: what is left is how finely the rolling is followed, nanometres."""
+    coarse, fine = (max(tasks.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
+    assert coarse < 0.01
+    assert fine < coarse / 10
+    assert max(tasks.slip_um("float32", (0.004, 0.01))) < 0.1  # roundings of 50 steps
+    with pytest.raises(ValueError, match="does not stick"):
+        tasks.slip_um("float64", (0.03,))
+
+
+def test_rows(tmp_path):
+    """One row a case, type and batch; a record beside itself is not slower, beside one of half the cost it is."""
+    seen = []
+    record = run.run(("push",), ("float32",), (64, 128), keep=lambda r: seen.append(len(r["rows"])))
+    assert seen == [1, 2]
+    for row, batch in zip(record["rows"], (64, 128), strict=True):
+        assert (row["case"], row["dtype"], row["batch"]) == ("push_quartic", "float32", batch)
+        assert row["steps"] == 8
+        assert 0 < row["ceiling_fraction"] < 1
+        assert 500 < row["flops_needed_per_step"] < 1500
+        assert row["pose_error_mm"] <= tasks.ALLOWED_MM
+        assert row["run_s_middle_half"][0] <= row["run_s"] <= row["run_s_middle_half"][1]
+        # a push's own cost in multiply-adds, and the share of the ceiling, are one figure
+        share = row["flops_needed_per_step"] / 2 / row["multiply_adds_per_step"]
+        assert row["ceiling_fraction"] == pytest.approx(share)
+    assert "push_quartic" in run.summary(record)
+    assert run.slower(record["rows"], record) == []
+    half = [row | {"multiply_adds_per_step": row["multiply_adds_per_step"] / 2} for row in record["rows"]]
+    assert [row["times"] for row in run.slower(record["rows"], {"rows": half})] == pytest.approx([2, 2])
+    (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half}))
+    assert run.kept(tmp_path / "half.json")["rows"] == half
+
+
+def test_cases_work():
+    """Each runs, and moves what it should."""
+    grasp = cases.grasp("float64", 8)
+    assert 5 < grasp.steps <= cases.GRASP_STEPS
+    poses = np.asarray(jax.jit(grasp.function)(*grasp.args))
+    # turned until both fingers are within their friction cones: a grasp jams no flatter
+    assert np.abs(poses[:, 2]).max() < 1.2 * cases.GRASP_FRICTION < np.abs(grasp.args[0][:, 2]).max()
+    problems = cases.solve("float64", 16, 2)
+    twist = np.asarray(jax.jit(problems.function)(*problems.args))
+    assert twist.shape == (16, 3)
+    assert np.abs(twist).max() > 0
+    sampled = cases.sampling("float64", 4)
+    surface = jax.jit(sampled.function)(*sampled.args)
+    assert all(pj.Quartic(c, surface.length[0]).is_convex() for c in surface.coefficients)
+
+
+def test_tiles_change_nothing(monkeypatch):
+    monkeypatch.setattr(cases, "TILE", 16)
+    work = cases.push("float64", 40)
+    tiled = np.asarray(jax.jit(work.function)(*work.args))
+    monkeypatch.setattr(cases, "TILE", 64)
+    np.testing.assert_array_equal(tiled, np.asarray(jax.jit(cases.push("float64", 40).function)(*work.args)))
+
+
+def test_float32_beside_float64(monkeypatch):
+    monkeypatch.setattr(numerics, "MODELS", ("quartic",))
+    monkeypatch.setattr(numerics, "STEPS", (8,))
+    monkeypatch.setattr(numerics, "CHUNK", 128)
+    record = numerics.run(scale=0.002)
+    assert len(record["rows"]) == 1
+    for row in record["rows"]:
+        assert row["pushes"] == 200
+        assert row["failed_steps"] == 0
+        assert row["same_bits_again"]
+        assert 0 < row["median_mm"] < 1e-3
+        assert row["mode_flips"] < 1e-2
+    assert record["steps_for_mm"]["quartic, float32"]["0.1"] == 8
+    assert "same bits" in numerics.summary(record)
+    with pytest.raises(ValueError, match="one push"):
+        numerics.run(scale=1e-9)
+
+
+def test_turns():
+    """Every program as often; medians between the quartiles; and the kernels compute what they are said to."""
+    calls = []
+    timings = measure.alternate({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    assert set(timings) == {"a", "b"}
+    for timing in timings.values():
+        assert timing.low <= timing.median <= timing.high
+    top = measure.ceiling("float32")
+    values = np.asarray(top.multiply_add.run())
+    assert values.dtype == np.float32
+    assert np.isfinite(values).all()
+    # the compiler counts one round of the loop
+    assert top.multiply_add.flops == pytest.approx(top.flops / measure.ROUNDS, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["contacts", "push"], "contacts is measured alone"),
+        (["push", "--scale", "0.1"], "--scale is for contacts, numerics"),
+        (["numerics", "--batch", "3"], "--batch is for the others"),
+        (["push", "--batch", "0"], "batch must be positive; got 0"),
+        (["push", "--baseline", "README.md"], "holds no record of pushjax bench"),
+    ],
+)
+def test_wrong_options(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["bench", *arguments])
+    assert end.value.code == 1
+    assert message in capsys.readouterr().err
