@@ -114,6 +114,8 @@ class Bench(Common):
     """Floating types. Default: both; contacts: float64."""
     batch: tuple[int, ...] | None = None
     """How many at once. Default: 2000."""
+    cores: int | None = None
+    """Of the machine's, how many may be used (Linux): of one, times are those of a core. Default: all."""
     peers: bool = False
     """The same push by MuJoCo and MJX beside it: pip install 'pushjax[bench]'."""
     baseline: Path | None = None
@@ -217,7 +219,7 @@ def _bench(command: Bench, progress: Progress) -> Result:
         raise ValueError(f"{alone[0]} is measured alone; got {' '.join(command.case)}")
     kind = alone[0] if alone else "the others"
     given = {name: getattr(command, name) for name in BENCH_TAKES["contacts"] | BENCH_TAKES["the others"]}
-    given = {name: value for name, value in given.items() if value not in (None, False)}
+    given = {name: value for name, value in given.items() if value is not None and value is not False}
     for name in given:
         if name not in BENCH_TAKES[kind]:
             others = ", ".join(other for other, takes in BENCH_TAKES.items() if name in takes)
@@ -234,18 +236,21 @@ def _bench(command: Bench, progress: Progress) -> Result:
 
         record = numerics.run(seed=command.seed, progress=progress, **given)
         return record, numerics.summary(record)
+    import jax
+
     from pushjax.bench import run as bench
 
+    jax.config.update("jax_enable_compilation_cache", False)  # what is timed is compiling, not loading
     if command.case:
         given["case"] = command.case
-    record = bench.run(seed=command.seed, progress=progress, keep=keep, **given)
+    record = bench.run(seed=command.seed, out=command.out, progress=progress, keep=keep, **given)
     return record, bench.summary(record)
 
 
 BENCH_TAKES = {
     "contacts": {"dtype", "scale", "starts", "contacts"},
     "numerics": {"scale"},
-    "the others": {"dtype", "batch", "peers", "baseline"},
+    "the others": {"dtype", "batch", "cores", "peers", "baseline"},
 }
 
 

@@ -158,6 +158,7 @@ def test_turns():
         (["push", "--scale", "0.1"], "--scale is for contacts, numerics"),
         (["numerics", "--batch", "3"], "--batch is for the others"),
         (["push", "--batch", "0"], "batch must be positive; got 0"),
+        (["push", "--cores", "0"], "--cores must be from 1 to"),
         (["push", "--baseline", "README.md"], "holds no record of pushjax bench"),
     ],
 )
@@ -166,3 +167,42 @@ def test_wrong_options(arguments, message, capsys):
         cli.main(["bench", *arguments])
     assert end.value.code == 1
     assert message in capsys.readouterr().err
+
+
+def test_picture():
+    from pushjax import plot
+
+    axes = plot.speed_figure({"a": [(2e-6, 0.01), (1e-6, 0.1)], "b": [(1e-3, 0.2)]}, 0.1).axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a", "b"]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [1, 2])
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), [0.1, 0.01])
+    assert "mm" in axes.get_xlabel()
+    assert "µs" in axes.get_ylabel()
+
+
+def test_only_new_shapes_are_compiled():
+    """Not other values, also of outline, path and friction; of `monte_carlo`, not more tiles of pushes either."""
+    here = tasks.task("quartic", "float64")
+    path = tasks.paths(jnp.array([0.01]), jnp.array([0.1]), 6)[0]
+    model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
+    made = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **more: made.append(event) if event.endswith("backend_compile_duration") else None
+    )
+
+    def other(scale):
+        surface = pj.Quartic(scale * here.slider.surface.coefficients, here.slider.surface.length)
+        slider = pj.Slider(pj.Polygon.rectangle(0.09 * scale, 0.09), surface)
+        here._replace(slider=slider, pose=here.pose + 1e-4 * scale).push(path - 1e-3 * scale, 0.3 * scale)
+
+    def many(n):
+        pj.monte_carlo(jax.random.key(n), n, here.slider, here.hand, path, pose=here.pose, model=model, tile=64)
+
+    def compiled_by(*calls):
+        before = len(made)
+        for call in calls:
+            call()
+        return len(made) - before
+
+    assert compiled_by(lambda: other(1.0), lambda: many(128)) > 0
+    assert compiled_by(lambda: other(1.01), lambda: many(320), lambda: many(1000)) == 0

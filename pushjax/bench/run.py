@@ -1,6 +1,7 @@
 """`pushjax bench`: rows of figures, in turns with the machine's own ceilings; and against figures kept from before."""
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -26,15 +27,18 @@ BATCH = 2000
 SLOWER = 1.5  # times what was kept: more is a regression. Runs beside other programs scatter by 1.2.
 MOST_REPEATS = 7
 MOST_S = 20.0  # of one row
+CURVE = (2, 4, 8, 16, 32, 64)  # steps of a push, beside peers
 
 
 def run(
     case: Sequence[str] = tuple(CASES),
     dtype: Sequence[str] = ("float32", "float64"),
     batch: Sequence[int] = (BATCH,),
+    cores: int | None = None,
     peers: bool = False,
     baseline: Path | None = None,
     seed: int = 0,
+    out: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
@@ -43,21 +47,26 @@ def run(
     machine's multiply-add ceiling that the FLOPs the mathematics needs make up (of one processor, both by processor
     time).
 
-    peers: the same push by MuJoCo and MJX beside it. baseline: a record written before; `slower` then names the rows
-    that cost more than `SLOWER` times what they did, both in units of the multiply-add kernel. keep: called with the
-    record so far.
+    cores: how many of the machine's may be used, to be said before JAX is; of several, the threads that share a
+    program wait for each other, so what it costs of one core is to be measured on one. peers: the same push by MuJoCo
+    and MJX beside it, by steps, with a picture in `out`. baseline: a record written before; `slower` then names the
+    rows that cost more than `SLOWER` times what they did, both in units of the multiply-add kernel. keep: called with
+    the record so far.
 
-    Raises ValueError for a batch that is not positive, peers that are not installed, or a baseline that is no record.
+    Raises ValueError for a batch that is not positive, cores that are not there, peers that are not installed, or a
+    baseline that is no record.
     """
     for number in batch:
         if number < 1:
             raise ValueError(f"batch must be positive; got {number}")
     before = None if baseline is None else kept(baseline)
+    if cores is not None:
+        _use(cores)
     each = [make for name in case for make in CASES[name].values()]
     makes = [(make, kind, number) for make in each for kind in dtype for number in batch]
     total = len(makes) + (1 if peers else 0)
     rows: list[dict[str, Any]] = []
-    settings = {"cases": list(case), "dtypes": list(dtype), "batches": list(batch), "seed": seed}
+    settings = {"cases": list(case), "dtypes": list(dtype), "batches": list(batch), "cores": cores, "seed": seed}
     record = envelope("bench", settings, rows=rows, ceilings={}, slower=[])
     # float32 too: what it is compared with is worked out in float64, and the library computes in what it is given
     with_x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
@@ -74,12 +83,23 @@ def run(
 
             record["peers"] = others.rows()
             others.compare(rows, record["peers"])
+            record["by_steps"] = [_row(cases.push(kind, BATCH, steps=n))[0] for kind in dtype for n in CURVE]
+            record["pictures"] = [] if out is None else [others.draw(record, out)]
             progress(total, total)
     finally:
         jax.config.update("jax_enable_x64", with_x64)
     if before is not None:
         record["slower"] = slower(rows, before)
     return record
+
+
+def _use(cores: int) -> None:
+    if not hasattr(os, "sched_setaffinity"):
+        raise ValueError("--cores can be told to Linux only")
+    mine = sorted(os.sched_getaffinity(0))
+    if not 1 <= cores <= len(mine):
+        raise ValueError(f"--cores must be from 1 to {len(mine)}; got {cores}")
+    os.sched_setaffinity(0, mine[:cores])
 
 
 def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
@@ -165,6 +185,7 @@ def summary(record: dict[str, Any]) -> str:
         from pushjax.bench.peers import rows as others
 
         lines += others.summary(record["peers"], record["rows"])
+        lines += [f"drew {path}" for path in record["pictures"]]
     for row in record["slower"]:
         which = f"{row['case']}, {row['dtype']}, {row['batch']}"
         lines.append(f"SLOWER than the baseline: {which}: {row['times']:.2f} times")

@@ -1,4 +1,5 @@
-"""Pictures: of single pushes and tables (`figures`), of distributions (`distributions`), of errors (`causes`)."""
+"""Pictures: of single pushes and tables (`figures`), of distributions (`distributions`), of errors (`causes`), of what
+accuracy costs (`speed`)."""
 
 from pushjax.plot.causes import causes_figure as causes_figure
 from pushjax.plot.distributions import density_panel as density_panel
@@ -25,3 +26,4 @@ from pushjax.plot.figures import outline as outline
 from pushjax.plot.figures import push_figure as push_figure
 from pushjax.plot.figures import save as save
 from pushjax.plot.figures import table_figure as table_figure
+from pushjax.plot.speed import speed_figure as speed_figure

@@ -1,6 +1,7 @@
 """The same push by MuJoCo and MJX, each at its largest step within 0.1 mm of its own converged answer."""
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,22 @@ def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
             row["peer"] = "mujoco"
             row["peer_ratio"] = best["processor_s_per_push"] * row["batch"] / row["processor_s"]
             row["slip_um"] = tasks.slip_um(row["dtype"], STICKS)
+
+
+def draw(record: dict[str, Any], out: Path) -> str:
+    """Time against error, of pushes by their steps."""
+    from pushjax import plot
+
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for row in record["by_steps"]:
+        point = row["processor_s"] / row["batch"], row["pose_error_mm"]
+        curves.setdefault(f"pushjax, {row['dtype']}", []).append(point)
+    for peer in record["peers"]:
+        # the last is what the others are compared with
+        points = [(1e-6 * row["us_per_push"], row["error_mm"]) for row in peer["by_timestep"] if row["error_mm"] > 0]
+        if points:
+            curves[f"MuJoCo, {peer['supports']} supports"] = points
+    return str(plot.save(plot.speed_figure(curves, tasks.ALLOWED_MM), out / "bench.png"))
 
 
 def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
