@@ -19,5 +19,5 @@ def speed_figure(curves: Mapping[str, Sequence[tuple[float, float]]], allowed_mm
         axes.axvline(allowed_mm, color="0.6", lw=0.9, ls="--")
         axes.set(xlabel="worst error of a final pose / mm", ylabel="time of one core per push / µs")
         axes.set_title("What accuracy costs")
-        axes.legend(loc="center left", bbox_to_anchor=(0, 0.42))
+        axes.legend(loc="center right", bbox_to_anchor=(1, 0.5))
         return figure
