@@ -1,14 +1,14 @@
-"""Timing for the benchmarks: compile time apart, medians after warm-up, alternating between what is compared."""
+"""Timing for the scripts, as `pushjax.bench.measure` does it; and a line on the machine."""
 
 import os
 import platform
-import time
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any
 
 import jax
-import numpy as np
+
+from pushjax.bench import measure
 
 
 def header() -> str:
@@ -25,18 +25,15 @@ def header() -> str:
 
 def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
     """The jitted function, compiled for `args`, and the seconds that tracing and compiling took."""
-    begin = time.perf_counter()
-    program = jax.jit(function).lower(*args).compile()
-    return program, time.perf_counter() - begin
+    program = measure.compiled(function, *args)
+    return program.call, program.compile_s
 
 
-def alternate(programs: dict[str, tuple[Callable, tuple]], repeats: int = 7) -> dict[str, float]:
-    """Median run time in s of each program, run in turn so that a slow spell of the machine meets all of them."""
-    times: dict[str, list[float]] = {name: [] for name in programs}
-    for k in range(repeats + 1):
-        for name, (program, args) in programs.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(program(*args))
-            if k:  # the first round warms up
-                times[name].append(time.perf_counter() - begin)
-    return {name: float(np.median(t)) for name, t in times.items()}
+def alternate(programs: dict[str, tuple[Callable, tuple]], repeats: int = measure.REPEATS) -> dict[str, float]:
+    """Median run time in s of each program, run in turn (`measure.alternate`)."""
+
+    def run(program: Callable, args: tuple) -> Callable[[], Any]:
+        return lambda: jax.block_until_ready(program(*args))
+
+    timings = measure.alternate({name: run(*each) for name, each in programs.items()}, repeats)
+    return {name: timing.median for name, timing in timings.items()}

@@ -211,6 +211,13 @@ def _identify(command: Identify, progress: Progress) -> Result:
     return record, f"{text}\nwrote {write_page(record, text, command.out / 'identify.html')}"
 
 
+BENCH_TAKES = {
+    "contacts": {"dtype", "scale", "starts", "contacts"},
+    "numerics": {"scale"},
+    "the others": {"dtype", "batch", "cores", "peers", "baseline"},
+}
+
+
 def _bench(command: Bench, progress: Progress) -> Result:
     from pushjax.report import write_json
 
@@ -245,13 +252,6 @@ def _bench(command: Bench, progress: Progress) -> Result:
         given["case"] = command.case
     record = bench.run(seed=command.seed, out=command.out, progress=progress, keep=keep, **given)
     return record, bench.summary(record)
-
-
-BENCH_TAKES = {
-    "contacts": {"dtype", "scale", "starts", "contacts"},
-    "numerics": {"scale"},
-    "the others": {"dtype", "batch", "cores", "peers", "baseline"},
-}
 
 
 def _bench_contacts(seed: int, given: dict[str, Any], progress: Progress, keep: Callable) -> Result:

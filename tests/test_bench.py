@@ -10,6 +10,7 @@ import pytest
 import pushjax as pj
 from pushjax import cli
 from pushjax.bench import cases, measure, needed, numerics, run, tasks
+from pushjax.bench.peers import rows
 
 
 def counted(offset, angle, steps, **options):
@@ -63,12 +64,12 @@ def test_errors_fall_with_the_square_of_the_step():
 
 def test_no_slip_where_it_sticks():
     """A tip that sticks rolls as the side turns: what is left is how finely the rolling is followed, nanometres."""
-    coarse, fine = (max(tasks.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
+    coarse, fine = (max(rows.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
     assert coarse < 0.01
     assert fine < coarse / 10
-    assert max(tasks.slip_um("float32", (0.004, 0.01))) < 0.1  # roundings of 50 steps
+    assert max(rows.slip_um("float32", (0.004, 0.01))) < 0.1  # roundings of 50 steps
     with pytest.raises(ValueError, match="does not stick"):
-        tasks.slip_um("float64", (0.03,))
+        rows.slip_um("float64", (0.03,))
 
 
 def test_rows(tmp_path):

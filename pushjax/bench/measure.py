@@ -4,8 +4,11 @@ Machines are shared and their clocks change: only ratios of what ran in turns in
 timing goes with a reference kernel, a chain of fused multiply-adds (FMA), run in the same turns.
 """
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -53,12 +56,17 @@ def compiled(function: Callable, *args: Any) -> Program:
     return Program(call, args, compile_s, costs.get("flops"), costs.get("bytes accessed"))
 
 
-def alternate(programs: dict[str, Callable[[], Any]], repeats: int = REPEATS) -> dict[str, Timing]:
-    """Time each, run in turns, so that a slow spell of the machine meets all of them; a short one several times in a
-    turn. The first turn warms up."""
-    counts = {name: max(1, round(LEAST_S / _seconds(run)[0])) for name, run in programs.items()}
+def alternate(
+    programs: dict[str, Callable[[], Any]], repeats: int = REPEATS, most_s: float = math.inf
+) -> dict[str, Timing]:
+    """Time each, run in turns, so that a slow spell of the machine meets all of them; in a turn once without a clock,
+    since the one before has left its own numbers in the caches, and a short one several times. most_s: of all turns
+    together, which leaves out some if need be."""
+    once = {name: max(_seconds(run)[0], 1e-9) for name, run in programs.items()}
+    counts = {name: max(1, round(LEAST_S / seconds)) for name, seconds in once.items()}
+    turn = sum(seconds * (counts[name] + 1) for name, seconds in once.items())
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in programs}
-    for _ in range(repeats):
+    for _ in range(max(1, int(min(repeats, most_s / turn)))):
         for name, run in programs.items():
             times[name].append(_seconds(run, counts[name]))
     found = {}
@@ -78,6 +86,17 @@ def _seconds(run: Callable[[], Any], count: int = 1) -> tuple[float, float]:
     return (time.perf_counter() - begin) / count, (time.process_time() - busy) / count
 
 
+@contextmanager
+def both_dtypes() -> Iterator[None]:
+    """float64 is allowed, whatever the process had set; the library computes in what it is given."""
+    before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
+
+
 class Ceiling(NamedTuple):
     """The machine's own kernels: FMA as fast as it computes, `copied` as fast as it moves what fits no cache."""
 
@@ -87,6 +106,7 @@ class Ceiling(NamedTuple):
     bytes: float
 
 
+@cache
 def ceiling(dtype: str) -> Ceiling:
     """Both kernels, in `dtype`, written as the library is: JAX on batches, compiled by XLA."""
     kind = jnp.dtype(dtype)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pushjax.bench import tasks
+from pushjax.bench.measure import both_dtypes
 from pushjax.report import envelope
 
 PUSHES, CHUNK = 100_000, 5000
@@ -28,11 +29,9 @@ def run(
     pushes = round(scale * PUSHES)
     if pushes < 1:
         raise ValueError(f"scale must leave one push of {PUSHES} at least; got {scale}")
-    with_x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_enable_x64", True)
     todo = [(model, steps) for model in MODELS for steps in STEPS]
     rows = []
-    try:
+    with both_dtypes():
         for done, (model, steps) in enumerate(todo):
             rows.append(_row(model, steps, pushes, seed))
             progress(done + 1, len(todo))
@@ -41,8 +40,6 @@ def run(
             for model in MODELS
             for kind in ("float32", "float64")
         }
-    finally:
-        jax.config.update("jax_enable_x64", with_x64)
     return envelope("numerics", {"pushes": pushes, "seed": seed}, rows=rows, steps_for_mm=largest)
 
 
@@ -66,9 +63,8 @@ def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
         path = tasks.paths(jnp.asarray(offset), jnp.asarray(angle), steps)
         found = {d: _pushed(here, path.astype(d), jnp.asarray(friction, d)) for d, here in kinds.items()}
         one, two = (tuple(np.asarray(part) for part in found[d]) for d in ("float32", "float64"))
-        off = one[0].astype(float) - two[0]
         here = min(CHUNK, pushes - chunk * CHUNK)
-        apart.append(1e3 * np.maximum(np.hypot(off[:, 0], off[:, 1]), length * np.abs(off[:, 2]))[:here])
+        apart.append(tasks.error_mm(one[0].astype(float), two[0], length)[:here])
         flips += int((one[1] != two[1])[:here].sum())
         failed += int(one[2][:here].sum() + two[2][:here].sum())
         if not chunk:

@@ -5,15 +5,12 @@ import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-import jax
+from typing import Any
 
 from pushjax.bench import cases
-from pushjax.bench.measure import Program, Timing, alternate, ceiling, compiled, rates
+from pushjax.bench.measure import alternate, both_dtypes, ceiling, compiled, rates
 from pushjax.report import envelope
 
-Case = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling"]
 Make = Callable[[str, int], cases.Work]
 CASES: dict[str, dict[str, Make]] = {
     "push": {"push_quartic": cases.push},
@@ -25,7 +22,6 @@ CASES: dict[str, dict[str, Make]] = {
 }
 BATCH = 2000
 SLOWER = 1.5  # times what was kept: more is a regression. Runs beside other programs scatter by 1.2.
-MOST_REPEATS = 7
 MOST_S = 20.0  # of one row
 CURVE = (2, 4, 8, 16, 32, 64)  # steps of a push, beside peers
 
@@ -68,10 +64,7 @@ def run(
     rows: list[dict[str, Any]] = []
     settings = {"cases": list(case), "dtypes": list(dtype), "batches": list(batch), "cores": cores, "seed": seed}
     record = envelope("bench", settings, rows=rows, ceilings={}, slower=[])
-    # float32 too: what it is compared with is worked out in float64, and the library computes in what it is given
-    with_x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_enable_x64", True)
-    try:
+    with both_dtypes():  # float32 too is compared with what float64 gives
         for done, (make, kind, number) in enumerate(makes):
             row, top = _row(make(kind, number))
             record["ceilings"][kind] = top
@@ -86,8 +79,6 @@ def run(
             record["by_steps"] = [_row(cases.push(kind, BATCH, steps=n))[0] for kind in dtype for n in CURVE]
             record["pictures"] = [] if out is None else [others.draw(record, out)]
             progress(total, total)
-    finally:
-        jax.config.update("jax_enable_x64", with_x64)
     if before is not None:
         record["slower"] = slower(rows, before)
     return record
@@ -105,8 +96,8 @@ def _use(cores: int) -> None:
 def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
     program = compiled(work.function, *work.args)
     top = ceiling(work.dtype)
-    repeats = _repeats(program)
-    timings = alternate({"it": program.run, "multiply_add": top.multiply_add.run, "copied": top.copied.run}, repeats)
+    timings = alternate({"it": program.run, "multiply_add": top.multiply_add.run}, most_s=MOST_S)
+    timings |= alternate({"copied": top.copied.run}, repeats=2)
     mine, reference = timings["it"], timings["multiply_add"]
     steps = work.batch * work.steps
     row: dict[str, Any] = {
@@ -133,11 +124,6 @@ def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
     if work.needed is not None:
         row["ceiling_fraction"] = work.needed / 2 / row["multiply_adds_per_step"]
     return row, rates(top, timings)
-
-
-def _repeats(program: Program) -> int:
-    once: Timing = alternate({"it": program.run}, 1)["it"]
-    return max(1, min(MOST_REPEATS, int(MOST_S / max(once.median, 1e-9))))
 
 
 def kept(path: Path) -> dict[str, Any]:

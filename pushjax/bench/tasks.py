@@ -18,6 +18,7 @@ SIDE, RADIUS, TRAVEL, FRICTION = 0.09, 0.00475, 0.05, 0.25
 REACH, STEEPEST = 0.03, np.radians(30)  # how far from the middle of the side, and from its normal
 REFERENCE_STEPS = 3200
 ALLOWED_MM = 0.1
+LENGTH = 0.0367  # m, makes angles commensurate with positions: the square's radius of gyration
 STEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 
 
@@ -91,18 +92,18 @@ def reference(model: str) -> np.ndarray:
     return final_poses(model, REFERENCE_STEPS, "float64")
 
 
-def error_mm(pose: np.ndarray, exact: np.ndarray, length: float) -> float:
-    """The worst final pose: distance in mm, or the angle's, times the surface's length, if that is more."""
-    off = np.linalg.norm(pose[:, :2] - exact[:, :2], axis=1)
-    turn = length * np.abs(pose[:, 2] - exact[:, 2])
-    return 1e3 * float(np.maximum(off, turn).max())
+def error_mm(pose: np.ndarray, other: np.ndarray, length: float = LENGTH) -> np.ndarray:
+    """(n,) mm: the larger of the distance of two poses (n, 3) and length times the angle between them."""
+    apart = np.abs(pose - other)
+    return 1e3 * np.maximum(np.hypot(apart[:, 0], apart[:, 1]), length * apart[:, 2])
 
 
 @cache
 def errors(model: str, dtype: str) -> dict[int, float]:
     """Worst error of the fan, mm, by the number of steps."""
     length = float(square(model).surface.length)
-    return {steps: error_mm(final_poses(model, steps, dtype), reference(model), length) for steps in STEPS}
+    exact = reference(model)
+    return {steps: float(error_mm(final_poses(model, steps, dtype), exact, length).max()) for steps in STEPS}
 
 
 def fewest_steps(by_steps: dict[int, float], allowed_mm: float = ALLOWED_MM) -> int:
@@ -111,21 +112,3 @@ def fewest_steps(by_steps: dict[int, float], allowed_mm: float = ALLOWED_MM) -> 
     if not fine:
         raise ValueError(f"no number of steps up to {max(by_steps)} comes within {allowed_mm} mm")
     return min(fine)
-
-
-def slip_um(dtype: str, offsets: tuple[float, ...], steps: int = 50) -> list[float]:
-    """How far the tip of straight pushes slides along the side, all that it does not roll: um. Offsets must stick."""
-    here = task("quartic", dtype)
-    found = []
-    for offset in offsets:
-        path = paths(jnp.asarray([offset], dtype), jnp.zeros(1, dtype), steps)[0]
-        push = here.push(path)
-        if not np.all(np.asarray(push.mode) == pj.ContactMode.STICKING):
-            raise ValueError(f"a push {1e3 * offset:g} mm off the middle does not stick")
-        ends = np.array([np.asarray(q, float) for q in (path[0], path[-1])])
-        pose = np.array([np.asarray(p, float) for p in (push.pose[0], push.pose[-1])])
-        rel = ends - pose[:, :2]
-        along = -np.sin(pose[:, 2]) * rel[:, 0] + np.cos(pose[:, 2]) * rel[:, 1]
-        # a disc that does not turn rolls along a side that does
-        found.append(1e6 * abs(float(along[1] - along[0] - RADIUS * (pose[1, 2] - pose[0, 2]))))
-    return found

@@ -9,7 +9,7 @@ import numpy as np
 import pushjax as pj
 
 LEVELS = (0.5, 0.9)
-FINE = tuple(np.linspace(0.005, 0.995, 199).tolist())  # levels, with those of `LEVELS` among them
+FINE = tuple(np.linspace(0.005, 0.995, 199).tolist())
 TOGETHER = 16  # pushes
 
 
@@ -40,10 +40,9 @@ def scored(draws: np.ndarray, ends: np.ndarray, length: float) -> Scored:
 @jax.jit
 def _scores(draws, ends, length):
     def one(drawn, end):
-        inside = pj.coverage(drawn, end[None], length, FINE)
-        level = 1 - jnp.sum(inside) / (len(FINE) + 1)
-        both = jnp.stack([inside[FINE.index(min(FINE, key=lambda f, share=share: abs(f - share)))] for share in LEVELS])
-        return pj.energy_score(drawn, end, length), pj.log_density(drawn, end, length), level, both
+        inside = pj.coverage(drawn, end[None], length, (*LEVELS, *FINE))
+        level = 1 - jnp.sum(inside[len(LEVELS) :]) / (len(FINE) + 1)
+        return pj.energy_score(drawn, end, length), pj.log_density(drawn, end, length), level, inside[: len(LEVELS)]
 
     return jax.lax.map(lambda args: one(*args), (draws, ends), batch_size=TOGETHER)
 

@@ -89,7 +89,7 @@ class QuarticForm(_QuarticFields):
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
         """H = xx A + yy B + zz C with A, B, C linear in the six squares and products of F's entries; along a + s b all
-        of these are quadratic in s. A third of the arithmetic of gradients and a Hessian at both ends."""
+        of these are quadratic in s. Two thirds of the arithmetic of gradients and a Hessian at both ends."""
         ends = (_products(a, a), _products(a, b, twice=True), _products(b, b))
         rows = settle(tuple((m[:3], self._factors(m)) for m in ends), a.x)
         squares, factors = ([row[k] for row in rows] for k in range(2))
@@ -107,7 +107,7 @@ class QuarticForm(_QuarticFields):
             for power in range(5)
         )
 
-    def _factors(self, m: "tuple[Scalar, ...]") -> tuple[Scalar, Scalar, Scalar]:
+    def _factors(self, m: tuple[Scalar, ...]) -> tuple[Scalar, Scalar, Scalar]:
         c, (xx, yy, zz, xy, xz, yz) = self.c, m
         return (
             c[0] * xx + c[3] * xy + c[4] * xz + c[9] * yy + c[10] * zz + c[12] * yz,

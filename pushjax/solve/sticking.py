@@ -20,6 +20,8 @@ from jaxtyping import Array, Int
 from pushjax._vec import Scalar, Vec2, settle
 from pushjax.solve._contact_plane import LimitCurve
 
+MOST_ROUNDS = 12  # with a bracket; see `ScalarRoot`
+
 
 def tolerance(dtype) -> float:
     """Largest sine of the angle between motion and push that counts as sticking: 4e-10 in float64, 7e-5 in float32."""
@@ -29,9 +31,6 @@ def tolerance(dtype) -> float:
 def finest(dtype) -> float:
     """The sine of the angle that even badly conditioned forms reach: 3e-13 in float64, 3e-6 in float32."""
     return float(jnp.finfo(dtype).eps) ** 0.8
-
-
-MOST_ROUNDS = 12
 
 
 class Sticking(NamedTuple):
@@ -120,31 +119,27 @@ class ScalarRoot(StickingSolver):
         eps = float(jnp.finfo(s.dtype).eps)
         # Newton doubles the digits: after a step as short as this it has landed; a bisection only to its own length
         near, fine = eps**0.6 * friction, eps**0.9 * friction
-        straight = 4 if eps > 1e-10 else 5
+        straight, most = 4 if eps > 1e-10 else 5, MOST_ROUNDS if self.rounds is None else self.rounds
         landed = jnp.zeros_like(forward)
         for _ in range(straight):
             new, power, steep, _ = _newton(curve, v, s)
             landed = steep & (power > 0) & (jnp.abs(new - s) <= near) & (jnp.abs(new) <= friction)
             s = settle(jnp.clip(new, -friction, friction), v.x)
         landed = settle(landed | (friction <= 0), v.x)  # without friction there is no room, and nothing to find
-        return self._safeguarded(curve, v, friction, s, landed, near, fine, straight)
-
-    def _safeguarded(self, curve, v, friction, s, landed, near, fine, done) -> tuple[Scalar, Int[Array, ""]]:
-        most = done + (MOST_ROUNDS if self.rounds is None else self.rounds)
 
         def body(state):
             s, low, high, _, k = state
             newton, power, steep, (r, side) = _newton(curve, v, s)
             low, high = jnp.where(side > 0, low, s), jnp.where(side < 0, high, s)
             trusted = steep & (power > 0) & (newton >= low) & (newton <= high)
-            trusted &= (k < done + 2) | (3 * r * r < power * power)
+            trusted &= (k < 2) | (3 * r * r < power * power)
             new = jnp.where(trusted, newton, (low + high) / 2)
             return new, low, high, jnp.abs(new - s) > jnp.where(trusted, near, fine), k + 1
 
         # a loop, not written out: the compiler would work out each round's bracket anew from all rounds before it
-        begin = (s, -friction, friction, ~landed, jnp.full(jnp.shape(s), done, jnp.int32))
+        begin = (s, -friction, friction, ~landed, jnp.zeros_like(s, jnp.int32))
         s, *_, rounds = jax.lax.while_loop(lambda state: state[3] & (state[4] < most), body, begin)
-        return s, rounds
+        return s, straight + rounds
 
 
 def _newton(curve: LimitCurve, v: Vec2, s: Scalar):

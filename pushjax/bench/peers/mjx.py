@@ -67,11 +67,11 @@ class Batch:
         self.compile_seconds = time.perf_counter() - begin
 
     def pushed(self) -> Pushed:
-        begin = time.perf_counter()
+        begin, busy = time.perf_counter(), time.process_time()
         qpos = np.asarray(jax.block_until_ready(self.program(*self.arguments)), float)
-        seconds = time.perf_counter() - begin
+        seconds, processor = time.perf_counter() - begin, time.process_time() - busy
         pose = np.array([final_pose(*each) for each in zip(self.frames, qpos, self.starts, strict=True)])
-        return Pushed(pose, slip(self.scene, pose, self.starts, self.ends), seconds)
+        return Pushed(pose, slip(self.scene, pose, self.starts, self.ends), seconds, processor)
 
 
 def _rollout(model: Any, speed: float, steps: int):

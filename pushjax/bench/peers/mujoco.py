@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pushjax.bench.peers.scene import Scene, Settings, build, engine
+from pushjax.bench.tasks import error_mm
 
 SETTLE = 400  # time constants of normal contact, until the slider lies still
 AWAY = 10.0  # m: where it settles, out of the tip's reach
@@ -31,22 +32,23 @@ PUSHES = (
     (0.02, -0.44),
     (-0.03, 0.61),
 )
-LENGTH = 0.0367  # m: makes angles commensurate with positions; a square of 90 mm has this radius of gyration
 REFINEMENTS = 3.5  # halvings below the time constant until a step counts as converged
 COARSEST = 8  # times the time constant: contact is certainly lost
 
 
 class Pushed(NamedTuple):
     """pose: (n, 3) m, rad: the slider's final pose in the frame of its start pose. slip: (n,) m, how far the tip's
-    contact has slid along the slider's side, to its left of the inward normal. seconds: of the pushes alone."""
+    contact has slid along the slider's side, to its left of the inward normal. seconds: of the pushes alone, without
+    building and settling; processor: of all threads."""
 
     pose: np.ndarray
     slip: np.ndarray
     seconds: float
+    processor: float
 
 
 class StepError(NamedTuple):
-    """timestep, s; error_mm: worst final pose against the smallest timestep's; us_per_push: on one core."""
+    """timestep, s; error_mm: worst final pose against the smallest timestep's; us_per_push: of a processor."""
 
     timestep: float
     error_mm: float
@@ -83,7 +85,7 @@ def push(
     qpos = np.array([initial(model, settled, *each) for each in zip(frames, starts, strict=True)])
     shares = [range(k, len(starts), threads) for k in range(threads)]
     workers = [(copy.copy(model), engine().MjData(model)) for _ in shares]
-    begin = time.perf_counter()
+    begin, busy = time.perf_counter(), time.process_time()
     if threads == 1:
         _run(*workers[0], scene, frames, qpos, shares[0])
     else:
@@ -94,9 +96,9 @@ def push(
             ]
             for task in tasks:
                 task.result()
-    seconds = time.perf_counter() - begin
+    seconds, processor = time.perf_counter() - begin, time.process_time() - busy
     pose = np.array([final_pose(*each) for each in zip(frames, qpos, ends, strict=True)]).reshape(-1, 3)
-    return Pushed(pose, slip(scene, pose, starts, ends), seconds)
+    return Pushed(pose, slip(scene, pose, starts, ends), seconds, processor)
 
 
 def settle(model: Any, settings: Settings) -> np.ndarray:
@@ -166,12 +168,6 @@ def slip(scene: Scene, pose: np.ndarray, starts: np.ndarray, ends: np.ndarray) -
     return np.sum((seen - starts) * left, axis=1) - scene.tip_radius * pose[:, 2]
 
 
-def error_mm(pose: np.ndarray, other: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """(n,) mm: the larger of the distance of two poses (n, 3) and length times the angle between them."""
-    apart = np.abs(pose - other)
-    return 1e3 * np.maximum(np.hypot(apart[:, 0], apart[:, 1]), length * apart[:, 2])
-
-
 def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) -> list[StepError]:
     """Rows of `fan`, from the largest timestep to the smallest; the last, against which the errors are, is left out.
 
@@ -182,7 +178,7 @@ def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) 
     runs = [push(scene, settings, each, starts, ends) for each in chosen]
     rows = zip(chosen[:-1], runs[:-1], strict=True)
     return [
-        StepError(step, float(error_mm(run.pose, runs[-1].pose).max()), 1e6 * run.seconds / len(starts))
+        StepError(step, float(error_mm(run.pose, runs[-1].pose).max()), 1e6 * run.processor / len(starts))
         for step, run in rows
     ]
 
@@ -200,6 +196,6 @@ def largest_step(scene: Scene, settings: Settings, allowed: float = 1e-4) -> tup
 
 
 def timed(scene: Scene, settings: Settings, timestep: float, n: int = 40) -> float:
-    """Seconds per push on one core, the mean of n pushes, `fan` again and again."""
+    """Processor seconds per push, the mean of n pushes, `fan` again and again."""
     starts, ends = (np.resize(each, (n, 2)) for each in fan(scene))
-    return push(scene, settings, timestep, starts, ends).seconds / n
+    return push(scene, settings, timestep, starts, ends).processor / n
