@@ -95,6 +95,7 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     cell["noise"] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
+    cell["held_level"] = there.level
     cell["noise"]["spread"] = float(predicted.friction[1] - found.friction)
     for k, (group, pushes) in enumerate(groups.items()):
         ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
@@ -130,7 +131,7 @@ def _deviation_mm(predicted: np.ndarray, ends: np.ndarray, length: float) -> flo
 
 def _per_push(each: Scored) -> dict[str, Any]:
     inside = {f"inside_{100 * level:g}": each.inside[:, k] for k, level in enumerate(LEVELS)}
-    return {"energy_mm": 1e3 * each.energy, "log_density": each.density} | inside
+    return {"energy_mm": 1e3 * each.energy, "log_density": each.density, "level": each.level} | inside
 
 
 def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generator) -> list[dict[str, Any]]:
