@@ -1,29 +1,36 @@
-"""Pictures: of single pushes and tables (`figures`), of distributions (`distributions`), of errors (`causes`), of what
-accuracy costs (`speed`)."""
+"""Pictures and motion, in mm and degrees, in colours that the colour-blind can tell apart.
+
+A function `..._figure` makes a whole figure, `save` a file of it; a `..._panel`, and what the pictures are made of
+(`outline`, `hand_at`, `traces`), draws into given axes.
+"""
 
 from pushjax.plot.causes import causes_figure as causes_figure
+from pushjax.plot.clouds import capture_figure as capture_figure
+from pushjax.plot.clouds import cloud_figure as cloud_figure
+from pushjax.plot.contacts import jam_figure as jam_figure
+from pushjax.plot.contacts import motion_cone_figure as motion_cone_figure
 from pushjax.plot.distributions import density_panel as density_panel
 from pushjax.plot.distributions import histogram_panel as histogram_panel
 from pushjax.plot.distributions import pose_panel as pose_panel
 from pushjax.plot.distributions import spread_figure as spread_figure
 from pushjax.plot.distributions import traces as traces
-from pushjax.plot.figures import BETWEEN as BETWEEN
-from pushjax.plot.figures import BLUE as BLUE
-from pushjax.plot.figures import END as END
-from pushjax.plot.figures import GREEN as GREEN
-from pushjax.plot.figures import MM as MM
-from pushjax.plot.figures import ORANGE as ORANGE
-from pushjax.plot.figures import PURPLE as PURPLE
-from pushjax.plot.figures import START as START
-from pushjax.plot.figures import STYLE as STYLE
-from pushjax.plot.figures import grasp_figure as grasp_figure
-from pushjax.plot.figures import hand_at as hand_at
-from pushjax.plot.figures import jam_figure as jam_figure
-from pushjax.plot.figures import legend_below as legend_below
-from pushjax.plot.figures import limit_surfaces as limit_surfaces
-from pushjax.plot.figures import motion_cone_figure as motion_cone_figure
-from pushjax.plot.figures import outline as outline
-from pushjax.plot.figures import push_figure as push_figure
-from pushjax.plot.figures import save as save
-from pushjax.plot.figures import table_figure as table_figure
+from pushjax.plot.files import save as save
+from pushjax.plot.parts import hand_at as hand_at
+from pushjax.plot.parts import outline as outline
+from pushjax.plot.pushes import RealPush as RealPush
+from pushjax.plot.pushes import grasp_figure as grasp_figure
+from pushjax.plot.pushes import push_figure as push_figure
+from pushjax.plot.pushes import real_figure as real_figure
 from pushjax.plot.speed import speed_figure as speed_figure
+from pushjax.plot.style import BETWEEN as BETWEEN
+from pushjax.plot.style import BLUE as BLUE
+from pushjax.plot.style import END as END
+from pushjax.plot.style import GREEN as GREEN
+from pushjax.plot.style import MM as MM
+from pushjax.plot.style import ORANGE as ORANGE
+from pushjax.plot.style import PURPLE as PURPLE
+from pushjax.plot.style import START as START
+from pushjax.plot.style import STYLE as STYLE
+from pushjax.plot.style import legend_below as legend_below
+from pushjax.plot.surfaces import limit_surfaces as limit_surfaces
+from pushjax.plot.tables import table_figure as table_figure

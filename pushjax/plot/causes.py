@@ -6,7 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from pushjax.plot.figures import BETWEEN, BLUE, ORANGE, STYLE
+from pushjax.plot.style import BETWEEN, BLUE, ORANGE, STYLE, bars
 
 Change = Mapping[str, float]
 
@@ -23,23 +23,27 @@ def causes_figure(
         figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 4.2), layout="constrained", width_ratios=(1.7, 1))
         names = list(alone)
         place = np.arange(len(names))[::-1]
-        both = (alone, 0.19, BLUE, "alone"), (beside, -0.19, ORANGE, "beside the calibration")
-        for rows, shift, color, label in both:
+        both = (alone, 0.19, bars(BLUE), "alone"), (beside, -0.19, bars(ORANGE, True), "beside the calibration")
+        for rows, shift, look, label in both:
             there = [(y, rows[name]) for y, name in zip(place, names, strict=True) if name in rows]
             if not there:
                 continue
             y = np.array([at for at, _ in there]) + shift
             change, interval = (np.array([each[key] for _, each in there]) for key in ("change_mm", "ci95_mm"))
-            left.barh(y, change, 0.36, xerr=interval, color=color, label=label, capsize=2, ecolor="0.25")
+            left.barh(y, change, 0.36, xerr=interval, label=label, **look)
         left.axvline(0, color="0.2", lw=0.8)
         left.set_yticks(place, names)
         left.set(xlabel="change of the mean deviation / mm (left is better)", title="What each cause explains")
         left.legend(loc="upper center", bbox_to_anchor=(0.4, -0.16), ncols=2)
-        kinds = ("nothing", "no cause", BETWEEN), ("calibration", "calibrated", BLUE), ("noise", "repetitions", ORANGE)
-        for k, (kind, label, color) in enumerate(kinds):
+        kinds = (
+            ("nothing", "no cause", bars(BETWEEN)),
+            ("calibration", "calibrated", bars(BLUE)),
+            ("noise", "repetitions", bars(ORANGE, True)),
+        )
+        for k, (kind, label, look) in enumerate(kinds):
             heights = [float("nan") if (mean := each[kind]) is None else mean for each in surfaces.values()]
             x = np.arange(len(surfaces)) + 0.27 * (k - 1)
-            right.bar(x, heights, 0.25, color=color, label=label)
+            right.bar(x, heights, 0.25, label=label, **look)
             for at, height in zip(x, heights, strict=True):
                 if np.isfinite(height):
                     right.annotate(f"{height:.2f}", (at, height), ha="center", va="bottom", fontsize=8)

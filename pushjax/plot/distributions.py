@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from pushjax.plot.figures import BLUE, END, GREEN, MM, ORANGE, PURPLE, START, STYLE
+from pushjax.plot.style import BLUE, END, GREEN, MM, ORANGE, PURPLE, START, STYLE
 
 TICK = 1.6  # mm, half the length of a pose's tick
 
@@ -29,7 +29,8 @@ def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = No
 
 
 def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian: tuple[float, float] | None = None):
-    """Bars of a histogram (edges, counts); gaussian: mean and deviation of one to draw over it."""
+    """Bars of a histogram with `edges` and `counts`, `label` on its axis; gaussian: mean and deviation of one to draw
+    over it."""
     edges, counts = np.asarray(counted["edges"]), np.asarray(counted["counts"])
     axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75)
     if gaussian is not None and gaussian[1] > 0:
@@ -58,17 +59,21 @@ def spread_figure(pooled: dict[str, dict[str, dict[str, Any]]], curve: list[dict
         methods = {"noise": ("identified noise", BLUE), "normal": ("normal errors", ORANGE)}
         methods |= {"process": ("Gaussian process", GREEN), "calibrated": ("calibrated levels", PURPLE)}
         left.plot([0, 100], [0, 100], color="0.7", lw=0.9, label="as it should be")
-        for group, style in (("middle", "o-"), ("whole", "s--")):
-            for name, (label, color) in methods.items():
+        for group, dash in (("middle", "-"), ("whole", "--")):
+            for (name, (label, color)), marker in zip(methods.items(), "os^D", strict=True):
                 row = pooled.get(group, {}).get(name)
                 if row is not None:
                     shares = [0, 100 * row["inside_50"], 100 * row["inside_90"], 100]
-                    left.plot([0, 50, 90, 100], shares, style, color=color, ms=4, lw=1.1, label=f"{label}, {group}")
+                    look = {"color": color, "ls": dash, "marker": marker, "ms": 4, "lw": 1.1}
+                    left.plot([0, 50, 90, 100], shares, label=f"{label}, {group}", **look)
         left.set(xlabel="predicted share / %", ylabel="share of the pushes / %", title="Pushes inside a region")
         left.legend(loc="lower right", fontsize=7.5)
         counts = [row["count"] for row in curve]
-        for name, label, color in (("physics", "physics", BLUE), ("process", "Gaussian process", GREEN)):
-            right.plot(counts, [row[f"{name}_mm"] for row in curve], "o-", color=color, ms=4, label=label)
+        for name, label, color, style in (
+            ("physics", "physics", BLUE, "o-"),
+            ("process", "Gaussian process", GREEN, "^--"),
+        ):
+            right.plot(counts, [row[f"{name}_mm"] for row in curve], style, color=color, ms=4, label=label)
         right.set(xlabel="pushes learned from", ylabel="mean deviation / mm", ylim=(0, None))
         right.set_title("Few pushes, and many")
         if counts:

@@ -5,19 +5,19 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pushjax.plot.figures import BLUE, GREEN, ORANGE, PURPLE, STYLE
+from pushjax.plot.style import STYLE, looks
 
 
 def speed_figure(curves: Mapping[str, Sequence[tuple[float, float]]], allowed_mm: float) -> Figure:
     """Time of a push against the error of its final pose: by name, points of processor seconds and mm. A dashed line at
     the error that is allowed."""
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(5.6, 3.8), layout="constrained")
-        for (name, points), color in zip(curves.items(), (BLUE, ORANGE, GREEN, PURPLE), strict=False):
+        figure, axes = plt.subplots(figsize=(6.8, 3.8), layout="constrained")
+        for name, points, look in looks(curves):
             times, errors = zip(*sorted(points), strict=True)
-            axes.loglog(errors, [1e6 * t for t in times], "o-", color=color, ms=4, lw=1.1, label=name)
+            axes.loglog(errors, [1e6 * t for t in times], ms=4, lw=1.1, label=name, **look)
         axes.axvline(allowed_mm, color="0.6", lw=0.9, ls="--")
         axes.set(xlabel="worst error of a final pose / mm", ylabel="time of one core per push / µs")
         axes.set_title("What accuracy costs")
-        axes.legend(loc="center right", bbox_to_anchor=(1, 0.5))
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         return figure

@@ -1,0 +1,80 @@
+"""One look for all pictures: colours, weights, units, and how a picture becomes a file."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+MM, DEGREES = 1e3, 180 / np.pi  # lengths are drawn in mm, angles in degrees
+# Okabe & Ito's, which the colour-blind can tell apart
+BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+# The moments of a push: of three lightnesses, so that a greyscale print keeps them apart
+START, BETWEEN, END = "black", "0.72", "#C1121F"
+# Curves beside each other: colour, dash, marker. The colours are of nearly one lightness: in greyscale the rest tells.
+SERIES = (
+    (BLUE, "-", "o"),
+    (ORANGE, "--", "s"),
+    (GREEN, "-.", "^"),
+    (PURPLE, ":", "D"),
+    ("#56B4E9", (0, (5, 1, 1, 1, 1, 1)), "v"),
+    ("black", (0, (1, 3)), "x"),
+)
+LOOK = ("color", "linestyle", "marker")
+HATCH = "////"  # of the second of two kinds of bars
+
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": cycler(color=[color for color, _, _ in SERIES]),
+    "lines.linewidth": 1.4,
+    "hatch.linewidth": 0.6,
+    "legend.frameon": False,
+    "savefig.dpi": 160,
+    "pdf.fonttype": 42,  # text that stays text
+    "svg.fonttype": "none",
+}
+
+
+def row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Panels side by side, each of that size in inches. shared: they show the same range."""
+    figure, axes = plt.subplots(
+        1, panels, figsize=(width * panels, height), sharex=shared, sharey=shared, layout="constrained", squeeze=False
+    )
+    return figure, list(axes[0])
+
+
+def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
+    """Each curve with its name, and its colour, dash and marker as arguments of `Axes.plot`.
+
+    Raises ValueError for more curves than one can tell apart.
+    """
+    if len(curves) > len(SERIES):
+        raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
+    rows = zip(curves.items(), SERIES, strict=False)
+    return [(name, curve, dict(zip(LOOK, look, strict=True))) for (name, curve), look in rows]
+
+
+def bars(color: str, hatched: bool = False) -> dict[str, Any]:
+    """How bars of a kind look, as arguments of `Axes.bar`; the error bars too."""
+    hatch = HATCH if hatched else None
+    return {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
+
+
+def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
+    """One legend for all panels, of what `axes` shows."""
+    handles, labels = axes.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+
+
+def legend_of_moments(figure: Figure, axes: Axes) -> None:
+    """The legend of pictures that show a push at its start, between, and at its end."""
+    for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
+        axes.plot([], [], color=color, label=label)
+    legend_below(figure, axes, columns=4)

@@ -1,0 +1,97 @@
+"""Pictures of limit surfaces."""
+
+from collections.abc import Mapping
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pushjax.limit_surface import LimitSurface
+from pushjax.plot.style import STYLE, looks
+from pushjax.support import WrenchTwistPairs
+
+FORCE_X, FORCE_Y, TORQUE = "$f_x$ / load", "$f_y$ / load", r"$\tau$ / (length · load)"
+NEARBY = 0.06  # of the load: pairs so near to a cut are drawn with it
+LONG = 0.5  # of an arrow, in the same unit
+TOWARDS = np.radians(30), np.radians(-60)  # where the viewer is: elevation and azimuth
+
+
+def limit_surfaces(
+    surfaces: Mapping[str, LimitSurface], pairs: WrenchTwistPairs, load: float, *, arrows: int = 12
+) -> Figure:
+    """Level sets H = 1 in 3-D, over load and length, and cuts through them, with the wrenches they were fitted to.
+
+    surfaces: by name. pairs: what they were fitted to. load: N, what wrenches are drawn in units of. arrows: so many
+    of the pairs, spread over the side that is seen, with an arrow at the wrench along the twist; where the surface
+    fits, it is the surface's normal, since the twist is the gradient of H (in `(vx, vy, length omega)`).
+    """
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(4.1 * len(surfaces) + 4.4, 3.9), layout="constrained")
+        grid = figure.add_gridspec(2, len(surfaces) + 1, width_ratios=[1.0] * len(surfaces) + [0.85])
+        length = float(pairs.length)
+        wrench = np.asarray(pairs.wrench) / load / np.array([1, 1, length])
+        twist = np.asarray(pairs.twist) * np.array([1, 1, length])
+        shown = _spread(wrench, arrows)
+        for column, (name, surface, look) in enumerate(looks(surfaces)):
+            axes = figure.add_subplot(grid[:, column], projection="3d")
+            _level_set(axes, surface, load, look["color"])
+            axes.scatter(*wrench.T, s=3, color="0.2", depthshade=False)
+            axes.quiver(*wrench[shown].T, *(LONG * twist[shown]).T, color="black", lw=1.1, arrow_length_ratio=0.25)
+            axes.set_title(name)
+        for place, title, other in ((0, "cut through $f_y = 0$", 2), (1, "cut through $\\tau = 0$", 1)):
+            axes = figure.add_subplot(grid[place, -1])
+            _cut(axes, surfaces, wrench, load, other)
+            axes.set(title=title)
+        figure.axes[-2].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        return figure
+
+
+def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> None:
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
+    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    x, y, z = np.moveaxis(_on_level_set(surface, ball) / load, -1, 0)
+    axes.plot_surface(x, y, z, color=color, alpha=0.35, linewidth=0.2, edgecolor=color)  # type: ignore[attr-defined]
+    # few ticks: in between, the labels of the axes run into them
+    axes.set(xlabel=FORCE_X, ylabel=FORCE_Y, xticks=[-1, 0, 1], yticks=[-1, 0, 1])
+    axes.set_zlabel(TORQUE)  # type: ignore[attr-defined]
+    elevation, azimuth = np.degrees(TOWARDS)
+    axes.view_init(elev=elevation, azim=azimuth)  # type: ignore[attr-defined]
+    axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
+
+
+def _cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, other: int) -> None:
+    """The level sets where one component vanishes: f_x against the component number `other`."""
+    angle = np.linspace(0, 2 * np.pi, 241)
+    circle = np.zeros((len(angle), 3))
+    circle[:, 0], circle[:, other] = np.cos(angle), np.sin(angle)
+    for name, surface, look in looks(surfaces):
+        cut = _on_level_set(surface, circle) / load
+        axes.plot(cut[:, 0], cut[:, other], color=look["color"], linestyle=look["linestyle"], label=name)
+    near = np.abs(wrench[:, 3 - other]) < NEARBY
+    axes.plot(wrench[near, 0], wrench[near, other], ".", color="0.2", ms=3, label="pairs nearby")
+    axes.set(xlabel=FORCE_X, ylabel=TORQUE if other == 2 else FORCE_Y, aspect="equal")
+
+
+def _spread(wrench: np.ndarray, count: int) -> np.ndarray:
+    """Indices of up to `count` wrenches on the viewer's side, each as far as can be from those before it."""
+    elevation, azimuth = TOWARDS
+    viewer = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    seen = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
+    if count < 1 or not len(seen):
+        return seen[:0]
+    chosen = [int(np.argmax(wrench[seen] @ viewer))]
+    away = np.full(len(seen), np.inf)
+    while len(chosen) < min(count, len(seen)):
+        away = np.minimum(away, np.linalg.norm(wrench[seen] - wrench[seen[chosen[-1]]], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return seen[chosen]
+
+
+def _on_level_set(surface: LimitSurface, normalized: np.ndarray) -> np.ndarray:
+    """Normalised wrenches scaled along their rays to H = 1."""
+    flat = normalized.reshape(-1, 3) * np.array([1, 1, float(surface.length)])
+    level = np.array(jax.vmap(surface.on_level_set)(flat.astype(surface.length.dtype)))
+    level[:, 2] /= float(surface.length)
+    return level.reshape(normalized.shape)

@@ -1,0 +1,36 @@
+"""Pictures of tables."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from pushjax.plot.style import BLUE, ORANGE, STYLE, bars
+
+
+def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
+    """Mean deviation by condition: ours with its interval, and the paper's, one group of bars a condition.
+
+    cells: each with `surface`, `object`, `model` ("quartic" or "ellipsoid"), `mean_mm`, `ci95_bootstrap_mm` and
+    `paper_mm` (or None). width: in.
+    """
+    with plt.rc_context(STYLE):
+        conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))
+        figure, axes = plt.subplots(figsize=(width, 3.8), layout="constrained")
+        for k, (model, look) in enumerate((("quartic", bars(BLUE)), ("ellipsoid", bars(ORANGE, True)))):
+            mine = [cell for cell in cells if cell["model"] == model]
+            if not mine:
+                continue
+            x = np.arange(len(conditions)) + (k - 0.5) * 0.36
+            height = [cell["mean_mm"] for cell in mine]
+            error = [cell["ci95_bootstrap_mm"] for cell in mine]
+            axes.bar(x, height, 0.34, yerr=error, label=f"{model}, this run", **look)
+            paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in mine]
+            axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
+        axes.set_xticks(np.arange(len(conditions)), [name for _, name in conditions])
+        surfaces = np.array([surface for surface, _ in conditions])
+        for surface in dict.fromkeys(surfaces.tolist()):
+            middle = float(np.mean(np.flatnonzero(surfaces == surface)))
+            axes.text(middle, -0.15, surface, transform=axes.get_xaxis_transform(), ha="center", va="center")
+        axes.set(ylabel="mean deviation / mm", title=title)
+        axes.legend(ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2))
+        return figure
