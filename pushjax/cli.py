@@ -11,6 +11,7 @@ import tyro
 
 from pushjax.datasets import find_data
 from pushjax.experiments import identify_logs
+from pushjax.experiments.identify_logs.setting import option
 
 
 @dataclass
@@ -19,7 +20,7 @@ class Common:
 
     out: Path = Path("pushjax-out")
     """Folder for pictures."""
-    json: Path | None = None
+    json: Annotated[Path | None, option("FILE")] = None
     """File for every figure the command prints. Default: NAME.json in --out; of bench, none."""
     seed: int = 0
     """Seed of everything random."""
@@ -46,41 +47,48 @@ Experiment = Literal[
 ]
 
 
+Method = Literal["ideal", "wrench_twist", "identified"]
+
+
 @dataclass
 class Reproduce(Common):
     """Reproduce an experiment of the paper beside the paper's own figures.
 
-    table1: eleven objects on two surfaces, pushed along straight lines; table1-causes: where its error comes from;
-    table1-spread: predicted distributions beside a Gaussian process. table2: a triangle on three support points,
-    pushed by a robot; predicted against measured final poses.
-    squeeze: a parallel jaw closes on a rectangle from four start poses. jam: two fingers that jam, and from what
-    friction. two-finger: the triangle pushed by two fingers, predicted against measured. three-finger: the original
-    authors' simulated grasps, run again. stochastic-push: a square pushed 2000 times under random friction. capture:
-    two fingers push a disc from anywhere. grasp-rectangle, grasp-butterfly: a jaw closes on them from random poses.
+    - table1: eleven objects on two surfaces, pushed by a robot; predicted against measured final poses.
+    - table1-causes: where its error comes from.
+    - table1-spread: predicted distributions beside a Gaussian process.
+    - table2: a triangle on three support points, pushed by a robot.
+    - two-finger: the triangle pushed by two fingers, predicted against measured.
+    - three-finger: the original authors' simulated grasps, run again.
+    - squeeze: a parallel jaw closes on a rectangle from four start poses.
+    - jam: two fingers that jam, and from what friction.
+    - stochastic-push: a square pushed 2000 times under random friction.
+    - capture: two fingers push a disc from anywhere.
+    - grasp-rectangle, grasp-butterfly: a jaw closes on them from random poses.
     """
 
     experiment: Annotated[Experiment, tyro.conf.Positional] = tyro.MISSING
     """Which."""
-    data: Path | None = None
+    data: Annotated[Path | None, option("FOLDER")] = None
     """Folder of the recorded pushes. Default: the environment variable PUSHJAX_DATA."""
-    geometry: Literal["nominal", "measured"] | None = None
+    geometry: Annotated[Literal["nominal", "measured"] | None, option("{nominal,measured}")] = None
     """table2: nominal (the default), as in the paper; or measured, contact and the push's end as force sensor and robot
     command tell."""
-    method: tuple[Literal["ideal", "wrench_twist", "identified"], ...] | None = None
+    method: Annotated[tuple[Method, ...] | None, option("{ideal,wrench_twist,identified} …")] = None
     """table1, table2: where the limit surface is from: the known support (table2 only), measured forces, or final
     poses. Default: all."""
-    surface: tuple[Literal["abs", "plywood", "delrin"], ...] | None = None
+    surface: Annotated[tuple[Literal["abs", "plywood", "delrin"], ...] | None, option("{abs,plywood,delrin} …")] = None
     """table1 and its like: on what; delrin is in the published folders only. Default: abs, plywood."""
-    object: tuple[str, ...] | None = None
+    object: Annotated[tuple[str, ...] | None, option("OBJECT …")] = None
     """table1 and its like: which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter.
     Default: all."""
-    steps: int | None = None
+    steps: Annotated[int | None, option("N")] = None
     """Steps of each push or grasp. Default: the experiment's own."""
-    n: int | None = None
+    n: Annotated[int | None, option("N")] = None
     """Random experiments: how many pushes or grasps. Default: the paper's."""
-    dof: tuple[float, ...] | None = None
+    dof: Annotated[tuple[float, ...] | None, option("DOF …")] = None
     """Random experiments: degrees of freedom of the limit surface's noise; capture: two, to compare."""
-    friction: tuple[float, ...] | None = None
+    friction: Annotated[tuple[float, ...] | None, option("MU …")] = None
     """Random experiments: lowest and highest; capture: one or more to push with."""
 
 
@@ -110,21 +118,21 @@ class Bench(Common):
 
     case: Annotated[tuple[BenchCase, ...], tyro.conf.Positional] = ()
     """Which. Default: all but numerics and contacts."""
-    dtype: tuple[Literal["float32", "float64"], ...] | None = None
+    dtype: Annotated[tuple[Literal["float32", "float64"], ...] | None, option("{float32,float64} …")] = None
     """Floating types. Default: both; contacts: float64."""
-    batch: tuple[int, ...] | None = None
+    batch: Annotated[tuple[int, ...] | None, option("N …")] = None
     """How many at once. Default: 2000."""
-    cores: int | None = None
+    cores: Annotated[int | None, option("N")] = None
     """Of the machine's, how many may be used (Linux): of one, times are those of a core. Default: all."""
     peers: bool = False
     """The same push by MuJoCo and MJX beside it: pip install 'pushjax[bench]'."""
-    baseline: Path | None = None
+    baseline: Annotated[Path | None, option("FILE")] = None
     """A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did there."""
-    scale: float | None = None
+    scale: Annotated[float | None, option("SHARE")] = None
     """contacts, numerics: how many problems, of 100 000 (contacts: 10 000 for more than four)."""
-    starts: int | None = None
+    starts: Annotated[int | None, option("N")] = None
     """contacts: starts of the independent solver on every problem that was called jammed. Default: 50."""
-    contacts: tuple[int, ...] | None = None
+    contacts: Annotated[tuple[int, ...] | None, option("N …")] = None
     """contacts: of how many. Default: one to eight."""
 
 
@@ -168,14 +176,14 @@ INSIDE = {"table1-causes": "table1.causes", "table1-spread": "table1.spread"}
 def _reproduce(command: Reproduce, progress: Progress) -> Result:
     name = command.experiment
     takes, given = TAKES[name], {}
-    for option in ("data", "geometry", "method", "surface", "object", *RANDOM):
-        value = getattr(command, option)
+    for each in ("data", "geometry", "method", "surface", "object", *RANDOM):
+        value = getattr(command, each)
         if value is None:
             continue
-        if option not in takes:
-            others = ", ".join(other for other in TAKES if option in TAKES[other])
-            raise ValueError(f"--{option} is for {others}; got it with {name}")
-        given[option] = value
+        if each not in takes:
+            others = ", ".join(other for other in TAKES if each in TAKES[other])
+            raise ValueError(f"--{each} is for {others}; got it with {name}")
+        given[each] = value
     if "dof" in given and name != "capture":
         if len(given["dof"]) != 1:
             raise ValueError(f"--dof: {name} takes one; got {len(given['dof'])}")
@@ -269,11 +277,17 @@ def _bench_contacts(seed: int, given: dict[str, Any], progress: Progress, keep: 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point. Bad input ends with one line on standard error and exit status 1."""
+    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+        from pushjax import __version__
+
+        print(f"pushjax {__version__}")
+        return
     command = tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
         args=arguments,
         prog="pushjax",
-        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.",
+        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
+        "`pushjax --version` tells which this is.",
     )
     import matplotlib
 

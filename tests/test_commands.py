@@ -180,6 +180,27 @@ def test_wrong_words_end_with_a_usage_error(arguments, capsys):
     assert capsys.readouterr().err
 
 
+def test_version(capsys):
+    cli.main(["--version"])
+    assert capsys.readouterr().out == f"pushjax {pj.__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["reproduce", "identify", "bench"])
+def test_help_reads_well(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main([command, "--help"])
+    assert end.value.code == 0
+    printed = capsys.readouterr().out
+    assert "{None}" not in printed  # what an option may be, not how its type is written
+    assert "default: None" not in printed
+
+
+def test_a_wrong_flag_suggests_the_right_one(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["reproduce", "table1", "--objet", "rect1"])
+    assert "--object" in capsys.readouterr().err
+
+
 def test_import_changes_nothing_global():
     """No configuration of JAX's, no drawing library, no command line on import."""
     program = (

@@ -15,7 +15,7 @@ from scipy.stats import multivariate_t
 import pushjax as pj
 from pushjax import cli
 from pushjax.datasets import LogError, load_recordings
-from pushjax.experiments.identify_logs import Options
+from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identify import bootstrap, profile_interval, screened
 
@@ -179,6 +179,28 @@ def test_bad_options_end_with_one_line(log, tmp_path, capsys, changed, message):
     assert message in error
     assert error.startswith("pushjax: ")
     assert error.count("\n") == 1
+
+
+def test_calibration_that_is_asked_for_is_looked_for(log, tmp_path, monkeypatch):
+    class Asked(Exception):
+        pass
+
+    def identify(pushes, slider, hand, unknowns, *, touching):
+        raise Asked(unknowns, touching)
+
+    monkeypatch.setattr(pj, "identify", identify)
+    with pytest.raises(Asked) as asked:
+        cli.main([*arguments(log, tmp_path), "--marker", "0.003", "--offset", "0.004", "--touching"])
+    unknowns, touching = asked.value.args
+    assert touching
+    assert unknowns.names == ("friction", "surface", "inset", "offset", "marker")
+    assert (float(unknowns.marker), float(unknowns.offset)) == pytest.approx((0.003, 0.004), rel=1e-6)
+
+
+def test_units_of_what_is_found():
+    assert findings.unit("marker.1") == findings.unit("offset.0") == ("mm", 1e3)
+    assert findings.unit("marker.2") == ("°", 180 / np.pi)
+    assert findings.unit("friction") == ("", 1.0)
 
 
 def test_too_few_pushes(rollouts, tmp_path, capsys):

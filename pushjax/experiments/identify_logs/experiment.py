@@ -96,8 +96,10 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         end=options.end,
         lag=options.lag,
         offset=options.offset,
+        marker=options.marker,
     )
-    found = pj.identify(pushes, slider, hand, unknowns)
+    touching = options.touching
+    found = pj.identify(pushes, slider, hand, unknowns, touching=touching)
     labels = list(scalars(found))
     total = len(labels) + 1
     progress(1, total)
@@ -109,7 +111,7 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
     if options.noise:
         # of pushes that were learned from too little is left over: every second about what the others tell
         odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
-        others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns)
+        others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns, touching=touching)
         second = pushes.weighted(pushes.weight * odd)
         noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]

@@ -11,7 +11,8 @@ from pushjax.datasets import LogError
 from pushjax.identify.noise import Noise
 from pushjax.identify.uncertainty import Profile, normal_interval, profile_interval
 
-METRES = ("center", "inset", "end", "lag", "offset")
+METRES = ("center", "inset", "end", "lag", "offset", "marker")
+ANGLE = "marker.2"
 
 
 class Findings(NamedTuple):
@@ -44,6 +45,8 @@ class Findings(NamedTuple):
 
 def unit(label: str) -> tuple[str, float]:
     """In which a number is shown, and how many of those there are in one of SI."""
+    if label == ANGLE:
+        return "°", 180 / np.pi
     return ("mm", 1e3) if label.startswith(METRES) else ("", 1.0)
 
 

@@ -4,10 +4,11 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
+import tyro
 
 import pushjax as pj
 from pushjax.datasets.recordings import Recordings
@@ -19,18 +20,26 @@ PAIRS = 400
 CELLS = 100  # under a slider whose pressure is known everywhere
 
 
+def option(metavar: str) -> Any:
+    """How the help shows an option whose text says what it is by default."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+Metres = Annotated[float | None, option("M")]
+
+
 @dataclass
 class Options:
     """What is known and what is to be found, as a command line has it."""
 
-    shape: str | None = None
+    shape: Annotated[str | None, option("SHAPE")] = None
     """The object: rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04, regular:6x0.05 (m), or a CSV file of vertices.
     Default: what the logs tell."""
     hand: str = "finger"
     """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
-    radius: float | None = None
+    radius: Metres = None
     """Of the fingers, m. Default: what the logs tell."""
-    support: str | None = None
+    support: Annotated[str | None, option("SUPPORT")] = None
     """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
     Default: what the logs tell, else uniform."""
     surface: Literal["quartic", "ellipsoid"] = "quartic"
@@ -39,16 +48,20 @@ class Options:
     """How well it is known beforehand: degrees of freedom; fewer, less well."""
     friction: tuple[float, float] = (0.0, 1.0)
     """Lowest and highest that the fingers' friction may be."""
-    center: float | None = None
-    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next four)."""
-    inset: float | None = None
+    center: Metres = None
+    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next five)."""
+    inset: Metres = None
     """Find by how much the outline is smaller."""
-    end: float | None = None
+    end: Metres = None
     """Find how far the hand went on after its path ends."""
-    lag: float | None = None
+    lag: Metres = None
     """Find how far the hand was behind where its path says."""
-    offset: float | None = None
+    offset: Metres = None
     """Find how far the hand's coordinates are off those of the object."""
+    marker: Metres = None
+    """Find how far the object's frame is off the one that was tracked; its angle, times the radius of gyration."""
+    touching: bool = False
+    """At the end of most pushes the finger touches the object: learn from the gap that was seen there."""
     separate: bool = False
     """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
     steps: int = 40
