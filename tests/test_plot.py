@@ -238,7 +238,8 @@ def test_motion_cone_figure(block, surface):
         np.testing.assert_allclose(along / np.linalg.norm(along, axis=1, keepdims=True), np.asarray(edges), atol=1e-5)
     arrow = next(text for text in axes.texts if text.arrow_patch is not None)
     np.testing.assert_allclose(arrow.xy, at, atol=1e-5)
-    assert np.cross(np.subtract(arrow.xy, arrow.xyann), np.asarray(contacts.displacement[0])) == pytest.approx(0)
+    along, push = np.subtract(arrow.xy, arrow.xyann), np.asarray(contacts.displacement[0])
+    assert along[0] * push[1] - along[1] * push[0] == pytest.approx(0, abs=1e-9)
     center = next(line.get_xydata()[0] for line in axes.lines if line.get_markeredgecolor() == plot.PURPLE)
     np.testing.assert_allclose(center, [-10, 50], atol=1e-5)
     assert "+" in [text.get_text() for text in axes.texts]

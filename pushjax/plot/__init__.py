@@ -1,9 +1,11 @@
 """Pictures and motion, in mm and degrees, in colours that the colour-blind can tell apart.
 
-A function `..._figure` makes a whole figure, `save` a file of it; a `..._panel`, and what the pictures are made of
-(`outline`, `hand_at`, `traces`), draws into given axes.
+A function `..._figure` makes a whole figure, `animate` and `animate_cloud` a moving one, `save` a file of either; a
+`..._panel`, and what the pictures are made of (`outline`, `hand_at`, `traces`), draws into given axes.
 """
 
+from pushjax.plot.animation import animate as animate
+from pushjax.plot.animation import animate_cloud as animate_cloud
 from pushjax.plot.causes import causes_figure as causes_figure
 from pushjax.plot.clouds import capture_figure as capture_figure
 from pushjax.plot.clouds import cloud_figure as cloud_figure
@@ -15,6 +17,9 @@ from pushjax.plot.distributions import pose_panel as pose_panel
 from pushjax.plot.distributions import spread_figure as spread_figure
 from pushjax.plot.distributions import traces as traces
 from pushjax.plot.files import save as save
+from pushjax.plot.forces import ContactForces as ContactForces
+from pushjax.plot.forces import contact_forces as contact_forces
+from pushjax.plot.motion import Animation as Animation
 from pushjax.plot.parts import hand_at as hand_at
 from pushjax.plot.parts import outline as outline
 from pushjax.plot.pushes import RealPush as RealPush
@@ -34,3 +39,4 @@ from pushjax.plot.style import STYLE as STYLE
 from pushjax.plot.style import legend_below as legend_below
 from pushjax.plot.surfaces import limit_surfaces as limit_surfaces
 from pushjax.plot.tables import table_figure as table_figure
+from pushjax.plot.tracks import Recorded as Recorded

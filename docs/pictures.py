@@ -1,0 +1,106 @@
+"""Make the documentation's pictures and animations, by the package itself.
+
+    python docs/pictures.py [push grasp stochastic limit_surfaces motion_cone] [--to FOLDER] [--suffix .gif]
+
+Two minutes, most of it compiling. Without a name, all of them.
+"""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")  # draws to files; there may be no screen
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import pushjax as pj
+from pushjax import plot
+from pushjax.experiments import demo, squeeze, stochastic_push
+
+PUSHES = 200
+FRICTIONS = {"friction 0.1: it slides": 0.1, "friction 0.6: it sticks": 0.6}
+GRASPS = {"held flat": "grasped with offset", "wedged": "jammed"}
+
+
+def square(side: float = 0.09) -> tuple[pj.Support, pj.WrenchTwistPairs, pj.Slider]:
+    """A square on 64 points, with the quartic of its support."""
+    block = pj.Polygon.rectangle(side, side)
+    support = pj.Support.uniform(block, points=64)
+    pairs = support.wrench_twist_pairs(jax.random.key(0), 400)
+    return support, pairs, pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+
+
+def push() -> plot.Animation:
+    """A square pushed aslant: a finger of little friction slides along its side, one of more sticks to it."""
+    _, _, slider = square()
+    hand, path = pj.Hand.finger(0.00475), pj.line((-0.052, 0.020), (0.018, -0.020), 120)
+    pushes = {name: pj.rollout(slider, hand, path, pose=jnp.zeros(3), friction=mu) for name, mu in FRICTIONS.items()}
+    return plot.animate(slider.shape, hand, pushes)
+
+
+def grasp() -> plot.Animation:
+    """A parallel jaw closes on a rectangle from two start poses: one ends held flat, one wedged."""
+    block = pj.Polygon.rectangle(squeeze.WIDTH, squeeze.HEIGHT)
+    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 400)
+    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    hand = pj.Hand.parallel_jaw(squeeze.PAD, squeeze.THICKNESS)
+    path = pj.line((0.0, 0.0, 0.0, squeeze.OPENING), (0.0, 0.0, 0.0, squeeze.CLOSED), 700)
+    grasps = {}
+    for name, start in GRASPS.items():
+        x, y, angle = squeeze.STARTS[start]
+        pose = jnp.array([x, y, np.radians(angle)])
+        grasps[name] = pj.rollout(slider, hand, path, pose=pose, friction=squeeze.FRICTION)
+    return plot.animate(block, hand, grasps)
+
+
+def stochastic() -> plot.Animation:
+    """One push, 200 draws of the friction below the square and at the finger."""
+    slider, hand, path = stochastic_push.setting(0, 100)
+    model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
+    many = pj.monte_carlo(
+        jax.random.key(1), PUSHES, slider, hand, path, pose=jnp.zeros(3), model=model, trajectories=True
+    )
+    title = "One push under uncertain friction"
+    return plot.animate_cloud(slider.shape, hand, path, np.asarray(many.trajectory), title=title)
+
+
+def limit_surfaces() -> Figure:
+    """The ellipsoid and the quartic of a square on four corners, with the twists of wrenches as arrows."""
+    block = pj.Polygon.rectangle(demo.SIDE, demo.SIDE)
+    support = pj.Support.points(block.vertices)
+    pairs = support.wrench_twist_pairs(jax.random.key(0), 400)
+    fitted = {name: pj.fit_limit_surface(*pairs, degree=d) for name, d in (("ellipsoid", 2), ("quartic", 4))}
+    return plot.limit_surfaces(fitted, pairs, float(support.load))
+
+
+def motion_cone() -> Figure:
+    """One contact of a square, with its friction cone, its motion cone, and a push beyond it."""
+    return plot.motion_cone_figure(*demo.motion_cone_setup(jax.random.key(0)))
+
+
+MOVING: dict[str, Callable[[], plot.Animation]] = {"push": push, "grasp": grasp, "stochastic": stochastic}
+STILL: dict[str, Callable[[], Figure]] = {"limit_surfaces": limit_surfaces, "motion_cone": motion_cone}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(MOVING | STILL))
+    parser.add_argument("--to", type=Path, default=Path(__file__).parent)
+    parser.add_argument("--suffix", default=".gif", help="of what moves: .gif, .html or .mp4")
+    arguments = parser.parse_args()
+    unknown = [name for name in arguments.names if name not in MOVING | STILL]
+    if unknown:
+        parser.error(f"no picture is named {', '.join(unknown)}; there are {', '.join(MOVING | STILL)}")
+    for name in arguments.names or MOVING | STILL:
+        suffix = arguments.suffix if name in MOVING else ".png"
+        path = plot.save((MOVING | STILL)[name](), arguments.to / f"{name}{suffix}")
+        print(f"drew {path}, {path.stat().st_size / 1e3:.0f} kB", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""Pushes and grasps in motion.
+
+The frames are equally spaced over a push's steps, whatever their number, so that a recording and its simulation run
+side by side from start to end. What happens after the last thing has moved is left out, and the last frame stays.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from pushjax.hands import Hand
+from pushjax.plot.motion import Animation
+from pushjax.plot.parts import placed, vertices
+from pushjax.plot.style import BETWEEN, BLUE, END, GREEN, MM, ORANGE, START, STYLE, legend_below, row
+from pushjax.plot.tracks import Moved, Track, fingers_along, track_of
+from pushjax.shapes import Shape
+
+LONGEST = 0.4  # of the slider's size, the arrow of the largest force
+WEAKEST = 1e-3  # of the largest: a force that is not drawn
+WIDE, AROUND = 3.8, 1.2  # in, a panel, and what is above and below it
+RIM = 0.04  # of what is shown, the empty rim around it
+
+
+def animate(
+    shape: Shape,
+    hand: Hand,
+    pushes: Moved | Mapping[str, Moved],
+    *,
+    measured: Mapping[str, np.ndarray] | None = None,
+    forces: bool = True,
+    frames: int = 60,
+    seconds: float = 4.0,
+) -> Animation:
+    """Pushes or grasps in motion, side by side: the slider (its start grey), the fingers, the trace of its centre, the
+    contacts with the forces on the slider as arrows, and the step's status and contact modes in words.
+
+    pushes: one, or several by name: trajectories of `rollout`, or recordings (`Recorded`, shown without forces), all of
+    that shape and hand. measured: poses (points, 3) by a push's name, world, m and rad, shown dashed over it. forces:
+    whether contacts and forces are shown; the legend says how large the longest arrow is, and arrows of all panels
+    have one scale. frames: how many, equally spaced over the steps. seconds: how long it plays.
+
+    `save` writes it to a file. Raises ValueError for no push, fewer than two frames, a name in `measured` that no push
+    has, or a trajectory of a hand with another number of contacts.
+    """
+    by_name = dict(pushes) if isinstance(pushes, Mapping) else {"": pushes}
+    over = dict(measured or {})
+    if not by_name:
+        raise ValueError("pushes: there is none to show")
+    unknown = sorted(set(over) - set(by_name))
+    if unknown:
+        raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
+    tracks = [track_of(shape, hand, push, over.get(name), forces) for name, push in by_name.items()]
+    moments = _moments(tracks, frames)
+    largest = max(track.largest for track in tracks)
+    with plt.rc_context(STYLE):
+        figure, all_axes = row(len(tracks), WIDE, WIDE + AROUND, shared=True)
+        panels = [_Panel(axes, track, largest) for axes, track in zip(all_axes, tracks, strict=True)]
+        for axes, name in zip(all_axes, by_name, strict=True):
+            axes.set_title(name, pad=18)  # above the words
+            axes.set(xlabel="x / mm", aspect="equal")
+        all_axes[0].set_ylabel("y / mm")
+        _whole(figure, all_axes, tracks)
+        _legend(figure, all_axes[0], bool(over), largest)
+
+    def draw(frame: int) -> None:
+        for panel in panels:
+            panel.draw(moments[frame])
+
+    draw(0)
+    return Animation(figure, draw, frames, seconds)
+
+
+def animate_cloud(
+    shape: Shape,
+    hand: Hand,
+    path: Any,
+    trajectory: np.ndarray,
+    *,
+    title: str = "",
+    frames: int = 60,
+    seconds: float = 4.0,
+) -> Animation:
+    """Many pushes by one path, at once: all their outlines, faint, the ways of their centres, the start and the hand.
+
+    path: (steps + 1, dof), the hand's configurations. trajectory: (pushes, steps + 1, 3), poses as `monte_carlo(...,
+    trajectories=True)` keeps them; world, m and rad. frames, seconds: as in `animate`.
+
+    `save` writes it to a file. Raises ValueError for fewer than two frames, or a path of another length.
+    """
+    poses, fingers = np.asarray(trajectory, float), fingers_along(hand, path)
+    if poses.ndim != 3 or len(fingers[0]) != poses.shape[1]:
+        raise ValueError(
+            f"trajectory has shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
+        )
+    lines = placed(vertices(shape), poses)
+    steps, faint = _equally(poses.shape[1] - 1, frames), float(np.clip(12 / len(poses), 0.05, 0.6))
+    with plt.rc_context(STYLE):
+        figure, (axes,) = row(1, 5.4, 5.0)
+        outlines, ways = (LineCollection([], colors=BLUE, linewidths=w, alpha=faint) for w in (0.8, 0.6))
+        axes.add_collection(outlines)
+        axes.add_collection(ways)
+        (centers,) = axes.plot([], [], ".", color=END, ms=3, alpha=0.5, label="centres")
+        axes.plot(*lines[0, 0].T, color=START, lw=1.4, label="start")
+        axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
+        tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
+        axes.set(title=title, xlabel="x / mm", ylabel="y / mm", aspect="equal")
+        _range(axes, [lines.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
+        legend_below(figure, axes, columns=3)
+
+    def draw(frame: int) -> None:
+        k = steps[frame]
+        outlines.set_segments(list(lines[:, k]))
+        ways.set_segments(list(MM * poses[:, : k + 1, :2]))
+        centers.set_data(*(MM * poses[:, k, :2].T))
+        for tip, finger in zip(tips, fingers, strict=True):
+            tip.set_data(*finger[k].T)
+
+    draw(0)
+    return Animation(figure, draw, frames, seconds)
+
+
+class _Panel:
+    """The artists of one push, and how they look at a share of it."""
+
+    def __init__(self, axes: Axes, track: Track, largest: float):
+        self.track = track
+        size = float(np.ptp(track.outline[0], axis=0).max())
+        self.scale = LONGEST * size / largest if largest > 0 else 0.0
+        self.weakest = WEAKEST * largest
+        axes.plot(*track.outline[0].T, color=BETWEEN, lw=1.0, label="start")
+        (self.outline,) = axes.plot([], [], color=START, lw=1.5, label="slider")
+        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centre")
+        self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
+        (self.measured,) = axes.plot([], [], "--", color=END, lw=1.3, label="measured")
+        (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
+        zero = np.zeros(track.force.shape[1])
+        quiver: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
+        quiver |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
+        self.arrows = axes.quiver(zero, zero, zero, zero, **quiver) if len(zero) else None
+        above: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
+        self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above)
+
+    def draw(self, share: float) -> None:
+        """share: of the push, from 0 to 1."""
+        track = self.track
+        k = round(share * (len(track.outline) - 1))
+        self.outline.set_data(*track.outline[k].T)
+        self.trace.set_data(*track.center[: k + 1].T)
+        for line, finger in zip(self.fingers, track.fingers, strict=True):
+            line.set_data(*finger[k].T)
+        if track.measured is not None:
+            self.measured.set_data(*track.measured[round(share * (len(track.measured) - 1))].T)
+        self.words.set_text(track.words[k])
+        acts = np.linalg.norm(track.force[k], axis=1) > self.weakest
+        self.contacts.set_data(*track.contact[k][acts].T)
+        if self.arrows is not None:
+            # an arrow that is not there would leave a dot at its place
+            at, force = (np.where(acts[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
+            self.arrows.set_offsets(at)
+            self.arrows.set_UVC(*(self.scale * force).T)
+
+
+def _moments(tracks: list[Track], frames: int) -> np.ndarray:
+    """The shares of the pushes to show: up to where the last thing moves in any."""
+    last = 0.0
+    for track in tracks:
+        steps = len(track.outline) - 1
+        moving = [np.any(np.diff(each, axis=0) != 0, axis=(1, 2)) for each in (track.outline, *track.fingers)]
+        moves = np.flatnonzero(np.any(moving, axis=0))
+        stop = steps if moves.size == 0 else min(moves[-1] + 2, steps)  # with the step that says why
+        last = max(last, stop / steps)
+    return _equally(1.0, frames) * last
+
+
+def _equally(end: float, frames: int) -> np.ndarray:
+    """So many numbers from 0 to `end`; whole ones, where that is a number of steps."""
+    if frames < 2:
+        raise ValueError(f"frames must be at least 2; got {frames}")
+    spaced = np.linspace(0, end, frames)
+    return spaced.round().astype(int) if isinstance(end, int) else spaced
+
+
+def _whole(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:
+    """One range for all panels, with everything in it at all times, and a figure of its proportions."""
+    parts = [part for track in tracks for part in (track.outline, *track.fingers)]
+    parts += [track.measured for track in tracks if track.measured is not None]
+    _range(all_axes[0], [part.reshape(-1, 2) for part in parts])
+    wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
+    figure.set_layout_engine("compressed", h_pad=0.06)
+    figure.set_size_inches(WIDE * len(all_axes) + 0.5, float(np.clip(WIDE * high / wide, 1.5, 5.5)) + AROUND)
+
+
+def _range(axes: Axes, points: list[np.ndarray]) -> None:
+    low, high = (find(np.concatenate(points), axis=0) for find in (np.nanmin, np.nanmax))
+    rim = RIM * (high - low).max()
+    axes.set(xlim=(low[0] - rim, high[0] + rim), ylim=(low[1] - rim, high[1] + rim))
+
+
+def _legend(figure: Figure, axes: Axes, measured: bool, largest: float) -> None:
+    if largest > 0:
+        axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest:.2g} N")
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
+    shown = {label: handle for label, handle in handles.items() if measured or label != "measured"}
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3)

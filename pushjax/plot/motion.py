@@ -1,0 +1,144 @@
+"""A moving picture, and its files: GIF, a page with a player, a film."""
+
+import base64
+import html
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
+
+import matplotlib.pyplot as plt
+from matplotlib.animation import FFMpegWriter
+from matplotlib.figure import Figure
+from PIL import Image
+
+from pushjax.plot.style import STYLE
+
+DPI = 100
+REST = 1.2  # s, for which the last frame stays
+COLORS = 64  # of all frames together: what keeps the files small
+REFINE = 3  # of the colours: without it thin grey lines come out tinted
+SAMPLES = 6  # frames that the colours are taken from
+SUFFIXES = (".gif", ".html", ".mp4")
+
+
+@dataclass(frozen=True)
+class Animation:
+    """A figure that moves: `draw(k)` makes it show frame k of `frames`, which play in `seconds`, over and over.
+
+    `save` writes it to a file; a notebook shows it with its player.
+    """
+
+    figure: Figure
+    draw: Callable[[int], None]
+    frames: int
+    seconds: float
+
+    def pictures(self) -> list[Image.Image]:
+        """Every frame, all with one palette."""
+        with plt.rc_context(STYLE):
+            self._lay_out()
+            drawn = [self._picture(k) for k in range(self.frames)]
+        width, height = drawn[0].size
+        sampled = [drawn[round(k * (self.frames - 1) / (SAMPLES - 1))] for k in range(SAMPLES)]
+        sheet = Image.new("RGB", (width, SAMPLES * height))
+        for k, each in enumerate(sampled):
+            sheet.paste(each, (0, k * height))
+        palette = sheet.quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=REFINE, dither=Image.Dither.NONE)
+        return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in drawn]
+
+    def _lay_out(self) -> None:
+        """Once: nothing but the contents shall move."""
+        for _ in range(4):  # how a panel of fixed aspect fits, the layout learns from the drawing before
+            self.figure.canvas.draw()
+        self.figure.set_layout_engine("none")
+
+    def _picture(self, k: int) -> Image.Image:
+        self.draw(k)
+        buffer = io.BytesIO()
+        self.figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": 1})
+        return Image.open(buffer).convert("RGB")
+
+    def player(self) -> str:
+        """A fragment of a page that plays it, with everything in it."""
+        encoded = []
+        for picture in self.pictures():
+            buffer = io.BytesIO()
+            picture.save(buffer, "PNG", optimize=True)
+            encoded.append(f'"{base64.b64encode(buffer.getvalue()).decode()}"')
+        interval = 1e3 * self.seconds / self.frames
+        return PLAYER.substitute(frames=",\n".join(encoded), last=self.frames - 1, interval=interval, rest=1e3 * REST)
+
+    def _repr_html_(self) -> str:
+        return self.player()
+
+    def write(self, path: Path) -> None:
+        """As `save` does it, into a folder that exists.
+
+        Raises ValueError for another suffix, RuntimeError for .mp4 where there is no `ffmpeg`.
+        """
+        suffix = path.suffix.lower()
+        if suffix == ".gif":
+            first, *others = self.pictures()
+            interval = 1e3 * self.seconds / self.frames
+            durations = [interval] * len(others) + [1e3 * REST]
+            first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
+        elif suffix == ".html":
+            path.write_text(PAGE.substitute(title=html.escape(path.stem), player=self.player()), encoding="utf-8")
+        elif suffix == ".mp4":
+            self._film(path)
+        else:
+            raise ValueError(f"{path.name}: motion is written as {', '.join(SUFFIXES)}; got {path.suffix or 'none'}")
+
+    def _film(self, path: Path) -> None:
+        if not FFMpegWriter.isAvailable():
+            raise RuntimeError(f"{path.name}: .mp4 needs the program ffmpeg; .gif and .html need nothing")
+        rate = max(1, round(self.frames / self.seconds))
+        writer = FFMpegWriter(fps=rate, extra_args=["-pix_fmt", "yuv420p"])  # what every player shows
+        with plt.rc_context(STYLE), writer.saving(self.figure, str(path), dpi=DPI):
+            self._lay_out()
+            for k in [*range(self.frames), *[self.frames - 1] * round(REST * rate)]:
+                self.draw(k)
+                writer.grab_frame()
+
+
+PLAYER = Template("""<figure style="display:inline-block;margin:0;max-width:100%;font:14px sans-serif">
+<img alt="animation" style="display:block;max-width:100%">
+<div style="display:flex;gap:.6em;align-items:center">
+<button type="button" style="min-width:5em" title="space">Pause</button>
+<input type="range" min="0" max="$last" value="0" style="flex:1" aria-label="frame">
+<output style="min-width:4em;text-align:right"></output>
+</div>
+<script>
+(function () {
+  const frames = [
+$frames
+  ].map(code => "data:image/png;base64," + code);
+  const figure = document.currentScript.parentElement, last = frames.length - 1;
+  const [image, button, range, count] = ["img", "button", "input", "output"].map(tag => figure.querySelector(tag));
+  let timer = null;
+  function show(k) { range.value = k; image.src = frames[k]; count.value = (k + 1) + " / " + frames.length; }
+  function next() {
+    const k = +range.value === last ? 0 : +range.value + 1;
+    show(k);
+    timer = setTimeout(next, k === last ? $rest : $interval);
+  }
+  function pause() { clearTimeout(timer); timer = null; button.textContent = "Play"; }
+  function play() { button.textContent = "Pause"; timer = setTimeout(next, $interval); }
+  button.onclick = () => timer === null ? play() : pause();
+  range.oninput = () => { pause(); show(+range.value); };
+  show(0);
+  play();
+})();
+</script>
+</figure>""")
+
+PAGE = Template("""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>$title</title>
+$player
+</html>
+""")
