@@ -7,13 +7,14 @@ comment `<!-- not run: why -->` stands above it.
 
 import ast
 import importlib
+import json
 import os
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -76,6 +77,17 @@ def test_links_lead_somewhere(path):
         assert ROOT in there.parents, f"{target}: outside of the repository"
         if anchor and there.suffix == ".md":
             assert anchor in anchors(there), f"{target}: no such heading"
+
+
+def test_notebooks_links_lead_somewhere():
+    """As they lie in the repository, or in the site, where they are below docs/."""
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        cells = json.loads(path.read_text())["cells"]
+        text = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            if not target.startswith("http"):
+                file = target.partition("#")[0]
+                assert any((folder / file).resolve().exists() for folder in (path.parent, DOCS / "notebooks")), target
 
 
 @pytest.mark.parametrize("path", SITE, ids=label)
@@ -195,9 +207,14 @@ def commands() -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("command", sorted({command for _, command in commands()}))
-def test_commands_parse(command):
+def test_commands_parse(command, capsys):
+    from pushjax import cli
+
     arguments = shlex.split(command)[1:]
-    if "--help" in arguments:
+    if arguments == ["--version"]:  # which is looked at before anything is parsed
+        cli.main(arguments)
+        assert capsys.readouterr().out.startswith("pushjax ")
+    elif "--help" in arguments:
         with pytest.raises(SystemExit) as end:
             parsed(arguments)
         assert end.value.code in (0, None)
@@ -230,6 +247,7 @@ def test_options_are_all_in_the_command_line_page():
         for name in command.__dataclass_fields__:
             if name != "case":
                 assert f"--{name}" in page, name
+    assert [case for case in get_args(cli.BenchCase) if f"`{case}`" not in page] == []
     reproduce = (DOCS / "experiments" / "index.md").read_text()
     for name, takes in cli.TAKES.items():
         row = re.search(rf"^\| `{name}` \|.*$", reproduce, re.MULTILINE)

@@ -67,6 +67,7 @@ def _linked(found: re.Match, known: set[str]) -> str:
 
 def on_page_content(content, page, config, files):
     if page.file.src_path.endswith(".ipynb"):
+        content = re.sub(r'href="\.\./(?:docs/)?([\w/-]+)\.md', r'href="../\1.html', content)
         return WRITTEN.sub(_written, content)
     return FORMULA.sub(lambda found: _mathml(found[2]), content)
 
@@ -74,12 +75,17 @@ def on_page_content(content, page, config, files):
 def _mathml(text: str) -> str:
     r"""Of \(inline\) or \[displayed\] mathematics."""
     text = html.unescape(text.strip())
-    return convert(text[2:-2], display="block" if text.startswith(r"\[") else "inline")
+    return _drawn(text[2:-2], "block" if text.startswith(r"\[") else "inline")
+
+
+def _drawn(formula: str, display: str) -> str:
+    # A prime is an operator: as an identifier it is set twice as high.
+    return convert(formula, display=display).replace("<mi>&#x02032;</mi>", "<mo>&#x02032;</mo>")
 
 
 def _written(found: re.Match) -> str:
     if found["keep"]:
         return found["keep"]
     if found["block"]:
-        return convert(html.unescape(found["block"]), display="block")
-    return convert(html.unescape(found["line"]), display="inline")
+        return _drawn(html.unescape(found["block"]), "block")
+    return _drawn(html.unescape(found["line"]), "inline")
