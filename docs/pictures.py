@@ -1,8 +1,8 @@
 """Make the documentation's pictures and animations, by the package itself.
 
-    python docs/pictures.py [push grasp stochastic limit_surfaces motion_cone] [--to FOLDER] [--suffix .gif]
+    python docs/pictures.py [push grasp stochastic limit_surfaces motion_cone real] [--to FOLDER] [--suffix .gif]
 
-Two minutes, most of it compiling. Without a name, all of them.
+Two minutes, most of it compiling. Without a name, all of them; `real` needs PUSHJAX_DATA, and is left out without.
 """
 
 import argparse
@@ -20,10 +20,14 @@ from matplotlib.figure import Figure
 
 import pushjax as pj
 from pushjax import plot
+from pushjax.datasets import find_data
 from pushjax.experiments import demo, squeeze, stochastic_push
+from pushjax.experiments.table2 import conditions
 
 PUSHES = 200
 FRICTIONS = {"friction 0.1: it slides": 0.1, "friction 0.6: it sticks": 0.6}
+REAL, STEPS, REAL_FRICTION = ("hardboard", "3pts1"), 60, 0.25
+SHOWN = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
 GRASPS = {"held flat": "grasped with offset", "wedged": "jammed"}
 
 
@@ -83,8 +87,37 @@ def motion_cone() -> Figure:
     return plot.motion_cone_figure(*demo.motion_cone_setup(jax.random.key(0)))
 
 
+def real() -> Figure:
+    """Pushes of a triangle on three support points by a robot, and what the known points predict of them, without
+    anything learned from pushes: those at three percentiles of how far they are off."""
+    data = find_data()
+    if data is None:
+        raise SystemExit("real: set PUSHJAX_DATA to the folder of real data")
+    log, geometry = conditions.load(data / "three_point_push", *REAL), conditions.GEOMETRIES["measured"]
+    pushes, block = conditions.recorded(log, geometry, STEPS), conditions.outline(log, geometry)
+    slider = pj.Slider(block, conditions.ideal_surface(log, "quartic", jax.random.key(0)))
+    hand = pj.Hand.finger(geometry.radius)
+
+    def end(start, path):
+        return pj.rollout(slider, hand, path, pose=start, friction=REAL_FRICTION).pose[-1]
+
+    predicted = jax.jit(jax.vmap(end))(pushes.start, pushes.path)
+    off = plot.MM * np.asarray(pj.deviation(predicted, pushes.end, log.length))
+    order = np.argsort(off)
+    shown = {}
+    for name, share in SHOWN.items():
+        k = order[round(share * (len(order) - 1))]
+        one = plot.RealPush(*(np.asarray(part[k]) for part in (pushes.start, pushes.end, predicted, pushes.path)))
+        shown[f"{name}: {off[k]:.1f} mm"] = one
+    return plot.real_figure(block, shown, hand)
+
+
 MOVING: dict[str, Callable[[], plot.Animation]] = {"push": push, "grasp": grasp, "stochastic": stochastic}
-STILL: dict[str, Callable[[], Figure]] = {"limit_surfaces": limit_surfaces, "motion_cone": motion_cone}
+STILL: dict[str, Callable[[], Figure]] = {
+    "limit_surfaces": limit_surfaces,
+    "motion_cone": motion_cone,
+    "real": real,
+}
 
 
 def main() -> None:
@@ -96,7 +129,8 @@ def main() -> None:
     unknown = [name for name in arguments.names if name not in MOVING | STILL]
     if unknown:
         parser.error(f"no picture is named {', '.join(unknown)}; there are {', '.join(MOVING | STILL)}")
-    for name in arguments.names or MOVING | STILL:
+    without = [] if find_data() else ["real"]
+    for name in arguments.names or [name for name in MOVING | STILL if name not in without]:
         suffix = arguments.suffix if name in MOVING else ".png"
         path = plot.save((MOVING | STILL)[name](), arguments.to / f"{name}{suffix}")
         print(f"drew {path}, {path.stat().st_size / 1e3:.0f} kB", flush=True)

@@ -106,7 +106,7 @@ class Animation:
 PLAYER = Template("""<figure style="display:inline-block;margin:0;max-width:100%;font:14px sans-serif">
 <img alt="animation" style="display:block;max-width:100%">
 <div style="display:flex;gap:.6em;align-items:center">
-<button type="button" style="min-width:5em" title="space">Pause</button>
+<button type="button" style="min-width:5em">Pause</button>
 <input type="range" min="0" max="$last" value="0" style="flex:1" aria-label="frame">
 <output style="min-width:4em;text-align:right"></output>
 </div>
