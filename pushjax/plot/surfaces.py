@@ -28,7 +28,7 @@ def limit_surfaces(
     fits, it is the surface's normal, since the twist is the gradient of H (in `(vx, vy, length omega)`).
     """
     with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(4.1 * len(surfaces) + 4.4, 3.9), layout="constrained")
+        figure = plt.figure(figsize=(3.6 * len(surfaces) + 4.0, 3.9), layout="constrained")
         grid = figure.add_gridspec(2, len(surfaces) + 1, width_ratios=[1.0] * len(surfaces) + [0.85])
         length = float(pairs.length)
         wrench = np.asarray(pairs.wrench) / load / np.array([1, 1, length])
@@ -37,7 +37,7 @@ def limit_surfaces(
         for column, (name, surface, look) in enumerate(looks(surfaces)):
             axes = figure.add_subplot(grid[:, column], projection="3d")
             _level_set(axes, surface, load, look["color"])
-            axes.scatter(*wrench.T, s=3, color="0.2", depthshade=False)
+            axes.scatter(*wrench.T, s=2, color="0.2", alpha=0.6, depthshade=False)
             axes.quiver(*wrench[shown].T, *(LONG * twist[shown]).T, color="black", lw=1.1, arrow_length_ratio=0.25)
             axes.set_title(name)
         for place, title, other in ((0, "cut through $f_y = 0$", 2), (1, "cut through $\\tau = 0$", 1)):
