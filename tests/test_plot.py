@@ -1,7 +1,5 @@
-"""Pictures: what is drawn is what was given, with a unit on every axis and a legend that names it. Not their pixels."""
-
-import itertools
-import re
+"""Pictures of pushes, contacts and limit surfaces: what is drawn is what was given, with a unit on every axis and a
+legend that names it. Not their pixels."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,28 +7,18 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle
 from mpl_toolkits.mplot3d import Axes3D
 
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+from drawn import MM, RADIUS, SIDE, ends_of, in_world, legend, legible
 
 import pushjax as pj
 from pushjax import plot
-from pushjax.plot.style import SERIES, looks
 
-SIDE, RADIUS, LENGTH = 0.06, 0.005, 0.024
-MM = 1e3
-BARE = re.compile(r" / |^count$|^pushes learned from$")  # an axis names its unit, or what it counts
-SMALLEST = 7  # pt
-# Severe protanopia, deuteranopia and tritanopia on linear RGB (Machado, Oliveira & Fernandes 2009)
-BLIND = (
-    ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)),
-    ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
-    ((1.255528, -0.076749, -0.178779), (-0.078411, 0.930809, 0.147602), (0.004733, 0.691367, 0.303900)),
-)
+LENGTH = 0.024
 
 
 @pytest.fixture(autouse=True)
@@ -65,36 +53,6 @@ def slid(steps: int = 6, turn: float = 0.4, dof: int = 2) -> pj.Trajectory:
         mode=jnp.full((steps, 1), pj.ContactMode.STICKING, jnp.int8),
         status=jnp.zeros(steps, jnp.int8),
     )
-
-
-def in_world(pose, side=SIDE) -> np.ndarray:
-    """The corners of a square at a pose, mm, closed."""
-    corners = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return MM * (corners @ np.array([[c, s], [-s, c]]) + np.asarray(pose)[:2])
-
-
-def legend(figure_or_axes) -> list[str]:
-    """Entries of an axes' legend, or of all legends of a figure."""
-    of = getattr(figure_or_axes, "legends", None)
-    found = [figure_or_axes.get_legend()] if of is None else of
-    return [text.get_text() for each in found for text in each.get_texts()]
-
-
-def legible(figure) -> None:
-    """A unit on every axis, nothing too small; and it draws."""
-    figure.canvas.draw()
-    for axes in figure.axes:
-        for label in (axes.get_xlabel(), axes.get_ylabel()):
-            assert BARE.search(label), f"no unit: {label!r}"
-        sizes = [text.get_fontsize() for text in axes.texts] + [axes.title.get_fontsize()]
-        sizes += [text.get_fontsize() for text in axes.get_xticklabels() + axes.get_yticklabels()]
-        assert min(sizes) >= SMALLEST
-
-
-def ends_of(axes, color) -> list[np.ndarray]:
-    """The data of all lines of a colour."""
-    return [line.get_xydata() for line in axes.lines if line.get_color() == color and len(line.get_xydata())]
 
 
 def test_push_figure(block):
@@ -267,178 +225,3 @@ def test_jam_figure(block):
     slope = (cone[:, 1] - cone[:, 0])[:, 1] / (cone[:, 1] - cone[:, 0])[:, 0]
     np.testing.assert_allclose(np.abs(slope), 0.4)
     np.testing.assert_allclose(axes.lines[-4].get_xydata(), MM * np.asarray(point))
-
-
-def cell(surface, name, model, mean, paper):
-    named = {"surface": surface, "object": name, "model": model}
-    return named | {"mean_mm": mean, "ci95_bootstrap_mm": 0.2, "paper_mm": paper}
-
-
-def test_table_figure():
-    cells = [cell("abs", "rect1", "quartic", 5.0, 6.0), cell("abs", "tri1", "quartic", 4.0, None)]
-    cells += [cell("abs", "rect1", "ellipsoid", 5.5, 6.5), cell("abs", "tri1", "ellipsoid", 4.5, 5.5)]
-    figure = plot.table_figure(cells, "Table")
-    (axes,) = figure.axes
-    figure.canvas.draw()
-    assert axes.get_ylabel() == "mean deviation / mm"
-    assert axes.get_title() == "Table"
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["rect1", "tri1"]
-    assert [text.get_text() for text in axes.texts] == ["abs"]
-    assert sorted(legend(axes)) == ["ellipsoid, this run", "quartic, this run", "the paper"]
-    assert [bar.get_height() for bar in axes.patches] == [5.0, 4.0, 5.5, 4.5]
-    paper = [line.get_ydata() for line in axes.lines if line.get_marker() == "_" and line.get_markersize() == 13]
-    np.testing.assert_array_equal(paper, [[6.0, np.nan], [6.5, 5.5]])
-    hatched = [bar.get_hatch() is not None for bar in axes.patches]
-    assert hatched == [False, False, True, True]  # so that a greyscale print tells them apart
-
-
-def cloud(n=40) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    end = np.column_stack([0.03 + 0.002 * rng.normal(size=(n, 2)), rng.permutation(n) / n])
-    return np.linspace(0, 1, 5)[None, :, None] * end[:, None]
-
-
-def test_cloud_figure(block):
-    ways = cloud()
-    path = np.linspace([-0.04, 0.0], [0.0, 0.0], 5)
-    figure = plot.cloud_figure(block, pj.Hand.finger(RADIUS), path, ways, "40 pushes")
-    legible(figure)
-    (axes,) = figure.axes
-    assert axes.get_title() == "40 pushes"
-    assert legend(axes) == ["start", "end, 2.5 and 97.5 % of θ", "median end", "ways of the centre"]
-    np.testing.assert_allclose(axes.collections[0].get_segments(), MM * ways[..., :2])
-    order = np.argsort(ways[:, -1, 2])
-    drawn = [line for line in axes.lines if line.get_color() == plot.END]
-    for line, place in zip(drawn, (1, 20, 38), strict=True):
-        np.testing.assert_allclose(line.get_xydata(), in_world(ways[order[place], -1]), atol=1e-9)
-    assert [line.get_linestyle() for line in drawn] == [":", "-", ":"]
-    assert [circle.center[0] for circle in axes.patches] == [-40, 0]
-
-
-def test_capture_figure(block):
-    ways = cloud() + np.linspace(0, 0.02, 40)[:, None, None] * np.array([0, 1, 0])
-    wanted = np.arange(40) % 3 == 0
-    path = np.linspace([0, -0.04, 0, 0.08], [0, 0.0, 0, 0.08], 5)
-    x, y = np.meshgrid(np.linspace(-0.01, 0.01, 6), np.linspace(0, 0.02, 6))
-    density = ((x, y), np.exp(-((x / 0.005) ** 2)))
-    runs = {"few": (ways, wanted), "more": (ways, ~wanted)}
-    figure = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, runs, density, ways=10)
-    figure.canvas.draw()
-    few, more, heat, bar = figure.axes
-    assert [axes.get_title() for axes in (few, more, heat)] == ["few", "more", "start centres, more"]
-    assert legend(figure) == ["end as wanted", "do not"]
-    assert [axes.get_xlabel() for axes in (few, more, heat)] == ["x / mm"] * 3
-    assert bar.get_ylabel() == "density / (1/mm²)"
-    caught, missed = few.collections[:2]
-    np.testing.assert_allclose(caught.get_segments(), MM * ways[:10][wanted[:10], :, :2])
-    np.testing.assert_allclose(missed.get_segments(), MM * ways[:10][~wanted[:10], :, :2])
-    assert len(few.patches) == 4  # two fingers at both ends
-    (outside,) = ends_of(heat, plot.START)
-    np.testing.assert_allclose(outside, MM * ways[wanted, 0, :2])
-    alone = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, {"none": (ways, np.zeros(40, bool))})
-    assert len(alone.axes) == 1
-    assert not ends_of(alone.axes[0], plot.BLUE)  # none was caught
-
-
-def test_panels():
-    axes = plt.figure().subplots(1, 4)
-    poses = np.array([[0.01, 0.02, np.pi / 2], [0.0, 0.0, 0.0]])
-    plot.pose_panel(axes[0], poses, plot.BLUE, "here")
-    np.testing.assert_allclose(axes[0].lines[0].get_xydata(), [[10, 20], [0, 0]])
-    (ticks,) = axes[0].collections
-    np.testing.assert_allclose(np.diff(ticks.get_segments(), axis=1)[:, 0], [[0, 1.6], [1.6, 0]], atol=1e-9)
-    counts = {"edges": np.array([0.0, 1, 2]), "counts": np.array([3, 5])}
-    plot.histogram_panel(axes[1], counts, "x / mm", gaussian=(1.0, 0.5))
-    np.testing.assert_array_equal(axes[1].patches[0].get_data().values, [3, 5])
-    x, height = axes[1].lines[0].get_xydata().T
-    assert np.trapezoid(height, x) == pytest.approx(8, rel=0.06)  # of a Gaussian two deviations wide, 95 %
-    plot.histogram_panel(axes[2], counts, "x / mm", gaussian=(1.0, 0.0))
-    assert not axes[2].lines
-    plot.traces(axes[3], np.zeros((2, 3, 3)) + np.arange(3)[None, :, None], plot.GREEN)
-    np.testing.assert_allclose(axes[3].collections[0].get_segments(), 2 * [MM * np.arange(3)[:, None] * np.ones(2)])
-    assert axes[3].get_xlim()[1] >= 2 * MM
-
-
-def test_spread_figure():
-    shares = {"inside_50": 0.6, "inside_90": 0.9}
-    curve = [{"count": n, "physics_mm": 5.0, "process_mm": 30.0 - n} for n in (10, 20)]
-    figure = plot.spread_figure({"whole": {"noise": shares, "process": shares}}, curve)
-    legible(figure)
-    left, right = figure.axes
-    assert legend(left) == ["as it should be", "identified noise, whole", "Gaussian process, whole"]
-    assert legend(right) == ["physics", "Gaussian process"]
-    assert [text.get_text() for text in right.get_xticklabels()] == ["10", "20"]
-    assert len({(line.get_color(), line.get_marker()) for line in left.lines}) == 3
-    assert plot.spread_figure({}, []).axes[1].get_ylabel() == "mean deviation / mm"
-
-
-def test_causes_figure():
-    change = {"change_mm": -0.3, "ci95_mm": 0.1}
-    figure = plot.causes_figure(
-        {"tip": change, "drift": change}, {}, {"abs": {"nothing": 5, "calibration": 4, "noise": 3}}
-    )
-    left, right = figure.axes
-    figure.canvas.draw()
-    assert [bar.get_width() for bar in left.patches] == [-0.3, -0.3]
-    assert legend(left) == ["alone"]
-    assert legend(right) == ["no cause", "calibrated", "repetitions"]
-    assert [bar.get_height() for bar in right.patches] == [5, 4, 3]
-
-
-def test_speed_figure():
-    figure = plot.speed_figure({"a": [(2e-6, 0.01), (1e-6, 0.1)], "b": [(1e-3, 0.2)]}, 0.1)
-    legible(figure)
-    (axes,) = figure.axes
-    assert [line.get_marker() for line in axes.lines[:2]] == ["o", "s"]
-    np.testing.assert_allclose(axes.lines[2].get_xdata(), 0.1)
-    assert axes.get_xscale() == axes.get_yscale() == "log"
-
-
-def test_no_more_curves_than_can_be_told_apart():
-    with pytest.raises(ValueError, match="at most 6 curves can be told apart; got 7: a, b"):
-        plot.speed_figure({name: [(1e-6, 0.1)] for name in "abcdefg"}, 0.1)
-    seen = [tuple(map(str, look.values())) for _, _, look in looks(dict.fromkeys("abcdef", 0))]
-    for column in zip(*seen, strict=True):
-        assert len(set(column)) == 6
-
-
-def lab(linear: np.ndarray) -> np.ndarray:
-    """CIE Lab under D65."""
-    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
-    xyz = to_xyz @ linear / [0.9505, 1, 1.089]
-    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
-    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
-
-
-def seen_by(color, eyes) -> np.ndarray:
-    c = np.array(to_rgb(color))
-    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-    return lab(np.clip(np.asarray(eyes) @ linear, 0, 1))
-
-
-@pytest.mark.parametrize("eyes", [np.eye(3), *BLIND], ids=["full", "protan", "deutan", "tritan"])
-def test_colors_can_be_told_apart(eyes):
-    """Curves by 15, moments of a push by 40, where 2.3 is just noticeable."""
-    for colors, least in (([color for color, _, _ in SERIES], 15), ((plot.START, plot.BETWEEN, plot.END), 40)):
-        for a, b in itertools.combinations(colors, 2):
-            assert np.linalg.norm(seen_by(a, eyes) - seen_by(b, eyes)) > least, (a, b)
-
-
-def test_moments_in_greyscale():
-    lightness = sorted(seen_by(color, np.eye(3))[0] for color in (plot.START, plot.END, plot.BETWEEN, "white"))
-    assert np.diff(lightness).min() > 20
-
-
-@pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
-def test_save(tmp_path, suffix, block):
-    """In the folder it makes, at the resolution and with the letters of the style, also outside of its context."""
-    figure = plot.push_figure(block, {"push": (slid(), np.zeros((7, 2)))}, RADIUS)
-    path = plot.save(figure, tmp_path / "new" / f"push.{suffix}")
-    start = path.read_bytes()[:300]
-    assert {"png": b"PNG", "pdf": b"%PDF", "svg": b"<svg"}[suffix] in path.read_bytes()[:800], start
-    assert not plt.fignum_exists(figure.number)
-    if suffix == "png":
-        width = plt.imread(path).shape[1]
-        assert 3.5 * 160 < width < 5 * 160  # of about four inches
-    if suffix == "svg":
-        assert "centre of the slider" in path.read_text()  # text that stays text
