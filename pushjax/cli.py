@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -104,16 +104,18 @@ class Identify(identify_logs.Options, Common):
     """Files of recorded pushes."""
 
 
-BenchCase = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling", "numerics", "contacts"]
+TimedCase = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling", "fit", "monte_carlo", "outline"]
+BenchCase = Literal[TimedCase, "numerics", "contacts"]
 
 
 @dataclass
 class Bench(Common):
-    """Measure how exact and how fast: pushes, gradients, grasps, contact problems, random surfaces.
+    """Measure how exact and how fast: pushes, gradients, grasps, contact problems, random surfaces, fits.
 
     push, ellipsoid, gradient: of a square, 50 mm, in as few steps as 0.1 mm takes. grasp: two fingers close on it.
-    solve: random contact problems. sampling: random surfaces. numerics: float32 beside float64. contacts: every answer
-    of random contact problems checked by an independent solver (alone; takes an hour).
+    solve: random contact problems, of one to eight contacts. sampling: random surfaces. fit: surfaces from 400 pairs.
+    monte_carlo: a key in, a summary out. outline: pushes of polygons and of smooth shapes. numerics: float32 beside
+    float64. contacts: every answer of random contact problems checked by an independent solver (alone; an hour).
     """
 
     case: Annotated[tuple[BenchCase, ...], tyro.conf.Positional] = ()
@@ -121,11 +123,13 @@ class Bench(Common):
     dtype: Annotated[tuple[Literal["float32", "float64"], ...] | None, option("{float32,float64} …")] = None
     """Floating types. Default: both; contacts: float64."""
     batch: Annotated[tuple[int, ...] | None, option("N …")] = None
-    """How many at once. Default: 2000."""
+    """How many at once. Default: 2000; fit 200; monte_carlo 2000 and 100 000."""
     cores: Annotated[int | None, option("N")] = None
     """Of the machine's, how many may be used (Linux): of one, times are those of a core. Default: all."""
+    devices: Annotated[int | None, option("N")] = None
+    """push, ellipsoid: also with the batch over so many devices (of a CPU, host devices), against one."""
     peers: bool = False
-    """The same push by MuJoCo and MJX beside it: pip install 'pushjax[bench]'."""
+    """push, grasp, fit, solve: the same by MuJoCo and MJX, cvxpy, scipy: pip install 'pushjax[bench]' cvxpy."""
     baseline: Annotated[Path | None, option("FILE")] = None
     """A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did there."""
     scale: Annotated[float | None, option("SHARE")] = None
@@ -222,7 +226,7 @@ def _identify(command: Identify, progress: Progress) -> Result:
 BENCH_TAKES = {
     "contacts": {"dtype", "scale", "starts", "contacts"},
     "numerics": {"scale"},
-    "the others": {"dtype", "batch", "cores", "peers", "baseline"},
+    ", ".join(get_args(TimedCase)): {"dtype", "batch", "cores", "devices", "peers", "baseline"},
 }
 
 
@@ -232,8 +236,9 @@ def _bench(command: Bench, progress: Progress) -> Result:
     alone = [name for name in ("contacts", "numerics") if name in command.case]
     if alone and len(command.case) > 1:
         raise ValueError(f"{alone[0]} is measured alone; got {' '.join(command.case)}")
-    kind = alone[0] if alone else "the others"
-    given = {name: getattr(command, name) for name in BENCH_TAKES["contacts"] | BENCH_TAKES["the others"]}
+    *_, timed = BENCH_TAKES
+    kind = alone[0] if alone else timed
+    given = {name: getattr(command, name) for name in BENCH_TAKES["contacts"] | BENCH_TAKES[timed]}
     given = {name: value for name, value in given.items() if value is not None and value is not False}
     for name in given:
         if name not in BENCH_TAKES[kind]:

@@ -1,6 +1,9 @@
 """What `pushjax bench` says of speed and accuracy; nothing here depends on how long anything takes."""
 
 import json
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ import pytest
 
 import pushjax as pj
 from pushjax import cli
-from pushjax.bench import cases, measure, needed, numerics, run, tasks
+from pushjax.bench import cases, devices, grasps, measure, needed, numerics, outlines, run, tasks
 from pushjax.bench.peers import rows
 
 
@@ -89,6 +92,8 @@ def test_rows(tmp_path):
         assert row["ceiling_fraction"] == pytest.approx(share)
     assert "push_quartic" in run.summary(record)
     assert run.slower(record["rows"], record) == []
+    older = [{name: value for name, value in row.items() if name != "devices"} for row in record["rows"]]
+    assert run.slower(record["rows"], {"rows": older}) == []
     half = [row | {"multiply_adds_per_step": row["multiply_adds_per_step"] / 2} for row in record["rows"]]
     assert [row["times"] for row in run.slower(record["rows"], {"rows": half})] == pytest.approx([2, 2])
     (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half}))
@@ -97,11 +102,6 @@ def test_rows(tmp_path):
 
 def test_cases_work():
     """Each runs, and moves what it should."""
-    grasp = cases.grasp("float64", 8)
-    assert 5 < grasp.steps <= cases.GRASP_STEPS
-    poses = np.asarray(jax.jit(grasp.function)(*grasp.args))
-    # turned until both fingers are within their friction cones: a grasp jams no flatter
-    assert np.abs(poses[:, 2]).max() < 1.2 * cases.GRASP_FRICTION < np.abs(grasp.args[0][:, 2]).max()
     problems = cases.solve("float64", 16, 2)
     twist = np.asarray(jax.jit(problems.function)(*problems.args))
     assert twist.shape == (16, 3)
@@ -109,6 +109,95 @@ def test_cases_work():
     sampled = cases.sampling("float64", 4)
     surface = jax.jit(sampled.function)(*sampled.args)
     assert all(pj.Quartic(c, surface.length[0]).is_convex() for c in surface.coefficients)
+
+
+def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
+    poses = grasps.random_poses(jax.random.key(2), 8, "float64")
+    square = pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)
+    for (x, y, theta), path in zip(np.asarray(poses), np.asarray(grasps.paths(poses, 3)), strict=True):
+        opening = path[:, 3]
+        away = np.array([[0, opening[0] / 2], [0, -opening[0] / 2]]) - [x, y]
+        cos, sin = np.cos(theta), np.sin(theta)
+        centres = away @ np.array([[cos, -sin], [sin, cos]])
+        nearest = min(float(square.signed_distance(centre)) for centre in centres)
+        assert nearest == pytest.approx(tasks.RADIUS, abs=1e-12)
+        assert opening[-1] == pytest.approx(grasps.FLAT + grasps.LEFT)
+        assert np.all(np.diff(opening) < 0)
+    by_steps = grasps.errors("float64")
+    assert by_steps[8] < tasks.ALLOWED_MM < by_steps[6]
+    assert by_steps[64] < by_steps[16] / 10
+    turned = np.abs(grasps.reference()[:, 2])
+    # both fingers touch: the angle is geometry; where one has come far before the other, it has turned the square more
+    assert turned.max() == pytest.approx(grasps.TURNED, abs=1e-9)
+    assert np.median(turned) == pytest.approx(grasps.TURNED, abs=1e-9)
+
+
+def needed_by(which):
+    """FLOPs of a push before the compiler sees it, and its work."""
+    work = outlines.push("float64", 2, which)
+    costs = jax.jit(work.function).lower(*work.args).cost_analysis() or {}
+    return costs["flops"], work
+
+
+def test_smooth_outlines_cost_the_same_whatever_they_were_traced_with():
+    """Of curves the control points count, of polygons the vertices."""
+    coarse, fine = (needed_by(("curve", 12, traced))[0] for traced in outlines.TRACED)
+    assert coarse == fine
+    few, many, most = (needed_by(("polygon", n, 0))[0] for n in (4, 16, 64))
+    assert few < many < most
+    # in proportion: a vertex more costs the same at 16 as at 64
+    assert (most - many) / 48 == pytest.approx((many - few) / 12, rel=0.2)
+    flops, work = needed_by(("disk", 0, 0))
+    assert flops < few
+    mode = jax.vmap(lambda *each: outlines.task("float64", ("disk", 0, 0)).push(*each).mode)(*work.args)
+    assert np.all(np.asarray(mode) != pj.ContactMode.SEPARATED)  # every step is counted
+
+
+@pytest.mark.parametrize("which", [("polygon", 6, 0), ("polygon", 64, 0), ("curve", 24, 1024), ("ellipse", 0, 0)])
+def test_outlines_are_touched_where_the_pushes_begin(which):
+    shape = outlines.outline(*which)
+    distance = float(shape.signed_distance(np.array([-outlines.HALF - 0.01, 0.0])))
+    assert distance == pytest.approx(0.01, abs=1e-6)
+
+
+def test_rows_of_fits_and_of_monte_carlo():
+    """What is not a push has rows with the same names."""
+    names = None
+    for case, kind in (("fit", "float64"), ("monte_carlo", "float32")):
+        record = run.run((case,), (kind,), (64,))
+        for row in record["rows"]:
+            names = names or set(row)
+            assert set(row) == names
+            assert (row["dtype"], row["batch"], row["devices"]) == (kind, 64, 1)
+            assert row["run_s"] > 0
+            assert row["compile_s"] >= 0
+        assert record["rows"][0]["case"] in run.summary(record)
+    assert 7 < record["rows"][0]["steps"] <= 8
+
+
+def test_several_devices(tmp_path):
+    """In a process of its own: how many there are must be said before JAX has any."""
+    program = """
+import numpy as np, jax
+from pushjax.bench import devices, measure, outlines
+devices.ask(2)
+with measure.both_dtypes():
+    make = lambda dtype, batch: outlines.push(dtype, batch, ("disk", 0, 0))
+    alone, both = make("float64", 16), devices.sharded(make, "float64", 16, 2)
+    one, two = (np.asarray(jax.jit(work.function)(*work.args)) for work in (alone, both))
+    np.testing.assert_allclose(two, one, rtol=0, atol=1e-12)
+    assert len(both.args[0].sharding.device_set) == 2
+    try:
+        devices.sharded(make, "float64", 15, 2)
+    except ValueError as error:
+        assert "multiple of the 2 devices; got 15" in str(error)
+    else:
+        raise AssertionError
+"""
+    done = subprocess.run([sys.executable, "-c", program], env=dict(os.environ), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    with pytest.raises(ValueError, match="at least 2; got 1"):
+        devices.ask(1)
 
 
 def test_tiles_change_nothing(monkeypatch):
@@ -157,9 +246,12 @@ def test_turns():
     [
         (["contacts", "push"], "contacts is measured alone"),
         (["push", "--scale", "0.1"], "--scale is for contacts, numerics"),
-        (["numerics", "--batch", "3"], "--batch is for the others"),
+        (["numerics", "--batch", "3"], "--batch is for push, ellipsoid, gradient, grasp, solve, sampling, fit,"),
         (["push", "--batch", "0"], "batch must be positive; got 0"),
         (["push", "--cores", "0"], "--cores must be from 1 to"),
+        (["push", "--devices", "1"], "--devices must be at least 2; got 1"),
+        (["push", "--devices", "999"], "JAX has started with"),
+        (["sampling", "--peers"], "--peers is for push, grasp, fit, solve; got it with sampling"),
         (["push", "--baseline", "README.md"], "holds no record of pushjax bench"),
     ],
 )

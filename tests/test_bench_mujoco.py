@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.bench.peers import coulomb, mujoco
+from pushjax.bench import grasps, tasks
+from pushjax.bench.peers import coulomb, grasp, mujoco, rows
 from pushjax.bench.peers.mujoco import error_mm, fan, push
 from pushjax.bench.peers.scene import Scene, Settings, build
 
@@ -92,11 +93,35 @@ def test_settings_out_of_the_box_are_far_off():
 
 
 def test_smaller_steps_converge_and_cost_more():
-    rows = mujoco.accuracy(Scene(FOUR), Settings(), (0.04, 0.01, 0.0025, 0.00125))
-    errors = [row.error_mm for row in rows]
+    found = mujoco.accuracy(Scene(FOUR), Settings(), (0.04, 0.01, 0.0025, 0.00125))
+    errors = [row.error_mm for row in found]
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.1
-    assert rows[2].us_per_push > rows[0].us_per_push
+    assert found[2].us_per_push > found[0].us_per_push
+    assert mujoco.largest(found, 1e-4).timestep < 0.04
+    with pytest.raises(ValueError, match="at no timestep"):
+        mujoco.largest(found, 1e-12)
+
+
+def test_grasps_turn_the_square_as_far_as_it_must():
+    """At the end both fingers touch, and the angle is geometry; what they sink in is multiplied by eleven."""
+    scene, poses = Scene(FOUR, friction_tip=grasps.FRICTION), grasps.fan()[[0, 10, 17, 26]]
+    fine, coarse = (grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), h, poses).pose for h in (FINE, 0.01))
+    assert np.abs(np.abs(fine[:, 2]) - grasps.TURNED).max() * tasks.LENGTH < 3e-4
+    np.testing.assert_array_equal(np.sign(fine[:, 2]), np.sign(poses[:, 2]))
+    assert 0 < error_mm(fine, coarse).max() < 0.2
+    soft = grasp.Fingers(normal=0.02, impedance=(0.7, 0.7))
+    assert np.abs(grasp.grasp(scene, grasp.SUPPORTED, soft, FINE, poses).pose[:, 2]).min() > grasps.TURNED + 0.03
+
+
+def test_rows_are_compared_with_their_own():
+    """The fastest of those that do the same."""
+    mine = [{"case": name, "dtype": "float32", "batch": 10, "processor_s": 2.0} for name in ("fit_quartic", "gradient")]
+    mine = [row | {"peer_ratio": None} for row in mine]
+    theirs = [{"of": "fit_quartic", "peer": name, "processor_s_each": t} for name, t in (("a", 3.0), ("b", 1.0))]
+    rows.compare(mine, [*theirs, {"of": "solve_1", "peer": "c", "processor_s_each": 0.1}])
+    assert (mine[0]["peer"], mine[0]["peer_ratio"]) == ("b", 5.0)
+    assert mine[1]["peer_ratio"] is None
 
 
 def test_threads_change_nothing():

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.bench import needed, tasks
+from pushjax.bench import grasps, needed, tasks
 from pushjax.problems import random_contacts_problem
 
 TILE = 4000  # pushes at once, of a larger batch: what they work on stays in the cache
-GRASP_STEPS, GRASP_FRICTION = 50, 0.1
 NEEDED_OF = 12  # pushes whose FLOPs are counted
+PAIRS = 400  # of a fit
 
 
 class Work(NamedTuple):
     """One program to time. steps: of each of the batch, in contact. needed: FLOPs of such a step that the mathematics
-    needs, if they have been counted. error_mm: worst final pose of the fan at this number of steps."""
+    needs, if they have been counted. error_mm: worst final pose of the fan at this number of steps. host: a function to
+    be called as it is, not one to compile."""
 
     case: str
     dtype: str
@@ -28,6 +29,7 @@ class Work(NamedTuple):
     args: tuple
     needed: float | None = None
     error_mm: float | None = None
+    host: bool = False
 
 
 def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = None) -> Work:
@@ -56,25 +58,20 @@ def gradient(dtype: str, batch: int) -> Work:
     return plain._replace(case="gradient", function=lambda *args: derivative(args), needed=None)
 
 
-def grasp(dtype: str, batch: int) -> Work:
-    """Two fingers close 30 mm on the square, askew, which turns it until they hold it."""
-    here = tasks.task("quartic", dtype)
-    hand = tasks.cast(pj.Hand.two_fingers(tasks.RADIUS), dtype)
-    wide = tasks.SIDE + 2 * tasks.RADIUS
-    opening = jnp.linspace(wide + 0.025, wide - 0.005, GRASP_STEPS + 1, dtype=dtype)
-    path = jnp.zeros((GRASP_STEPS + 1, 4), dtype).at[:, 3].set(opening)
-    askew = jax.random.uniform(jax.random.key(1), (batch, 3), dtype, -1, 1) * jnp.array([[5e-3, 5e-3, 0.4]], dtype)
+def grasp(dtype: str, batch: int, steps: int | None = None) -> Work:
+    """Two fingers close on the square, askew, and turn it; final poses."""
+    by_steps = grasps.errors(dtype) if steps is None else {}
+    steps = tasks.fewest_steps(by_steps) if steps is None else steps
+    slider, hand = tasks.task("quartic", dtype).slider, grasps.hand(dtype)
+    friction = jnp.asarray(grasps.FRICTION, dtype)
+    poses = grasps.random_poses(jax.random.key(1), batch, dtype)
+    args = poses, grasps.paths(poses, steps)
 
-    def one(pose):
-        return pj.rollout(here.slider, hand, path, pose=pose, friction=jnp.asarray(GRASP_FRICTION, dtype))
+    def final(*args):
+        one = lambda pose, path: pj.rollout(slider, hand, path, pose=pose, friction=friction).pose[-1]  # noqa: E731
+        return in_tiles(one, args, batch)
 
-    modes = np.asarray(jax.vmap(lambda pose: one(pose).mode)(askew[: min(batch, 200)]))
-    contact = float(np.mean((modes != pj.ContactMode.SEPARATED).any(axis=-1)))
-
-    def final(poses):
-        return in_tiles(lambda pose: one(pose).pose[-1], (poses,), batch)
-
-    return Work("grasp_two_fingers", dtype, batch, GRASP_STEPS * contact, final, (askew,))
+    return Work("grasp_two_fingers", dtype, batch, steps, final, args, None, by_steps.get(steps))
 
 
 def solve(dtype: str, batch: int, contacts: int) -> Work:
@@ -98,6 +95,38 @@ def sampling(dtype: str, batch: int) -> Work:
         return in_tiles(lambda key: random.sample(key)[0], (keys,), batch)
 
     return Work("sampling", dtype, batch, 1.0, surfaces, (keys,))
+
+
+def fit(dtype: str, batch: int, degree: int) -> Work:
+    """Surfaces of `degree` from `PAIRS` wrench-twist pairs each, as a user has them: with checks and report."""
+
+    def surfaces(*args):
+        return jax.vmap(lambda *each: pj.fit_limit_surface(*each, degree=degree, report=True))(*args)
+
+    name = {2: "ellipsoid", 4: "quartic"}[degree]
+    return Work(f"fit_{name}", dtype, batch, 1.0, surfaces, pairs(dtype, batch))
+
+
+def pairs(dtype: str, batch: int) -> tuple:
+    """Wrenches and twists (batch, PAIRS, 3) and lengths (batch,) of the square on its 64 points."""
+    support = tasks.cast(pj.Support.uniform(pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)), "float64")
+    keys = jax.random.split(jax.random.key(0), batch)
+    return tasks.cast(jax.jit(jax.vmap(lambda key: support.wrench_twist_pairs(key, PAIRS)))(keys), dtype)
+
+
+def monte_carlo(dtype: str, batch: int) -> Work:
+    """Pushes under random friction from end to end: a key in, numpy and the summary out."""
+    steps = 8  # 0.1 mm, see `push`
+    here = tasks.task("quartic", dtype)
+    path = tasks.paths(jnp.array([0.01], dtype), jnp.array([0.2], dtype), steps)[0]
+    model = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype)
+
+    def pushed(key):
+        return pj.monte_carlo(key, batch, here.slider, here.hand, path, pose=here.pose, model=model)
+
+    contact = 1 - float(np.mean(pushed(jax.random.key(0)).steps_in_mode[..., pj.ContactMode.SEPARATED])) / steps
+    key = jax.random.key(1)
+    return Work("monte_carlo", dtype, batch, steps * contact, lambda key: pushed(key).summary(), (key,), host=True)
 
 
 def in_tiles(function: Callable, args: tuple, batch: int) -> Any:

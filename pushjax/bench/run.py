@@ -7,30 +7,38 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pushjax.bench import cases
-from pushjax.bench.measure import alternate, both_dtypes, ceiling, compiled, rates
+from pushjax.bench import cases, outlines
+from pushjax.bench import devices as sharding
+from pushjax.bench.measure import Program, Timing, alternate, both_dtypes, called, ceiling, compiled, rates
 from pushjax.report import envelope
 
 Make = Callable[[str, int], cases.Work]
-CASES: dict[str, dict[str, Make]] = {
-    "push": {"push_quartic": cases.push},
-    "ellipsoid": {"push_ellipsoid": partial(cases.push, model="ellipsoid")},
-    "gradient": {"gradient": cases.gradient},
-    "grasp": {"grasp_two_fingers": cases.grasp},
-    "solve": {f"solve_{m}": partial(cases.solve, contacts=m) for m in (1, 2, 3, 4)},
-    "sampling": {"sampling": cases.sampling},
+CASES: dict[str, tuple[Make, ...]] = {
+    "push": (cases.push,),
+    "ellipsoid": (partial(cases.push, model="ellipsoid"),),
+    "gradient": (cases.gradient,),
+    "grasp": (cases.grasp,),
+    "solve": tuple(partial(cases.solve, contacts=m) for m in range(1, 9)),
+    "sampling": (cases.sampling,),
+    "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),
+    "monte_carlo": (cases.monte_carlo,),
+    "outline": tuple(partial(outlines.push, which=each) for each in outlines.EACH),
 }
 BATCH = 2000
+BATCHES = {"fit": (200,), "monte_carlo": (2000, 100_000)}  # where it is not that
+SHARDED = ("push", "ellipsoid")  # cases that --devices is for
 SLOWER = 1.5  # times what was kept: more is a regression. Runs beside other programs scatter by 1.2.
 MOST_S = 20.0  # of one row
 CURVE = (2, 4, 8, 16, 32, 64)  # steps of a push, beside peers
+SAME = ("case", "dtype", "batch", "devices")  # what makes two rows the same one
 
 
 def run(
     case: Sequence[str] = tuple(CASES),
     dtype: Sequence[str] = ("float32", "float64"),
-    batch: Sequence[int] = (BATCH,),
+    batch: Sequence[int] | None = None,
     cores: int | None = None,
+    devices: int | None = None,
     peers: bool = False,
     baseline: Path | None = None,
     seed: int = 0,
@@ -43,45 +51,80 @@ def run(
     machine's multiply-add ceiling that the FLOPs the mathematics needs make up (of one processor, both by processor
     time).
 
-    cores: how many of the machine's may be used, to be said before JAX is; of several, the threads that share a
-    program wait for each other, so what it costs of one core is to be measured on one. peers: the same push by MuJoCo
-    and MJX beside it, by steps, with a picture in `out`. baseline: a record written before; `slower` then names the
-    rows that cost more than `SLOWER` times what they did, both in units of the multiply-add kernel. keep: called with
-    the record so far.
+    batch: default `BATCH`, of some cases `BATCHES`. cores: how many of the machine's may be used, to be said before JAX
+    is; of several, the threads that share a program wait for each other, so what it costs of one core is to be measured
+    on one. devices: a second row of each push, its batch over that many (`bench.devices`). peers: the same by others
+    beside it, of the cases that have such (`peers.rows`); of pushes also by steps, with a picture in `out`. baseline: a
+    record written before; `slower` then names the rows that cost more than `SLOWER` times what they did, both in units
+    of the multiply-add kernel. keep: called with the record so far.
 
-    Raises ValueError for a batch that is not positive, cores that are not there, peers that are not installed, or a
-    baseline that is no record.
+    Raises ValueError for a batch that is not positive, cores or devices that are not there, peers that are not
+    installed or that no case has, or a baseline that is no record.
     """
-    for number in batch:
+    for number in batch or ():
         if number < 1:
             raise ValueError(f"batch must be positive; got {number}")
     before = None if baseline is None else kept(baseline)
     if cores is not None:
         _use(cores)
-    each = [make for name in case for make in CASES[name].values()]
-    makes = [(make, kind, number) for make in each for kind in dtype for number in batch]
-    total = len(makes) + (1 if peers else 0)
+    if devices is not None:
+        sharding.ask(devices)
+    if peers:
+        from pushjax.bench.peers import rows as others
+
+        others.check(case)
+    todo = [
+        partial(_beside_one, make, kind, number, devices)
+        if devices is not None and name in SHARDED
+        else partial(_alone, make, kind, number)
+        for name in case
+        for make in CASES[name]
+        for kind in dtype
+        for number in batch or BATCHES.get(name, (BATCH,))
+    ]
+    total = len(todo) + (1 if peers else 0)
     rows: list[dict[str, Any]] = []
-    settings = {"cases": list(case), "dtypes": list(dtype), "batches": list(batch), "cores": cores, "seed": seed}
+    settings = {"cases": list(case), "dtypes": list(dtype), "batches": None if batch is None else list(batch)}
+    settings |= {"cores": cores, "devices": devices, "seed": seed}
     record = envelope("bench", settings, rows=rows, ceilings={}, slower=[])
     with both_dtypes():  # float32 too is compared with what float64 gives
-        for done, (make, kind, number) in enumerate(makes):
-            row, top = _row(make(kind, number))
-            record["ceilings"][kind] = top
-            rows.append(row)
+        for done, measured in enumerate(todo):
+            found, top = measured()
+            record["ceilings"][found[0]["dtype"]] = top
+            rows += found
             keep(record)
             progress(done + 1, total)
         if peers:
             from pushjax.bench.peers import rows as others
 
-            record["peers"] = others.rows()
+            record["peers"] = others.rows(case)
             others.compare(rows, record["peers"])
-            record["by_steps"] = [_row(cases.push(kind, BATCH, steps=n))[0] for kind in dtype for n in CURVE]
-            record["pictures"] = [] if out is None else [others.draw(record, out)]
+            record["by_steps"], record["pictures"] = [], []
+            if "push" in case:
+                record["by_steps"] = [_row(cases.push(kind, BATCH, steps=n))[0] for kind in dtype for n in CURVE]
+                record["pictures"] = [] if out is None else [others.draw(record, out)]
             progress(total, total)
     if before is not None:
         record["slower"] = slower(rows, before)
     return record
+
+
+Rows = tuple[list[dict[str, Any]], dict[str, float]]
+
+
+def _alone(make: Make, dtype: str, batch: int) -> Rows:
+    row, top = _row(make(dtype, batch))
+    return [row], top
+
+
+def _beside_one(make: Make, dtype: str, batch: int, devices: int) -> Rows:
+    """On one device and on several, in turns."""
+    works = [make(dtype, batch), sharding.sharded(make, dtype, batch, devices)]
+    programs = [compiled(work.function, *work.args) for work in works]
+    timings, top = _timed({str(k): program for k, program in enumerate(programs)}, dtype)
+    rows = [_figures(*each, timings[str(k)], timings) for k, each in enumerate(zip(works, programs, strict=True))]
+    rows[1] |= {"devices": devices, "speedup": timings["0"].median / timings["1"].median}
+    return rows, top
 
 
 def _use(cores: int) -> None:
@@ -94,16 +137,27 @@ def _use(cores: int) -> None:
 
 
 def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
-    program = compiled(work.function, *work.args)
-    top = ceiling(work.dtype)
-    timings = alternate({"it": program.run, "multiply_add": top.multiply_add.run}, most_s=MOST_S)
+    program = (called if work.host else compiled)(work.function, *work.args)
+    timings, top = _timed({"it": program}, work.dtype)
+    return _figures(work, program, timings["it"], timings), top
+
+
+def _timed(programs: dict[str, Program], dtype: str) -> tuple[dict[str, Timing], dict[str, float]]:
+    top = ceiling(dtype)
+    runs = {name: program.run for name, program in programs.items()}
+    timings = alternate(runs | {"multiply_add": top.multiply_add.run}, most_s=MOST_S)
     timings |= alternate({"copied": top.copied.run}, repeats=2)
-    mine, reference = timings["it"], timings["multiply_add"]
+    return timings, rates(top, timings)
+
+
+def _figures(work: cases.Work, program: Program, mine: Timing, timings: dict[str, Timing]) -> dict[str, Any]:
     steps = work.batch * work.steps
+    multiply_add = timings["multiply_add"].processor / (ceiling(work.dtype).flops / 2)
     row: dict[str, Any] = {
         "case": work.case,
         "dtype": work.dtype,
         "batch": work.batch,
+        "devices": 1,
         "steps": work.steps,
         "compile_s": program.compile_s,
         "run_s": mine.median,
@@ -116,14 +170,15 @@ def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
         "compiler_bytes": program.bytes,
         "ceiling_fraction": None,
         # what regressions are judged by: steps' worth of multiply-adds
-        "multiply_adds_per_step": mine.processor / steps / (reference.processor / (top.flops / 2)),
+        "multiply_adds_per_step": mine.processor / steps / multiply_add,
         "pose_error_mm": work.error_mm,
+        "speedup": None,
         "peer": None,
         "peer_ratio": None,
     }
     if work.needed is not None:
         row["ceiling_fraction"] = work.needed / 2 / row["multiply_adds_per_step"]
-    return row, rates(top, timings)
+    return row
 
 
 def kept(path: Path) -> dict[str, Any]:
@@ -139,28 +194,33 @@ def kept(path: Path) -> dict[str, Any]:
 
 def slower(rows: list[dict[str, Any]], before: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows that cost more than they did, in multiply-adds per step."""
+
+    def name(row: dict[str, Any]) -> dict[str, Any]:
+        return {"devices": 1} | {key: row[key] for key in SAME if key in row}
+
     found = []
     for row in rows:
         for old in before["rows"]:
-            if all(old[name] == row[name] for name in ("case", "dtype", "batch")):
+            if name(old) == name(row):
                 times = row["multiply_adds_per_step"] / old["multiply_adds_per_step"]
                 if times > SLOWER:
-                    found.append({name: row[name] for name in ("case", "dtype", "batch")} | {"times": times})
+                    found.append(name(row) | {"times": times})
     return found
 
 
 def summary(record: dict[str, Any]) -> str:
     """What the command prints."""
     lines = [
-        f"{'case':18}{'dtype':9}{'batch':>8}{'steps':>7}{'compile':>10}{'run':>11}{'steps/s':>10}{'ns/step':>9}"
+        f"{'case':20}{'dtype':9}{'batch':>8}{'steps':>7}{'compile':>10}{'run':>11}{'steps/s':>10}{'ns/step':>9}"
         f"{'of ceiling':>11}{'error':>11}"
     ]
     for row in record["rows"]:
         share = "" if row["ceiling_fraction"] is None else f"{100 * row['ceiling_fraction']:.1f} %"
         error = "" if row["pose_error_mm"] is None else f"{row['pose_error_mm']:.3f} mm"
         lines.append(
-            f"{row['case']:18}{row['dtype']:9}{row['batch']:8}{row['steps']:7.4g}{row['compile_s']:8.2f} s"
+            f"{row['case']:20}{row['dtype']:9}{row['batch']:8}{row['steps']:7.4g}{row['compile_s']:8.2f} s"
             f"{1e3 * row['run_s']:8.1f} ms{row['steps_per_s']:10.2e}{row['ns_per_step']:9.1f}{share:>11}{error:>11}"
+            + ("" if row["speedup"] is None else f"  {row['devices']} devices: {row['speedup']:.2f} times as fast")
         )
     for dtype, top in record["ceilings"].items():
         lines.append(

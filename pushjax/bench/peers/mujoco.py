@@ -183,16 +183,17 @@ def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) 
     ]
 
 
-def largest_step(scene: Scene, settings: Settings, allowed: float = 1e-4) -> tuple[float, list[StepError]]:
-    """The largest timestep (s) up to which the final poses stay within `allowed` (m) of the converged ones, and the
-    rows of `accuracy`. NaN where not even the smallest does."""
-    rows = accuracy(scene, settings)
-    good = float("nan")
+def largest(rows: Sequence[StepError], allowed: float = 1e-4) -> StepError:
+    """Of the largest timestep up to which the final poses stay within `allowed` (m) of the converged ones; from rows
+    with falling timesteps. Raises ValueError where not even the smallest does."""
+    good = None
     for row in reversed(rows):
         if not row.error_mm <= 1e3 * allowed:
             break
-        good = row.timestep
-    return good, rows
+        good = row
+    if good is None:
+        raise ValueError(f"MuJoCo comes within {1e3 * allowed:g} mm at no timestep")
+    return good
 
 
 def timed(scene: Scene, settings: Settings, timestep: float, n: int = 40) -> float:

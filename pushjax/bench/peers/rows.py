@@ -1,5 +1,9 @@
-"""The same push by MuJoCo and MJX, each at its largest step within 0.1 mm of its own converged answer."""
+"""The same by others: pushes and grasps by MuJoCo and MJX, fits by cvxpy, contact problems by scipy.
 
+MuJoCo and MJX each at their largest step within 0.1 mm of their own converged answer.
+"""
+
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.bench import tasks
-from pushjax.bench.peers import mjx, mujoco
-from pushjax.bench.peers.scene import Scene, Settings
+from pushjax.bench import cases, grasps, tasks
+from pushjax.bench.peers import contacts, fits, grasp, mjx, mujoco
+from pushjax.bench.peers.scene import Scene, Settings, engine
 
 HALF = tasks.SIDE / 2
 SUPPORTS = {
@@ -19,27 +23,101 @@ SUPPORTS = {
 }
 STICKS = (0.004, 0.01)  # m off the middle of the side
 TIMED, BATCH = 40, 64
+FITS, PROBLEMS, MOST_CONTACTS = 20, 100, 4
 
 
-def rows() -> list[dict[str, Any]]:
-    """Of MuJoCo on three supports and on four, and of MJX on four: seconds of processor per push, and how far a finger
-    that sticks slips."""
+def check(case: Sequence[str]) -> None:
+    """Raises ValueError if what the cases are compared with is not installed, or there is no such thing."""
+    if not set(case) & set(PEERS):
+        raise ValueError(f"--peers is for {', '.join(PEERS)}; got it with {' '.join(case)}")
+    if {"push", "grasp"} & set(case):
+        engine()
+    if "fit" in case:
+        fits.cvxpy()
+
+
+def rows(case: Sequence[str]) -> list[dict[str, Any]]:
+    """Each with `of`, the name of the rows that it is compared with, and seconds of processor for one of these."""
+    return [found for name in case if name in PEERS for found in PEERS[name]()]
+
+
+def _pushes() -> list[dict[str, Any]]:
+    """Of MuJoCo on three supports and on four, and of MJX on four; also how far a finger that sticks slips."""
     found = [_mujoco(name) for name in SUPPORTS]
     return [*found, _mjx("four", found[-1])]
 
 
+def _grasps() -> list[dict[str, Any]]:
+    """Of MuJoCo on four supports; against rigid contact too, where the angle at the end is geometry."""
+    scene = Scene(SUPPORTS["four"], friction_tip=grasps.FRICTION)
+    table, pose = grasp.accuracy(scene, grasp.SUPPORTED, grasp.Fingers())
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    poses = np.resize(grasps.fan(), (TIMED, 3))
+    timed = grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses).processor / TIMED
+    both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])
+    return [
+        {
+            "of": "grasp_two_fingers",
+            "peer": "mujoco",
+            "supports": "four",
+            "timestep_s": at.timestep,
+            "error_mm": at.error_mm,
+            "rigid_error_mm": float(1e3 * tasks.LENGTH * np.abs(both).max()),
+            "processor_s_each": timed,
+            "by_timestep": [row._asdict() for row in table],
+        }
+    ]
+
+
+def _fits() -> list[dict[str, Any]]:
+    found = []
+    for degree, name in ((4, "fit_quartic"), (2, "fit_ellipsoid")):
+        wrench, twist, length = (np.asarray(part) for part in cases.pairs("float64", FITS))
+        theirs = fits.fit(wrench, twist, length, degree)
+        ratio = {}
+        for dtype in ("float32", "float64"):
+            work = cases.fit(dtype, FITS, degree)
+            loss = np.asarray(jax.jit(work.function)(*work.args)[1].loss, float)
+            ratio[dtype] = float((loss / theirs.loss).max())
+        each = {"of": name, "peer": "cvxpy", "processor_s_each": theirs.processor / FITS}
+        found.append(each | {"clipped": theirs.clipped, "loss_over_theirs": ratio})
+    return found
+
+
+def _problems() -> list[dict[str, Any]]:
+    """Of problems that have a motion, what share scipy finds one of."""
+    found = []
+    for m in range(1, MOST_CONTACTS + 1):
+        work = cases.solve("float64", 4 * PROBLEMS, m)
+        surface, problem = work.args
+        moving = np.flatnonzero(np.any(np.asarray(jax.jit(work.function)(*work.args)) != 0, axis=1))[:PROBLEMS]
+        kept = jax.tree.map(lambda leaf, k=moving: leaf[k], problem)
+        theirs = contacts.solve(surface.coefficients[moving], surface.length[moving], kept)
+        each = {"of": f"solve_{m}", "peer": "scipy", "processor_s_each": theirs.processor / len(moving)}
+        found.append(each | {"found": float(theirs.found.mean())})
+    return found
+
+
+PEERS: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    "push": _pushes,
+    "grasp": _grasps,
+    "fit": _fits,
+    "solve": _problems,
+}
+
+
 def _mujoco(name: str) -> dict[str, Any]:
     scene, settings = Scene(SUPPORTS[name]), Settings()
-    timestep, table = mujoco.largest_step(scene, settings, 1e-3 * tasks.ALLOWED_MM)
-    if np.isnan(timestep):
-        raise ValueError(f"MuJoCo on {name} supports comes within {tasks.ALLOWED_MM} mm at no timestep")
-    at = next(row for row in table if row.timestep == timestep)
+    table = mujoco.accuracy(scene, settings)
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    timestep = at.timestep
     return {
+        "of": "push_quartic",
         "peer": "mujoco",
         "supports": name,
         "timestep_s": timestep,
         "error_mm": at.error_mm,
-        "processor_s_per_push": mujoco.timed(scene, settings, timestep, TIMED),
+        "processor_s_each": mujoco.timed(scene, settings, timestep, TIMED),
         "slip_um": _um(mujoco.push(scene, settings, timestep, *_straight(scene, STICKS)).slip),
         "by_timestep": [row._asdict() for row in table],
     }
@@ -54,11 +132,12 @@ def _mjx(name: str, converged: dict[str, Any]) -> dict[str, Any]:
     pose = batch.pushed().pose[: len(starts)]
     exact = mujoco.push(scene, mjx.SETTINGS, mjx.TIMESTEP / 10, starts, ends).pose
     return {
+        "of": "push_quartic",
         "peer": "mjx",
         "supports": name,
         "timestep_s": mjx.TIMESTEP,
         "error_mm": float(np.max(tasks.error_mm(pose, exact))),
-        "processor_s_per_push": batch.pushed().processor / BATCH,
+        "processor_s_each": batch.pushed().processor / BATCH,
         "compile_s": batch.compile_seconds,
         "batch": BATCH,
         "dtype": "float64",
@@ -93,14 +172,16 @@ def _um(slip: np.ndarray) -> list[float]:
 
 
 def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
-    """Write into the rows of quartic pushes how many times as many of them a processor does, beside the faster of
-    MuJoCo's; and how far theirs and ours slip."""
-    best = min((peer for peer in peers if peer["peer"] == "mujoco"), key=lambda peer: peer["processor_s_per_push"])
+    """Write into rows how many times as many a processor does, beside the fastest of the others; into those of pushes
+    also how far a finger that sticks slips."""
     for row in rows:
-        if row["case"] == "push_quartic":
-            row["peer"] = "mujoco"
-            row["peer_ratio"] = best["processor_s_per_push"] * row["batch"] / row["processor_s"]
-            row["slip_um"] = slip_um(row["dtype"])
+        same = [peer for peer in peers if peer["of"] == row["case"]]
+        if same:
+            best = min(same, key=lambda peer: peer["processor_s_each"])
+            row["peer"] = best["peer"]
+            row["peer_ratio"] = best["processor_s_each"] * row["batch"] / row["processor_s"]
+            if row["case"] == "push_quartic":
+                row["slip_um"] = slip_um(row["dtype"])
 
 
 def draw(record: dict[str, Any], out: Path) -> str:
@@ -111,7 +192,7 @@ def draw(record: dict[str, Any], out: Path) -> str:
     for row in record["by_steps"]:
         point = row["processor_s"] / row["batch"], row["pose_error_mm"]
         curves.setdefault(f"pushjax, {row['dtype']}", []).append(point)
-    for peer in record["peers"]:
+    for peer in (peer for peer in record["peers"] if peer["of"] == "push_quartic"):
         # the last is what the others are compared with
         points = [(1e-6 * row["us_per_push"], row["error_mm"]) for row in peer["by_timestep"] if row["error_mm"] > 0]
         if points:
@@ -121,20 +202,32 @@ def draw(record: dict[str, Any], out: Path) -> str:
 
 def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
     """What the command prints."""
-    lines = ["", f"the same push, each within {tasks.ALLOWED_MM} mm of its own converged answer:"]
+    lines = ["", f"the same by others; simulators within {tasks.ALLOWED_MM} mm of their own converged answer:"]
     for peer in peers:
-        slip = "" if peer["slip_um"] is None else f", slip {' and '.join(f'{x:.1f}' for x in peer['slip_um'])} um"
-        lines.append(
-            f"  {peer['peer']}, {peer['supports']} supports: {1e3 * peer['timestep_s']:.3g} ms steps "
-            f"({peer['error_mm']:.3f} mm), {1e3 * peer['processor_s_per_push']:.2f} ms of a processor{slip}"
-        )
+        each = f"{1e3 * peer['processor_s_each']:.2f} ms of a processor"
+        lines.append(f"  {peer['of']}, {peer['peer']}: {each}{_more(peer)}")
     for row in rows:
         if row["peer_ratio"] is not None:
-            slip = " and ".join(f"{x:.1g}" for x in row["slip_um"])
             each = 1e6 * row["processor_s"] / row["batch"]
+            more = "" if row["pose_error_mm"] is None else f" ({row['steps']:.3g} steps, {row['pose_error_mm']:.3f} mm)"
+            slip = f"; slip {' and '.join(f'{x:.1g}' for x in row['slip_um'])} um" if "slip_um" in row else ""
             lines.append(
-                f"  pushjax, {row['dtype']}, batch {row['batch']}: {row['steps']:.3g} steps "
-                f"({row['pose_error_mm']:.3f} mm), {each:.2f} us of a processor, "
-                f"1/{row['peer_ratio']:.0f} of {row['peer']}'s; slip {slip} um"
+                f"  {row['case']}, pushjax, {row['dtype']}, batch {row['batch']}: {each:.2f} us of a processor{more}, "
+                f"1/{row['peer_ratio']:.0f} of {row['peer']}'s{slip}"
             )
     return lines
+
+
+def _more(peer: dict[str, Any]) -> str:
+    said = ""
+    if "timestep_s" in peer:
+        said += f", {peer['supports']} supports, {1e3 * peer['timestep_s']:.3g} ms steps ({peer['error_mm']:.3f} mm)"
+    if "rigid_error_mm" in peer:
+        said += f", {peer['rigid_error_mm']:.2f} mm from rigid contact"
+    if peer.get("slip_um"):
+        said += f", slip {' and '.join(f'{x:.1f}' for x in peer['slip_um'])} um"
+    if "loss_over_theirs" in peer:
+        said += "; our loss over theirs: " + ", ".join(f"{x:.6f} ({d})" for d, x in peer["loss_over_theirs"].items())
+    if "found" in peer:
+        said += f", finds {100 * peer['found']:.0f} % of the motions"
+    return said

@@ -119,26 +119,20 @@ def build(scene: Scene, settings: Settings, timestep: float, conveyor: bool = Tr
     mujoco = engine()
     table = f'surfacevel="{-scene.speed:.9g} 0 0"' if conveyor else ""
     joint = '<joint type="slide" axis="1 0 0"/>' if not conveyor else ""
-    inertia = scene.mass * np.mean(np.sum(scene.vertices**2, axis=1)) / 3
-    shape, mesh = _slider(scene)
+    body, mesh = slider_body(scene)
+    tip = pair("tip", "slider", scene.friction_tip, settings.normal, settings.tip_sliding, settings.impedance)
     text = f"""<mujoco>
-      <option timestep="{timestep:.12g}" integrator="{settings.integrator}" cone="{settings.cone}" jacobian="dense"
-        solver="{settings.solver}" iterations="{settings.iterations}" tolerance="{settings.tolerance}"
-        ls_iterations="{settings.line_search}" noslip_iterations="{settings.noslip}" impratio="{settings.impratio}"
-        gravity="0 0 {-GRAVITY}"/>
+      {options(settings, timestep)}
       <asset>{mesh}</asset>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
       <worldbody>
         <geom name="table" type="plane" size="1 1 .1" {table}/>
-        <body name="slider"><freejoint/>
-          <inertial mass="{scene.mass}" pos="0 0 0" diaginertia="{inertia / 2} {inertia / 2} {inertia}"/>
-          <geom name="slider" {shape}/>{_feet(scene)}
-        </body>
+        {body}
         <body name="tip">{joint}<inertial mass="{TIP_MASS}" pos="0 0 0" diaginertia="1 1 1"/>
           <geom name="tip" type="sphere" size="{scene.tip_radius}"/>
         </body>
       </worldbody>
-      <contact>{_pairs(scene, settings)}</contact>
+      <contact>{supported(scene, settings)}{tip}</contact>
     </mujoco>"""
     return mujoco.MjModel.from_xml_string(text)
 
@@ -151,20 +145,42 @@ def _slider(scene: Scene) -> tuple[str, str]:
     return 'type="mesh" mesh="slider"', f'<mesh name="slider" vertex="{corners}"/>'
 
 
-def _feet(scene: Scene) -> str:
-    feet = enumerate(scene.supports)
-    return "".join(f'<geom name="foot{k}" type="sphere" size="{FOOT}" pos="{x} {y} {FOOT}"/>' for k, (x, y) in feet)
+def feet(scene: Scene) -> str:
+    """Spheres under the slider, one a support."""
+    each = enumerate(scene.supports)
+    return "".join(f'<geom name="foot{k}" type="sphere" size="{FOOT}" pos="{x} {y} {FOOT}"/>' for k, (x, y) in each)
 
 
-def _pairs(scene: Scene, settings: Settings) -> str:
-    low, high = settings.impedance
+def pair(one: str, other: str, friction: float, normal: float, sliding: float, impedance: tuple[float, float]) -> str:
+    """A contact of two geoms: time constants (s) of its normal and of its friction, which has the normal's if 0."""
+    rest = f'solreffriction="{sliding} 1"' if sliding else ""
+    return (
+        f'<pair geom1="{one}" geom2="{other}" condim="3" friction="{friction} {friction} 0 0 0" '
+        f'solref="{normal} 1" solimp="{impedance[0]} {impedance[1]} 0.001 0.5 2" {rest}/>'
+    )
 
-    def pair(one: str, other: str, friction: float, sliding: float) -> str:
-        rest = f'solreffriction="{sliding} 1"' if sliding else ""
-        return (
-            f'<pair geom1="{one}" geom2="{other}" condim="3" friction="{friction} {friction} 0 0 0" '
-            f'solref="{settings.normal} 1" solimp="{low} {high} 0.001 0.5 2" {rest}/>'
-        )
 
-    feet = (pair("table", f"foot{k}", scene.friction_table, settings.sliding) for k in range(len(scene.supports)))
-    return "".join(feet) + pair("tip", "slider", scene.friction_tip, settings.tip_sliding)
+def supported(scene: Scene, settings: Settings) -> str:
+    """The contacts of table and feet."""
+    of = scene.friction_table, settings.normal, settings.sliding, settings.impedance
+    return "".join(pair("table", f"foot{k}", *of) for k in range(len(scene.supports)))
+
+
+def options(settings: Settings, timestep: float) -> str:
+    return (
+        f'<option timestep="{timestep:.12g}" integrator="{settings.integrator}" cone="{settings.cone}" '
+        f'jacobian="dense" solver="{settings.solver}" iterations="{settings.iterations}" '
+        f'tolerance="{settings.tolerance}" ls_iterations="{settings.line_search}" '
+        f'noslip_iterations="{settings.noslip}" impratio="{settings.impratio}" gravity="0 0 {-GRAVITY}"/>'
+    )
+
+
+def slider_body(scene: Scene) -> tuple[str, str]:
+    """The slider on its feet, free, and the mesh that it needs."""
+    inertia = scene.mass * np.mean(np.sum(scene.vertices**2, axis=1)) / 3
+    shape, mesh = _slider(scene)
+    body = f"""<body name="slider"><freejoint/>
+          <inertial mass="{scene.mass}" pos="0 0 0" diaginertia="{inertia / 2} {inertia / 2} {inertia}"/>
+          <geom name="slider" {shape}/>{feet(scene)}
+        </body>"""
+    return body, mesh

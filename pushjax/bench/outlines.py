@@ -1,0 +1,69 @@
+"""What a push costs by the outline: polygons by their vertices, smooth shapes, which have none.
+
+A disk and an ellipse have no vertices. A `Curve` has control points, and costs in proportion to these; how many
+vertices the outline had that it was fitted to (`Curve.fit`) does not matter. The tip's paths, the limit surface and the
+friction are the same for all; each outline is some 90 mm wide and is touched where it meets the negative x axis.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import pushjax as pj
+from pushjax.bench import tasks
+from pushjax.bench.cases import Work, in_tiles
+from pushjax.shapes import Shape
+
+HALF = tasks.SIDE / 2
+VERTICES = (4, 6, 16, 64)
+CONTROLS = (12, 24)
+TRACED = (64, 1024)  # vertices of the outline that a curve was fitted to
+OFFSET, TRAVEL, STEPS = 2e-3, 0.02, 8  # m: the tip stays where it touches, also on a disk
+
+
+# name, count of vertices or control points, vertices of the outline that was fitted to
+EACH = (
+    *(("polygon", n, 0) for n in VERTICES),
+    ("disk", 0, 0),
+    ("ellipse", 0, 0),
+    *(("curve", n, TRACED[0]) for n in CONTROLS),
+    ("curve", CONTROLS[-1], TRACED[1]),
+)
+
+
+def outline(name: str, count: int = 0, traced: int = 0) -> Shape:
+    """A "polygon" of `count` vertices, a "curve" of as many control points through a disk of `traced` vertices, a
+    "disk" or an "ellipse"."""
+    if name == "polygon":
+        angle = np.pi * (1 + (2 * np.arange(count) + 1) / count)
+        rim = HALF / np.cos(np.pi / count)
+        return pj.Polygon(rim * np.stack([np.cos(angle), np.sin(angle)], axis=1), convex=True)
+    if name == "curve":
+        angle = 2 * np.pi * np.arange(traced) / traced
+        return pj.Curve.fit(HALF * np.stack([np.cos(angle), np.sin(angle)], axis=1), count, convex=True)
+    return pj.Disk(HALF) if name == "disk" else pj.Ellipse(HALF, 0.8 * HALF)
+
+
+def task(dtype: str, which: tuple[str, int, int]) -> tasks.Task:
+    here = tasks.task("quartic", dtype)
+    return here._replace(slider=pj.Slider(tasks.cast(outline(*which), dtype), here.slider.surface))
+
+
+def push(dtype: str, batch: int, which: tuple[str, int, int]) -> Work:
+    """Pushes of 20 mm, each with its own path and friction; final poses. which: of `EACH`."""
+    here = task(dtype, which)
+    keys = jax.random.split(jax.random.key(0), 3)
+
+    def uniform(key, low, high):
+        return jax.random.uniform(key, (batch,), dtype, low, high)
+
+    ends = tasks.paths(uniform(keys[0], -OFFSET, OFFSET), uniform(keys[1], -tasks.STEEPEST, tasks.STEEPEST), 1)
+    start, along = ends[:, :1], (ends[:, 1:] - ends[:, :1]) * (TRAVEL / tasks.TRAVEL)
+    path = start + jnp.linspace(0, 1, STEPS + 1, dtype=dtype)[None, :, None] * along
+
+    def final(*args: Array) -> Array:
+        return in_tiles(lambda path, mu: here.push(path, mu).pose[-1], args, batch)
+
+    label = "_".join(str(part) for part in ("push", *which) if part)
+    return Work(label, dtype, batch, STEPS, final, (path, uniform(keys[2], 0.15, 0.35)))
