@@ -156,3 +156,10 @@ def test_no_more_curves_than_can_be_told_apart():
     seen = [tuple(map(str, look.values())) for _, _, look in looks(dict.fromkeys("abcdef", 0))]
     for column in zip(*seen, strict=True):
         assert len(set(column)) == 6
+
+
+def test_a_model_looks_the_same_in_every_picture():
+    one, other = looks({"quartic": 0, "ellipsoid": 0}), looks({"ellipsoid": 0, "quartic": 0})
+    assert one == other[::-1]
+    assert looks({"ellipsoid": 0})[0][2] == one[1][2]
+    assert looks({"a": 0})[0][2] == looks({"ellipsoid": 0, "a": 0})[0][2] == one[0][2]  # others: in order

@@ -96,42 +96,26 @@ def converged(pushes: pj.MonteCarlo) -> np.ndarray:
 
 
 def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: dict[float, tuple]) -> list[str]:
-    import matplotlib.pyplot as plt
-
     from pushjax import plot
 
-    with plt.rc_context(plot.STYLE):
-        ratios = [*[1.0] * len(shown), 1.45]
-        figure, panels = plt.subplots(
-            1, len(shown) + 1, figsize=(12.5, 5.6), layout="constrained", gridspec_kw={"width_ratios": ratios}
-        )
-        for axes, (degrees, (pushes, settled)) in zip(panels, shown.items(), strict=False):
-            few = slice(0, DRAWN)
-            for which, color in ((settled[few], plot.END), (~settled[few], plot.START)):
-                plot.traces(axes, pushes.trajectory[few][which], color, alpha=0.5)
-                axes.plot(*(plot.MM * pushes.start[few][which, :2].T), ".", color=color, ms=3)
-            for at, color in ((path[0], plot.BETWEEN), (path[-1], plot.BLUE)):
-                plot.hand_at(axes, hand, np.asarray(hand.poses(at)), color, 2.0)
-            ends = pushes.pose[settled]
-            if len(ends):
-                plot.outline(axes, slider.shape, ends[0], plot.BLUE, 1.0)
-            axes.set(title=f"dof {degrees:g}: {settled.mean():.1%} of {len(settled)} converge", aspect="equal")
-            axes.set(xlabel="x / mm")
-        panels[0].set_ylabel("y / mm")
-        _, (pushes, settled) = list(shown.items())[-1]
-        axes, inside, outside = panels[-1], pushes.start[settled, :2], pushes.start[~settled, :2]
-        if len(inside) > 2:
-            x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
-            at = np.stack(np.meshgrid(x, y))
-            kernel = scipy.stats.gaussian_kde(inside.T)
-            plot.density_panel(
-                axes, (at[0], at[1]), kernel(at.reshape(2, -1)).reshape(GRID, GRID) / 1e6, inside, outside
-            )
-        axes.set(title=f"start centres, dof {list(shown)[-1]:g}")
-        for color, label in ((plot.END, "converge"), (plot.START, "do not")):
-            panels[0].plot([], [], color=color, label=label)
-        plot.legend_below(figure, panels[0], columns=2)
-        return [str(plot.save(figure, out / "capture.png"))]
+    runs = {
+        f"dof {degrees:g}: {settled.mean():.1%} of {len(settled)} converge": (pushes.trajectory, settled)
+        for degrees, (pushes, settled) in shown.items()
+    }
+    pushes, settled = list(shown.values())[-1]
+    figure = plot.capture_figure(
+        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[settled, :2]), ways=DRAWN
+    )
+    return [str(plot.save(figure, out / "capture.png"))]
+
+
+def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray] | None:
+    """Of start centres (n, 2), 1/mm^2, over a grid; None of too few to tell."""
+    if len(centers) <= 2:
+        return None
+    x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
+    at = np.stack(np.meshgrid(x, y))
+    return (at[0], at[1]), scipy.stats.gaussian_kde(centers.T)(at.reshape(2, -1)).reshape(GRID, GRID) / 1e6
 
 
 def summary(record: dict[str, Any]) -> str:

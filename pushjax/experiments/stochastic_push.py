@@ -112,21 +112,9 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: 
 
     from pushjax import plot
 
+    title = f"{len(trajectory)} of {len(pushes)} pushes"
+    ways = plot.cloud_figure(slider.shape, hand, np.asarray(path), trajectory, title)
     with plt.rc_context(plot.STYLE):
-        ways, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
-        plot.traces(axes, trajectory)
-        plot.outline(axes, slider.shape, np.zeros(3), plot.START, 1.4, label="start")
-        spread = np.argsort(pushes.pose[:, 2])
-        ends = [spread[round(q * (len(spread) - 1))] for q in (0.025, 0.5, 0.975)]
-        for k, style in zip(ends, (":", "-", ":"), strict=True):
-            label = "median end" if style == "-" else "end, 2.5 and 97.5 % of θ"
-            plot.outline(axes, slider.shape, pushes.pose[k], plot.END, 1.2, linestyle=style, label=label)
-        for at, color in ((path[0], plot.START), (path[-1], plot.END)):
-            plot.hand_at(axes, hand, np.asarray(at)[None], color, 1.0)
-        axes.plot([], [], color=plot.BLUE, lw=0.8, label="ways of the centre")
-        axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=f"{len(trajectory)} of {len(pushes)} pushes")
-        handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-        axes.legend(handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
         counts, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
         for k, (axes, name) in enumerate(zip(panels, COORDINATES, strict=True)):
             scale, label = LABELS[name]

@@ -23,6 +23,7 @@ SERIES = (
     ("#56B4E9", (0, (5, 1, 1, 1, 1, 1)), "v"),
     ("black", (0, (1, 3)), "x"),
 )
+MODELS = {"quartic": 0, "ellipsoid": 1}  # in every picture the same
 LOOK = ("color", "linestyle", "marker")
 HATCH = "////"  # of the second of two kinds of bars
 
@@ -57,8 +58,9 @@ def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
     """
     if len(curves) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
-    rows = zip(curves.items(), SERIES, strict=False)
-    return [(name, curve, dict(zip(LOOK, look, strict=True))) for (name, curve), look in rows]
+    order = [MODELS[name] for name in curves] if MODELS.keys() >= curves.keys() else range(len(curves))
+    rows = zip(curves.items(), order, strict=True)
+    return [(name, curve, dict(zip(LOOK, SERIES[k], strict=True))) for (name, curve), k in rows]
 
 
 def bars(color: str, hatched: bool = False) -> dict[str, Any]:
