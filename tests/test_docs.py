@@ -31,8 +31,6 @@ VALUE = re.compile(r"#\s*=\s*([-+\d.e, ]+?)\s*$")
 NUMBER = re.compile(r"^[-+]?\d+(?:\.(\d+))?$")
 # Words that stand for something else in a command, as in `pushjax reproduce NAME`.
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…|\||\.\.\.")
-# In README.md: pushes that the reader has recorded.
-RECORDED = "pj.Pushes(starts, paths, ends)"
 PAPER = {"Equations": [f"({k})" for k in range(1, 21)], "Figures": "12345678", "Tables": ["I", "II"]}
 
 
@@ -293,7 +291,7 @@ def run_page(path: Path) -> None:
     names: dict[str, Any] = {}
     text = path.read_text()
     for found in BLOCK.finditer(text):
-        if found[1] or RECORDED in found[2]:
+        if found[1]:
             ast.parse(found[2])
             continue
         before = text[: found.start(2)].count("\n")
