@@ -116,17 +116,16 @@ def pairs(dtype: str, batch: int) -> tuple:
 
 def monte_carlo(dtype: str, batch: int) -> Work:
     """Pushes under random friction from end to end: a key in, numpy and the summary out."""
-    steps = 8  # 0.1 mm, see `push`
+    steps = 8  # 0.1 mm, see `push`; the tip touches in all of them
     here = tasks.task("quartic", dtype)
     path = tasks.paths(jnp.array([0.01], dtype), jnp.array([0.2], dtype), steps)[0]
     model = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype)
 
-    def pushed(key):
-        return pj.monte_carlo(key, batch, here.slider, here.hand, path, pose=here.pose, model=model)
+    def summary(key):
+        pushes = pj.monte_carlo(key, batch, here.slider, here.hand, path, pose=here.pose, model=model)
+        return pushes.summary()
 
-    contact = 1 - float(np.mean(pushed(jax.random.key(0)).steps_in_mode[..., pj.ContactMode.SEPARATED])) / steps
-    key = jax.random.key(1)
-    return Work("monte_carlo", dtype, batch, steps * contact, lambda key: pushed(key).summary(), (key,), host=True)
+    return Work("monte_carlo", dtype, batch, steps, summary, (jax.random.key(1),), host=True)
 
 
 def in_tiles(function: Callable, args: tuple, batch: int) -> Any:
