@@ -28,6 +28,7 @@ gc.set_threshold(100_000, 50, 100)
 
 # Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
 LONG = (
+    "docs",
     "grasps",
     "random_contacts",
     "contact_derivatives",

@@ -49,7 +49,7 @@ def _counts(push: pj.Trajectory) -> dict[str, int]:
 
 
 def motion_cone_setup(key: jax.Array):
-    """The paper's first figure: 100 grid points, a quartic from 200 pairs, a push to the right of the motion cone."""
+    """The paper's figure 2: 100 grid points, a quartic from 200 pairs, a push to the right of the motion cone."""
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=100)
     surface = pj.fit_limit_surface(*support.wrench_twist_pairs(key, 200), degree=4)

@@ -1,6 +1,6 @@
 """A parallel jaw closes on a rectangle: four start poses, four outcomes.
 
-The paper's second figure: a jaw with 27 x 10 mm pads closing along y on a 50 x 35 mm rectangle. Depending on where the
+The paper's first figure: a jaw with 27 x 10 mm pads closing along y on a 50 x 35 mm rectangle. Depending on where the
 rectangle lies it ends grasped off centre, jammed, grasped off centre the other way, or slipped out.
 
 Both a jam and a grasp end the motion. Called grasped here is what ends flat between the pads, each touching along an
