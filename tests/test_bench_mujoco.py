@@ -104,7 +104,7 @@ def test_smaller_steps_converge_and_cost_more():
 
 
 def test_grasps_turn_the_square_as_far_as_it_must():
-    """At the end both fingers touch, and the angle is geometry; what they sink in is multiplied by eleven."""
+    """At the end both fingers touch, and the angle is geometry; what they sink in counts 2.6 times."""
     scene, poses = Scene(FOUR, friction_tip=grasps.FRICTION), grasps.fan()[[0, 10, 17, 26]]
     fine, coarse = (grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), h, poses).pose for h in (FINE, 0.01))
     assert np.abs(np.abs(fine[:, 2]) - grasps.TURNED).max() * tasks.LENGTH < 3e-4
