@@ -136,6 +136,9 @@ def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 do
     """A straight path of `steps` equal steps between two configurations (dof,), both included.
 
     Raises ValueError for fewer than one step, or configurations that differ in shape or are not finite.
+
+    >>> line((0.0, 0.0), (0.5, 0.0), steps=2).tolist()
+    [[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]]
     """
     _check_steps(steps)
     dtype = common_dtype(start, end)

@@ -244,6 +244,13 @@ def rollout(
     straight in each step, and two that hold something between them close on it by the arc's sagitta.
 
     Source: Zhou et al. 2017, section IV.A, and open problem 2 of section VII; the header of `advance` has the scheme.
+
+    >>> import numpy as np, pushjax as pj
+    >>> slider = Slider(pj.Polygon.rectangle(0.09, 0.06), pj.Ellipsoid(np.eye(3), length=0.03))
+    >>> path = pj.line((-0.05, 0.01), (0.0, 0.01), steps=20)
+    >>> push = rollout(slider, pj.Hand.finger(0.005), path, pose=(0.0, 0.0, 0.0), friction=0.3)
+    >>> print(pj.Status(int(push.status[-1])).name, np.asarray(push.pose[-1]).round(3))
+    MOVING [ 0.047 -0.01  -0.234]
     """
     slider, hand, p, start, mu = prepared(slider, hand, path, pose, friction)
     if table is not None:

@@ -1,7 +1,7 @@
 """Docstrings as the reference shows them; the sources stay as they are.
 
 Classes whose arguments are their fields (equinox modules, named tuples, dataclasses) get a signature. Names in
-backticks become links. Columns set out by spaces stay columns.
+backticks become links. Columns set out by spaces stay columns, examples become code.
 """
 
 import re
@@ -64,11 +64,13 @@ def _named(text: str, arguments: set[str]) -> str:
 
 
 def _columns_kept(text: str) -> str:
-    """Paragraphs that are set out in columns, as blocks of code."""
+    """Paragraphs that are set out in columns, and examples, as blocks of code."""
     paragraphs = re.split(r"\n\s*\n", text)
     for k, paragraph in enumerate(paragraphs):
         lines = paragraph.split("\n")
-        if sum(bool(COLUMNS.match(line)) for line in lines) >= 2:
+        if lines[0].startswith(">>>"):
+            paragraphs[k] = "\n".join(["```pycon", *lines, "```"])
+        elif sum(bool(COLUMNS.match(line)) for line in lines) >= 2:
             paragraphs[k] = "\n".join("    " + line.replace("[`", "`").split("`][")[0] for line in lines)
     return "\n\n".join(paragraphs)
 
@@ -83,7 +85,7 @@ def _signed(found: griffe.Class) -> None:
     parameters = [griffe.Parameter("self", kind=griffe.ParameterKind.positional_or_keyword)]
     for name, member in found.members.items():
         annotation = str(getattr(member, "annotation", None) or "")
-        if not member.is_attribute or not annotation or re.search("Abstract|ClassVar", annotation):
+        if not isinstance(member, griffe.Attribute) or not annotation or re.search("Abstract|ClassVar", annotation):
             continue
         if "property" in member.labels:
             continue

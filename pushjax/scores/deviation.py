@@ -15,6 +15,9 @@ def deviation(pose_a: Numeric, pose_b: Numeric, length: Numeric) -> Float[Array,
     Raises ValueError for poses of other shapes, or a length that is not positive and finite.
 
     Source: Zhou et al. 2017, section VI.A.
+
+    >>> print(f"{1e3 * deviation((0.003, 0.004, 0.0), (0.0, 0.0, 0.1), length=0.05):.1f} mm")
+    10.0 mm
     """
     finite("length", length)
     positive("length", length)

@@ -129,6 +129,13 @@ def solve_contacts(
     finite, or a negative friction, give `Status.INVALID` and no motion.
 
     Source: Zhou et al. 2017, sections IV.A and IV.B; the gap is that of Stewart & Trinkle 1996.
+
+    >>> import numpy as np, pushjax as pj
+    >>> surface = pj.Ellipsoid(np.eye(3), length=0.03)
+    >>> contacts = pj.Contacts([(0.02, -0.04)], [(0.0, 1.0)], displacement=[(0.0, 0.001)], friction=0.25)
+    >>> motion = solve_contacts(surface, contacts)
+    >>> print(pj.ContactMode(int(motion.mode[0])).name, (1e3 * np.asarray(motion.twist)).round(1))
+    SLIDING_LEFT [-0.2  0.8  9.1]
     """
     _countable(contacts.point.shape[0])
     return _solved(surface, contacts, solver)
@@ -215,6 +222,12 @@ def motion_cone(surface: LimitSurface, point: Numeric, normal: Numeric, friction
     A pusher at body point `point` (2,) m, with inward unit normal `normal` (2,), that moves between them sticks. The
     cone may open beyond 90 degrees from the normal. Raises ValueError as `Contacts` does. Source: Mason 1986; Zhou et
     al. 2017, section IV.A.
+
+    >>> import numpy as np, pushjax as pj
+    >>> surface = pj.Ellipsoid(np.eye(3), length=0.03)
+    >>> print(np.asarray(motion_cone(surface, (0.02, -0.04), (0.0, 1.0), friction=0.25)).round(3))
+    [[0.157 0.988]
+     [0.689 0.725]]
     """
     contact = _at_rest(point, normal, friction, common_dtype(surface, point, normal))
     curve = LimitCurve.of(surface.form(), contact)
