@@ -91,7 +91,7 @@ def weights_of(weights: Any, count: int, dtype: Any) -> jax.Array:
 
 
 def _brief(value: np.ndarray) -> str:
-    return str(value.item()) if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
+    return f"{value.item():.6g}" if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
 
 
 def traced(tree: Any) -> bool:

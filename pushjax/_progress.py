@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TimeRemainingColumn
 from rich.text import Text
 
@@ -15,10 +16,11 @@ class _Rate(ProgressColumn):
 
 
 @contextmanager
-def progress_bar(*, visible: bool = True) -> Iterator[Report]:
-    """A bar on the terminal, gone when done; yields what to tell it."""
+def progress_bar() -> Iterator[Report]:
+    """A bar on the terminal, gone when done, and nothing where there is none; yields what to tell it."""
     columns = (BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not visible) as bar:
+    console = Console()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=None)
 
         def report(done: int, total: int) -> None:

@@ -129,7 +129,7 @@ class Bench(Common):
     devices: Annotated[int | None, option("N")] = None
     """push, ellipsoid: also with the batch over so many devices (of a CPU, host devices), against one."""
     peers: bool = False
-    """push, grasp, fit, solve: the same by MuJoCo and MJX, cvxpy, scipy: pip install 'pushjax[bench]'."""
+    """push, grasp, fit, solve: the same by MuJoCo and MJX, cvxpy, scipy: pip install '.[bench]'."""
     baseline: Annotated[Path | None, option("FILE")] = None
     """A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did there."""
     scale: Annotated[float | None, option("SHARE")] = None
@@ -301,7 +301,7 @@ def main(arguments: list[str] | None = None) -> None:
     from pushjax._progress import progress_bar
 
     try:
-        with progress_bar(visible=not isinstance(command, Demo)) as progress:
+        with progress_bar() as progress:
             if isinstance(command, Reproduce):
                 record, text = _reproduce(command, progress)
             elif isinstance(command, Identify):

@@ -36,6 +36,10 @@ class Slider(eqx.Module):
     shape: Shape
     surface: LimitSurface
 
+    def __check_init__(self):
+        instance("shape", self.shape, Shape)
+        instance("surface", self.surface, LimitSurface)
+
 
 class Step(eqx.Module):
     """One step of a push.
@@ -237,8 +241,8 @@ def rollout(
     Differentiable, forward and reverse, in slider, hand, path, pose, friction and table. Batches come from `vmap`.
 
     Raises ValueError as `step` does, and for a finger that starts inside the slider by more than a fifth of the
-    surface's length (less is pushed out in the first step), where it is not traced. Traced values, `status` at every
-    step tells of as there, and `first_failure` where.
+    surface's length (less is pushed out in the first step), where it is not traced. For traced values the `status` of
+    each step says so instead, and `first_failure` which step.
 
     A hand whose kinematics give angles may turn with what it holds; of one that gives only centres, every finger goes
     straight in each step, and two that hold something between them close on it by the arc's sagitta.

@@ -169,7 +169,9 @@ def test_table2_wants_data(tmp_path, monkeypatch, capsys):
     assert error.count("\n") == 1
     with pytest.raises(SystemExit):
         cli.main(["reproduce", "table2", "--data", str(tmp_path)])
-    assert "hardboard_3pts1.npz" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "hardboard_3pts1.npz, or published logs named hardboard_3pts1….txt" in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("arguments", [["demmo"], ["reproduce", "table3"], ["demo", "--sed", "1"], []])

@@ -332,7 +332,7 @@ def test_picture_of_the_architecture_is_that_of_the_imports(monkeypatch):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     for module in ("mkdocs", "material", "mkdocstrings_handlers.python", "mkdocs_jupyter", "latex2mathml"):
-        pytest.importorskip(module, reason="pip install 'pushjax[docs]'")
+        pytest.importorskip(module, reason="pip install '.[docs]'")
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(out)]
     done = subprocess.run(

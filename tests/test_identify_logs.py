@@ -197,6 +197,18 @@ def test_calibration_that_is_asked_for_is_looked_for(log, tmp_path, monkeypatch)
     assert (float(unknowns.marker), float(unknowns.offset)) == pytest.approx((0.003, 0.004), rel=1e-6)
 
 
+def test_what_is_no_pushes_is_named(log, block, surface):
+    slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
+    with pytest.raises(TypeError, match="pushes: expected a Pushes; got a Recordings"):
+        pj.identify(load_recordings(log), slider, hand)
+    with pytest.raises(TypeError, match="log: expected a PushLog or Recordings; got a str"):
+        pj.Pushes.of("pushes.csv")
+    with pytest.raises(TypeError, match="shape: expected a Shape; got a"):
+        pj.Slider(surface, block)
+    with pytest.raises(TypeError, match="surface: expected a LimitSurface; got a NoneType"):
+        pj.Slider(block, None)
+
+
 def test_units_of_what_is_found():
     assert findings.unit("marker.1") == findings.unit("offset.0") == ("mm", 1e3)
     assert findings.unit("marker.2") == ("°", 180 / np.pi)
@@ -220,6 +232,12 @@ def test_a_file_in_degrees(rollouts, tmp_path):
     rows = [(str(k), path[k][ends], seen[k], np.zeros((2, 2))) for k in range(16)]
     with pytest.raises(LogError, match=r"object_theta is up to .* rad; .*is it in degrees\? \(and 15 more"):
         load_recordings(write(tmp_path / "degrees.csv", rows))
+    # a third of them could be nothing else: the others, which could, are no better
+    seen[5:, :, 2] /= 57.3
+    seen[:5, :, 2] = np.linspace(0, 60, 5)[:, None] + [0.0, 30.0]
+    rows = [(str(k), path[k][ends], seen[k], np.zeros((2, 2))) for k in range(16)]
+    with pytest.raises(LogError, match="15 more"):
+        load_recordings(write(tmp_path / "some.csv", rows))
 
 
 def test_what_explains_nothing_is_called_so():

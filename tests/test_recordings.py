@@ -556,7 +556,7 @@ def test_archives_of_streams_that_are_none(tmp_path):
 def test_hdf5_without_its_reader(tmp_path, monkeypatch):
     path = mit_log(tmp_path, tables(), ".h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    fails(path, "h5py", "pip install 'pushjax[hdf5]'")
+    fails(path, "h5py", "pip install '.[hdf5]'")
     assert "h5py" not in vars(sys.modules["pushjax.datasets.mit"])
 
 

@@ -23,7 +23,7 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
         `force` (n, k, 2) and `time` (n, k).
     `.npz` of the folders `three_point_push` and `mit_push_full`.
     `.txt`, `.txt.gz`: an original log of the aluminium triangle.
-    `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install 'pushjax[hdf5]'` for the latter two).
+    `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install '.[hdf5]'` for the latter two).
 
     Lengths are m, angles rad, forces N, times s; all in the world, forces on the object. How a file begins tells its
     kind before its name does. What is wrong with single pushes is in `problems`. Raises LogError if the file is none

@@ -53,7 +53,7 @@ def load_mit_hdf5(path: Path) -> Recordings:
     try:
         import h5py
     except ImportError as error:
-        message = "expected the package h5py, which reads HDF5, found none: pip install 'pushjax[hdf5]'"
+        message = "expected the package h5py, which reads HDF5, found none: pip install '.[hdf5]'"
         raise LogError(path, message) from error
     library: Any = h5py  # it has no types
     try:

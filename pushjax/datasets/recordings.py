@@ -106,9 +106,9 @@ def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
 def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
     """Recordings of what was made of each push of a file. Raises LogError where nothing is usable."""
     each = list(found)
-    if 2 * sum(isinstance(one, InDegrees) for one in each) > len(each):
+    if 4 * sum(isinstance(one, InDegrees) for one in each) > len(each):
         # the angles of the others are just small
-        message = "the angles of most other pushes of the file cannot be in rad: are all in degrees?"
+        message = "the angles of many other pushes of the file cannot be in rad: are all in degrees?"
         each = [InDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
     problems = tuple(one for one in each if isinstance(one, LogError))
     pushes = tuple(one for one in each if isinstance(one, Recording))

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, finite, instance, non_negative, positive, shaped
 from pushjax.hands import Hand, RoundFinger
 from pushjax.identify.fit import ROUNDS, Effort, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
@@ -57,6 +57,7 @@ def identify(
     Source: goes beyond Zhou et al. 2017, section VI, where the friction alone is found, on a grid; sigma is that of
     the evidence (MacKay 1992).
     """
+    instance("pushes", pushes, Pushes)
     check_kinds(slider, hand)
     unknowns = Unknowns() if unknowns is None else unknowns
     dtype = common_dtype(pushes, slider, hand)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._checks import Numeric, as_float, common_dtype, finite, non_negative, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, finite, instance, non_negative, shaped
 from pushjax.shapes import Shape
 
 STEPS = 50
@@ -130,10 +130,12 @@ class Pushes(eqx.Module):
 
         parts: of a push, after each of which the slider's pose counts, if all saw it on the way; else
         only the end's does. shape: with it, and with forces of a single finger, wrenches count too. Raises ValueError
-        for fewer than one part, or not fewer than steps.
+        for fewer than one part, or not fewer than steps, and TypeError for another kind of log.
         """
+        from pushjax.datasets import PushLog
         from pushjax.identify.recorded import Recordings, recorded
 
+        instance("log", log, PushLog, Recordings)
         recordings = log if isinstance(log, Recordings) else Recordings.of_log(log)
         return recorded(recordings, steps, parts, shape)
 

@@ -47,7 +47,7 @@ def cvxpy() -> Any:
     try:
         import cvxpy
     except ImportError as missing:
-        raise ValueError("--peers of fit needs cvxpy: pip install 'pushjax[bench]'") from missing
+        raise ValueError("--peers of fit needs cvxpy: pip install '.[bench]'") from missing
     return cvxpy
 
 

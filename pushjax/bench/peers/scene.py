@@ -106,7 +106,7 @@ def engine() -> Any:
     try:
         import mujoco
     except ImportError as missing:
-        raise ValueError("--peers needs the extra: pip install 'pushjax[bench]'") from missing
+        raise ValueError("--peers needs the extra: pip install '.[bench]'") from missing
     return mujoco
 
 

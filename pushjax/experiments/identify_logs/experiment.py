@@ -72,7 +72,7 @@ def run(
 
 def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int, int], None]) -> Findings:
     if not logs:
-        raise ValueError("LOG: expected at least one file of recorded pushes; got none")
+        raise ValueError("PATH: expected at least one file of recorded pushes; got none")
     recordings, useless = _each(logs, load_recordings)
     shape = setting.shape_of(options.shape, recordings)
     hand = setting.hand_of(options.hand, options.radius, recordings)
@@ -205,7 +205,8 @@ def summary(record: dict[str, Any]) -> str:
         name = row["label"] + (f" / {row['unit']}" if row["unit"] else "")
         lines.append(f"{name:14}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
     lines += [
-        f"limit surface: {record['surface_determined']:.1f} of its {record['surface_numbers']} numbers determined",
+        f"limit surface: {record['surface_determined']:.1f} of the {record['surface_numbers']} numbers that its prior "
+        "varies are determined",
         "",
         f"deviation of predicted final poses: {record['mean_mm']:.2f} mm in the mean, {record['worst_mm']:.2f} mm at "
         f"worst; as expected before any push, {record['expected_mm']:.2f} mm; the objects moved "

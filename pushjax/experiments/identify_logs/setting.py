@@ -33,8 +33,8 @@ class Options:
     """What is known and what is to be found, as a command line has it."""
 
     shape: Annotated[str | None, option("SHAPE")] = None
-    """The object: rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04, regular:6x0.05 (m), or a CSV file of vertices.
-    Default: what the logs tell."""
+    """The object: rectangle:0.1x0.05, disk:0.05 (radius), ellipse:0.06x0.04 (semi-axes), regular:6x0.05 (corners,
+    distance of each), all in m, or a CSV file of vertices. Default: what the logs tell."""
     hand: str = "finger"
     """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
     radius: Metres = None

@@ -2,7 +2,7 @@
 
 The displacement is told along the push and across, where it is smoothest; tip and direction in the object's frame.
 
-The regression is scikit-learn's: `pip install 'pushjax[peers]'`.
+The regression is scikit-learn's: `pip install '.[peers]'`.
 """
 
 import warnings
@@ -58,7 +58,7 @@ def learn(pushes: StraightPushes, rows: np.ndarray, length: float) -> Learned:
         from sklearn.gaussian_process import GaussianProcessRegressor
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     except ImportError as error:
-        message = "the Gaussian process needs the package scikit-learn, found none: pip install 'pushjax[peers]'"
+        message = "the Gaussian process needs the package scikit-learn, found none: pip install '.[peers]'"
         raise ValueError(message) from error
     known = features(pushes, rows, length)
     moved = _displacement(pushes.start[rows], pushes.end[rows], _heading(pushes, rows), length)

@@ -44,8 +44,13 @@ def load(folder: Path, surface: str, name: str) -> PushLog:
     """A condition's pushes: its tidy archive, or else an original log whose name begins with the condition."""
     archive = folder / f"{surface}_{name}.npz"
     originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
-    if archive.exists() or not originals:
+    if archive.exists():
         return load_push_npz(archive)
+    if not originals:
+        raise ValueError(
+            f"--data: expected {surface}_{name}.npz, or published logs named {surface}_{name}….txt, in {folder}; "
+            "found neither"
+        )
     return load_triangle_log(originals[0], surface=surface, arrangement=name)
 
 
