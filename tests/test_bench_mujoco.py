@@ -157,7 +157,7 @@ def test_robot_pushes_are_predicted_as_well_as_by_table_two(data):
 
 def test_without_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ValueError, match="pushjax\\[bench\\]"):
+    with pytest.raises(ValueError, match=r"pip install '\.\[bench\]'"):
         build(Scene(THREE), Settings(), FINE)
 
 

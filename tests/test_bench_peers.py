@@ -62,5 +62,5 @@ def test_the_root_finder_has_the_same_answers():
 
 def test_without_cvxpy(monkeypatch):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
-    with pytest.raises(ValueError, match="pip install cvxpy"):
+    with pytest.raises(ValueError, match=r"pip install '\.\[bench\]'"):
         fits.cvxpy()

@@ -324,7 +324,7 @@ def test_hdf5_without_its_reader(tmp_path, monkeypatch):
     for row in range(3):
         (tmp_path / f"{name(row)}.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(LogError, match=r"found 0; .* 3 files cannot be used: .*pip install 'pushjax\[hdf5\]'"):
+    with pytest.raises(LogError, match=r"found 0; .* 3 files cannot be used: .*pip install '\.\[hdf5\]'"):
         load_mit_folder(tmp_path, "abs", "rect1")
 
 

@@ -658,8 +658,9 @@ def test_what_is_no_slider_or_hand_is_refused():
     given: Any = {"pose": np.zeros(3), "friction": 0.2}
     for wrong, message in (
         ((block, Hand.finger(0.005)), "slider: expected a Slider; got a Polygon"),
-        ((Slider(cast(Any, surface), cast(Any, block)), Hand.finger(0.005)), r"slider\.shape: expected a Shape; got a"),
         ((slider, "finger"), "hand: expected a Hand; got a str"),
     ):
         with pytest.raises(TypeError, match=message):
             rollout(*cast(Any, wrong), path, **given)
+    with pytest.raises(TypeError, match="shape: expected a Shape; got a"):
+        Slider(cast(Any, surface), cast(Any, block))
