@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
+from pushjax._options import option
 from pushjax.datasets import find_data
 from pushjax.experiments import identify_logs
-from pushjax.experiments.identify_logs.setting import option
 
 
 @dataclass

@@ -5,6 +5,7 @@ The compiled programs are cached between runs and between pytest's workers where
 
 import gc
 import os
+import sys
 from pathlib import Path
 
 # Newer compilers make one function of a loop over small arrays: twice as fast to run, three times as long to compile.
@@ -62,6 +63,14 @@ def _programs_end_with_their_module():
     """
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def _figures_are_closed():
+    yield
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    if pyplot is not None:
+        pyplot.close("all")
 
 
 @pytest.fixture(scope="session")

@@ -21,12 +21,6 @@ from pushjax import plot
 LENGTH = 0.024
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 @pytest.fixture(scope="module")
 def block():
     return pj.Polygon.rectangle(SIDE, SIDE)

@@ -17,18 +17,12 @@ from PIL import Image
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+from drawn import MM, RADIUS, SIDE
 
 import pushjax as pj
 from pushjax import plot
 
-SIDE, RADIUS, LENGTH = 0.06, 0.005, 0.024
-MM = 1e3
-
-
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
+LENGTH = 0.024
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,6 @@ from pushjax import plot
 from pushjax.plot.style import looks
 
 
-@pytest.fixture(autouse=True)
-def _closed():
-    yield
-    plt.close("all")
-
-
 @pytest.fixture(scope="module")
 def block():
     return pj.Polygon.rectangle(SIDE, SIDE)

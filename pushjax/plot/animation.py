@@ -98,7 +98,8 @@ def animate_cloud(
             f"trajectory has shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
         )
     lines = placed(vertices(shape), poses)
-    steps, faint = _equally(poses.shape[1] - 1, frames), float(np.clip(12 / len(poses), 0.05, 0.6))
+    steps = _equally(poses.shape[1] - 1, frames).round().astype(int)
+    faint = float(np.clip(12 / len(poses), 0.05, 0.6))
     with plt.rc_context(STYLE):
         figure, (axes,) = row(1, 5.4, 5.0)
         outlines, ways = (LineCollection([], colors=BLUE, linewidths=w, alpha=faint) for w in (0.8, 0.6))
@@ -178,11 +179,10 @@ def _moments(tracks: list[Track], frames: int) -> np.ndarray:
 
 
 def _equally(end: float, frames: int) -> np.ndarray:
-    """So many numbers from 0 to `end`; whole ones, where that is a number of steps."""
+    """So many numbers from 0 to `end`."""
     if frames < 2:
         raise ValueError(f"frames must be at least 2; got {frames}")
-    spaced = np.linspace(0, end, frames)
-    return spaced.round().astype(int) if isinstance(end, int) else spaced
+    return np.linspace(0, end, frames)
 
 
 def _whole(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:

@@ -4,13 +4,13 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import numpy as np
-import tyro
 
 import pushjax as pj
+from pushjax._options import option
 from pushjax.datasets.recordings import Recordings
 
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
@@ -18,11 +18,6 @@ HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width an
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
 PAIRS = 400
 CELLS = 100  # under a slider whose pressure is known everywhere
-
-
-def option(metavar: str) -> Any:
-    """How the help shows an option whose text says what it is by default."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
 Metres = Annotated[float | None, option("M")]
