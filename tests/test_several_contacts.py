@@ -7,7 +7,8 @@ import pytest
 from contact_batches import flat_push, square
 
 import pushjax as pj
-from pushjax.solve._edge_line import roots
+from pushjax.solve._edge_line import pieces
+from pushjax.solve._edge_line import root as root_of
 
 solve = pj.solve_contacts
 
@@ -55,8 +56,11 @@ def test_roots_of_very_different_sizes_are_found(rng):
     b = np.where(single, root[0] ** 2 + root[1] ** 2, b)
     cubic = [-b * root[2], b - a * root[2], a - root[2], np.ones(n)]
     low = -rng.uniform(0, 1, n)
-    places = jax.jit(jax.vmap(lambda c, low: roots(c, low, low + 1)))(tuple(map(jnp.asarray, cubic)), jnp.asarray(low))
-    found = np.stack([np.where(is_root, place, np.inf) for place, is_root in places])
+
+    def roots(c, low):
+        return jnp.stack([jnp.where(has, root_of(c, piece), jnp.inf) for piece, has in pieces(c, low, low + 1)])
+
+    found = np.asarray(jax.jit(jax.vmap(roots, out_axes=1))(tuple(map(jnp.asarray, cubic)), jnp.asarray(low)))
     for k in range(3):
         apart = np.min([np.abs(root[k] - root[j]) for j in range(3) if j != k], axis=0)
         wanted = (root[k] > low) & (root[k] < low + 1) & ((apart > 1e-2 * np.abs(root[k])) | (single & (k == 2)))

@@ -9,6 +9,8 @@ from jaxtyping import Array, Bool
 from pushjax._vec import Scalar, Vec3, settle
 from pushjax.limit_surface import Form
 
+Cubic = tuple[Scalar, Scalar, Scalar, Scalar]  # coefficients, the constant first
+
 ROUNDS = {4: 7, 8: 8}  # of the search for a cubic's root
 
 
@@ -45,14 +47,17 @@ class Line(NamedTuple):
         return m0 + (m1 + (m2 + m3.scale(u)).scale(u)).scale(u)
 
 
-def roots(
-    c: tuple[Scalar, Scalar, Scalar, Scalar], low: Scalar, high: Scalar
-) -> tuple[tuple[Scalar, Bool[Array, ""]], ...]:
-    """Roots of c0 + c1 u + c2 u^2 + c3 u^3 in [low, high]: one from each piece between turning points, if it has one.
+class Piece(NamedTuple):
+    """A stretch of a cubic between turning points, where it is monotone. value_low, value_high: of the cubic."""
 
-    Each piece is monotone: Laguerre's method with a bracket, a fixed count of rounds. Newton's comes by thirds from
-    afar and is thrown out again where two complex roots are near.
-    """
+    low: Scalar
+    high: Scalar
+    value_low: Scalar
+    value_high: Scalar
+
+
+def pieces(c: Cubic, low: Scalar, high: Scalar) -> tuple[tuple[Piece, Bool[Array, ""]], ...]:
+    """The three pieces in [low, high] of c0 + c1 u + c2 u^2 + c3 u^3, and whether each has a root."""
     # c1 + 2 c2 u + 3 c3 u^2 = 0, written so as not to cancel
     disc = c[2] * c[2] - 3 * c[3] * c[1]
     turns = disc > 0
@@ -60,29 +65,29 @@ def roots(
     t1 = jnp.where(turns & (c[3] != 0), q / jnp.where(c[3] != 0, 3 * c[3], 1.0), low)
     t2 = jnp.where(turns & (q != 0), c[1] / jnp.where(q != 0, q, 1.0), low)
     t1, t2 = jnp.clip(jnp.minimum(t1, t2), low, high), jnp.clip(jnp.maximum(t1, t2), low, high)
-    witness = c[0] + low
-    c, marks = settle((c, (low, t1, t2, high)), witness)
-
-    def value(s):
-        return ((c[3] * s + c[2]) * s + c[1]) * s + c[0]
-
-    rounds = ROUNDS[witness.dtype.itemsize]
-    levels = settle(tuple(value(mark) for mark in marks), witness)
-
-    def body(_, pieces):
-        return tuple(piece.next(c, value) for piece in pieces)
-
-    pieces, has = [], []
+    marks = settle((low, t1, t2, high), c[0] + low)
+    values = settle(tuple(_value(c, mark) for mark in marks), c[0] + low)
+    found = []
     for k in range(3):
-        low, high, p_low, p_high = marks[k], marks[k + 1], levels[k], levels[k + 1]
-        opposite = ((p_low <= 0) & (p_high >= 0)) | ((p_low >= 0) & (p_high <= 0))
-        has.append(opposite & (high > low) & (p_low != p_high))
-        pieces.append(_Piece.of(c, low, high, p_low, p_high))
-    pieces = jax.lax.fori_loop(0, rounds, body, tuple(pieces))
-    return tuple(settle((piece.s, root), witness) for piece, root in zip(pieces, has, strict=True))
+        piece = Piece(marks[k], marks[k + 1], values[k], values[k + 1])
+        a, b = piece.value_low, piece.value_high
+        opposite = ((a <= 0) & (b >= 0)) | ((a >= 0) & (b <= 0))
+        found.append((piece, opposite & (piece.high > piece.low) & (a != b)))
+    return tuple(settle(found, c[0] + low))
 
 
-class _Piece(NamedTuple):
+def root(c: Cubic, piece: Piece) -> Scalar:
+    """Its root: Laguerre's method with a bracket, a fixed count of rounds. Newton's comes by thirds from afar and is
+    thrown out again where two complex roots are near."""
+    search = _Search.of(c, piece)
+    return jax.lax.fori_loop(0, ROUNDS[search.s.dtype.itemsize], lambda _, search: search.next(c), search).s
+
+
+def _value(c: Cubic, u: Scalar) -> Scalar:
+    return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
+
+
+class _Search(NamedTuple):
     """A root of a cubic, bracketed: s, between near and far. near: at first where the cubic is small, an end or zero.
 
     sign: of the cubic at `far`.
@@ -95,9 +100,10 @@ class _Piece(NamedTuple):
     sign: Scalar
 
     @staticmethod
-    def of(c: tuple, low: Scalar, high: Scalar, p_low: Scalar, p_high: Scalar) -> "_Piece":
+    def of(c: Cubic, piece: Piece) -> "_Search":
         """Begins as far from where the cubic is small as its derivatives there let the root be, to a factor of two:
         roots may lie a millionth of the interval from a turning point or from u = 0, where the cubic has its scale."""
+        low, high, p_low, p_high = piece
         between = (low < 0) & (high > 0)
         p_zero = jnp.where(between, c[0], jnp.inf)
         at_low = jnp.abs(p_low) < jnp.abs(p_high)
@@ -109,13 +115,13 @@ class _Piece(NamedTuple):
         first = (3 * c[3] * place + 2 * c[2]) * place + c[1]
         second = 3 * c[3] * place + c[2]
         ratios = [jnp.abs(p) / jnp.where(d != 0, jnp.abs(d), jnp.finfo(p.dtype).tiny) for d in (first, second, c[3])]
-        reach = jnp.minimum(jnp.minimum(ratios[0], jnp.sqrt(ratios[1])), jnp.cbrt(ratios[2]))
+        reach = jnp.minimum(jnp.minimum(ratios[0], jnp.sqrt(ratios[1])), _about_cbrt(ratios[2]))
         s = place + jnp.where(upward, 1.0, -1.0) * jnp.minimum(reach, jnp.abs(far - place))
-        return _Piece(*settle((s, place, far, place, jnp.where(p_far > 0, 1.0, -1.0)), c[0] + low))
+        return _Search(*settle((s, place, far, place, jnp.where(p_far > 0, 1.0, -1.0)), c[0] + low))
 
-    def next(self, c: tuple, value) -> "_Piece":
+    def next(self, c: Cubic) -> "_Search":
         s = self.s
-        p = value(s)
+        p = _value(c, s)
         slope = (3 * c[3] * s + 2 * c[2]) * s + c[1]
         bend = 6 * c[3] * s + 2 * c[2]
         beyond = (p > 0) == (self.sign > 0)  # the root lies nearer
@@ -128,4 +134,12 @@ class _Piece(NamedTuple):
         a, b = near - self.origin, far - self.origin
         a = jnp.where(jnp.abs(a) > 1e-3 * jnp.abs(b), a, 1e-3 * b)
         middle = self.origin + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(a * b)
-        return _Piece(jnp.where(inside, laguerre, middle), near, far, self.origin, self.sign)
+        return _Search(jnp.where(inside, laguerre, middle), near, far, self.origin, self.sign)
+
+
+def _about_cbrt(x: Scalar) -> Scalar:
+    """The cube root of x >= 0 to 6 %: a third of its exponent. An exact one takes as long as the rounds that follow."""
+    bits = {4: jnp.int32, 8: jnp.int64}[x.dtype.itemsize]
+    one, this = (jax.lax.bitcast_convert_type(v, bits) for v in (jnp.ones_like(x), x))
+    three = jnp.full_like(this, 3)
+    return jax.lax.bitcast_convert_type(jax.lax.div(this, three) + 2 * jax.lax.div(one, three), x.dtype)

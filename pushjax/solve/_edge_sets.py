@@ -14,7 +14,7 @@ from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.limit_surface import Form
 from pushjax.limit_surface._aligned import aligned_wrench
 from pushjax.solve._basis import Basis
-from pushjax.solve._edge_line import Line, roots
+from pushjax.solve._edge_line import Line, pieces, root
 from pushjax.solve._several import HASTY, Index, Several, clean, fastest, pick, violation
 
 NONE = -1  # in place of a generator's number
@@ -73,13 +73,19 @@ def two_edges(problem: Several, found: Found, e1: Index, e2: Index) -> Found:
     row2 = select(sticks, pick(problem.tangent, c1), pick(problem.normal, c2))
     b1, b2 = push1.x, jnp.where(sticks, push1.y, push2.x)
     across = row1.scale(b2) - row2.scale(b1)
-    cubic = tuple(across.dot(motion) for motion in line.motions)
+    constant, linear, quadratic, leading = (across.dot(motion) for motion in line.motions)
+    cubic = settle((constant, linear, quadratic, leading), unit)
     normal = row1.cross(row2)
     independent = normal.dot(normal) > jnp.finfo(unit.dtype).eps * row1.dot(row1) * row2.dot(row2)
-    places = roots(cubic, -line.nearest, 1 - line.nearest)
+    monotone, todo = zip(*pieces(cubic, -line.nearest, 1 - line.nearest), strict=True)
+    todo = settle(tuple(has & independent for has in todo), unit)
 
-    def at_root(which, found):
-        u, is_root = pick(places, which)
+    def at_root(state):
+        todo, found = state
+        first, second, third = todo
+        piece = select(first, monotone[0], select(second, monotone[1], monotone[2]))
+        todo = first & False, first & second, (first | second) & third
+        u = root(cubic, piece)
         motion = line.motion(u)
         u1, u2 = row1.dot(motion), row2.dot(motion)
         squared = u1 * u1 + u2 * u2
@@ -89,15 +95,16 @@ def two_edges(problem: Several, found: Found, e1: Index, e2: Index) -> Found:
         tolerance = violation(twist)
         right_way = ((1 - 2 * (e1 % 2)) * slip1 <= tolerance) & ((1 - 2 * (e2 % 2)) * slip2 <= tolerance)
         stuck = jnp.abs(slip1) <= tolerance
-        passes = is_root & independent & (k > 0) & touching1 & touching2 & apart & jnp.where(sticks, stuck, right_way)
+        passes = (k > 0) & touching1 & touching2 & apart & jnp.where(sticks, stuck, right_way)
         f = line.at(u)
         passes &= f.dot(f) > (faint(unit.dtype)) ** 2
         dh = motion.dot(f)
         s = line.nearest + u
         key = _key(form, k * dh, dh / form.degree)
-        return _consider(found, passes, (e1, e2, NONE), Vec3(1 - s, s, 0 * s), twist, key)
+        return todo, _consider(found, passes, (e1, e2, NONE), Vec3(1 - s, s, 0 * s), twist, key)
 
-    return jax.lax.fori_loop(0, len(places), at_root, found)
+    # in a batch few have more than one root: all take their next one together
+    return jax.lax.while_loop(lambda state: state[0][0] | state[0][1] | state[0][2], at_root, (todo, found))[1]
 
 
 def three_edges(problem: Several, found: Found, contacts: tuple, sides: Index) -> Found:
@@ -122,7 +129,8 @@ def three_edges(problem: Several, found: Found, contacts: tuple, sides: Index) -
     for touching, slip in seen:
         feasible &= touching
         allowed.append((slip <= tolerance, slip >= -tolerance))  # left edge, right edge; both where it sticks
-    f, aligned = aligned_wrench(problem.form, twist, clean(problem.speed.dtype))
+    feasible = settle(feasible, problem.speed)
+    f, aligned = aligned_wrench(problem.form, twist, feasible, clean(problem.speed.dtype))
     h = problem.form.value(f)
     feasible, allowed = settle((feasible & aligned & (h > 0), tuple(allowed)), problem.speed)
     steep = tuple(problem.beyond(c) for c in contacts)

@@ -186,7 +186,7 @@ def _to_scale(system: _System, beta: Vec3) -> Vec3:
     u = Vec3(*(row.dot(motion) for row in system.rows))
     squared = u.dot(u)
     k = jnp.maximum(u.dot(system.b) / jnp.where(squared > 0, squared, 1.0), 0)
-    return beta.scale(k if system.form.degree == 2 else jnp.cbrt(k))
+    return beta.scale(k if system.form.degree == 2 else jnp.exp(jnp.log(k) / 3))  # faster than cbrt
 
 
 def _least(system: _System, missing: Vec3) -> Vec3:

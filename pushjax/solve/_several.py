@@ -100,11 +100,13 @@ def assemble(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array
     relative = _largest([push.scale(1 / component).dot(push.scale(1 / component)) for push in pushers])
     speed = jnp.maximum(component * jnp.sqrt(relative), _largest(deepest))
     speed = jax.lax.stop_gradient(jnp.where(speed > 0, speed, 1.0))
-    axes = (Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one))
-    size = jax.lax.stop_gradient(sum((form.value(axis) for axis in axes), zero))
-    size = jnp.where(size > 0, size, one)
+    nothing, unit = jnp.zeros_like(form.length), jnp.ones_like(form.length)
+    axes = (Vec3(unit, nothing, nothing), Vec3(nothing, unit, nothing), Vec3(nothing, nothing, unit))
+    size = jax.lax.stop_gradient(sum((form.value(axis) for axis in axes), nothing))
+    # the surface's alone: where a batch shares one, the scaled one stays one too, and is not read for each of it
+    size = settle(jnp.where(size > 0, size, 1.0), form.length)
     witness = jnp.where(known, witness, 1.0)
-    speed, size = settle((speed, size), witness)
+    speed = settle(speed, witness)
 
     normals, tangents, approaches = [], [], []
     for contact in contacts:

@@ -21,7 +21,7 @@ from pushjax.limit_surface import Symmetric3
 from pushjax.solve._basis import completed
 from pushjax.solve._several import pick
 
-ROUNDS = 7
+ROUNDS = 7  # at most
 SEARCHES = 5  # rounds of the line search, in each
 SOFTNESS = 256  # roundings of its trace, by which the curvature is stiffened
 
@@ -48,7 +48,9 @@ def share_force(
     unit = jnp.sqrt(jnp.where(size > 0, size, 1.0))
     target = f.scale(1 / unit)
     kept = tuple(select(s, g, Vec3(zero, zero, zero)) for g, s in zip(generators, suitable, strict=True))
-    y, curvature = undifferentiated(_minimised, kept, chosen, alpha.scale(1 / unit), target)
+    # three edges in one plane are all there are, and yet one too many: with independent ones both ways agree
+    several = settle((count > used) | (count > 2), size)
+    y, curvature = undifferentiated(_minimised, kept, chosen, alpha.scale(1 / unit), target, several)
     # Differentiated rounds: each makes one order of derivative exact, with the curvature held fixed
     y = settle(y + _solve(curvature, target - weighted(kept, _pulls(kept, y))), size)
     weights = settle(_pulls(kept, y), size)
@@ -61,19 +63,33 @@ def share_force(
         # only those that pull: the others would be given what the step rounds to
         shared.append(jnp.where(a > 0, jnp.maximum(a + more, 0), 0.0))
 
-    rest = target - weighted(kept, shared)
-    eps = jnp.finfo(size.dtype).eps
-    fits = rest.dot(rest) <= (64 * eps * (1 + sum(shared, zero))) ** 2
-    # three edges in one plane are all there are, and yet one too many: with independent ones both ways agree
-    indeterminate = settle(((count > used) | (count > 2)) & fits, size)
+    indeterminate = settle(several & _fits(kept, shared, target, 64), size)
     return tuple(jnp.where(indeterminate, s * unit, o) for s, o in zip(shared, own, strict=True))
 
 
-def _minimised(kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3) -> tuple[Vec3, Symmetric3]:
-    """y, and the Hessian of phi there."""
+def _minimised(
+    kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3, several: Bool[Array, ""]
+) -> tuple[Vec3, Symmetric3]:
+    """y, and the Hessian of phi there; where not `several`, of y as it begins."""
+
+    def goes_on(y: Vec3) -> Bool[Array, ""]:
+        return several & ~_fits(kept, _pulls(kept, y), target, 8)  # the gradient of phi is what is missing
+
+    def round_(state):
+        count, y, _ = state
+        y = settle(y + _searched(kept, target, y), target.x)
+        return count + 1, y, (count + 1 < ROUNDS) & goes_on(y)
+
     begin = _begin(kept, chosen, alpha, target)
-    y = jax.lax.fori_loop(0, ROUNDS, lambda _, y: settle(y + _searched(kept, target, y), target.x), begin)
+    _, y, _ = jax.lax.while_loop(lambda state: state[2], round_, (jnp.zeros((), jnp.int32), begin, goes_on(begin)))
     return y, _curvature(kept, y)
+
+
+def _fits(kept: tuple[Vec3, ...], weights: list[Scalar], target: Vec3, roundings: int) -> Bool[Array, ""]:
+    """Whether the weights make up the target."""
+    rest = target - weighted(kept, weights)
+    allowed = roundings * jnp.finfo(target.x.dtype).eps * (1 + sum(weights, 0 * target.x))
+    return rest.dot(rest) <= allowed**2
 
 
 def _begin(kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3) -> Vec3:
