@@ -148,7 +148,7 @@ def advance(
                 # the gap is that at the beginning, for both stages: what the rule leaves then does not add up
                 gap = before.distance
                 motion = grip.motion(there, touch.point, at.center, rest, first)
-                contact = Contact(touch.point, touch.normal, motion, grip.friction, gap)
+                contact = settle(Contact(touch.point, touch.normal, motion, grip.friction, gap), pose.x)
                 near |= gap <= reach
                 each.append(contact)
                 fresh.append(before)
