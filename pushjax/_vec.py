@@ -6,12 +6,12 @@ ten times faster on a CPU. So everything below the public edge is written with `
 where a user sees them (`of`, `array`).
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Scalar = Float[Array, ""]
 
@@ -148,6 +148,16 @@ def settle(values, witness: Scalar):
         return value.astype(one.dtype) / one > 0.5
 
     return jax.tree.map(settled, values)
+
+
+def wherever(condition: Bool[Array, ""], update: Callable, state):
+    """`update(state)` where the condition holds, else `state`. Under `vmap` it takes no time if it holds for none of
+    the batch; of `cond`, both branches would run. Not for reverse mode."""
+
+    def once(left):
+        return left[0] & False, update(left[1])
+
+    return jax.lax.while_loop(lambda left: left[0], once, (condition, state))[1]
 
 
 def select(condition, yes, no):

@@ -153,7 +153,7 @@ def advance(
                 each.append(contact)
                 fresh.append(before)
             holds &= near
-        motion = motion_under(form, tuple(each), on, solver)
+        motion = motion_under(form, tuple(each), on, solver, margin=False)
         # A failed prediction must show, whatever the correction made of it
         status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
         where = _center(tuple(each), motion.force)

@@ -35,11 +35,11 @@ def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
 
 
 def openings(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1"]:
-    """From where each touches to the end, in steps by which the square turns about evenly: it swings by the square root
-    of what is left."""
-    first, last = jnp.sqrt(touching(pose) - FLAT), jnp.sqrt(jnp.asarray(LEFT, pose.dtype))
+    """From where each touches to the end, in steps that each leave the same share of what was left: the square swings
+    by the root of it, the faster the straighter it is."""
+    first = touching(pose) - FLAT
     share = jnp.linspace(0, 1, steps + 1, dtype=pose.dtype)
-    return FLAT + (first[:, None] + share[None] * (last - first)[:, None]) ** 2
+    return FLAT + first[:, None] * (LEFT / first[:, None]) ** share[None]
 
 
 def paths(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1 4"]:
@@ -70,19 +70,19 @@ def final_poses(steps: int, dtype: str) -> np.ndarray:
 @jax.jit
 def _final(here: tasks.Task, poses: Float[Array, "n 3"], steps: Array) -> Array:
     """Step by step, so that one program does any number of steps."""
-    ends = jnp.sqrt(openings(poses, 1) - FLAT)
+    left = openings(poses, 1) - FLAT
 
-    def one(pose: Array, ends: Array) -> Array:
+    def one(pose: Array, left: Array) -> Array:
         def at(k):
-            opening = FLAT + (ends[0] + (k / steps).astype(ends.dtype) * (ends[1] - ends[0])) ** 2
-            return jnp.zeros(4, ends.dtype).at[3].set(opening)
+            opening = FLAT + left[0] * (left[1] / left[0]) ** (k / steps).astype(left.dtype)
+            return jnp.zeros(4, left.dtype).at[3].set(opening)
 
         def step(k, pose):
             return pj.step(here.slider, here.hand, at(k), at(k + 1), pose=pose, friction=FRICTION).pose
 
         return jax.lax.fori_loop(0, steps, step, pose)
 
-    return jax.vmap(one)(poses, ends)
+    return jax.vmap(one)(poses, left)
 
 
 @cache

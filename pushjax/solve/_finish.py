@@ -114,7 +114,8 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     passes = _passes(problem, chosen, slips, tolerance, alpha, motion, twist)
     solved = settle(solved & passes, problem.speed)
 
-    power, presses = squeeze(problem)
+    unsolved = problem.pushes & ~chosen.found & ~chosen.hasty
+    power, presses = squeeze(problem, True if problem.margin else settle(unsolved, problem.speed))
     # what the search found and the last look refused, or it could not write down, proves nothing
     stuck = jnp.where(proves_jams & presses & ~chosen.found & ~chosen.hasty, Status.JAMMED, Status.NOT_CONVERGED)
     status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, stuck), Status.FREE)

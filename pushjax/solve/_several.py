@@ -43,7 +43,7 @@ class Several(NamedTuple):
     normal, tangent: the rows. generators: wrenches of the cones' edges, with unit normal force. approach: what (n,
     t) the contact point must do to stay with its pusher, the gap taken off. speed: the unit of displacement, m.
     size: what H was divided by. pushes: whether any contact would be violated if the slider stayed. valid: whether
-    every number was usable; if not, nothing pushes.
+    every number was usable; if not, nothing pushes. margin: whether that is asked for, also where there is a motion.
     """
 
     form: Form
@@ -57,6 +57,7 @@ class Several(NamedTuple):
     size: Scalar
     pushes: Bool[Array, ""]
     valid: Bool[Array, ""]
+    margin: bool
 
     @property
     def count(self) -> int:
@@ -80,7 +81,9 @@ class ContactSolver(eqx.Module):
         """The motion; its derivatives are those of the solution."""
 
 
-def assemble(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array, ""], ...]) -> Several:
+def assemble(
+    form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array, ""], ...], *, margin: bool
+) -> Several:
     """The problem of several contacts; where not all of its numbers are usable, one in which nothing pushes."""
     known = jnp.isfinite(sum(jnp.where(a, sum(jax.tree.leaves(c)), 0.0) for c, a in zip(contacts, active, strict=True)))
     for contact, counts in zip(contacts, active, strict=True):
@@ -125,7 +128,8 @@ def assemble(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array
         generators += [n + t.scale(mu), n - t.scale(mu)]
     generators, pushes = settle((tuple(generators), pushes), witness)
     scaled = form.scaled(1 / size)
-    return Several(scaled, normals, tangents, generators, approaches, friction, counts, speed, size, pushes, known)
+    each = (normals, tangents, generators, approaches, friction, counts)
+    return Several(scaled, *each, speed, size, pushes, known, margin)
 
 
 def _largest(values: list[Scalar]) -> Scalar:

@@ -150,7 +150,7 @@ def _countable(contacts: int) -> None:
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     form, friction = ground(surface, contacts.friction)
     each = _in_scalars(contacts, friction)
-    result = motion_under(form, each, entries(contacts.active), solver)
+    result = motion_under(form, each, entries(contacts.active), solver, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
         twist=result.twist.array(),
@@ -168,18 +168,21 @@ def motion_under(
     contacts: tuple[Contact, ...],
     active: tuple[Bool[Array, ""], ...],
     solver: ContactSolver | StickingSolver | None,
+    *,
+    margin: bool,
 ) -> SeveralMotion:
-    """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`)."""
+    """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`). margin: whether it is
+    asked for; else it is infinite wherever there is a motion, and takes no time."""
     _countable(len(contacts))  # a hand's too
     if solver is None:
         solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
     if not isinstance(solver, StickingSolver):
-        return solver.solve(assemble(form, contacts, active))
+        return solver.solve(assemble(form, contacts, active, margin=margin))
     if len(contacts) != 1:
         raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {len(contacts)}")
     one = solve_single(form, contacts[0], solver)
-    margin = jnp.full_like(one.twist.x, jnp.inf)
-    return SeveralMotion(one.twist, one.wrench, (one.force,), (one.mode,), one.status, margin, one.unique)
+    far = jnp.full_like(one.twist.x, jnp.inf)
+    return SeveralMotion(one.twist, one.wrench, (one.force,), (one.mode,), one.status, far, one.unique)
 
 
 def ground(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:

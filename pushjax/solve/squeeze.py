@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._autodiff import undifferentiated
-from pushjax._vec import Scalar, Vec3, select, settle
+from pushjax._vec import Scalar, Vec3, select, settle, wherever
 from pushjax.solve._several import Index, Several, pick
 
 # What may be left over of two or three edges that balance, of their sum: rounding of what a user computes them from.
@@ -102,14 +102,15 @@ def _where(condition: Flag, yes, no):
     return select(condition, yes, no)
 
 
-def squeeze(problem: Several) -> Squeeze:
-    """The squeeze power."""
+def squeeze(problem: Several, wanted: Flag) -> Squeeze:
+    """The squeeze power; where it is not wanted, as if there were no internal equilibrium. Not wanted by any of a batch
+    it takes no time."""
     m = problem.count
     lowest = jnp.full_like(problem.speed, -jnp.inf)
     if m < 2:
         return Squeeze(lowest, jnp.zeros((), bool))
     edges = _edges(problem)
-    power, presses, *best = undifferentiated(_best, edges, problem.speed)
+    power, presses, *best = undifferentiated(_wanted_best, edges, wanted, problem.speed)
     # Only the best is differentiated. That it exists is not decided again: another rounding could deny it.
     first, second, third, fourth = best
     kind = _Kind(first // 2 == second // 2, third // 2 == fourth // 2, fourth == edges.across, third == edges.moment)
@@ -164,10 +165,15 @@ def _sets(edges: int) -> list[tuple[list[tuple[int, ...]], Callable[..., _Kind]]
     ]
 
 
-def _best(edges: _Edges, witness: Scalar) -> tuple:
+def _wanted_best(edges: _Edges, wanted: Flag, witness: Scalar) -> tuple:
     """The largest power, whether any is positive for certain, and the four edges of the largest."""
     lowest = jnp.full_like(witness, -jnp.inf)
-    best = (lowest, jnp.zeros(lowest.shape, bool), *(jnp.zeros(lowest.shape, jnp.int32),) * 4)
+    none = (lowest, jnp.zeros(lowest.shape, bool), *(jnp.zeros(lowest.shape, jnp.int32),) * 4)
+    search = functools.partial(_best, edges, witness)
+    return wherever(jnp.asarray(wanted), search, none)
+
+
+def _best(edges: _Edges, witness: Scalar, best: tuple) -> tuple:
     for fours, kind in _sets(edges.moment):
 
         def body(best, four, kind=kind):
