@@ -269,6 +269,8 @@ def test_spread(logs, data, monkeypatch, tmp_path):
     monkeypatch.setattr(methods, "MODELS", {"quartic": 2})
     monkeypatch.setattr(spread, "COUNTS", (20,))
     monkeypatch.setattr(spread, "DRAWS", 60)
+    monkeypatch.setattr(spread, "FINE_FOLDS", spread.FOLDS)  # one program for both
+    monkeypatch.setattr(spread, "FINE_FOLD", spread.FOLD)
     monkeypatch.setattr(pj, "identify_noise", functools.partial(pj.identify_noise, steps=20, samples=8))
     given = ["--surface", "abs", "--object", "rect1", "--steps", "15", "--data", str(data), "--out", str(tmp_path)]
     cli.main(["reproduce", "table1-spread", *given])
@@ -285,6 +287,9 @@ def test_spread(logs, data, monkeypatch, tmp_path):
         # the same draws, regions that are not too wide in the middle
         assert pooled["calibrated"]["energy_mm"] == pooled["noise"]["energy_mm"]
         assert abs(pooled["calibrated"]["inside_50"] - 0.5) < 0.12
+        assert pooled["noise"]["error_50"] == pytest.approx(0.5 / np.sqrt(196))
+        both = 1 / 196 + 1 / pooled["calibrated"]["levels_of"]
+        assert pooled["calibrated"]["error_50"] == pytest.approx(0.5 * np.sqrt(both))
         energy, error = pooled["normal"]["noise_less_energy_mm"]
         assert energy < -2 * error
         density, error = pooled["normal"]["noise_less_log_density"]

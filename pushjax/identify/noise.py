@@ -112,11 +112,10 @@ class Noise(eqx.Module):
         return density[0] if self.found.single else density
 
     def about(self, found: Identified) -> "Noise":
-        """The same noise about what was found of other pushes, of one condition. Raises ValueError for several."""
-        if not found.single:
-            raise ValueError("found must be of one condition; got several")
+        """The same noise about what was found of other pushes, of one condition or of several: of several noises of
+        the friction, the widest."""
         spread = jnp.max(self.friction[..., 1] - self.found.friction)
-        friction = jnp.stack([jnp.maximum(found.friction - spread, 0), found.friction + spread])
+        friction = jnp.stack([jnp.maximum(found.friction - spread, 0), found.friction + spread], axis=-1)
         return eqx.tree_at(lambda noise: (noise.found, noise.friction), self, (found, friction))
 
     @property

@@ -2,8 +2,8 @@
 
 noise     what `identify_noise` finds: of each part of the pushes to learn from, about what the rest tells; then about
           what all of them tell.
-calibrated  the same, but regions of the levels that held their share of those parts: what happens is nearer to the
-          middle than the noise says, at the same tails.
+calibrated  the same, but regions of the levels that held their share of the pushes to learn from, each predicted from
+          nearly all others: what happens is nearer to the middle than the noise says, at the same tails.
 normal    the same point prediction, with a normal distribution of its errors on those parts.
 process   a Gaussian process of the same pushes. It knows nothing of how far a push goes, so it is asked for whole
           pushes only, as it has learned from.
@@ -31,6 +31,8 @@ from pushjax.report import envelope
 
 STEPS = 25
 FOLDS, FOLD = 3, 48  # parts, and pushes in each at most
+# For the levels: predicted from fewer pushes, what happens looks rarer than it is.
+FINE_FOLDS, FINE_FOLD = 12, 12
 DRAWS = 200
 COUNTS = (10, 20, 40, 80, 128)  # pushes to learn from
 CURVE_TESTS = 0.3  # share of all whole pushes
@@ -65,7 +67,8 @@ def run(
         cells.append(cell)
         progress(len(cells), total)
     paper = [cell for cell in cells if cell["object"] not in APART]
-    pooled = {group: _pooled([cell[group] for cell in paper]) for group in ("middle", "whole") if paper}
+    seen = [len(cell["held_level"]) for cell in paper]
+    pooled = {group: _pooled([cell[group] for cell in paper], seen) for group in ("middle", "whole") if paper}
     curve = _mean_curve([cell["curve"] for cell in paper])
     pictures = [] if out is None or not paper else [_draw(pooled, curve, out)]
     kept.forget()
@@ -77,12 +80,7 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     rng = np.random.default_rng(seed)
     slider, hand, length = setting.slider, setting.hand, setting.length
     rows = rng.permutation(np.flatnonzero(log.learned & log.whole.valid))
-    parts = np.array_split(rows, FOLDS)
-    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, LEARNED) for part in parts]
-    held = pj.Pushes.conditions([straight(log, log.whole, part, steps, FOLD) for part in parts])
-    # each part's own, as if they were of different objects
-    apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
-    of_rest = fitted(pj.Pushes.conditions(rest), setting, apart)
+    of_rest, held = _crossed(log, setting, rows, steps, FOLDS, FOLD)
     first, *keys = jax.random.split(jax.random.key(seed), 6)
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
     every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
@@ -91,7 +89,9 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     predicted = noise.about(found)
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
-    there = scored(own(noise.predict(first, held, slider, hand, DRAWS), held), own(held.end, held), length)
+    of_nearly_all, each = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
+    about_each = noise.about(of_nearly_all).predict(first, each, slider, hand, DRAWS)
+    there = scored(own(about_each, each), own(each.end, each), length)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     cell["noise"] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
@@ -119,6 +119,18 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
         cell[f"{group}_mm"] = _deviation_mm(point, ends, length)
     cell["curve"] = _curve(log, setting, steps, rng)
     return cell
+
+
+def _crossed(
+    log: MitPushes, setting: Setting, rows: np.ndarray, steps: int, count: int, most: int
+) -> tuple[pj.Identified, pj.Pushes]:
+    """What the rest of the pushes tells about each of `count` parts, and the parts, of `most` pushes at most."""
+    parts = np.array_split(rows, count)
+    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, LEARNED) for part in parts]
+    held = pj.Pushes.conditions([straight(log, log.whole, part, steps, most) for part in parts])
+    # each part's own, as if they were of different objects
+    apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
+    return fitted(pj.Pushes.conditions(rest), setting, apart), held
 
 
 def _ends(found: pj.Identified, pushes: pj.Pushes, setting: Setting) -> np.ndarray:
@@ -156,16 +168,22 @@ def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generato
     return found
 
 
-def _pooled(cells: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Of all pushes: means; standard errors of the shares; and against `noise`, pairs of the same push."""
+def _pooled(cells: list[dict[str, Any]], seen: list[int]) -> dict[str, dict[str, Any]]:
+    """Of all pushes: means; standard errors of the shares; and against `noise`, pairs of the same push. seen: of how
+    many pushes each cell's calibrated levels are, which have an error of their own."""
     found: dict[str, dict[str, Any]] = {}
     ours = {name: np.concatenate([cell["noise"][name] for cell in cells]) for name in ("energy_mm", "log_density")}
     for method in cells[0]:
         pool = {name: np.concatenate([cell[method][name] for cell in cells]) for name in cells[0][method]}
         count = len(pool["energy_mm"])
         row: dict[str, Any] = {name: float(values.mean()) for name, values in pool.items()} | {"pushes": count}
+        variance = 1 / count
+        if method == "calibrated":
+            tested = [len(cell[method]["energy_mm"]) for cell in cells]
+            variance += sum((mine / count) ** 2 / of for mine, of in zip(tested, seen, strict=True))
+            row["levels_of"] = sum(seen)
         for level in LEVELS:
-            row[f"error_{100 * level:g}"] = float(np.sqrt(level * (1 - level) / count))
+            row[f"error_{100 * level:g}"] = float(np.sqrt(level * (1 - level) * variance))
         for name, values in ours.items():
             less = values - pool[name]
             row[f"noise_less_{name}"] = [float(less.mean()), float(less.std(ddof=1) / np.sqrt(count))]
@@ -206,8 +224,12 @@ def summary(record: dict[str, Any]) -> str:
                     f"noise less {name}: energy score {energy[0]:+.3f} +- {energy[1]:.3f} mm, log density "
                     f"{density[0]:+.2f} +- {density[1]:.2f}"
                 )
-        row = methods["noise"]
-        lines += [f"standard errors of the shares: {100 * row['error_50']:.1f} and {100 * row['error_90']:.1f} %", ""]
+        tested, calibrated = (
+            f"{100 * row['error_50']:.1f} and {100 * row['error_90']:.1f} %"
+            for row in (methods["noise"], methods["calibrated"])
+        )
+        of = f"of calibrated ones, with levels of {methods['calibrated']['levels_of']} pushes: {calibrated}"
+        lines += [f"standard errors of the shares: {tested}; {of}", ""]
     if record["curve"]:
         lines.append(f"{'learned from':14}{'physics':>14}{'process':>14}   mean deviation (energy score), mm")
         for row in record["curve"]:
