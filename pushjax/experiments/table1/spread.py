@@ -34,6 +34,9 @@ FOLDS, FOLD = 3, 48  # parts, and pushes in each at most
 # For the levels: predicted from fewer pushes, what happens looks rarer than it is.
 FINE_FOLDS, FINE_FOLD = 12, 12
 DRAWS = 200
+# Cells of which compiled programs are kept. A process may hold 65 530 pieces of memory (Linux, as it comes), a program
+# has thousands; beyond, LLVM ends the process.
+TOGETHER = 6
 COUNTS = (10, 20, 40, 80, 128)  # pushes to learn from
 CURVE_TESTS = 0.3  # share of all whole pushes
 
@@ -56,7 +59,7 @@ def run(
     surface = chosen(folder, surface, object)
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
     kept = Kept(None if out is None else out / "table1-spread-cells.json", settings)
-    cells, total = [], len(surface) * len(object)
+    cells, total, computed = [], len(surface) * len(object), 0
     for log in (load(folder, on, target, seed) for on in surface for target in object):
         labels = {"surface": log.surface, "object": log.shape}
         cell = kept.find(labels)
@@ -64,6 +67,9 @@ def run(
             begin = time.perf_counter()
             found = _cell(log, Setting.of(log, "quartic", steps), steps, seed)
             cell = kept.add(labels | found | {"run_s": time.perf_counter() - begin})
+            computed += 1
+            if computed % TOGETHER == 0:
+                jax.clear_caches()
         cells.append(cell)
         progress(len(cells), total)
     paper = [cell for cell in cells if cell["object"] not in APART]
