@@ -407,7 +407,7 @@ def test_density(few, found, block, surface):
     again = moved.about(other)
     np.testing.assert_allclose(again.friction, other.friction + jnp.array([-0.05, 0.05]), atol=1e-12)
     np.testing.assert_array_equal(again.found.z, other.z)
-    twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), again.friction)
+    twice = jnp.stack([moved.friction, moved.friction])
     several = eqx.tree_at(lambda noise: noise.friction, moved, twice)  # of two conditions, of one spread
     np.testing.assert_array_equal(several.about(other).friction, again.friction)
     # found again
