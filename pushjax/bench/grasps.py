@@ -37,9 +37,12 @@ def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
 def openings(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1"]:
     """From where each touches to the end, in steps that each leave the same share of what was left: the square swings
     by the root of it, the faster the straighter it is."""
-    first = touching(pose) - FLAT
-    share = jnp.linspace(0, 1, steps + 1, dtype=pose.dtype)
-    return FLAT + first[:, None] * (LEFT / first[:, None]) ** share[None]
+    return opening_at(touching(pose)[:, None], jnp.linspace(0, 1, steps + 1, dtype=pose.dtype)[None])
+
+
+def opening_at(first: Float[Array, "..."], share: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The opening (m) after this share of the steps, of a grasp that begins at the opening `first`."""
+    return FLAT + (first - FLAT) * (LEFT / (first - FLAT)) ** share
 
 
 def paths(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1 4"]:
@@ -70,19 +73,18 @@ def final_poses(steps: int, dtype: str) -> np.ndarray:
 @jax.jit
 def _final(here: tasks.Task, poses: Float[Array, "n 3"], steps: Array) -> Array:
     """Step by step, so that one program does any number of steps."""
-    left = openings(poses, 1) - FLAT
 
-    def one(pose: Array, left: Array) -> Array:
+    def one(pose: Array, first: Array) -> Array:
         def at(k):
-            opening = FLAT + left[0] * (left[1] / left[0]) ** (k / steps).astype(left.dtype)
-            return jnp.zeros(4, left.dtype).at[3].set(opening)
+            opening = opening_at(first, (k / steps).astype(first.dtype))
+            return jnp.zeros(4, first.dtype).at[3].set(opening)
 
         def step(k, pose):
             return pj.step(here.slider, here.hand, at(k), at(k + 1), pose=pose, friction=FRICTION).pose
 
         return jax.lax.fori_loop(0, steps, step, pose)
 
-    return jax.vmap(one)(poses, left)
+    return jax.vmap(one)(poses, touching(poses))
 
 
 @cache

@@ -7,18 +7,19 @@ from jaxtyping import Array, Bool
 from pushjax._vec import Scalar, Vec3, settle
 from pushjax.limit_surface._base import Form
 
-CLOSE = 5e-3  # Newton's next step from so near leaves its square
+CLOSE = 0.01  # a step of so much of the wrench leaves an error of about its square
 
 
 def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: float) -> tuple[Vec3, Bool[Array, ""]]:
     """A wrench, of any size, whose grad H is along `twist`; and whether it is, to `tolerance`. wanted: False where it
     does not matter, which holds up no batch.
 
-    Newton's method on grad H(F) = c V. By homogeneity only the direction of F counts, so F is never rescaled: c is
-    set to what suits F as it is (c = d H / (V . F)), which saves a root a round. The first rounds choose the longest
-    useful of a few steps by V . F / H^(1/d), whose largest value is the solution; they end where grad H was CLOSE to
-    c V before the last. Of 20 000 twists of random surfaces
-    (condition up to 1e3) and of the nearly flat fitted ones all were in Newton's basin after four rounds.
+    Newton's method on grad H(F) = c V. By homogeneity only the direction of F counts, so F is never rescaled: c is set
+    to what suits F as it is (c = d H / (V . F)), which saves a root a round. The first rounds choose the longest
+    useful of a few steps by V . F / H^(1/d), whose largest value is the solution. They end with a full step shorter
+    than CLOSE. (Not by the residual: where H is nearly flat, a small one may be far from the solution.) Of 20 000
+    twists of random surfaces of condition up to 1e3, and of each of seven fitted ones, on two supports to a rectangle,
+    every one was found, in float32 and float64.
     """
     d = form.degree
     squared = twist.dot(twist)
@@ -31,12 +32,11 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
         dh = f.dot(g)
         c = dh / jnp.where(power > 0, power, 1.0)
         rest = v.scale(c) - g
-        far = rest.dot(rest) > (CLOSE * c) ** 2
-        return g, power, dh / d, form.hessian(f).solve(rest), far | (power <= 0)
+        return g, power, dh / d, form.hessian(f).solve(rest)
 
     def searched(state):
         count, f, _ = state
-        g, power, h, step, far = settle(newton(f), squared)
+        g, power, h, step = settle(newton(f), squared)
         c1, c2 = g.dot(step), form.hessian(f).times(step).dot(step) / 2
         g_step = form.gradient(step)
         c3, c4 = f.dot(g_step), step.dot(g_step) / 4
@@ -51,6 +51,7 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
         for t in (0.5, 0.2, 0.06, 0.02, 0.005, 2.0):
             this = merit(t)
             best, top = jnp.where(this > top, t, best), jnp.maximum(this, top)
+        far = (best != 1) | (step.dot(step) > CLOSE**2 * f.dot(f)) | (power <= 0)
         return count + 1, settle(f + step.scale(best), squared), far & (count + 1 < search)
 
     def plainly(_, f: Vec3) -> Vec3:

@@ -117,7 +117,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     unsolved = problem.pushes & ~chosen.found & ~chosen.hasty
     power, presses = squeeze(problem, True if problem.margin else settle(unsolved, problem.speed))
     # what the search found and the last look refused, or it could not write down, proves nothing
-    stuck = jnp.where(proves_jams & presses & ~chosen.found & ~chosen.hasty, Status.JAMMED, Status.NOT_CONVERGED)
+    stuck = jnp.where(proves_jams & presses & unsolved, Status.JAMMED, Status.NOT_CONVERGED)
     status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, stuck), Status.FREE)
     status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
 

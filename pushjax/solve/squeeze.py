@@ -174,6 +174,7 @@ def _wanted_best(edges: _Edges, wanted: Flag, witness: Scalar) -> tuple:
 
 
 def _best(edges: _Edges, witness: Scalar, best: tuple) -> tuple:
+    """The same, from `best` on: kind by kind over all sets of edges that may make up a squeeze."""
     for fours, kind in _sets(edges.moment):
 
         def body(best, four, kind=kind):
