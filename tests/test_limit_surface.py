@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pushjax as pj
 from pushjax import Ellipsoid, LimitSurface, Quartic, Status
 from pushjax._vec import Vec3
 from pushjax.limit_surface import MONOMIALS, angle_between
+from pushjax.limit_surface._aligned import aligned_wrench
 from pushjax.limit_surface.quartic import CONVEXITY_TOLERANCE, MAX_NEWTON_ROUNDS, least_curvature
 from pushjax.problems import random_surface
 
@@ -486,3 +488,19 @@ def test_rounding_in_a_is_symmetrised():
     a = np.eye(3)
     a[0, 1] = 1e-6
     np.testing.assert_array_equal(Ellipsoid(a, 1).A, (a + a.T) / 2)
+
+
+def test_aligned_wrench_of_every_twist_on_a_nearly_flat_surface():
+    """That of two points: a round that ended by a small residual, far from the solution, lost 3 of these twists."""
+    support = pj.Support(jnp.array([[0.04, 0.0], [-0.04, 0.0]]), jnp.array([0.5, 0.5]))
+    form = pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(1), 300)).form()
+    first, second = jax.random.split(jax.random.key(5))
+    twist = jax.random.normal(first, (20_000, 3))
+    stretched = twist * jnp.exp(jax.random.uniform(second, twist.shape, minval=-4.0, maxval=0.0))
+    twist = jnp.where(jnp.arange(len(twist))[:, None] % 2 == 0, twist, stretched)
+    solve = jax.jit(jax.vmap(lambda v: aligned_wrench(form, Vec3.of(v), jnp.ones((), bool), 1e-9)))
+    wrench, aligned = solve(twist)
+    assert aligned.all()
+    along = np.stack(jax.jit(jax.vmap(form.gradient))(wrench), axis=-1)
+    along /= np.linalg.norm(along, axis=-1, keepdims=True)
+    np.testing.assert_allclose(along, twist / np.linalg.norm(twist, axis=-1, keepdims=True), atol=2e-9)
