@@ -116,10 +116,10 @@ def run(case: Case, seed: int, say) -> list[dict]:
     begun = time.perf_counter()
     learned = chosen(case, second)
     noise = pj.identify_noise(jax.random.key(seed), found, learned, case.slider, case.hand)
+    way, turn = 100 * np.asarray(noise.relative)
     values = f"dof {float(noise.dof):.1f}, spread {float(noise.friction[0, 1] - found.friction[0]):.2f}, hand "
-    values += (
-        f"{1e3 * float(noise.offset):.2f} mm, pose {1e3 * float(noise.sigma):.2f} mm, tails {float(noise.tails):.1f}"
-    )
+    values += f"{1e3 * float(noise.offset):.2f} mm, pose {1e3 * float(noise.sigma):.2f} mm, {way:.1f} % of its way, "
+    values += f"{turn:.1f} % of its turn, tails {float(noise.tails):.1f}"
     say(f"    noise in {time.perf_counter() - begun:.0f} s: {values}")
     tested = chosen(case, third)
     ours = np.asarray(noise.predict(jax.random.key(1000 + seed), tested, case.slider, case.hand, DRAWS))

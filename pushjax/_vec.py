@@ -163,3 +163,17 @@ def wherever(condition: Bool[Array, ""], update: Callable, state):
 def select(condition, yes, no):
     """`where` over two equal pytrees of scalars."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def each_of(of: Callable, items: tuple) -> tuple:
+    """(of(item), ...). Of several items that are alike in all but their numbers, `of` is written into the program
+    once, in a loop over them: written out it would be compiled as often, and that is what a first call waits for."""
+
+    def kind(item):
+        leaves = jax.tree.leaves(item)
+        return jax.tree.structure(item), tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
+    if len(items) == 1 or len({kind(item) for item in items}) > 1:
+        return tuple(of(item) for item in items)
+    found = jax.lax.map(of, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(items)))

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._vec import Scalar, Vec2, Vec3, select, settle, turn
-from pushjax.contacts import FAR, Placement, Touch, choose, count, meet, overlap, places, taken
+from pushjax._vec import Scalar, Vec2, Vec3, each_of, select, settle, turn
+from pushjax.contacts import FAR, Meeting, Placement, Touch, choose, count, meet, overlap, places, taken
 from pushjax.hands import Finger, Hand, Pad
 from pushjax.limit_surface import Form
 from pushjax.shapes import Outline
@@ -112,9 +112,12 @@ def advance(
     """One step of all fingers."""
     start = Placed.at(pose)
     begin, overlapping = jnp.ones_like(pose.x), jnp.zeros((), bool)
-    for grip in grips:
+
+    def first_contact(grip: Grip) -> Meeting:
         at, path = settle((grip.seen(start, jnp.zeros_like(pose.x)), grip.path.unrotate(start.angle)), pose.x)
-        met = meet(grip.finger, outline, at, path, form.length)
+        return meet(grip.finger, outline, at, path, form.length)
+
+    for met in each_of(first_contact, grips):
         begin, overlapping = jnp.minimum(begin, met.start), overlapping | met.overlapping
     begin = settle(begin, pose.x)
     rest = 1 - begin
@@ -131,38 +134,43 @@ def advance(
         twist, point, angle, status, begun, chosen, _ = carry
         there = start.moved(point, twist.scale(share), angle)
         first = share == 0
-        each, fresh, picked, holds = [], [], [], jnp.ones((), bool)
-        for k, grip in enumerate(grips):
+
+        def contacts_of(gripped: tuple[Grip, tuple[Scalar, ...], tuple[Touch, ...]]):
+            grip, chosen, begun = gripped
             at = settle(grip.seen(there, begin + rest * share), pose.x)
             touches = settle(places(grip.finger, outline, at, form.length), pose.x)
             mine = tuple(
                 jnp.where(first, new, old)
-                for new, old in zip(choose(touches, form.length, outline), chosen[k], strict=True)
+                for new, old in zip(choose(touches, form.length, outline), chosen, strict=True)
             )
-            picked.append(mine)
-            near = jnp.zeros((), bool)
-            for touch in taken(touches, mine):
-                before = select(first, touch, begun[len(each)])
+            each, fresh, near = [], [], jnp.zeros((), bool)
+            for touch, before in zip(taken(touches, mine), begun, strict=True):
+                before = select(first, touch, before)
                 # a corner that has passed the end of an edge by now still counts as it began
                 touch = select(settle(touch.distance > FAR / 2, pose.x), before, touch)
                 # the gap is that at the beginning, for both stages: what the rule leaves then does not add up
                 gap = before.distance
                 motion = grip.motion(there, touch.point, at.center, rest, first)
-                contact = settle(Contact(touch.point, touch.normal, motion, grip.friction, gap), pose.x)
+                each.append(settle(Contact(touch.point, touch.normal, motion, grip.friction, gap), pose.x))
                 near |= gap <= reach
-                each.append(contact)
                 fresh.append(before)
+            return tuple(each), mine, tuple(fresh), near
+
+        found = each_of(contacts_of, tuple(zip(grips, chosen, begun, strict=True)))
+        each, holds = sum((contacts for contacts, *_ in found), ()), jnp.ones((), bool)
+        for *_, near in found:
             holds &= near
-        motion = motion_under(form, tuple(each), on, solver, margin=False)
+        picked, fresh = tuple(mine for _, mine, _, _ in found), tuple(touches for _, _, touches, _ in found)
+        motion = motion_under(form, each, on, solver, margin=False)
         # A failed prediction must show, whatever the correction made of it
         status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
-        where = _center(tuple(each), motion.force)
-        return (motion.twist, where, there.angle, status, tuple(fresh), tuple(picked), holds), motion
+        where = _center(each, motion.force)
+        return (motion.twist, where, there.angle, status, fresh, picked, holds), motion
 
     still = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
     none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
     nowhere = Touch(zero, Vec2(zero, zero), Vec2(zero, zero))
-    carry = (*still, (nowhere,) * contacts, none, jnp.zeros((), bool))
+    carry = (*still, tuple((nowhere,) * n for n in counts), none, jnp.zeros((), bool))
     carry, motions = jax.lax.scan(stage, carry, jnp.array([0.0, 0.5], zero.dtype))
     twist, point, angle, status, _, _, holds = carry
     motion: SeveralMotion = jax.tree.map(lambda leaf: leaf[-1], motions)

@@ -354,8 +354,10 @@ def test_noise(few, found, block, surface, tmp_path):
     """Pushes drawn from a noise that is known: predicted better by what is found than at the start."""
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.friction + 0.15 * jnp.array([[-1.0, 1.0]])
-    dof, offset, sigma, tails = (jnp.array(value) for value in (15.0, 3e-4, 4e-4, 4.0))
-    known = pj.Noise(found, dof, friction[0], offset, sigma, tails, jnp.array(0.0), jnp.zeros(1), "terms")
+    values = (15.0, 3e-4, 4e-4, [0.01, 0.02], 4.0)
+    dof, offset, sigma, relative, tails = (jnp.array(value) for value in values)
+    score = jnp.array(0.0), jnp.zeros(1)
+    known = pj.Noise(found, dof, friction[0], offset, sigma, relative, tails, *score, "terms")
     many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
     drawn = known.predict(jax.random.key(1), many, slider, hand, 2)
     assert drawn.shape == (80, 2, 3)
@@ -374,6 +376,10 @@ def test_noise(few, found, block, surface, tmp_path):
     loaded = pj.Noise.load(tmp_path / "noise.json")
     for one, other in zip(jax.tree.leaves(noise), jax.tree.leaves(loaded), strict=True):
         np.testing.assert_array_equal(one, other)
+    record = json.loads((tmp_path / "noise.json").read_text())
+    del record["relative"]  # as files of before it was asked for
+    (tmp_path / "old.json").write_text(json.dumps(record))
+    np.testing.assert_array_equal(pj.Noise.load(tmp_path / "old.json").relative, [0, 0])
     found.save(tmp_path / "found.json")
     with pytest.raises(ValueError, match="does not hold noise that pushjax identified: its format is another"):
         pj.Noise.load(tmp_path / "found.json")
@@ -388,11 +394,11 @@ def test_density(few, found, block, surface):
     """Of predicted poses: where surface and friction are certain, Student's about the one pose there is; and the noise
     that makes it largest is near that of the pushes."""
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
-    sigma, tails = 4e-4, 4.0
+    sigma, relative, tails = 4e-4, np.array([0.05, 0.15]), 4.0
     sure = jnp.stack([found.friction, found.friction])
-    numbers = (jnp.array(value) for value in (1e9, 1e-9, sigma, tails))
-    dof, offset, spread, nu = numbers
-    known = pj.Noise(found, dof, sure, offset, spread, nu, jnp.array(0.0), jnp.zeros(1), "terms")
+    numbers = (jnp.array(value) for value in (1e9, 1e-9, sigma, [0.0, 0.0], tails))
+    dof, offset, spread, none, nu = numbers
+    known = pj.Noise(found, dof, sure, offset, spread, none, nu, jnp.array(0.0), jnp.zeros(1), "terms")
     ends = found.predict(few, slider, hand).pose[:, -1]
     off = 1e-3 * np.random.default_rng(0).normal(size=ends.shape) / [1, 1, float(found.length)]
     off[:, 2] += 2 * np.pi * np.arange(len(off))  # turns do not count
@@ -400,6 +406,15 @@ def test_density(few, found, block, surface):
     apart = off * [1, 1, float(found.length)]
     apart[:, 2] = float(found.length) * (off[:, 2] - 2 * np.pi * np.arange(len(off)))
     expected = multivariate_t(np.zeros(3), sigma**2 * np.eye(3), tails).logpdf(apart)
+    np.testing.assert_allclose(density, expected, atol=0.05)
+    # with an error that grows with how far the slider went and turned
+    growing = eqx.tree_at(lambda noise: noise.relative, known, jnp.array(relative))
+    density = growing.log_density(jax.random.key(0), pj.Pushes(few.start, few.path, ends + off), slider, hand, 3)
+    moved = np.asarray(ends - few.start) * [1, 1, float(found.length)]
+    shares = relative[[0, 0, 1]] * moved
+    assert np.all(np.max(np.abs(shares), axis=0) > 2 * sigma)
+    shapes = (np.eye(3) * (sigma**2 + share @ share) for share in shares)
+    expected = [multivariate_t(np.zeros(3), each, tails).logpdf(a) for each, a in zip(shapes, apart, strict=True)]
     np.testing.assert_allclose(density, expected, atol=0.05)
     # about what others tell
     other = eqx.tree_at(lambda f: f.z, found, found.z + 0.1)
@@ -414,7 +429,10 @@ def test_density(few, found, block, surface):
     friction = found.friction + 0.1 * jnp.array([-1.0, 1.0])
     values = (jnp.array(30.0), friction, jnp.array(2e-4))
     truth = eqx.tree_at(lambda noise: (noise.dof, noise.friction, noise.offset), known, values)
-    many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
+    # short pushes too: only between them and long ones can errors of the two kinds be told apart
+    first = few.path[:, :1]
+    short = eqx.tree_at(lambda pushes: pushes.path, few, first + 0.2 * (few.path - first))
+    many = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *[few] * 3, *[short] * 2)
     seen = pj.Pushes(many.start, many.path, truth.predict(jax.random.key(1), many, slider, hand, 1)[:, 0])
     noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=60, score="density")
     assert noise.score < noise.history[:5].mean()
@@ -427,3 +445,9 @@ def test_density(few, found, block, surface):
     )
     assert first + 1 < best
     assert best - 0.3 < ours
+    # errors that grow
+    truth = eqx.tree_at(lambda noise: noise.relative, truth, jnp.array(relative))
+    seen = pj.Pushes(many.start, many.path, truth.predict(jax.random.key(1), many, slider, hand, 1)[:, 0])
+    noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=90, score="density")
+    assert 0.5 * sigma < float(noise.sigma) < 2 * sigma
+    assert 0.5 * np.hypot(*relative) < float(jnp.hypot(*noise.relative)) < 2 * np.hypot(*relative)

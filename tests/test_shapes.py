@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax.typing import ArrayLike
 
 from pushjax import Disk, Polygon
-from pushjax._vec import Vec2, Vec3, select, settle, turn
+from pushjax._vec import Vec2, Vec3, each_of, select, settle, turn
 from pushjax.shapes._base import first_hit
 
 # Closed forms on lengths of order 0.1 m, in units of the dtype's rounding.
@@ -762,3 +762,31 @@ def test_select():
     a, b = Vec2(jnp.array(1.0), jnp.array(2.0)), Vec2(jnp.array(3.0), jnp.array(4.0))
     assert select(jnp.array(True), a, b) == a
     assert select(jnp.array(False), a, b) == b
+
+
+def test_each_of():
+    """Written once for what is alike, with the same values and derivatives; one by one for what is not."""
+
+    def of(item):
+        v, k = item
+        return v.dot(v) * v.x, k + 1
+
+    def items(scale, kinds):
+        return tuple((Vec2(k * scale, scale), jnp.asarray(k, kind)) for k, kind in enumerate(kinds, start=1))
+
+    def once(scale, kinds):
+        return each_of(of, items(scale, kinds))
+
+    def apart(scale, kinds):
+        return tuple(of(item) for item in items(scale, kinds))
+
+    for kinds, loops in (((np.int8,) * 3, True), ((np.int8, np.int8, np.int32), False), ((np.int8,), False)):
+        found, expected = (way(jnp.array(0.7), kinds) for way in (once, apart))
+        assert [int(k) for _, k in found] == [int(k) for _, k in expected]
+        assert [k.dtype for _, k in found] == list(kinds)
+        np.testing.assert_allclose([v for v, _ in found], [v for v, _ in expected], rtol=1e-14)
+        assert ("scan" in str(jax.make_jaxpr(once, static_argnums=1)(0.7, kinds))) == loops
+        slopes = (
+            jax.grad(lambda s, way=way, kinds=kinds: sum(v for v, _ in way(s, kinds)))(0.7) for way in (once, apart)
+        )
+        assert next(slopes) == pytest.approx(float(next(slopes)), rel=1e-14)

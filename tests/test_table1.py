@@ -311,6 +311,14 @@ def test_calibrated_levels_hold_their_share():
     assert rest.inside[:, 0].mean() > 0.85
     shares = rest.calibrated(seen.level).inside.mean(axis=0)
     assert np.all(np.abs(shares - [0.5, 0.9]) < 3 * np.sqrt([0.25 / 100, 0.09 / 100]))
+    # also those of few, in the mean
+    repeats, few = 2000, 19
+    shares = []
+    for levels in rng.uniform(size=(repeats, 2 * few)):
+        some = Scored(*(part[:few] for part in each))._replace(level=levels[:few])
+        shares.append(some.calibrated(levels[few:]).inside.mean(axis=0))
+    error = np.sqrt(2 * np.array([0.25, 0.09]) / (repeats * few))
+    assert np.all(np.abs(np.mean(shares, axis=0) - [0.5, 0.9]) < 4 * error)
 
 
 def test_files_left_out_are_named(tmp_path, monkeypatch):

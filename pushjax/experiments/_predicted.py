@@ -24,10 +24,9 @@ class Scored(NamedTuple):
 
     def calibrated(self, seen: np.ndarray) -> "Scored":
         """With regions of other levels: those that held a share `LEVELS` of what happened in other pushes, whose levels
-        these are (split conformal prediction)."""
-        count = len(seen)
-        shares = [min(1.0, level * (count + 1) / count) for level in LEVELS]
-        return self._replace(inside=self.level[:, None] <= np.quantile(seen, shares)[None])
+        these are (split conformal prediction). Of n of them the k-th smallest holds k / (n + 1) in the mean, so that is
+        where the shares are looked up: other quantiles hold too much, the more the fewer there are."""
+        return self._replace(inside=self.level[:, None] <= np.quantile(seen, LEVELS, method="weibull")[None])
 
 
 def scored(draws: np.ndarray, ends: np.ndarray, length: float) -> Scored:

@@ -12,7 +12,7 @@ from pushjax.identify.unknowns import SIDES, SPREADS, Layout, Mean, Prior, Unkno
 
 FORMAT, NOISE_FORMAT, VERSION = "pushjax identified", "pushjax noise", 1
 ARRAYS = ("z", "precision", "sigma", "direction", "gap", "residual", "information", "loss", "length")
-NOISE_ARRAYS = ("dof", "friction", "offset", "sigma", "tails", "score", "history")
+NOISE_ARRAYS = ("dof", "friction", "offset", "sigma", "relative", "tails", "score", "history")
 
 
 def save(found: Identified, path: str | Path) -> None:
@@ -51,6 +51,7 @@ def load_noise(path: str | Path) -> Noise:
 
 
 def _noise(record: dict[str, Any], dtype: Any) -> Noise:
+    record.setdefault("relative", [0.0, 0.0])  # as in files of before there was any
     arrays = {name: jnp.asarray(record[name], dtype) for name in NOISE_ARRAYS}
     return Noise(found=_identified(record["found"], dtype), sampler=record["sampler"], **arrays)
 

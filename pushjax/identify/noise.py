@@ -1,10 +1,12 @@
 """How much pushes scatter about what was found: the noise that predicts what was recorded best.
 
 A push meets a limit surface drawn about the one that was found, with `dof` degrees of freedom, and a friction, uniform
-about the one found, up to `spread` away from it. Its hand is off by `offset` in x and in y, and its final pose is
-measured with an error of `sigma` in x, y and length * theta; both are normal but for a factor that they have in common,
-so that together they have Student's distribution with `tails` degrees of freedom: few pushes, but more than a normal
-distribution would have, slip where no model says they do.
+about the one found, up to `spread` away from it. Its hand is off by `offset` in x and in y. Its final pose is off, in
+x, y and length * theta, by `sigma`, an error of measurement, and by shares `relative` of how far the slider went and
+turned, which are what no model of friction says and add up on the way: a push that hardly moves the slider is predicted
+far better than one that turns it around. All of these errors are normal but for a factor that they have in
+common, so that together they have Student's distribution with `tails` degrees of freedom: few pushes, but more than a
+normal distribution would have, slip where no model says they do.
 
 The mean score of the recorded final poses is minimised, a proper one, so that in the mean no other noise scores better
 than that which the pushes had. "energy" does not depend in the mean on how many samples of a push are drawn, and hardly
@@ -37,7 +39,6 @@ from pushjax.identify.predictive import (
     Values,
     log_density,
     predict,
-    student_density,
 )
 from pushjax.identify.pushes import Pushes
 from pushjax.rollout import Slider
@@ -49,7 +50,7 @@ STEPS = 80
 CHUNK = 10  # steps between two reports of progress
 RATE, LAST = 0.1, 0.1  # of a logarithm, per step, and what part of it is left at the end
 AVERAGED = 30  # of the last steps
-START = {"dof": 60.0, "spread": 0.1, "offset": 5e-4, "tails": 6.0}
+START = {"dof": 60.0, "spread": 0.1, "offset": 5e-4, "relative": (0.05, 0.05), "tails": 6.0}
 LEAST_DOF, LEAST_TAILS = 9.0, 1.0
 
 
@@ -58,8 +59,9 @@ class Noise(eqx.Module):
 
     dof: of the limit surface. friction: (..., 2), the range on which mu is uniform, of each condition. offset: m, by
     how much the hand's place against the slider's is off, in x and in y, from push to push. sigma: m, the same of a
-    measured final pose, in x, y and length * theta. tails: degrees of freedom of both. score: the mean score of the
-    pushes' final poses at the end of the search (energy: m), and history: (steps,), on the way there.
+    final pose, in x, y and length * theta, however far the slider went; and relative: (2,), by what shares of how far
+    it went, and of length * its turn, it is off besides. tails: degrees of freedom of all of these. score: the mean
+    score of the pushes' final poses at the end of the search (energy: m), and history: (steps,), on the way there.
     """
 
     found: Identified
@@ -67,6 +69,7 @@ class Noise(eqx.Module):
     friction: Float[Array, "*conditions 2"]
     offset: Float[Array, ""]
     sigma: Float[Array, ""]
+    relative: Float[Array, "2"]
     tails: Float[Array, ""]
     score: Float[Array, ""]
     history: Float[Array, "steps"]
@@ -106,7 +109,7 @@ class Noise(eqx.Module):
     ) -> Float[Array, "*conditions pushes"]:
         """The logarithm of what is predicted, per cubic metre of (x, y, length * theta), at the final poses of these or
         other pushes of the same conditions: the mean of Student's densities about `n` draws, which the error of
-        measurement makes of them. (There, that error and the hand's have no factor in common.)"""
+        the final pose makes of them. (There, that error and the hand's have no factor in common.)"""
         predictive = Predictive.of(self.found, pushes, slider, hand, self.sampler)
         density = log_density(key, predictive, self._values, n)
         return density[0] if self.found.single else density
@@ -121,7 +124,7 @@ class Noise(eqx.Module):
     @property
     def _values(self) -> Values:
         friction = self.friction[None] if self.found.single else self.friction
-        return Values(self.dof, friction, self.offset, self.sigma, self.tails)
+        return Values(self.dof, friction, self.offset, self.sigma, self.relative, self.tails)
 
 
 def identify_noise(
@@ -182,6 +185,7 @@ class _Scatter(NamedTuple):
     spread: Float[Array, ""]
     offset: Float[Array, ""]
     sigma: Float[Array, ""]
+    relative: Float[Array, "2"]
     tails: Float[Array, ""]
 
     def values(self, center: Float[Array, "conditions"]) -> Values:
@@ -189,15 +193,13 @@ class _Scatter(NamedTuple):
         spread = jnp.exp(self.spread)
         friction = jnp.stack([jnp.maximum(center - spread, 0), center + spread], axis=-1)
         dof, tails = LEAST_DOF + jnp.exp(self.dof), LEAST_TAILS + jnp.exp(self.tails)
-        return Values(dof, friction, jnp.exp(self.offset), jnp.exp(self.sigma), tails)
+        return Values(dof, friction, jnp.exp(self.offset), jnp.exp(self.sigma), jnp.exp(self.relative), tails)
 
 
 def _first(found: Identified) -> _Scatter:
-    dof, spread, offset, tails = (
-        jnp.log(jnp.asarray(number, found.z.dtype))
-        for number in (START["dof"] - LEAST_DOF, START["spread"], START["offset"], START["tails"] - LEAST_TAILS)
-    )
-    return _Scatter(dof, spread, offset, jnp.log(found.sigma / 2), tails)
+    least = {"dof": LEAST_DOF, "tails": LEAST_TAILS}
+    first = {name: jnp.asarray(value, found.z.dtype) - least.get(name, 0.0) for name, value in START.items()}
+    return _Scatter(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
 
 
 @eqx.filter_jit
@@ -236,13 +238,13 @@ def _score(
     def mean(scatter: _Scatter) -> Array:
         values = scatter.values(center)
         dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
-        off = poses + slopes.dof * dof + slopes.mu * mu - pushes.end[..., None, :]
         errors = chances.errors(values.tails)
-        off = off + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
+        there = poses + slopes.dof * dof + slopes.mu * mu
+        there = there + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
         if score == "density":
-            each = -student_density(off, values, predictive.length)
+            each = -predictive.log_density(there, pushes, values)
         else:
-            off = off + predictive.measurement(errors, values.sigma)
+            off = predictive.measured(there, pushes, values, errors) - pushes.end[..., None, :]
             each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
         return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
 

@@ -1,5 +1,5 @@
-"""How pushes come out under noise: a limit surface and a friction drawn for each, a hand that is off, an error of
-measurement."""
+"""How pushes come out under noise: a limit surface and a friction drawn for each, a hand that is off, and an error of
+the final pose that grows with how far the slider went and turned."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,6 +29,7 @@ class Values(NamedTuple):
     friction: Float[Array, "*conditions 2"]
     offset: Float[Array, ""]
     sigma: Float[Array, ""]
+    relative: Float[Array, "2"]
     tails: Float[Array, ""]
 
     def own(self, chances: "Chances") -> tuple[Array, Array]:
@@ -147,9 +148,26 @@ class Predictive(eqx.Module):
         keys = jax.random.split(key, len(self.theta.friction))
         return jax.vmap(condition)(keys, self.around, self.theta, self.pushes, values.friction)
 
-    def measurement(self, errors: Float[Array, "... 5"], sigma: Array) -> Float[Array, "... 3"]:
-        """Errors of measured poses, of those in x, y and length * theta."""
-        return (sigma * errors[..., 2:]).at[..., 2].divide(self.length)
+    def error(self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: Values) -> Float[Array, "*pushes n"]:
+        """Of each of these final poses, in x, y and length * theta: m."""
+        moved = poses - pushes.start[..., None, :]
+        went, turned = moved[..., 0] ** 2 + moved[..., 1] ** 2, (self.length * moved[..., 2]) ** 2
+        by_way, by_turn = values.relative**2
+        return jnp.sqrt(values.sigma**2 + by_way * went + by_turn * turned)
+
+    def measured(
+        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: Values, errors: Float[Array, "*pushes n 5"]
+    ) -> Float[Array, "*pushes n 3"]:
+        """Final poses, with their errors."""
+        error = self.error(poses, pushes, values)[..., None]
+        return poses + (error * errors[..., 2:]).at[..., 2].divide(self.length)
+
+    def log_density(
+        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: Values
+    ) -> Float[Array, "*pushes"]:
+        """Of the recorded final poses: of the mean of Student's densities about these."""
+        off = poses - pushes.end[..., None, :]
+        return student_density(off, self.error(poses, pushes, values), values.tails, self.length)
 
 
 @eqx.filter_jit
@@ -160,7 +178,7 @@ def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -
         chances = drawing.chances(key, n)
         errors = chances.errors(values.tails)
         poses = drawing.poses(chances, values, values.offset * errors[..., :2])
-        return poses + predictive.measurement(errors, values.sigma)
+        return predictive.measured(poses, drawing.pushes, values, errors)
 
     return predictive.over_conditions(measured, key, values)
 
@@ -172,19 +190,18 @@ def log_density(key: PRNGKeyArray, predictive: Predictive, values: Values, n: in
     def density(drawing: Drawing, key, values: Values):
         chances = drawing.chances(key, n)
         poses = drawing.poses(chances, values, values.offset * chances.errors(values.tails)[..., :2])
-        return student_density(poses - drawing.pushes.end[:, None], values, predictive.length)
+        return predictive.log_density(poses, drawing.pushes, values)
 
     return predictive.over_conditions(density, key, values)
 
 
 def student_density(
-    off: Float[Array, "*pushes n 3"], values: Values, length: Float[Array, ""]
+    off: Float[Array, "*pushes n 3"], sigma: Float[Array, "*pushes n"], tails: Array, length: Float[Array, ""]
 ) -> Float[Array, "*pushes"]:
-    """The logarithm of the mean, over poses that are off by so much, of the density of an error of measurement."""
+    """The logarithm of the mean, over poses that are off by so much, of the density of their errors."""
     turn = 2 * jnp.pi
     angle = off[..., 2] - turn * jax.lax.stop_gradient(jnp.round(off[..., 2] / turn))
-    squared = (off[..., 0] ** 2 + off[..., 1] ** 2 + (length * angle) ** 2) / values.sigma**2
-    nu = values.tails
-    scale = gammaln((nu + 3) / 2) - gammaln(nu / 2) - 1.5 * jnp.log(nu * jnp.pi) - 3 * jnp.log(values.sigma)
-    each = scale - (nu + 3) / 2 * jnp.log1p(squared / nu)
+    squared = (off[..., 0] ** 2 + off[..., 1] ** 2 + (length * angle) ** 2) / sigma**2
+    scale = gammaln((tails + 3) / 2) - gammaln(tails / 2) - 1.5 * jnp.log(tails * jnp.pi) - 3 * jnp.log(sigma)
+    each = scale - (tails + 3) / 2 * jnp.log1p(squared / tails)
     return jax.nn.logsumexp(each, axis=-1) - jnp.log(jnp.asarray(off.shape[-2], each.dtype))

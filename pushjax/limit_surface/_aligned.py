@@ -40,7 +40,7 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
         c1, c2 = g.dot(step), form.hessian(f).times(step).dot(step) / 2
         g_step = form.gradient(step)
         c3, c4 = f.dot(g_step), step.dot(g_step) / 4
-        gain = step.dot(v)
+        c1, c2, c3, c4, gain = settle((c1, c2, c3, c4, step.dot(v)), squared)  # once, not for every merit
 
         def merit(t: float) -> Scalar:
             p = power + t * gain
@@ -51,6 +51,7 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
         for t in (0.5, 0.2, 0.06, 0.02, 0.005, 2.0):
             this = merit(t)
             best, top = jnp.where(this > top, t, best), jnp.maximum(this, top)
+        best = settle(best, squared)
         far = (best != 1) | (step.dot(step) > CLOSE**2 * f.dot(f)) | (power <= 0)
         return count + 1, settle(f + step.scale(best), squared), far & (count + 1 < search)
 

@@ -67,7 +67,8 @@ def two_edges(problem: Several, found: Found, e1: Index, e2: Index) -> Found:
     c1, c2 = e1 // 2, e2 // 2
     sticks = c1 == c2
     form, unit = problem.form, problem.speed
-    line = settle(Line.between(form, pick(problem.generators, e1), pick(problem.generators, e2)), unit)
+    ends = settle((pick(problem.generators, e1), pick(problem.generators, e2)), unit)
+    line = settle(Line.between(form, *ends), unit)
     push1, push2 = pick(problem.approach, c1), pick(problem.approach, c2)
     row1 = pick(problem.normal, c1)
     row2 = select(sticks, pick(problem.tangent, c1), pick(problem.normal, c2))

@@ -91,6 +91,8 @@ def assemble(
     zero, one = jnp.zeros_like(contacts[0].gap), jnp.ones_like(contacts[0].gap)
     still = Vec2(zero, zero)
     witness = form.length + sum((c.point.x + c.displacement.x for c in contacts), zero)  # variable, if anything is
+    # once, or the sum of everything would be part of every row below
+    known, witness = settle((known, witness), witness)
     counts = tuple(settle(known & a, witness) for a in active)
     contacts = tuple(contact.where(a) for a, contact in zip(counts, contacts, strict=True))
 

@@ -179,6 +179,7 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "friction": np.asarray(noise.friction),
         "offset_mm": 1e3 * float(noise.offset),
         "sigma_mm": 1e3 * float(noise.sigma),
+        "relative": np.asarray(noise.relative),
         "tails": float(noise.tails),
         "score_mm": 1e3 * float(noise.score),
     }
@@ -216,9 +217,11 @@ def summary(record: dict[str, Any]) -> str:
     if record["noise"] is not None:
         noise = record["noise"]
         friction = np.array2string(np.asarray(noise["friction"]), precision=3)
+        way, turn = noise["relative"]
         lines.append(
             f"noise: dof {noise['dof']:.0f}, friction {friction}, hand off by {noise['offset_mm']:.2f} mm, poses by "
-            f"{noise['sigma_mm']:.2f} mm; energy score {noise['score_mm']:.2f} mm"
+            f"{noise['sigma_mm']:.2f} mm, {100 * way:.1f} % of their way and {100 * turn:.1f} % of their turn; energy "
+            f"score {noise['score_mm']:.2f} mm"
         )
     lines.append("interval: normal; profile: all else at its best; determined: how much of the doubt before is gone.")
     if record["failed_steps"]:

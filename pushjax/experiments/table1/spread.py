@@ -100,9 +100,10 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     there = scored(own(about_each, each), own(each.end, each), length)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
-    cell["noise"] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
+    numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
+    spread = float(predicted.friction[1] - found.friction)
+    cell["noise"] = numbers | {"relative": np.asarray(noise.relative), "spread": spread}
     cell["held_level"] = there.level
-    cell["noise"]["spread"] = float(predicted.friction[1] - found.friction)
     for k, (group, pushes) in enumerate(groups.items()):
         ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
         draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
