@@ -135,7 +135,7 @@ def advance(
         there = start.moved(point, twist.scale(share), angle)
         first = share == 0
 
-        def contacts_of(gripped: tuple[Grip, tuple[Scalar, ...], tuple[Touch, ...]]):
+        def contacts_of(gripped: tuple[Grip, tuple[Int[Array, ""], ...], tuple[Touch, ...]]):
             grip, chosen, begun = gripped
             at = settle(grip.seen(there, begin + rest * share), pose.x)
             touches = settle(places(grip.finger, outline, at, form.length), pose.x)
@@ -157,10 +157,10 @@ def advance(
             return tuple(each), mine, tuple(fresh), near
 
         found = each_of(contacts_of, tuple(zip(grips, chosen, begun, strict=True)))
-        each, holds = sum((contacts for contacts, *_ in found), ()), jnp.ones((), bool)
-        for *_, near in found:
-            holds &= near
-        picked, fresh = tuple(mine for _, mine, _, _ in found), tuple(touches for _, _, touches, _ in found)
+        made, picked, fresh, near = zip(*found, strict=True)
+        each, holds = sum(made, ()), jnp.ones((), bool)
+        for one in near:
+            holds &= one
         motion = motion_under(form, each, on, solver, margin=False)
         # A failed prediction must show, whatever the correction made of it
         status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
