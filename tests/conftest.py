@@ -8,10 +8,9 @@ import os
 import sys
 from pathlib import Path
 
-# Newer compilers make one function of a loop over small arrays: twice as fast to run, three times as long to compile.
-SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1024"
-if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SMALL_LOOPS}".strip()
+from compiling import set_quick
+
+set_quick()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -30,18 +29,22 @@ gc.set_threshold(100_000, 50, 100)
 # Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
 LONG = (
     "docs",
-    "grasps",
+    "table1",
     "random_contacts",
-    "contact_derivatives",
     "commands",
-    "friction_model",
+    "grasps",
+    "bench",
     "identify_logs",
+    "identify",
+    "friction_model",
     "derivative_modes",
     "smooth_shapes",
+    "table",
+    "contact_derivatives",
     "single_contact",
-    "rollout_gradients",
-    "smooth_pads",
+    "several_contacts",
     "monte_carlo",
+    "rollout",
 )
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"
@@ -51,7 +54,12 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
 
 def pytest_collection_modifyitems(items):
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
-    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
+    def place(item) -> int:
+        notebook = item.path.suffix == ".ipynb"
+        return order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
+
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="module", autouse=True)

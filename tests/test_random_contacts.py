@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import AS_USERS
 from contact_batches import BATCH, MOST, problems
 
 import pushjax as pj
@@ -16,8 +17,8 @@ CONDITIONS, RECORDED = 1e-8, 1e-6
 EQUIVALENT = 1e-6
 
 solve = pj.solve_contacts
-solve_all = jax.jit(jax.vmap(solve))
-solve_one_as_several = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Exhaustive())))
+solve_all = jax.jit(jax.vmap(solve), compiler_options=AS_USERS)
+solve_one_as_several = jax.jit(jax.vmap(lambda s, c: solve(s, c, solver=pj.Exhaustive())), compiler_options=AS_USERS)
 
 
 def slots(count: int, degree: int) -> int:

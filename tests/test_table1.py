@@ -13,7 +13,7 @@ from pushjax import cli
 from pushjax.datasets import LogError, load_mit_pushes_npz
 from pushjax.datasets.mit_pushes import StraightPushes
 from pushjax.experiments import table1
-from pushjax.experiments._predicted import Scored, scored
+from pushjax.experiments._predicted import Scored, density_ratio, effective, reach, scored
 from pushjax.experiments.table1 import causes, conditions, experiment, gaussian_process, methods, spread
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
@@ -319,6 +319,40 @@ def test_calibrated_levels_hold_their_share():
         shares.append(some.calibrated(levels[few:]).inside.mean(axis=0))
     error = np.sqrt(2 * np.array([0.25, 0.09]) / (repeats * few))
     assert np.all(np.abs(np.mean(shares, axis=0) - [0.5, 0.9]) < 4 * error)
+
+
+def test_levels_of_pushes_of_other_reach():
+    """Where what goes far is predicted better, levels of pushes that go less far hold too much, unless those are
+    weighed: by the true ratio, and by the one that is found, which is near it."""
+    pytest.importorskip("sklearn")
+    rng = np.random.default_rng(0)
+    count = 4000
+
+    def drawn(middle):  # log of way and turn, and a level that is smaller where the way is long
+        features = rng.normal(size=(count, 2)) * 0.6 + [middle, 1.0]
+        return np.expm1(features), features[:, 0], rng.uniform(size=count) ** np.exp(features[:, 0] - 2)
+
+    (far, x, seen), (further, y, level) = drawn(2.0), drawn(2.5)
+    blank = np.zeros(count)
+    some = Scored(blank, blank, level, blank)
+    plain = some.calibrated(seen).inside.mean(axis=0)
+    assert np.all(plain - [0.5, 0.9] > [0.1, 0.02])
+    true = tuple(np.exp(0.5 * (z - 2.25) / 0.36) for z in (x, y))  # of normal densities
+    ratio = density_ratio(far, further)
+    for mine, exact in zip(ratio, true, strict=True):
+        assert np.median(np.abs(np.log(mine / exact))) < 0.1
+    for weights in (true, ratio):
+        error = np.sqrt([0.25, 0.09]) * np.sqrt(1 / count + 1 / effective(weights[0]))
+        assert np.all(np.abs(some.calibrated(seen, weights).inside.mean(axis=0) - [0.5, 0.9]) < 3 * error)
+    equal = np.full(count, 3.0)
+    assert effective(equal) == count
+    np.testing.assert_array_equal(some.calibrated(seen, (equal, equal)).inside, some.calibrated(seen).inside)
+
+
+def test_reach_of_draws():
+    start = np.array([[1.0, 2.0, 0.5]])
+    moves = np.array([[3e-3, 4e-3, -0.1], [3e-3, 4e-3, 0.3], [0.0, 1.0, 0.2]])
+    np.testing.assert_allclose(reach(start[:, None] + moves, start, 0.05), [[5.0, 10.0]])
 
 
 def test_files_left_out_are_named(tmp_path, monkeypatch):

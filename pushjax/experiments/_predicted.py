@@ -22,11 +22,48 @@ class Scored(NamedTuple):
     level: np.ndarray
     inside: np.ndarray
 
-    def calibrated(self, seen: np.ndarray) -> "Scored":
+    def calibrated(self, seen: np.ndarray, ratio: tuple[np.ndarray, np.ndarray] | None = None) -> "Scored":
         """With regions of other levels: those that held a share `LEVELS` of what happened in other pushes, whose levels
         these are (split conformal prediction). Of n of them the k-th smallest holds k / (n + 1) in the mean, so that is
-        where the shares are looked up: other quantiles hold too much, the more the fewer there are."""
-        return self._replace(inside=self.level[:, None] <= np.quantile(seen, LEVELS, method="weibull")[None])
+        where the shares are looked up: other quantiles hold too much, the more the fewer there are.
+
+        ratio: of each of those pushes and of each of these, how many times as common its kind is here as there
+        (`density_ratio`); it counts for so many (Tibshirani et al. 2019, conformal prediction under covariate shift).
+        """
+        there, here = (np.ones(len(seen)), np.ones(len(self.level))) if ratio is None else ratio
+        order = np.argsort(seen)
+        held = np.cumsum(there[order])
+        levels = [np.interp(LEVELS, held / (held[-1] + own), seen[order]) for own in here]
+        return self._replace(inside=self.level[:, None] <= np.reshape(levels, (-1, len(LEVELS))))
+
+
+def reach(draws: np.ndarray, start: np.ndarray, length: float) -> np.ndarray:
+    """(pushes, 2) mm: how far, and length times by what angle, a push is predicted to move the slider; medians of its
+    draws (pushes, n, 3)."""
+    moved = draws - start[:, None]
+    each = np.stack([np.hypot(moved[..., 0], moved[..., 1]), length * np.abs(moved[..., 2])], axis=-1)
+    return 1e3 * np.median(each, axis=1)
+
+
+def density_ratio(there: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How many times as common pushes of such a `reach` are `here` as `there`: of each push there, and of each here.
+
+    By logistic regression, quadratic in the logarithms (a millimetre added), of which of the two a push is of.
+    """
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+    features = StandardScaler(), PolynomialFeatures(2, include_bias=False), LogisticRegression()
+    both = np.log1p(np.concatenate([there, here]))
+    odds = np.exp(make_pipeline(*features).fit(both, np.arange(len(both)) >= len(there)).decision_function(both))
+    found = odds * len(there) / len(here)
+    return found[: len(there)], found[len(there) :]
+
+
+def effective(weight: np.ndarray) -> float:
+    """How many pushes of equal weight say as much as these (Kish)."""
+    return float(weight.sum() ** 2 / (weight**2).sum())
 
 
 def scored(draws: np.ndarray, ends: np.ndarray, length: float) -> Scored:

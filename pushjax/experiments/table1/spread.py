@@ -3,7 +3,9 @@
 noise     what `identify_noise` finds: of each part of the pushes to learn from, about what the rest tells; then about
           what all of them tell.
 calibrated  the same, but regions of the levels that held their share of the pushes to learn from, each predicted from
-          nearly all others: what happens is nearer to the middle than the noise says, at the same tails.
+          nearly all others: what happens is nearer to the middle than the noise says, at the same tails, and most so
+          where a push goes far. How far those tested go, by prediction, is not how far those learned from do; each of
+          these counts for as many as there are of its kind.
 normal    the same point prediction, with a normal distribution of its errors on those parts.
 process   a Gaussian process of the same pushes. It knows nothing of how far a push goes, so it is asked for whole
           pushes only, as it has learned from.
@@ -23,7 +25,16 @@ from scipy.stats import multivariate_normal
 import pushjax as pj
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments._kept import Kept
-from pushjax.experiments._predicted import LEVELS, Scored, errors, normal_draws, scored
+from pushjax.experiments._predicted import (
+    LEVELS,
+    Scored,
+    density_ratio,
+    effective,
+    errors,
+    normal_draws,
+    reach,
+    scored,
+)
 from pushjax.experiments.table1 import gaussian_process
 from pushjax.experiments.table1.conditions import APART, OBJECTS, chosen, load, straight
 from pushjax.experiments.table1.methods import LEARNED, TESTED, UNKNOWNS, Setting, fitted, own
@@ -73,8 +84,11 @@ def run(
         cells.append(cell)
         progress(len(cells), total)
     paper = [cell for cell in cells if cell["object"] not in APART]
-    seen = [len(cell["held_level"]) for cell in paper]
-    pooled = {group: _pooled([cell[group] for cell in paper], seen) for group in ("middle", "whole") if paper}
+    pooled = {
+        group: _pooled([cell[group] for cell in paper], [cell["levels_of"][group] for cell in paper])
+        for group in ("middle", "whole")
+        if paper
+    }
     curve = _mean_curve([cell["curve"] for cell in paper])
     pictures = [] if out is None or not paper else [_draw(pooled, curve, out)]
     kept.forget()
@@ -97,19 +111,22 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     first, *keys = keys
     of_nearly_all, each = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
     about_each = noise.about(of_nearly_all).predict(first, each, slider, hand, DRAWS)
-    there = scored(own(about_each, each), own(each.end, each), length)
+    draws = own(about_each, each)
+    there, far = scored(draws, own(each.end, each), length), reach(draws, own(each.start, each), length)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
     spread = float(predicted.friction[1] - found.friction)
     cell["noise"] = numbers | {"relative": np.asarray(noise.relative), "spread": spread}
-    cell["held_level"] = there.level
+    cell |= {"held_level": there.level, "levels_of": {}}
     for k, (group, pushes) in enumerate(groups.items()):
         ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
         draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
         density = own(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
         methods = {"noise": scored(draws, ends, length)._replace(density=density)}
-        methods["calibrated"] = methods["noise"].calibrated(there.level)
+        weights = density_ratio(far, reach(draws, start, length))
+        methods["calibrated"] = methods["noise"].calibrated(there.level, weights)
+        cell["levels_of"][group] = effective(weights[0])
         point = own(_ends(found, pushes, setting), pushes)
         seen = errors(point, ends, start)
         scale = np.array([1, 1, length])
@@ -175,9 +192,9 @@ def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generato
     return found
 
 
-def _pooled(cells: list[dict[str, Any]], seen: list[int]) -> dict[str, dict[str, Any]]:
+def _pooled(cells: list[dict[str, Any]], seen: list[float]) -> dict[str, dict[str, Any]]:
     """Of all pushes: means; standard errors of the shares; and against `noise`, pairs of the same push. seen: of how
-    many pushes each cell's calibrated levels are, which have an error of their own."""
+    many pushes, were their weights equal, each cell's calibrated levels are, which have an error of their own."""
     found: dict[str, dict[str, Any]] = {}
     ours = {name: np.concatenate([cell["noise"][name] for cell in cells]) for name in ("energy_mm", "log_density")}
     for method in cells[0]:
@@ -235,7 +252,7 @@ def summary(record: dict[str, Any]) -> str:
             f"{100 * row['error_50']:.1f} and {100 * row['error_90']:.1f} %"
             for row in (methods["noise"], methods["calibrated"])
         )
-        of = f"of calibrated ones, with levels of {methods['calibrated']['levels_of']} pushes: {calibrated}"
+        of = f"of calibrated ones, with levels of {methods['calibrated']['levels_of']:.0f} pushes: {calibrated}"
         lines += [f"standard errors of the shares: {tested}; {of}", ""]
     if record["curve"]:
         lines.append(f"{'learned from':14}{'physics':>14}{'process':>14}   mean deviation (energy score), mm")
