@@ -14,8 +14,8 @@ _QUICK = {
     # newer compilers make one function of a loop over small arrays: twice as fast, three times as long to compile
     "xla_backend_extra_options": "xla_cpu_small_while_loop_byte_threshold=1024",
 }
-# Options of `jax.jit` that compile as a user's process does: which values are worked out anew where, and so how they
-# are rounded, is another matter there.
+# Options of `jax.jit` that compile as a user's process does (but for small loops, where the compiler is new): which
+# values are worked out anew where, and so how they are rounded, is another matter there.
 AS_USERS: dict[str, str | bool | int] = {"xla_backend_optimization_level": 3}
 if tuple(int(part) for part in version("jax").split(".")[:2]) < UNSEEN:
     _QUICK["xla_cpu_use_fusion_emitters"] = "false"

@@ -319,6 +319,10 @@ def test_calibrated_levels_hold_their_share():
         shares.append(some.calibrated(levels[few:]).inside.mean(axis=0))
     error = np.sqrt(2 * np.array([0.25, 0.09]) / (repeats * few))
     assert np.all(np.abs(np.mean(shares, axis=0) - [0.5, 0.9]) < 4 * error)
+    # of five, the largest holds five sixths of others: only everything holds nine tenths
+    some = Scored(*(part[:few] for part in each))._replace(level=np.linspace(0, 1, few))
+    assert some.calibrated(rng.uniform(size=5)).inside[:, 1].all()
+    assert not some.calibrated(np.full(9, 0.5)).inside[:, 1].all()
 
 
 def test_levels_of_pushes_of_other_reach():

@@ -33,7 +33,8 @@ class Scored(NamedTuple):
         there, here = (np.ones(len(seen)), np.ones(len(self.level))) if ratio is None else ratio
         order = np.argsort(seen)
         held = np.cumsum(there[order])
-        levels = [np.interp(LEVELS, held / (held[-1] + own), seen[order]) for own in here]
+        # where those seen do not suffice, only everything holds the share
+        levels = [np.interp(LEVELS, held / (held[-1] + own), seen[order], right=1.0) for own in here]
         return self._replace(inside=self.level[:, None] <= np.reshape(levels, (-1, len(LEVELS))))
 
 

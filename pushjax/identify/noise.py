@@ -2,11 +2,11 @@
 
 A push meets a limit surface drawn about the one that was found, with `dof` degrees of freedom, and a friction, uniform
 about the one found, up to `spread` away from it. Its hand is off by `offset` in x and in y. Its final pose is off, in
-x, y and length * theta, by `sigma`, an error of measurement, and by shares `relative` of how far the slider went and
-turned, which are what no model of friction says and add up on the way: a push that hardly moves the slider is predicted
-far better than one that turns it around. All of these errors are normal but for a factor that they have in
-common, so that together they have Student's distribution with `tails` degrees of freedom: few pushes, but more than a
-normal distribution would have, slip where no model says they do.
+x, y and length * theta, by `sigma`, an error of measurement, and by shares `relative` of how far from its start the
+slider ends and by how much it has turned: a push that hardly moves the slider is predicted far better than one that
+turns it around. All of these errors are normal but for a factor that they have in common, so that they have Student's
+distribution with `tails` degrees of freedom: few pushes, but more than a normal distribution would have, slip where no
+model says they do.
 
 The mean score of the recorded final poses is minimised, a proper one, so that in the mean no other noise scores better
 than that which the pushes had. "energy" does not depend in the mean on how many samples of a push are drawn, and hardly
@@ -240,11 +240,13 @@ def _score(
         dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
         errors = chances.errors(values.tails)
         there = poses + slopes.dof * dof + slopes.mu * mu
+        # before the hand's error: a share of that would be a product of two with tails, whose mean may be infinite
+        error = predictive.error(there, pushes, values)
         there = there + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
         if score == "density":
             each = -predictive.log_density(there, pushes, values)
         else:
-            off = predictive.measured(there, pushes, values, errors) - pushes.end[..., None, :]
+            off = predictive.measured(there, error, errors) - pushes.end[..., None, :]
             each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
         return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
 

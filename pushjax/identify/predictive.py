@@ -156,11 +156,10 @@ class Predictive(eqx.Module):
         return jnp.sqrt(values.sigma**2 + by_way * went + by_turn * turned)
 
     def measured(
-        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: Values, errors: Float[Array, "*pushes n 5"]
+        self, poses: Float[Array, "*pushes n 3"], error: Float[Array, "*pushes n"], errors: Float[Array, "*pushes n 5"]
     ) -> Float[Array, "*pushes n 3"]:
-        """Final poses, with their errors."""
-        error = self.error(poses, pushes, values)[..., None]
-        return poses + (error * errors[..., 2:]).at[..., 2].divide(self.length)
+        """Final poses, with their errors, of the size `error`."""
+        return poses + (error[..., None] * errors[..., 2:]).at[..., 2].divide(self.length)
 
     def log_density(
         self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: Values
@@ -178,7 +177,7 @@ def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -
         chances = drawing.chances(key, n)
         errors = chances.errors(values.tails)
         poses = drawing.poses(chances, values, values.offset * errors[..., :2])
-        return predictive.measured(poses, drawing.pushes, values, errors)
+        return predictive.measured(poses, predictive.error(poses, drawing.pushes, values), errors)
 
     return predictive.over_conditions(measured, key, values)
 

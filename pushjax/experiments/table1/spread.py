@@ -50,6 +50,7 @@ DRAWS = 200
 TOGETHER = 6
 COUNTS = (10, 20, 40, 80, 128)  # pushes to learn from
 CURVE_TESTS = 0.3  # share of all whole pushes
+FORMAT = 2  # of cells: those kept by another are of another method
 
 
 def run(
@@ -68,7 +69,7 @@ def run(
     folder, surface, object: as of table 1. Raises as it does, and ValueError without scikit-learn.
     """
     surface = chosen(folder, surface, object)
-    settings = {"seed": seed, "steps": steps, "version": pj.__version__}
+    settings = {"seed": seed, "steps": steps, "version": pj.__version__, "format": FORMAT}
     kept = Kept(None if out is None else out / "table1-spread-cells.json", settings)
     cells, total, computed = [], len(surface) * len(object), 0
     for log in (load(folder, on, target, seed) for on in surface for target in object):
