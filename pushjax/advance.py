@@ -122,9 +122,8 @@ def advance(
     begin = settle(begin, pose.x)
     rest = 1 - begin
     counts = [count(grip.finger, outline) for grip in grips]
-    contacts = sum(counts)
     zero = jnp.zeros_like(pose.x)
-    on = (jnp.ones((), bool),) * contacts
+    on = (jnp.ones((), bool),) * sum(counts)
     reach = HOLDING * form.length
     for grip in grips:
         reach = jnp.maximum(reach, jax.lax.stop_gradient(4 * (jnp.abs(grip.path.x) + jnp.abs(grip.path.y))))

@@ -18,6 +18,8 @@ from pushjax.datasets import LogError, load_recordings
 from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identify import bootstrap, profile_interval, screened
+from pushjax.identify.noise import _Scatter, _score
+from pushjax.identify.predictive import Predictive
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
 COLUMNS = ("push", "hand_x", "hand_y", "object_x", "object_y", "object_theta", "force_x", "force_y")
@@ -388,6 +390,23 @@ def test_noise(few, found, block, surface, tmp_path):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, score=likelihood)
     with pytest.raises(ValueError, match="samples must be at least 2"):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)
+
+
+def test_energy_score_has_a_mean_for_the_longest_tails(few, found, block, surface):
+    """An error that grows with the way does not grow with how far the hand is off besides, which has tails too: shares
+    of the slider's way of 50 mm at most change the score by some of that, not by shares of the hand's metre."""
+    predictive = Predictive.of(found, few, pj.Slider(block, surface), pj.Hand.finger(RADIUS), "terms")
+    values = {"dof": 50.0, "spread": 0.1, "offset": 1.0, "sigma": 1e-4, "tails": 0.5}
+
+    @jax.jit
+    def scored(key, relative):
+        numbers = {name: jnp.log(value) for name, value in values.items()}
+        scatter = _Scatter(**numbers, relative=jnp.log(jnp.full(2, relative)))
+        return _score(scatter, key, predictive, 8, "energy")[0]
+
+    keys = jax.random.split(jax.random.key(0), 20)
+    changes = [float(scored(key, 0.05) - scored(key, 1e-6)) for key in keys]
+    assert np.max(np.abs(changes)) < 0.05
 
 
 def test_density(few, found, block, surface):

@@ -240,13 +240,13 @@ def _score(
         dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
         errors = chances.errors(values.tails)
         there = poses + slopes.dof * dof + slopes.mu * mu
-        # before the hand's error: a share of that would be a product of two with tails, whose mean may be infinite
-        error = predictive.error(there, pushes, values)
-        there = there + values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
+        aside = values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
         if score == "density":
-            each = -predictive.log_density(there, pushes, values)
+            each = -predictive.log_density(there + aside, pushes, values)
         else:
-            off = predictive.measured(there, error, errors) - pushes.end[..., None, :]
+            # without the hand's error: a share of that would be a product of two with tails, whose mean may be infinite
+            error = predictive.error(there, pushes, values)
+            off = predictive.measured(there + aside, error, errors) - pushes.end[..., None, :]
             each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
         return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
 

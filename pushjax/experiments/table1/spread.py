@@ -20,6 +20,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 from scipy.stats import multivariate_normal
 
 import pushjax as pj
@@ -110,23 +111,20 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     predicted = noise.about(found)
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
-    of_nearly_all, each = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
-    about_each = noise.about(of_nearly_all).predict(first, each, slider, hand, DRAWS)
-    draws = own(about_each, each)
-    there, far = scored(draws, own(each.end, each), length), reach(draws, own(each.start, each), length)
+    levels, far = _held(first, log, setting, noise, rows, steps)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
     spread = float(predicted.friction[1] - found.friction)
     cell["noise"] = numbers | {"relative": np.asarray(noise.relative), "spread": spread}
-    cell |= {"held_level": there.level, "levels_of": {}}
+    cell |= {"held_level": levels, "levels_of": {}}
     for k, (group, pushes) in enumerate(groups.items()):
         ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
         draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
         density = own(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
         methods = {"noise": scored(draws, ends, length)._replace(density=density)}
         weights = density_ratio(far, reach(draws, start, length))
-        methods["calibrated"] = methods["noise"].calibrated(there.level, weights)
+        methods["calibrated"] = methods["noise"].calibrated(levels, weights)
         cell["levels_of"][group] = effective(weights[0])
         point = own(_ends(found, pushes, setting), pushes)
         seen = errors(point, ends, start)
@@ -144,6 +142,16 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
         cell[f"{group}_mm"] = _deviation_mm(point, ends, length)
     cell["curve"] = _curve(log, setting, steps, rng)
     return cell
+
+
+def _held(
+    key: PRNGKeyArray, log: MitPushes, setting: Setting, noise: pj.Noise, rows: np.ndarray, steps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the pushes to learn from, each predicted from nearly all others: levels, and the reach predicted."""
+    of_rest, held = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
+    draws = own(noise.about(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
+    there = scored(draws, own(held.end, held), setting.length)
+    return there.level, reach(draws, own(held.start, held), setting.length)
 
 
 def _crossed(
