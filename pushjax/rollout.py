@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._autodiff import keep_found
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, instance, non_negative, shaped, traced
+from pushjax._programs import compiled
 from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.advance import Record, advance, columns, deepest, grips_of
 from pushjax.contacts import DEEPEST_OVERLAP, count
@@ -165,7 +166,7 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
         )
 
 
-@eqx.filter_jit
+@compiled
 def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
     """By how much the deepest finger overlaps the slider, m, of each pose."""
     where = columns(hand.poses(configuration))
@@ -213,7 +214,7 @@ def step(
     return _step(slider, hand, *ends, start, mu, solver)
 
 
-@eqx.filter_jit
+@compiled
 def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
     outline = slider.shape.outline()
     form, mu = ground(slider.surface, friction)
@@ -263,7 +264,7 @@ def rollout(
     return _rollout(slider, hand, p, start, mu, solver, table)
 
 
-@eqx.filter_jit
+@compiled
 def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
     form, mu = ground(slider.surface, friction)
     if table is None:

@@ -27,6 +27,7 @@ from pushjax._checks import (
     shaped,
     weights_of,
 )
+from pushjax._programs import compiled
 from pushjax.shapes import Shape
 
 FACET_SHARE = 0.1  # of the wrench-twist pairs
@@ -204,7 +205,7 @@ class Support(eqx.Module):
         return _pairs(self, key, pairs, rho)
 
 
-@eqx.filter_jit
+@compiled
 def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
     dtype = support.point.dtype
     k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
@@ -248,7 +249,7 @@ def _covered(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tu
     return mean[share > 0], share[share > 0]
 
 
-@eqx.filter_jit
+@compiled
 def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
     """1 inside, 0 outside, and one half on the outline, where rounding would decide."""
     low, high = shape.bounds

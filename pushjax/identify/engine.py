@@ -1,11 +1,11 @@
 """From pushes to what they tell."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, instance, non_negative, positive, shaped
+from pushjax._programs import compiled
 from pushjax.hands import Hand, RoundFinger
 from pushjax.identify.fit import ROUNDS, Effort, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
@@ -121,10 +121,10 @@ def identify(
     )
 
 
-_prior = eqx.filter_jit(Prior.of)
+_prior = compiled(Prior.of)
 
 
-@eqx.filter_jit
+@compiled
 def program(
     setup: Setup, pushes: Pushes, start, fresh, sigma, known, held: Held, effort: Effort, *, robust: float | None
 ) -> Fit:

@@ -28,6 +28,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._checks import positive
+from pushjax._programs import compiled
 from pushjax.friction_model import FrictionModel, Sampler
 from pushjax.hands import Hand
 from pushjax.identify.identified import Identified
@@ -202,7 +203,7 @@ def _first(found: Identified) -> _Scatter:
     return _Scatter(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
 
 
-@eqx.filter_jit
+@compiled
 def _descend(scatter, state, keys, predictive: Predictive, samples: int, steps: int, score: Score):
     rule = _rule(steps)
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from pushjax._programs import compiled
 from pushjax.friction_model import FrictionModel, RandomSurface, Sampler, TermsQuartic
 from pushjax.hands import Hand
 from pushjax.identify.identified import Identified, surfaces
@@ -169,7 +170,7 @@ class Predictive(eqx.Module):
         return student_density(off, self.error(poses, pushes, values), values.tails, self.length)
 
 
-@eqx.filter_jit
+@compiled
 def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -> Float[Array, "conditions pushes n 3"]:
     """`n` measured final poses of each push."""
 
@@ -182,7 +183,7 @@ def predict(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -
     return predictive.over_conditions(measured, key, values)
 
 
-@eqx.filter_jit
+@compiled
 def log_density(key: PRNGKeyArray, predictive: Predictive, values: Values, n: int) -> Float[Array, "conditions pushes"]:
     """Of the recorded final poses: the mean of Student's densities about `n` poses of each push."""
 

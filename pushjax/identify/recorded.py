@@ -3,11 +3,11 @@
 In numpy, for recordings have as many samples as they have: JAX would compile anew for each.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pushjax._programs import compiled
 from pushjax.datasets.pushes import Floats, rotation
 from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.identify.pushes import STEPS, Pushes
@@ -94,7 +94,7 @@ def _pairs(pushes: tuple[Recording, ...], poses: Floats, which: list[np.ndarray]
     return {"wrench": wrench, "twist": twist}
 
 
-@eqx.filter_jit
+@compiled
 def _feet(shape: Shape, points: jax.Array) -> jax.Array:
     """Of each point the nearest one of the outline: where a finger touches."""
     return jax.vmap(lambda point: shape.closest(point)[1])(points)

@@ -2,13 +2,13 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.stats import norm
 
+from pushjax._programs import compiled
 from pushjax.hands import Hand
 from pushjax.identify.engine import program
 from pushjax.identify.fit import Effort, Held, fit
@@ -93,7 +93,7 @@ def bootstrap(
     return jax.vmap(lambda one: found._own(found.prior.physical(one)))(z), z
 
 
-@eqx.filter_jit
+@compiled
 def _refitted(setup: Setup, pushes: Pushes, start, sigma, weights, robust: float | None):
     held, known, once = Held.none(start), jnp.array([True, True, True]), Effort.of(start.dtype, 1, ENOUGH)
 

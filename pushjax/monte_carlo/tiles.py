@@ -17,6 +17,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import Array
 
+from pushjax._programs import uncollected
 from pushjax.friction_model import FrictionModel, RandomSurface
 from pushjax.hands import Hand
 from pushjax.random_rollout import draw, push_under
@@ -106,12 +107,14 @@ def fetch(outcomes: list[Outcome], devices: Devices) -> Outcome:
     return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), mine)
 
 
+@uncollected
 @partial(jax.jit, static_argnums=(0, 1))
 def _draw(impl: Any, steps: int, key: Array, around: RandomSurface, model: FrictionModel, index: Array):
     root = jax.random.wrap_key_data(key, impl=impl)
     return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), around, model, steps))(index)
 
 
+@uncollected
 @partial(jax.jit, static_argnums=(0, 1))
 def _push(every: int | None, keep: bool, draws, rest: tuple, poses: Array) -> Outcome:
     shape, hand, path, solver = rest

@@ -8,11 +8,11 @@ began; of all orders that one is right with which the forces add up to the step'
 from itertools import chain, pairwise, product
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pushjax._programs import compiled
 from pushjax._vec import Vec3
 from pushjax.advance import Placed, columns, grips_of
 from pushjax.contacts import choose, count, places, taken
@@ -62,7 +62,7 @@ def _orders(counts: list[int]) -> list[list[int]]:
     return [list(chain(*order)) for order in product(*mine)]
 
 
-@eqx.filter_jit
+@compiled
 def _touches(shape: Shape, hand: Hand, pose: jax.Array, configuration: jax.Array, size: jax.Array):
     """Points and inward normals (steps, contacts, 2), body frame, halfway through each step."""
     outline, fingers = shape.outline(), hand.poses(configuration)

@@ -113,18 +113,17 @@ def assemble(
     witness = jnp.where(known, witness, 1.0)
     speed = settle(speed, witness)
 
-    normals, tangents, approaches = [], [], []
+    normals, moments, approaches = [], [], []
     for contact in contacts:
-        unit = Vec2(one, zero), Vec2(zero, one)
-        normals.append(contact.wrench(unit[0], form.length))
-        tangents.append(contact.wrench(unit[1], form.length))
+        normals.append(contact.wrench(Vec2(one, zero), form.length))
+        moments.append(contact.wrench(Vec2(zero, one), form.length).z)
         approaches.append(contact.approach().scale(1 / speed))
-    rows = settle((tuple(normals), tuple(tangents), tuple(approaches)), witness)
+    normals, moments, approaches = settle((tuple(normals), tuple(moments), tuple(approaches)), witness)
+    tangents = tuple(Vec3(-n.y, n.x, moment) for n, moment in zip(normals, moments, strict=True))
     pushes = jnp.zeros((), bool)
-    for a, approach in zip(counts, rows[2], strict=True):
+    for a, approach in zip(counts, approaches, strict=True):
         pushes |= a & (approach.x > 0)
     friction = tuple(contact.friction for contact in contacts)
-    normals, tangents, approaches = rows
     generators = []
     for n, t, mu in zip(normals, tangents, friction, strict=True):
         generators += [n + t.scale(mu), n - t.scale(mu)]

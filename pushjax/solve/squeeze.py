@@ -15,23 +15,22 @@ written as such, with mu taken out: so they are exact for the smallest friction,
 """
 
 import functools
-from collections.abc import Callable
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from pushjax._autodiff import undifferentiated
 from pushjax._vec import Scalar, Vec3, select, settle, wherever
-from pushjax.solve._several import Index, Several, pick
+from pushjax.solve._several import Several, pick
 
 # What may be left over of two or three edges that balance, of their sum: rounding of what a user computes them from.
 BALANCE = {4: 2e-6, 8: 1e-10}
 NOISE = 2  # roundings of its terms, which a determinant may be off by
 
-Flag = bool | Bool[Array, ""]  # known, or of a loop's numbers
+Numbers = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Int[Array, ""]]  # of four edges
 
 
 class Squeeze(NamedTuple):
@@ -63,7 +62,7 @@ class _Edges(NamedTuple):
     def across(self) -> int:
         return len(self.wrench) - 1
 
-    def four(self, numbers: tuple[Index, ...]) -> "_Four":
+    def four(self, numbers: Numbers) -> "_Four":
         firsts = numbers[0], numbers[2]
         return _Four(
             tuple(pick(self.wrench, e) for e in numbers),
@@ -72,6 +71,10 @@ class _Edges(NamedTuple):
             tuple(pick(self.turning, e) for e in firsts),
             functools.reduce(jnp.logical_and, (pick(self.active, e) for e in numbers)),
         )
+
+    def kind(self, numbers: Numbers) -> "_Kind":
+        first, second, third, fourth = numbers
+        return _Kind(first // 2 == second // 2, third // 2 == fourth // 2, fourth == self.across, third == self.moment)
 
 
 class _Four(NamedTuple):
@@ -83,7 +86,7 @@ class _Four(NamedTuple):
     turning: tuple[Vec3, ...]
     active: Bool[Array, ""]
 
-    def cross(self, pair: int, same: Flag) -> tuple[Vec3, Scalar, Scalar]:
+    def cross(self, pair: int, same: Bool[Array, ""]) -> tuple[Vec3, Scalar, Scalar]:
         """The product of the first two (pair 0) or the last two (1), as a vector and a factor, and the size of the
         vector's terms.
 
@@ -92,17 +95,10 @@ class _Four(NamedTuple):
         g, h = self.wrench[2 * pair : 2 * pair + 2]
         apart = g.cross(h), jnp.ones_like(g.x), _size(g) * _size(h)
         turning = self.turning[pair]
-        return _where(same, (turning, self.friction[pair], _size(turning)), apart)
+        return select(same, (turning, self.friction[pair], _size(turning)), apart)
 
 
-def _where(condition: Flag, yes, no):
-    """`select`, also of what is known without numbers."""
-    if isinstance(condition, bool):
-        return yes if condition else no
-    return select(condition, yes, no)
-
-
-def squeeze(problem: Several, wanted: Flag) -> Squeeze:
+def squeeze(problem: Several, wanted: bool | Bool[Array, ""]) -> Squeeze:
     """The squeeze power; where it is not wanted, as if there were no internal equilibrium. Not wanted by any of a batch
     it takes no time."""
     m = problem.count
@@ -110,11 +106,9 @@ def squeeze(problem: Several, wanted: Flag) -> Squeeze:
     if m < 2:
         return Squeeze(lowest, jnp.zeros((), bool))
     edges = _edges(problem)
-    power, presses, *best = undifferentiated(_wanted_best, edges, wanted, problem.speed)
+    power, presses, best = undifferentiated(_wanted_best, edges, wanted, problem.speed)
     # Only the best is differentiated. That it exists is not decided again: another rounding could deny it.
-    first, second, third, fourth = best
-    kind = _Kind(first // 2 == second // 2, third // 2 == fourth // 2, fourth == edges.across, third == edges.moment)
-    again = _basic(settle(edges.four(tuple(best)), problem.speed), kind).power
+    again = _basic(settle(edges.four(best), problem.speed), edges.kind(best)).power
     return Squeeze(jnp.where(power > lowest, again, lowest), presses)
 
 
@@ -141,55 +135,42 @@ class _Kind(NamedTuple):
     are to balance, the fourth being `across`. twisting: whether the third is `moment`.
     """
 
-    same12: Flag
-    same34: Flag
-    by_itself: Flag
-    twisting: Flag
+    same12: Bool[Array, ""]
+    same34: Bool[Array, ""]
+    by_itself: Bool[Array, ""]
+    twisting: Bool[Array, ""]
 
 
-def _sets(edges: int) -> list[tuple[list[tuple[int, ...]], Callable[..., _Kind]]]:
-    """All fours, with the two edges of a contact first; all threes, and twos with the moment. With each list, the kind
-    of its members."""
-    pairs, others = [], []
+def _sets(edges: int) -> list[tuple[int, ...]]:
+    """All fours, with the two edges of a contact first; all threes, and twos with the moment."""
+    sets = []
     for four in combinations(range(edges), 4):
         twice = [(a, b) for a, b in pairwise(four) if a // 2 == b // 2]
-        if twice:
-            pairs.append((*twice[0], *(e for e in four if e not in twice[0])))
-        else:
-            others.append(four)
-    threes = [(*three, edges + 1) for three in combinations(range(edges + 1), 3)]
-    return [
-        (pairs, lambda four: _Kind(True, four[2] // 2 == four[3] // 2, False, False)),
-        (others, lambda four: _Kind(False, False, False, False)),
-        (threes, lambda four: _Kind(False, False, True, four[2] == edges)),
-    ]
+        sets.append((*twice[0], *(e for e in four if e not in twice[0])) if twice else four)
+    return sets + [(*three, edges + 1) for three in combinations(range(edges + 1), 3)]
 
 
-def _wanted_best(edges: _Edges, wanted: Flag, witness: Scalar) -> tuple:
+def _wanted_best(edges: _Edges, wanted: bool | Bool[Array, ""], witness: Scalar) -> tuple:
     """The largest power, whether any is positive for certain, and the four edges of the largest."""
     lowest = jnp.full_like(witness, -jnp.inf)
-    none = (lowest, jnp.zeros(lowest.shape, bool), *(jnp.zeros(lowest.shape, jnp.int32),) * 4)
+    none = lowest, jnp.zeros(lowest.shape, bool), (jnp.zeros(lowest.shape, jnp.int32),) * 4
     search = functools.partial(_best, edges, witness)
     return wherever(jnp.asarray(wanted), search, none)
 
 
 def _best(edges: _Edges, witness: Scalar, best: tuple) -> tuple:
-    """The same, from `best` on: kind by kind over all sets of edges that may make up a squeeze."""
-    for fours, kind in _sets(edges.moment):
+    """The same, from `best` on, over all sets of edges that may make up a squeeze."""
 
-        def body(best, four, kind=kind):
-            largest, presses, *kept = best
-            # settled, or everything that uses an edge would pick it again
-            found = _basic(settle(edges.four(four), witness), kind(four))
-            better, sure = found.exists & (found.power > largest), found.exists & (found.power > found.noise)
-            better, sure = settle((better, sure), witness)
-            kept = (jnp.where(better, e, b) for e, b in zip(four, kept, strict=True))
-            return (jnp.where(better, found.power, largest), presses | sure, *kept), None
+    def body(best, four):
+        largest, presses, kept = best
+        # settled, or everything that uses an edge would pick it again
+        found = _basic(settle(edges.four(four), witness), edges.kind(four))
+        better, sure = found.exists & (found.power > largest), found.exists & (found.power > found.noise)
+        better, sure = settle((better, sure), witness)
+        return (jnp.where(better, found.power, largest), presses | sure, select(better, four, kept)), None
 
-        if fours:
-            columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*fours, strict=True))
-            best = jax.lax.scan(body, best, columns)[0]
-    return best
+    columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*_sets(edges.moment), strict=True))
+    return jax.lax.scan(body, best, columns)[0]
 
 
 def _powers(problem: Several) -> tuple[Scalar, ...]:
@@ -215,19 +196,17 @@ def _basic(four: _Four, kind: _Kind) -> _Basic:
     g1, g2, g3, g4 = four.wrench
     x12, mu12, s12 = four.cross(0, kind.same12)
     x34, mu34, s34 = four.cross(1, kind.same34)
-    if kind.by_itself is not False:
-        normal = _normal(x12, g2.cross(g3), g3.cross(g1))
-        alone = normal, (g3.cross(normal), jnp.ones_like(g3.x), _size(g3))
-        g4, (x34, mu34, s34) = _where(kind.by_itself, alone, (g4, (x34, mu34, s34)))
+    normal = _normal(x12, g2.cross(g3), g3.cross(g1))
+    alone = normal, (g3.cross(normal), jnp.ones_like(g3.x), _size(g3))
+    g4, (x34, mu34, s34) = select(kind.by_itself, alone, (g4, (x34, mu34, s34)))
     unit = jax.lax.stop_gradient(1 / jnp.maximum(jnp.maximum(mu12, mu34), jnp.finfo(g1.x.dtype).tiny))
     mu12, mu34 = mu12 * unit, mu34 * unit
     # settled: two roundings of a weight that cancels would differ by more than rounding
     weights = settle((mu34 * g2.dot(x34), -mu34 * g1.dot(x34), mu12 * g4.dot(x12), -mu12 * g3.dot(x12)), g1.x + g2.y)
-    idle = 0 * weights[0]
-    if kind.by_itself is not False:
-        carries = [True, True, jnp.logical_not(kind.twisting), jnp.logical_not(kind.by_itself)]
-        idle = sum((jnp.where(c, 0.0, jnp.abs(w)) for w, c in zip(weights, carries, strict=True)), idle)
-        weights = tuple(jnp.where(c, w, 0.0) for w, c in zip(weights, carries, strict=True))
+    # the moment and what stands in for a fourth carry nothing: of an equilibrium they are rounding
+    third, fourth = weights[2:]
+    idle = jnp.where(kind.twisting, jnp.abs(third), 0.0) + jnp.where(kind.by_itself, jnp.abs(fourth), 0.0)
+    weights = (*weights[:2], jnp.where(kind.twisting, 0.0, third), jnp.where(kind.by_itself, 0.0, fourth))
     total = weights[0] + weights[1] + weights[2] + weights[3]
     extent = sum((jnp.abs(w) for w in weights), 0 * total)
     eps, balance = jnp.finfo(total.dtype).eps, BALANCE[total.dtype.itemsize]
