@@ -3,8 +3,8 @@
 import os
 from importlib.metadata import version
 
-# XLA ends a process that sets an option which it does not know: this JAX has not been seen yet.
-UNSEEN = (0, 13)
+# XLA ends a process that sets an option which it does not know: JAX 0.12 has no choice of emitters any more.
+WITHOUT_CHOICE = (0, 11)
 
 # Nearly every program is run once, and waited for while it compiles: these take three fifths of the time. Not level 0:
 # without fusion emitters, and in batches that are split over two cores, one in a hundred solves then does not converge
@@ -17,7 +17,7 @@ _QUICK = {
 # Options of `jax.jit` that compile as a user's process does (but for small loops, where the compiler is new): which
 # values are worked out anew where, and so how they are rounded, is another matter there.
 AS_USERS: dict[str, str | bool | int] = {"xla_backend_optimization_level": 3}
-if tuple(int(part) for part in version("jax").split(".")[:2]) < UNSEEN:
+if tuple(int(part) for part in version("jax").split(".")[:2]) < WITHOUT_CHOICE:
     _QUICK["xla_cpu_use_fusion_emitters"] = "false"
     AS_USERS["xla_cpu_use_fusion_emitters"] = True
 
