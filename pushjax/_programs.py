@@ -10,6 +10,9 @@ import equinox as eqx
 P = ParamSpec("P")
 R = TypeVar("R")
 
+MANY = 50_000  # objects that a call has made, from which on it has traced something
+ASIDE = gc.get_freeze_count()  # of the interpreter's own
+
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """`function` as a compiled program, of which everything that is not an array is a constant (`equinox.filter_jit`);
@@ -22,21 +25,32 @@ def uncollected(function: Callable[P, R]) -> Callable[P, R]:
 
     The first call of a program traces it, and then again for each `vmap` and `grad` around it, which makes objects by
     the million, nearly all of which stay. The collector looks through them every few hundred, finds nothing, and took
-    up to half of the time of tracing. So it pauses for the call; and what has been made counts as old afterwards, as it
-    would had the collector run, or it would look through all of that three times more.
+    up to half of the time of tracing. So it pauses for the call, in all threads; and what has been traced counts as old
+    afterwards, as it would had the collector run, or it would look through all of that three times more. A call that
+    traces nothing leaves no trace in the collector either: garbage is found as soon as without it.
     """
 
-    @functools.wraps(function)
+    @functools.wraps(function, updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if not gc.isenabled():  # paused by an outer program, or off altogether
             return function(*args, **kwargs)
-        gc.disable()
-        try:
+        try:  # everything in it: an interrupt may come between any two lines
+            gc.disable()
             return function(*args, **kwargs)
         finally:
-            if not gc.get_freeze_count():  # else someone has put objects aside, and wants them to stay there
-                gc.freeze()
-                gc.unfreeze()  # gives everything back as old
-            gc.enable()
+            try:
+                _age()
+            finally:
+                gc.enable()
 
     return call
+
+
+def _age() -> None:
+    """All objects count as old from now on, if there are many new ones."""
+    if gc.get_count()[0] < MANY or gc.get_freeze_count() > ASIDE:  # who has put objects aside wants them to stay there
+        return
+    try:
+        gc.freeze()
+    finally:
+        gc.unfreeze()  # gives everything back as old

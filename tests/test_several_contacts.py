@@ -7,8 +7,12 @@ import pytest
 from contact_batches import flat_push, square
 
 import pushjax as pj
+from pushjax._vec import Vec2
+from pushjax.solve._contact_plane import Contact
 from pushjax.solve._edge_line import pieces
 from pushjax.solve._edge_line import root as root_of
+from pushjax.solve._several import assemble
+from pushjax.solve.squeeze import squeeze
 
 solve = pj.solve_contacts
 
@@ -40,6 +44,29 @@ def test_pinched_disc_moves_to_the_middle():
     assert gap.status == pj.Status.MOVING
     np.testing.assert_allclose(gap.twist, [0.001, 0, 0], atol=1e-15)
     assert gap.mode[1] == pj.ContactMode.SEPARATED
+
+
+def test_a_squeeze_does_not_depend_on_the_order_of_the_contacts(rng):
+    """In float32, of a frictionless finger opposite one of hardly any friction: that their forces can cancel hangs on
+    the product of the latter's two edges, which is exact whichever of the two it is."""
+    n = 2000
+    angle, mu = rng.uniform(-np.pi, np.pi, n), 10.0 ** rng.uniform(-6, -2, n)
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    point = np.stack([-0.03 * normal, 0.03 * normal], axis=1)
+    arrays = point, np.stack([normal, -normal], axis=1), rng.normal(size=(n, 2, 2)), np.stack([0 * mu, mu], axis=1)
+    form = pj.Ellipsoid(np.eye(3, dtype=np.float32), np.float32(0.02)).form()
+
+    def tight(*arrays):
+        rows = zip(*(tuple(array) for array in arrays), strict=True)
+        contacts = tuple(Contact(Vec2(*p), Vec2(*n), Vec2(*d), mu, 0 * mu) for p, n, d, mu in rows)
+        return squeeze(assemble(form, contacts, (jnp.asarray(True),) * 2, margin=True), True)
+
+    program = jax.jit(jax.vmap(tight))
+    found, other = (program(*(jnp.asarray(a[:, order], jnp.float32) for a in arrays)) for order in ([0, 1], [1, 0]))
+    exists = np.isfinite(found.power)
+    assert np.mean(exists) > 0.95
+    np.testing.assert_array_equal(exists, np.isfinite(other.power))
+    np.testing.assert_array_equal(found.presses, other.presses)
 
 
 def test_roots_of_very_different_sizes_are_found(rng):

@@ -142,12 +142,14 @@ class _Kind(NamedTuple):
 
 
 def _sets(edges: int) -> list[tuple[int, ...]]:
-    """All fours, with the two edges of a contact first; all threes, and twos with the moment."""
-    sets = []
-    for four in combinations(range(edges), 4):
-        twice = [(a, b) for a, b in pairwise(four) if a // 2 == b // 2]
-        sets.append((*twice[0], *(e for e in four if e not in twice[0])) if twice else four)
-    return sets + [(*three, edges + 1) for three in combinations(range(edges + 1), 3)]
+    """All fours; all threes, and twos with the moment. Two edges of a contact, whose product is exact, come first."""
+
+    def pair_first(some: tuple[int, ...]) -> tuple[int, ...]:
+        twice = [(a, b) for a, b in pairwise(some) if a // 2 == b // 2]
+        return (*twice[0], *(e for e in some if e not in twice[0])) if twice else some
+
+    fours = [pair_first(four) for four in combinations(range(edges), 4)]
+    return fours + [(*pair_first(three), edges + 1) for three in combinations(range(edges + 1), 3)]
 
 
 def _wanted_best(edges: _Edges, wanted: bool | Bool[Array, ""], witness: Scalar) -> tuple:
