@@ -28,10 +28,6 @@ class Basis(NamedTuple):
         inverse = jnp.where(regular, 1.0 / jnp.where(regular, det, 1.0), 0.0)
         return Basis((v1, v2, v3), (x1, x2, x3), det, inverse, regular)
 
-    def independent(self, relative: float) -> Bool[Array, ""]:
-        """Whether |det| is above `relative` times the three lengths."""
-        return jnp.abs(self.det) > relative * _lengths(*self.vectors)
-
     def products(self, v: Vec3) -> Vec3:
         """vector_i . v."""
         return Vec3(*(vector.dot(v) for vector in self.vectors))
@@ -52,13 +48,10 @@ class Basis(NamedTuple):
 def completed(v1: Vec3, v2: Vec3, v3: Vec3, used2: Bool[Array, ""], used3: Bool[Array, ""], relative: float) -> Basis:
     """A basis of the vectors in use, v1 among them and none used after one that is not; at right angles to them, so
     that nothing goes that way, directions in place of the others. Regular where |det| is above `relative` times the
-    three lengths. The vectors should be settled."""
+    three lengths."""
     zero = jnp.zeros_like(v1.x)
     aside = select(jnp.abs(v1.x) > jnp.abs(v1.y), Vec3(-v1.y, v1.x, zero), Vec3(zero, -v1.z, v1.y))
-    v2 = settle(select(used2, v2, aside), v1.x)
-    v3 = settle(select(used3, v3, v1.cross(v2)), v1.x)
-    return Basis.of(v1, v2, v3, relative * _lengths(v1, v2, v3))
-
-
-def _lengths(v1: Vec3, v2: Vec3, v3: Vec3) -> Scalar:
-    return jnp.sqrt(v1.dot(v1) * v2.dot(v2) * v3.dot(v3))
+    v2 = select(used2, v2, aside)
+    v3 = select(used3, v3, v1.cross(v2))
+    v1, v2, v3 = settle((v1, v2, v3), v1.x)
+    return Basis.of(v1, v2, v3, relative * jnp.sqrt(v1.dot(v1) * v2.dot(v2) * v3.dot(v3)))

@@ -98,8 +98,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
     beta = _polished(system, select(moves, _to_scale(system, begin), Vec3(zero, zero, zero)))
     f = settle(_facing(system, system.wrench(beta)), problem.speed)
     alpha = edges.weights(f)
-    for _ in range(2):  # the second for forces that nearly cancel
-        alpha = settle(alpha + edges.weights(f - edges.total(alpha)), problem.speed)
+    alpha = settle(alpha + edges.weights(f - edges.total(alpha)), problem.speed)
     h = problem.form.value(f)
     solved = moves & (h > 0)
     # what the conditions fix of the twist is taken from them, not from H: a contact that sticks has no slip
@@ -111,7 +110,7 @@ def finish(problem: Several, chosen: Found, *, proves_jams: bool) -> SeveralMoti
 
     slips, tolerance = jax.lax.stop_gradient((problem.slips(twist), violation(twist)))
     suitable = _suitable(problem, chosen, slips, tolerance)
-    weights = settle(share_force(problem.generators, suitable, chosen.edges, edges, alpha, f), problem.speed)
+    weights = settle(share_force(problem.generators, suitable, chosen.edges, alpha, f), problem.speed)
     passes = _passes(problem, chosen, slips, tolerance, alpha, motion, twist)
     solved = settle(solved & passes, problem.speed)
 
@@ -152,7 +151,7 @@ def _edges(problem: Several, chosen: Found, moves: Bool[Array, ""]) -> Basis:
     """The chosen edges, and in place of unused ones directions at right angles to them."""
     zero = jnp.zeros_like(problem.speed)
     g1, g2, g3 = (pick(problem.generators, jnp.maximum(edge, 0)) for edge in chosen.edges)
-    g1 = settle(select(moves, g1, Vec3(zero + 1, zero, zero)), problem.speed)
+    g1 = select(moves, g1, Vec3(zero + 1, zero, zero))
     used2, used3 = (moves & (edge >= 0) for edge in chosen.edges[1:])
     return completed(g1, g2, g3, used2, used3, 0.01 * float(jnp.finfo(zero.dtype).eps))
 

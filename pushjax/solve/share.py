@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Int
 from pushjax._autodiff import undifferentiated
 from pushjax._vec import Scalar, Vec3, select, settle, weighted
 from pushjax.limit_surface import Symmetric3
-from pushjax.solve._basis import Basis
+from pushjax.solve._basis import completed
+from pushjax.solve._several import pick
 
 ROUNDS = 7  # at most
 SEARCHES = 5  # rounds of the line search, in each
@@ -29,14 +30,10 @@ def share_force(
     generators: tuple[Vec3, ...],
     suitable: tuple[Bool[Array, ""], ...],
     chosen: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]],
-    basis: Basis,
     alpha: Vec3,
     f: Vec3,
 ) -> tuple[Scalar, ...]:
-    """The weight of every generator. Where it is plain that no other suits, the chosen edges' own weights, `alpha`.
-
-    basis: of the chosen edges.
-    """
+    """The weight of every generator. Where it is plain that no other suits, the chosen edges' own weights."""
     zero = jnp.zeros_like(f.x)
     own = []
     for k in range(len(generators)):
@@ -53,7 +50,7 @@ def share_force(
     kept = tuple(select(s, g, Vec3(zero, zero, zero)) for g, s in zip(generators, suitable, strict=True))
     # three edges in one plane are all there are, and yet one too many: with independent ones both ways agree
     several = settle((count > used) | (count > 2), size)
-    y, curvature = undifferentiated(_minimised, kept, basis, alpha.scale(1 / unit), target, several)
+    y, curvature = undifferentiated(_minimised, kept, chosen, alpha.scale(1 / unit), target, several)
     # Differentiated rounds: each makes one order of derivative exact, with the curvature held fixed
     y = settle(y + _solve(curvature, target - weighted(kept, _pulls(kept, y))), size)
     weights = settle(_pulls(kept, y), size)
@@ -71,7 +68,7 @@ def share_force(
 
 
 def _minimised(
-    kept: tuple[Vec3, ...], basis: Basis, alpha: Vec3, target: Vec3, several: Bool[Array, ""]
+    kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3, several: Bool[Array, ""]
 ) -> tuple[Vec3, Symmetric3]:
     """y, and the Hessian of phi there; where not `several`, of y as it begins."""
 
@@ -83,9 +80,7 @@ def _minimised(
         y = settle(y + _searched(kept, target, y), target.x)
         return count + 1, y, (count + 1 < ROUNDS) & goes_on(y)
 
-    # the shortest y that gives the chosen edges their weights; of nearly dependent edges it is far off by rounding
-    steady = basis.independent(float(jnp.finfo(target.x.dtype).eps))
-    begin = select(basis.regular & steady, basis.with_products(alpha), target)
+    begin = _begin(kept, chosen, alpha, target)
     _, y, _ = jax.lax.while_loop(lambda state: state[2], round_, (jnp.zeros((), jnp.int32), begin, goes_on(begin)))
     return y, _curvature(kept, y)
 
@@ -95,6 +90,13 @@ def _fits(kept: tuple[Vec3, ...], weights: list[Scalar], target: Vec3, roundings
     rest = target - weighted(kept, weights)
     allowed = roundings * jnp.finfo(target.x.dtype).eps * (1 + sum(weights, 0 * target.x))
     return rest.dot(rest) <= allowed**2
+
+
+def _begin(kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3) -> Vec3:
+    """The shortest y that gives the chosen edges their weights."""
+    first, second, third = (pick(kept, jnp.maximum(edge, 0)) for edge in chosen)
+    basis = completed(first, second, third, chosen[1] >= 0, chosen[2] >= 0, float(jnp.finfo(target.x.dtype).eps))
+    return select(basis.regular, basis.with_products(alpha), target)
 
 
 def _pulls(kept: tuple[Vec3, ...], y: Vec3) -> list[Scalar]:
