@@ -52,7 +52,14 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
+# Three that make programs of their own, a minute each.
+LONG_NOTEBOOKS = ("03_several_contacts", "04_stochastic_pushing", "06_planning")
+
+
 def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.path.stem in LONG_NOTEBOOKS:
+            item.add_marker("long")
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
 
     def place(item) -> int:

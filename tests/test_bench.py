@@ -14,6 +14,7 @@ import pushjax as pj
 from pushjax import cli
 from pushjax.bench import cases, devices, grasps, measure, needed, numerics, outlines, run, tasks
 from pushjax.bench.peers import rows
+from pushjax.bench.traffic import traffic
 
 
 def counted(offset, angle, steps, **options):
@@ -90,14 +91,47 @@ def test_rows(tmp_path):
         # a push's own cost in multiply-adds, and the share of the ceiling, are one figure
         share = row["flops_needed_per_step"] / 2 / row["multiply_adds_per_step"]
         assert row["ceiling_fraction"] == pytest.approx(share)
-    assert "push_quartic" in run.summary(record)
-    assert run.slower(record["rows"], record) == []
-    older = [{name: value for name, value in row.items() if name != "devices"} for row in record["rows"]]
-    assert run.slower(record["rows"], {"rows": older}) == []
-    half = [row | {"multiply_adds_per_step": row["multiply_adds_per_step"] / 2} for row in record["rows"]]
-    assert [row["times"] for row in run.slower(record["rows"], {"rows": half})] == pytest.approx([2, 2])
-    (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half}))
-    assert run.kept(tmp_path / "half.json")["rows"] == half
+        # as compiled, which works out some things more than once; moved between kernels, not between memory and them
+        assert row["flops_needed_per_step"] < row["flops_per_step"] < 10 * row["flops_needed_per_step"]
+        assert 1000 < row["bytes_per_step"] < 100_000
+        assert 0 < row["near_copy_fraction"] < 1
+        assert row["per_processor_s"] == pytest.approx(batch / row["processor_s"])
+    lines = run.summary(record).splitlines()
+    assert lines[1].split()[:4] == ["push_quartic", "float32", "64", "8"]
+    assert lines[1].index("mm") == lines[2].index("mm")
+    rows = record["rows"]
+    assert run.slower(rows, record) == ([], [])
+    older = [{name: value for name, value in row.items() if name != "devices"} for row in rows]
+    assert run.slower(rows, {"rows": older}) == ([], [])
+    half = [row | {"multiply_adds_per_step": row["multiply_adds_per_step"] / 2} for row in rows]
+    found, new = run.slower(rows, {"rows": half})
+    assert [row["times"] for row in found] == pytest.approx([2, 2])
+    # half the cost a step in twice the steps is the same
+    assert run.slower(rows, {"rows": [row | {"steps": 2 * row["steps"]} for row in half]}) == ([], [])
+    found, new = run.slower(rows, {"rows": half[:1]})
+    assert (len(found), [row["batch"] for row in new]) == (1, [128])
+    assert "not in the baseline: push_quartic, float32, 128" in run.summary(record | {"new": new})
+    with pytest.raises(ValueError, match="no row of what was measured"):
+        run.slower(rows, {"rows": []})
+    (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half, "settings": {"cores": 1}}))
+    assert run.kept(tmp_path / "half.json", 1)["rows"] == half
+    with pytest.raises(ValueError, match="is of --cores 1; got all"):
+        run.kept(tmp_path / "half.json", None)
+
+
+def test_traffic_counts_rounds():
+    """A loop as often as it goes round, a kernel's operands and result; of a branch, everything there is."""
+    x = jnp.ones(1000, jnp.float32)
+
+    def of(function):
+        return traffic(jax.jit(function).lower(x).compile().as_text())
+
+    once, often = of(lambda x: x * 2.5 + 1.5), of(lambda x: jax.lax.fori_loop(0, 7, lambda k, x: x * 2.5 + 1.5, x))
+    assert once == (2000, 8000, 1)
+    assert often.flops == pytest.approx(7 * once.flops, rel=0.01)  # and the loop's own counting
+    assert 7 * once.bytes <= often.bytes < 7.2 * once.bytes + 8000  # and a copy of what begins
+    product = traffic(jax.jit(lambda x: x @ x.T).lower(jnp.ones((40, 30))).compile().as_text())
+    assert product.flops == pytest.approx(2 * 40 * 40 * 30)
 
 
 def test_cases_work():
@@ -109,6 +143,14 @@ def test_cases_work():
     sampled = cases.sampling("float64", 4)
     surface = jax.jit(sampled.function)(*sampled.args)
     assert all(pj.Quartic(c, surface.length[0]).is_convex() for c in surface.coefficients)
+    one, args = cases.each_push("quartic", "float64", 3, 2)
+    by = jax.jit(jax.grad(lambda *args: jnp.sum(jax.vmap(one)(*args).pose[:, -1]), argnums=(0, 1, 2)))(*args)
+    assert all(np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(by))
+    # what each has a surface of its own turns as what all share one does: scaled, it is the same
+    shared, own = (cases.grasp("float64", 4, steps=4, varied=varied) for varied in (False, True))
+    assert (shared.case, own.case) == ("grasp_two_fingers", "grasp_surfaces")
+    poses = [np.asarray(jax.jit(work.function)(*work.args)) for work in (shared, own)]
+    np.testing.assert_allclose(*poses, rtol=0, atol=1e-12)
 
 
 def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
@@ -241,8 +283,10 @@ def test_turns():
     values = np.asarray(top.multiply_add.run())
     assert values.dtype == np.float32
     assert np.isfinite(values).all()
-    # the compiler counts one round of the loop
-    assert top.multiply_add.flops == pytest.approx(top.flops / measure.ROUNDS, rel=0.1)
+    assert top.multiply_add.traffic.flops == pytest.approx(top.flops, rel=0.1)
+    copied = 2 * 4 * measure.NEAR * measure.NEAR_PASSES
+    assert top.near.traffic.bytes == pytest.approx(copied, rel=0.01)
+    np.testing.assert_allclose(np.asarray(top.near.run()), 1.000001**measure.NEAR_PASSES, rtol=1e-3)
 
 
 @pytest.mark.parametrize(

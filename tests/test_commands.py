@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import cache
 
 import matplotlib.image
 import numpy as np
@@ -86,6 +87,7 @@ def test_table2_from_forces(table):
         assert 0.85 < forces / ideal < 1.15
 
 
+@pytest.mark.long
 def test_table2_identified(data, monkeypatch, tmp_path):
     """Two splits with ellipsoids: better than the ideal surface, and far better than the paper."""
     from pushjax.experiments.table2 import experiment
@@ -234,18 +236,20 @@ RANDOM = {
 
 
 @pytest.fixture(scope="module")
-def random_records(tmp_path_factory):
-    """Every random experiment, small."""
-    folder, records = tmp_path_factory.mktemp("random"), {}
-    for name, options in RANDOM.items():
-        cli.main(["reproduce", name, *options, "--out", str(folder), "--json", str(folder / f"{name}.json")])
-        records[name] = read(folder / f"{name}.json")
-    return folder, records
+def random_record(tmp_path_factory):
+    """Of a random experiment, small: its folder and record. Each runs once."""
+
+    @cache
+    def run(name):
+        folder = tmp_path_factory.mktemp(name)
+        cli.main(["reproduce", name, *RANDOM[name], "--out", str(folder), "--json", str(folder / f"{name}.json")])
+        return folder, read(folder / f"{name}.json")
+
+    return run
 
 
-def test_stochastic_push(random_records):
-    _, records = random_records
-    record = records["stochastic-push"]
+def test_stochastic_push(random_record):
+    _, record = random_record("stochastic-push")
     assert record["n"] == 60
     assert record["nonconvex"] == 0
     assert 0 <= record["repaired"] < 0.3
@@ -260,9 +264,9 @@ def test_stochastic_push(random_records):
         assert 0 <= row["normality"]["p_value"] <= 1
 
 
-def test_capture(random_records):
-    _, records = random_records
-    record = records["capture"]
+@pytest.mark.long
+def test_capture(random_record):
+    _, record = random_record("capture")
     assert list(record["dof"]) == ["200", "10"]
     for row in record["rows"]:
         assert row["outcomes"]["failed"] == 0
@@ -277,10 +281,9 @@ def test_capture(random_records):
     assert not caught[np.abs(starts[:, 0]) > 0.07].any()
 
 
-@pytest.mark.parametrize("slider", ["rectangle", "butterfly"])
-def test_grasps_under_uncertainty(random_records, slider):
-    _, records = random_records
-    record = records[f"grasp-{slider}"]
+@pytest.mark.parametrize("slider", ["rectangle", pytest.param("butterfly", marks=pytest.mark.long)])
+def test_grasps_under_uncertainty(random_record, slider):
+    _, record = random_record(f"grasp-{slider}")
     cells = record["cells"]
     assert len(cells) == (2 if slider == "rectangle" else 1)
     assert record["outcomes"] == cells[0]["outcomes"]
@@ -293,18 +296,26 @@ def test_grasps_under_uncertainty(random_records, slider):
         assert len(cell["outcome_of_each"]) == len(cell["pose"]) == 40
 
 
-def test_random_experiments_draw_and_write_a_page(random_records):
+@pytest.mark.parametrize(
+    "name",
+    [
+        "stochastic-push",
+        pytest.param("capture", marks=pytest.mark.long),
+        "grasp-rectangle",
+        pytest.param("grasp-butterfly", marks=pytest.mark.long),
+    ],
+)
+def test_random_experiments_draw_and_write_a_page(random_record, name):
     """One file that holds its pictures and needs no other."""
-    folder, records = random_records
-    for name, record in records.items():
-        for picture in record["pictures"]:
-            assert matplotlib.image.imread(picture)[..., :3].std() > 0.02
-        page = (folder / f"{name}.html").read_text()
-        assert page.count("data:image/png;base64,") == len(record["pictures"]) >= 1
-        for outside in ("http://", "https://", 'src="/', "<script", "<link"):
-            assert outside not in page
-        inside = html.unescape(page.split('<pre id="record">')[1].split("</pre>")[0])
-        assert json.loads(inside)["experiment"] == name
+    folder, record = random_record(name)
+    for picture in record["pictures"]:
+        assert matplotlib.image.imread(picture)[..., :3].std() > 0.02
+    page = (folder / f"{name}.html").read_text()
+    assert page.count("data:image/png;base64,") == len(record["pictures"]) >= 1
+    for outside in ("http://", "https://", 'src="/', "<script", "<link"):
+        assert outside not in page
+    inside = html.unescape(page.split('<pre id="record">')[1].split("</pre>")[0])
+    assert json.loads(inside)["experiment"] == name
 
 
 def test_classes_of_grasps():

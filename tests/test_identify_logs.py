@@ -409,6 +409,7 @@ def test_energy_score_has_a_mean_for_the_longest_tails(few, found, block, surfac
     assert np.max(np.abs(changes)) < 0.05
 
 
+@pytest.mark.long
 def test_density(few, found, block, surface):
     """Of predicted poses: where surface and friction are certain, Student's about the one pose there is; and the noise
     that makes it largest is near that of the pushes."""

@@ -238,6 +238,7 @@ def test_bad_choices(data, arguments, message, capsys, tmp_path):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_causes(logs, data, monkeypatch, tmp_path):
     """Of one object, ellipsoids: where the tip really was matters; an overlap is explained by that."""
     monkeypatch.setattr(methods, "MODELS", {"quartic": 2})
@@ -264,6 +265,7 @@ def test_causes(logs, data, monkeypatch, tmp_path):
     assert not (tmp_path / "table1-causes-cells.json").exists()
 
 
+@pytest.mark.long
 def test_spread(logs, data, monkeypatch, tmp_path):
     """Of one object, ellipsoids, and a short search: better than normal errors, far better than data alone."""
     monkeypatch.setattr(methods, "MODELS", {"quartic": 2})

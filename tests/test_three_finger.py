@@ -78,6 +78,7 @@ def test_fingers_against_a_triangle(log):
     assert inside.normal[0, 0] @ inside.closing[0, 0] > 0  # still inwards
 
 
+@pytest.mark.long
 def test_simulated_again(data, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "OBJECTS", ("triangle",))
     monkeypatch.setattr(runs, "GRID", np.array([0.0, 0.05, 0.1, 0.2]))

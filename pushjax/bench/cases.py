@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 import pushjax as pj
 from pushjax.bench import grasps, needed, tasks
+from pushjax.bench.measure import on_cpu
 from pushjax.problems import random_contacts_problem
 
 TILE = 4000  # pushes at once, of a larger batch: what they work on stays in the cache
@@ -36,18 +38,14 @@ def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = Non
     """Pushes of the fan's range, each with a surface and a friction of its own; final poses."""
     by_steps = tasks.errors(model, dtype)
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
-    here, args = _varied(model, dtype, batch, steps)
-
-    def one(surface: Any, path: Any, friction: Any) -> Any:
-        slider = pj.Slider(here.slider.shape, surface)
-        return here._replace(slider=slider).push(path, friction)
+    one, args = each_push(model, dtype, batch, steps)
 
     def final(*args):
         return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
 
     modes = jax.vmap(lambda *each: one(*each).mode)(*jax.tree.map(lambda leaf: leaf[: min(batch, 500)], args))
     contact = float(np.mean(np.asarray(modes) != pj.ContactMode.SEPARATED))
-    count = _needed(here, args, dtype) if model == "quartic" else None
+    count = _needed(args, dtype) if model == "quartic" else None
     return Work(f"push_{model}", dtype, batch, steps * contact, final, args, count, by_steps.get(steps))
 
 
@@ -58,8 +56,8 @@ def gradient(dtype: str, batch: int) -> Work:
     return plain._replace(case="gradient", function=lambda *args: derivative(args), needed=None)
 
 
-def grasp(dtype: str, batch: int, steps: int | None = None) -> Work:
-    """Two fingers close on the square, askew, and turn it; final poses."""
+def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False) -> Work:
+    """Two fingers close on the square, askew, and turn it; final poses. varied: each has a surface of its own."""
     by_steps = grasps.errors(dtype) if steps is None else {}
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
     slider, hand = tasks.task("quartic", dtype).slider, grasps.hand(dtype)
@@ -67,11 +65,16 @@ def grasp(dtype: str, batch: int, steps: int | None = None) -> Work:
     poses = grasps.random_poses(jax.random.key(1), batch, dtype)
     args = poses, grasps.paths(poses, steps)
 
+    def one(pose: Any, path: Any, surface: Any = slider.surface) -> Any:
+        return pj.rollout(pj.Slider(slider.shape, surface), hand, path, pose=pose, friction=friction).pose[-1]
+
     def final(*args):
-        one = lambda pose, path: pj.rollout(slider, hand, path, pose=pose, friction=friction).pose[-1]  # noqa: E731
         return in_tiles(one, args, batch)
 
-    return Work("grasp_two_fingers", dtype, batch, steps, final, args, None, by_steps.get(steps))
+    name = "grasp_two_fingers"
+    if varied:
+        name, args = "grasp_surfaces", (*args, _surfaces(slider.surface, jax.random.key(0), batch))
+    return Work(name, dtype, batch, steps, final, args, None, by_steps.get(steps))
 
 
 def solve(dtype: str, batch: int, contacts: int) -> Work:
@@ -129,37 +132,46 @@ def monte_carlo(dtype: str, batch: int) -> Work:
 
 
 def in_tiles(function: Callable, args: tuple, batch: int) -> Any:
-    """`vmap`, of no more than TILE at once."""
-    if batch <= TILE:
+    """`vmap`, of no more than TILE at once; what has no cache to keep it in does all at once."""
+    if batch <= TILE or not on_cpu():
         return jax.vmap(function)(*args)
     return jax.lax.map(lambda each: function(*each), args, batch_size=TILE)
 
 
-def _varied(model: str, dtype: str, batch: int, steps: int) -> tuple[tasks.Task, tuple]:
-    """A task; and surface, path and friction of each push, all different, so that no work can be shared."""
+def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
+    """What makes one; and surface, path and friction of each, all different, so that no work can be shared."""
     here = tasks.task(model, dtype)
     keys = jax.random.split(jax.random.key(0), 4)
 
     def uniform(key, low, high):
         return jax.random.uniform(key, (batch,), dtype, low, high)
 
-    scale = 1 + 0.01 * jax.random.normal(keys[0], (batch,), dtype)
+    def one(surface: Any, path: Any, friction: Any) -> pj.Trajectory:
+        return here._replace(slider=pj.Slider(here.slider.shape, surface)).push(path, friction)
+
+    surface = _surfaces(here.slider.surface, keys[0], batch)
+    path = tasks.paths(
+        uniform(keys[1], -tasks.REACH, tasks.REACH), uniform(keys[2], -tasks.STEEPEST, tasks.STEEPEST), steps
+    )
+    return one, (surface, path, uniform(keys[3], 0.15, 0.35))
+
+
+def _surfaces(surface: pj.LimitSurface, key: Array, batch: int) -> pj.LimitSurface:
+    """As many, each scaled differently; their lengths are the same."""
+    scale = 1 + 0.01 * jax.random.normal(key, (batch,), surface.length.dtype)
 
     def each(leaf):
         return scale.reshape(-1, *(1,) * leaf.ndim) * leaf[None] if leaf.ndim else jnp.broadcast_to(leaf, (batch,))
 
-    surface = jax.tree.map(each, here.slider.surface)
-    path = tasks.paths(
-        uniform(keys[1], -tasks.REACH, tasks.REACH), uniform(keys[2], -tasks.STEEPEST, tasks.STEEPEST), steps
-    )
-    return here, (surface, path, uniform(keys[3], 0.15, 0.35))
+    return jax.tree.map(each, surface)
 
 
-def _needed(here: tasks.Task, args: tuple, dtype: str) -> float:
-    """FLOPs of a step, the mean of some of the pushes."""
+def _needed(args: tuple, dtype: str) -> float:
+    """FLOPs of a step, the mean of some of the pushes of a quartic."""
     surface, path, friction = jax.tree.map(lambda leaf: np.asarray(leaf[:NEEDED_OF], float), args)
-    assert isinstance(here.slider.shape, pj.Polygon)
-    vertices = [(float(x), float(y)) for x, y in np.asarray(here.slider.shape.vertices)]
+    shape = tasks.square("quartic").shape
+    assert isinstance(shape, pj.Polygon)
+    vertices = [(float(x), float(y)) for x, y in np.asarray(shape.vertices)]
     counts = []
     for k in range(len(path)):
         task = needed.Push(

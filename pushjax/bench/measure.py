@@ -15,21 +15,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pushjax.bench.traffic import Traffic, traffic
+
 REPEATS = 7
 LEAST_S = 0.03  # of a turn
-CHAINS, LINKS, LANES, ROUNDS = 8, 16, 4096, 200  # the FMA kernel: in the first-level cache, and compute-bound
-COPIED = 1 << 24  # numbers: beyond any cache
+CHAINS, LINKS, ROUNDS = 8, 16, 200  # the FMA kernel, compute-bound
+LANES, MANY_LANES = 4096, 1 << 22  # of a CPU, in the first-level cache; of an accelerator, which has many threads
+COPIED, PASSES = 1 << 24, 4  # numbers beyond any cache of a CPU, and how often
+NEAR, NEAR_PASSES = 1 << 16, 1000  # what the second-level cache holds, as it does what a tile of pushes works on
 
 
 class Program(NamedTuple):
-    """A compiled program with its arguments. flops, bytes: the compiler's own count, of one run, where it gives one (of
-    a loop's body it counts one round)."""
+    """A compiled program with its arguments. traffic: of one run, where there is one program and its text."""
 
     call: Callable
     args: tuple
     compile_s: float
-    flops: float | None
-    bytes: float | None
+    traffic: Traffic | None
 
     def run(self) -> Any:
         return jax.block_until_ready(self.call(*self.args))
@@ -37,7 +39,8 @@ class Program(NamedTuple):
 
 class Timing(NamedTuple):
     """Seconds of one run: median, and the range of the middle half. processor: the median of what all threads of the
-    process took of processors, which a machine's other programs change least."""
+    process took of processors, which a machine's other programs change least; where something else computes, of time
+    as such."""
 
     median: float
     low: float
@@ -51,9 +54,8 @@ def compiled(function: Callable, *args: Any) -> Program:
     begin = time.perf_counter()
     call = jax.jit(function).lower(*args).compile()
     compile_s = time.perf_counter() - begin
-    costs = call.cost_analysis() or {}
-    costs = costs[0] if isinstance(costs, list) else costs
-    return Program(call, args, compile_s, costs.get("flops"), costs.get("bytes accessed"))
+    text = call.as_text()
+    return Program(call, args, compile_s, None if text is None else traffic(text))
 
 
 def called(function: Callable, *args: Any) -> Program:
@@ -63,7 +65,7 @@ def called(function: Callable, *args: Any) -> Program:
     middle = time.perf_counter()
     jax.block_until_ready(function(*args))
     compile_s = max(0.0, 2 * middle - begin - time.perf_counter())
-    return Program(function, args, compile_s, None, None)
+    return Program(function, args, compile_s, None)
 
 
 def alternate(
@@ -89,11 +91,16 @@ def alternate(
 
 def _seconds(run: Callable[[], Any], count: int = 1) -> tuple[float, float]:
     """Wall and processor time of a run; the first of all runs is not counted."""
+    clock = time.process_time if on_cpu() else time.perf_counter
     run()
-    begin, busy = time.perf_counter(), time.process_time()
+    begin, busy = time.perf_counter(), clock()
     for _ in range(count):
         run()
-    return (time.perf_counter() - begin) / count, (time.process_time() - busy) / count
+    return (time.perf_counter() - begin) / count, (clock() - busy) / count
+
+
+def on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 @contextmanager
@@ -108,17 +115,21 @@ def both_dtypes() -> Iterator[None]:
 
 
 class Ceiling(NamedTuple):
-    """The machine's own kernels: FMA as fast as it computes, `copied` as fast as it moves what fits no cache."""
+    """The machine's own kernels: FMA as fast as it computes, `copied` as fast as it moves what fits no cache, `near`
+    what fits the second one."""
 
     multiply_add: Program
     flops: float
     copied: Program
-    bytes: float
+    near: Program
+
+    def runs(self) -> dict[str, Callable[[], Any]]:
+        return {"multiply_add": self.multiply_add.run, "copied": self.copied.run, "near": self.near.run}
 
 
 @cache
 def ceiling(dtype: str) -> Ceiling:
-    """Both kernels, in `dtype`, written as the library is: JAX on batches, compiled by XLA."""
+    """The kernels, in `dtype`, written as the library is: JAX on batches, compiled by XLA."""
     kind = jnp.dtype(dtype)
 
     def multiply_add(x):
@@ -133,17 +144,21 @@ def ceiling(dtype: str) -> Ceiling:
 
         return jax.lax.fori_loop(0, ROUNDS, lambda k, x: round_(k, [x * (1 + 0.01 * j) for j in range(CHAINS)])[0], x)
 
-    lanes = jnp.linspace(0.5, 1.5, LANES, dtype=kind)
-    many = jnp.ones(COPIED, kind)
-    flops = LANES * ROUNDS * CHAINS * (2.0 * LINKS + 2)
-    return Ceiling(
-        compiled(multiply_add, lanes), flops, compiled(lambda x: x * 1.000001, many), 2.0 * COPIED * kind.itemsize
-    )
+    def moved(count: int, passes: int) -> Program:
+        # in place, again and again: memory that is new to the process would be waited for
+        return compiled(lambda x: jax.lax.fori_loop(0, passes, lambda _, x: x * 1.000001, x), jnp.ones(count, kind))
+
+    many = LANES if on_cpu() else MANY_LANES
+    lanes = jnp.linspace(0.5, 1.5, many, dtype=kind)
+    flops = many * ROUNDS * CHAINS * (2.0 * LINKS + 2)
+    return Ceiling(compiled(multiply_add, lanes), flops, moved(COPIED, PASSES), moved(NEAR, NEAR_PASSES))
 
 
-def rates(top: Ceiling, timings: dict[str, Timing]) -> dict[str, float]:
-    """Ceilings in GFLOP/s and GB/s of one processor, from timings under the names "multiply_add" and "copied"."""
+def rates(top: Ceiling, dtype: str, timings: dict[str, Timing]) -> dict[str, float]:
+    """Ceilings in GFLOP/s and GB/s (read and written) of one processor, from timings of `Ceiling.runs`."""
+    each = 2e-9 * jnp.dtype(dtype).itemsize
     return {
         "multiply_add_gflops": top.flops / timings["multiply_add"].processor / 1e9,
-        "copy_gbytes": top.bytes / timings["copied"].processor / 1e9,
+        "copy_gbytes": each * COPIED * PASSES / timings["copied"].processor,
+        "near_copy_gbytes": each * NEAR * NEAR_PASSES / timings["near"].processor,
     }

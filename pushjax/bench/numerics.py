@@ -67,9 +67,9 @@ def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
         apart.append(tasks.error_mm(one[0].astype(float), two[0], length)[:here])
         flips += int((one[1] != two[1])[:here].sum())
         failed += int(one[2][:here].sum() + two[2][:here].sum())
-        if not chunk:
-            again = _pushed(kinds["float32"], path, jnp.asarray(friction))
-            same &= all(np.array_equal(a, b) for a, b in zip(one, map(np.asarray, again), strict=True))
+        for dtype, before in (("float32", one), ("float64", two)):
+            again = _pushed(kinds[dtype], path.astype(dtype), jnp.asarray(friction, dtype))
+            same &= all(np.array_equal(a, b) for a, b in zip(before, map(np.asarray, again), strict=True))
     quantiles = np.quantile(np.concatenate(apart), LEVELS)
     return {
         "model": model,

@@ -17,7 +17,7 @@ CASES: dict[str, tuple[Make, ...]] = {
     "push": (cases.push,),
     "ellipsoid": (partial(cases.push, model="ellipsoid"),),
     "gradient": (cases.gradient,),
-    "grasp": (cases.grasp,),
+    "grasp": (cases.grasp, partial(cases.grasp, varied=True)),
     "solve": tuple(partial(cases.solve, contacts=m) for m in range(1, 9)),
     "sampling": (cases.sampling,),
     "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),
@@ -55,8 +55,8 @@ def run(
     is; of several, the threads that share a program wait for each other, so what it costs of one core is to be measured
     on one. devices: a second row of each push, its batch over that many (`bench.devices`). peers: the same by others
     beside it, of the cases that have such (`peers.rows`); of pushes also by steps, with a picture in `out`. baseline: a
-    record written before; `slower` then names the rows that cost more than `SLOWER` times what they did, both in units
-    of the multiply-add kernel. keep: called with the record so far.
+    record written before, with as many cores; `slower` then names the rows that cost more than `SLOWER` times what they
+    did, both in units of the multiply-add kernel, `new` those that were not there. keep: called with the record so far.
 
     Raises ValueError for a batch that is not positive, cores or devices that are not there, peers that are not
     installed or that no case has, or a baseline that is no record.
@@ -64,7 +64,7 @@ def run(
     for number in batch or ():
         if number < 1:
             raise ValueError(f"batch must be positive; got {number}")
-    before = None if baseline is None else kept(baseline)
+    before = None if baseline is None else kept(baseline, cores)
     if cores is not None:
         _use(cores)
     if devices is not None:
@@ -86,7 +86,7 @@ def run(
     rows: list[dict[str, Any]] = []
     settings = {"cases": list(case), "dtypes": list(dtype), "batches": None if batch is None else list(batch)}
     settings |= {"cores": cores, "devices": devices, "seed": seed}
-    record = envelope("bench", settings, rows=rows, ceilings={}, slower=[])
+    record = envelope("bench", settings, rows=rows, ceilings={}, slower=[], new=[])
     with both_dtypes():  # float32 too is compared with what float64 gives
         for done, measured in enumerate(todo):
             found, top = measured()
@@ -105,7 +105,7 @@ def run(
                 record["pictures"] = [] if out is None else [others.draw(record, out)]
             progress(total, total)
     if before is not None:
-        record["slower"] = slower(rows, before)
+        record["slower"], record["new"] = slower(rows, before)
     return record
 
 
@@ -122,7 +122,7 @@ def _beside_one(make: Make, dtype: str, batch: int, devices: int) -> Rows:
     works = [make(dtype, batch), sharding.sharded(make, dtype, batch, devices)]
     programs = [compiled(work.function, *work.args) for work in works]
     timings, top = _timed({str(k): program for k, program in enumerate(programs)}, dtype)
-    rows = [_figures(*each, timings[str(k)], timings) for k, each in enumerate(zip(works, programs, strict=True))]
+    rows = [_figures(*each, timings[str(k)], timings, top) for k, each in enumerate(zip(works, programs, strict=True))]
     rows[1] |= {"devices": devices, "speedup": timings["0"].median / timings["1"].median}
     return rows, top
 
@@ -139,19 +139,21 @@ def _use(cores: int) -> None:
 def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
     program = (called if work.host else compiled)(work.function, *work.args)
     timings, top = _timed({"it": program}, work.dtype)
-    return _figures(work, program, timings["it"], timings), top
+    return _figures(work, program, timings["it"], timings, top), top
 
 
 def _timed(programs: dict[str, Program], dtype: str) -> tuple[dict[str, Timing], dict[str, float]]:
     top = ceiling(dtype)
     runs = {name: program.run for name, program in programs.items()}
-    timings = alternate(runs | {"multiply_add": top.multiply_add.run}, most_s=MOST_S)
-    timings |= alternate({"copied": top.copied.run}, repeats=2)
-    return timings, rates(top, timings)
+    timings = alternate(runs | top.runs(), most_s=MOST_S)
+    return timings, rates(top, dtype, timings)
 
 
-def _figures(work: cases.Work, program: Program, mine: Timing, timings: dict[str, Timing]) -> dict[str, Any]:
+def _figures(
+    work: cases.Work, program: Program, mine: Timing, timings: dict[str, Timing], top: dict[str, float]
+) -> dict[str, Any]:
     steps = work.batch * work.steps
+    made = program.traffic
     multiply_add = timings["multiply_add"].processor / (ceiling(work.dtype).flops / 2)
     row: dict[str, Any] = {
         "case": work.case,
@@ -165,10 +167,14 @@ def _figures(work: cases.Work, program: Program, mine: Timing, timings: dict[str
         "processor_s": mine.processor,
         "steps_per_s": steps / mine.median,
         "ns_per_step": 1e9 * mine.processor / steps,
+        "per_processor_s": work.batch / mine.processor,
         "flops_needed_per_step": work.needed,
-        "compiler_flops": program.flops,
-        "compiler_bytes": program.bytes,
+        # as compiled, which works out some of it several times
+        "flops_per_step": made and made.flops / steps,
+        "bytes_per_step": made and made.bytes / steps,
+        "kernels": made and made.kernels,
         "ceiling_fraction": None,
+        "near_copy_fraction": made and 1e-9 * made.bytes / mine.processor / top["near_copy_gbytes"],
         # what regressions are judged by: steps' worth of multiply-adds
         "multiply_adds_per_step": mine.processor / steps / multiply_add,
         "pose_error_mm": work.error_mm,
@@ -181,58 +187,87 @@ def _figures(work: cases.Work, program: Program, mine: Timing, timings: dict[str
     return row
 
 
-def kept(path: Path) -> dict[str, Any]:
-    """A record of `pushjax bench`. Raises ValueError for anything else."""
+def kept(path: Path, cores: int | None) -> dict[str, Any]:
+    """A record of `pushjax bench`. Raises ValueError for anything else, or of other cores."""
     try:
         record = json.loads(path.read_text())
         if record["experiment"] != "bench" or not isinstance(record["rows"], list):
             raise KeyError
     except (json.JSONDecodeError, KeyError, TypeError):
         raise ValueError(f"--baseline: {path} holds no record of pushjax bench") from None
+    there = record.get("settings", {}).get("cores")
+    if there != cores:
+        raise ValueError(f"--baseline: {path} is of --cores {there or 'all'}; got {cores or 'all'}")
     return record
 
 
-def slower(rows: list[dict[str, Any]], before: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows that cost more than they did, in multiply-adds per step."""
+def slower(rows: list[dict[str, Any]], before: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows that cost more than they did, in multiply-adds for one of the batch (also if it takes other steps now); and
+    rows that were not there. Raises ValueError if none was."""
 
     def name(row: dict[str, Any]) -> dict[str, Any]:
         return {"devices": 1} | {key: row[key] for key in SAME if key in row}
 
-    found = []
+    def cost(row: dict[str, Any]) -> float:
+        return row["multiply_adds_per_step"] * row["steps"]
+
+    found, new = [], []
     for row in rows:
-        for old in before["rows"]:
-            if name(old) == name(row):
-                times = row["multiply_adds_per_step"] / old["multiply_adds_per_step"]
-                if times > SLOWER:
-                    found.append(name(row) | {"times": times})
-    return found
+        same = [old for old in before["rows"] if name(old) == name(row)]
+        if not same:
+            new.append(name(row))
+        elif (times := cost(row) / cost(same[0])) > SLOWER:
+            found.append(name(row) | {"times": times})
+    if len(new) == len(rows):
+        raise ValueError("--baseline has no row of what was measured")
+    return found, new
+
+
+COLUMNS = "{:20}{:9}{:>8}{:>7}{:>10}{:>11}{:>10}{:>9}{:>11}{:>8}{:>9}{:>11}"
+HEADS = "case,dtype,batch,steps,compile,run,steps/s,ns/step,of ceiling,B/step,of copy,error".split(",")
 
 
 def summary(record: dict[str, Any]) -> str:
     """What the command prints."""
-    lines = [
-        f"{'case':20}{'dtype':9}{'batch':>8}{'steps':>7}{'compile':>10}{'run':>11}{'steps/s':>10}{'ns/step':>9}"
-        f"{'of ceiling':>11}{'error':>11}"
-    ]
+    lines = [COLUMNS.format(*HEADS)]
     for row in record["rows"]:
-        share = "" if row["ceiling_fraction"] is None else f"{100 * row['ceiling_fraction']:.1f} %"
-        error = "" if row["pose_error_mm"] is None else f"{row['pose_error_mm']:.3f} mm"
-        lines.append(
-            f"{row['case']:20}{row['dtype']:9}{row['batch']:8}{row['steps']:7.4g}{row['compile_s']:8.2f} s"
-            f"{1e3 * row['run_s']:8.1f} ms{row['steps_per_s']:10.2e}{row['ns_per_step']:9.1f}{share:>11}{error:>11}"
-            + ("" if row["speedup"] is None else f"  {row['devices']} devices: {row['speedup']:.2f} times as fast")
+        cells = (
+            row["case"],
+            row["dtype"],
+            row["batch"],
+            f"{row['steps']:.4g}",
+            f"{row['compile_s']:.2f} s",
+            f"{1e3 * row['run_s']:.1f} ms",
+            f"{row['steps_per_s']:.2e}",
+            f"{row['ns_per_step']:.1f}",
+            _if_there("{:.1%}", row["ceiling_fraction"]),
+            _if_there("{:.0f}", row["bytes_per_step"]),
+            _if_there("{:.0%}", row["near_copy_fraction"]),
+            _if_there("{:.3f} mm", row["pose_error_mm"]),
         )
+        lines.append(COLUMNS.format(*cells))
+        if row["speedup"] is not None:
+            lines[-1] += f"  {row['devices']} devices: {row['speedup']:.2f} times as fast"
     for dtype, top in record["ceilings"].items():
         lines.append(
             f"ceilings, {dtype}: {top['multiply_add_gflops']:.0f} GFLOP/s multiply-add (of one processor), "
-            f"{top['copy_gbytes']:.1f} GB/s copied"
+            f"{top['near_copy_gbytes']:.0f} GB/s copied within the second-level cache, {top['copy_gbytes']:.1f} beyond"
         )
     if "peers" in record:
         from pushjax.bench.peers import rows as others
 
         lines += others.summary(record["peers"], record["rows"])
         lines += [f"drew {path}" for path in record["pictures"]]
+    for row in record["new"]:
+        lines.append(f"not in the baseline: {_which(row)}")
     for row in record["slower"]:
-        which = f"{row['case']}, {row['dtype']}, {row['batch']}"
-        lines.append(f"SLOWER than the baseline: {which}: {row['times']:.2f} times")
+        lines.append(f"SLOWER than the baseline: {_which(row)}: {row['times']:.2f} times")
     return "\n".join(lines)
+
+
+def _which(row: dict[str, Any]) -> str:
+    return f"{row['case']}, {row['dtype']}, {row['batch']}"
+
+
+def _if_there(wanted: str, figure: float | None) -> str:
+    return "" if figure is None else wanted.format(figure)

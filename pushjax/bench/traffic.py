@@ -1,0 +1,117 @@
+"""What a compiled program computes and moves: read off its text, loops counted as often as they run.
+
+XLA's own cost analysis counts a loop's body once. Here a loop whose rounds the compiler knows counts with these, any
+other one (such as a root's, which ends when all have landed) once; so figures are from below. A kernel moves its
+operands and its result, as if nothing stayed in a cache: from above, where it needs a part of an operand only.
+"""
+
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from typing import NamedTuple
+
+# of floating-point numbers; each counts as one, as in `bench.needed`
+ARITHMETIC = frozenset(
+    "abs add atan2 cbrt cosine divide exponential log maximum minimum multiply negate power rsqrt sine sqrt subtract "
+    "tan tanh".split()
+)
+MOVES_NOTHING = frozenset("after-all bitcast constant get-tuple-element opt-barrier parameter tuple".split())
+BYTES = {"pred": 1, "s8": 1, "u8": 1, "s16": 2, "u16": 2, "f16": 2, "bf16": 2, "f64": 8, "s64": 8, "u64": 8}
+
+_COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.-]+) \(.*\{\s*$")
+_INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.-]+) = (\(.*?\)|\S+) ([\w-]+)\((.*)$")
+_ARRAY = re.compile(r"([a-z]+\d*)\[([\d,]*)\]")
+_CALLED = re.compile(r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.-]+)")
+_BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
+_ROUNDS = re.compile(r'known_trip_count":\{"n":"(\d+)"')
+
+
+class Traffic(NamedTuple):
+    """Of one run. kernels: how many different ones there are."""
+
+    flops: float
+    bytes: float
+    kernels: int
+
+
+class _Instruction(NamedTuple):
+    shape: str
+    opcode: str
+    operands: tuple[str, ...]
+    called: tuple[str, ...]
+    rounds: int
+
+
+def traffic(text: str) -> Traffic:
+    """Of a compiled program, from its text (`Compiled.as_text()`)."""
+    computations, entry = _parsed(text)
+
+    @cache
+    def total(name: str) -> tuple[float, float]:
+        """FLOPs and bytes of a computation."""
+        flops = moved = 0.0
+        here = computations[name]
+        for each in here.values():
+            inner = [total(called) for called in each.called]
+            if each.opcode in ("while", "call", "conditional"):
+                flops += each.rounds * sum(f for f, _ in inner)
+                moved += each.rounds * sum(b for _, b in inner)
+            elif each.opcode not in MOVES_NOTHING:
+                operands = [here[operand].shape for operand in each.operands if operand in here]
+                moved += sum(map(_size, (each.shape, *operands)))
+                flops += sum(f for f, _ in inner) if each.opcode == "fusion" else _flops(each, operands)
+        return flops, moved
+
+    flops, moved = total(entry)
+    return Traffic(flops, moved, sum(each.opcode == "fusion" for each in _outside_kernels(computations)))
+
+
+def _flops(each: _Instruction, operands: list[str]) -> float:
+    if each.opcode == "dot":  # of matrices (m, k) and (k, n)
+        return 2 * math.sqrt(math.prod(map(_count, (each.shape, *operands))))
+    if each.opcode in ("reduce", "reduce-window"):
+        return float(max(map(_count, operands), default=0))
+    return float(_count(each.shape)) if each.opcode in ARITHMETIC and re.match(r"b?f\d", each.shape) else 0.0
+
+
+def _outside_kernels(computations: dict[str, dict[str, _Instruction]]) -> Iterator[_Instruction]:
+    inside = {
+        called
+        for each in computations.values()
+        for instruction in each.values()
+        if instruction.opcode == "fusion"
+        for called in instruction.called
+    }
+    for name, each in computations.items():
+        if name not in inside:
+            yield from each.values()
+
+
+def _parsed(text: str) -> tuple[dict[str, dict[str, _Instruction]], str]:
+    """Computations by name, and the name of the first."""
+    computations: dict[str, dict[str, _Instruction]] = {}
+    entry, here = "", {}
+    for line in text.splitlines():
+        if opening := _COMPUTATION.match(line):
+            here = computations[opening[2]] = {}
+            entry = opening[2] if opening[1] else entry
+        elif found := _INSTRUCTION.match(line):
+            name, shape, opcode, rest = found.groups()
+            arguments, _, attributes = rest.partition(")")
+            operands = tuple(word.split()[-1].lstrip("%") for word in arguments.split(",") if word.strip())
+            branches = [branch for group in _BRANCHES.findall(attributes) for branch in group.split(",")]
+            called = (*_CALLED.findall(attributes), *(branch.strip().lstrip("%") for branch in branches))
+            rounds = _ROUNDS.search(attributes)
+            here[name] = _Instruction(shape, opcode, operands, called, int(rounds[1]) if rounds else 1)
+    return computations, entry
+
+
+def _count(shape: str) -> int:
+    return sum(math.prod(int(n) for n in size.split(",") if n) for _, size in _ARRAY.findall(shape))
+
+
+def _size(shape: str) -> int:
+    return sum(
+        BYTES.get(kind, 4) * math.prod(int(n) for n in size.split(",") if n) for kind, size in _ARRAY.findall(shape)
+    )
