@@ -15,6 +15,7 @@ from pushjax import cli
 from pushjax.bench import cases, devices, grasps, measure, needed, numerics, outlines, run, tasks
 from pushjax.bench.peers import rows
 from pushjax.bench.traffic import traffic
+from pushjax.problems import random_contacts_problem
 
 
 def counted(offset, angle, steps, **options):
@@ -336,6 +337,19 @@ def test_only_new_shapes_are_compiled():
         slider = pj.Slider(pj.Polygon.rectangle(0.09 * scale, 0.09), surface)
         here._replace(slider=slider, pose=here.pose + 1e-4 * scale).push(path - 1e-3 * scale, 0.3 * scale)
 
+    def slope(scale):
+        """Called as it is, not under a `jit` of the user's."""
+        jax.grad(lambda mu: here.push(path * scale, mu).pose[-1, 2])(0.3 * scale)
+
+    def grasp(scale):
+        poses = scale * grasps.random_poses(jax.random.key(3), 1, "float64")
+        hand = pj.Hand.two_fingers(tasks.RADIUS * scale)
+        pj.rollout(here.slider, hand, grasps.paths(poses, 2)[0], pose=poses[0], friction=0.1 * scale)
+
+    def solved(scale):
+        problem = random_contacts_problem(jax.random.key(5), contacts=1)
+        pj.solve_contacts(pj.Quartic(scale * problem.surface.coefficients, problem.surface.length), problem.contacts)
+
     def many(n):
         pj.monte_carlo(jax.random.key(n), n, here.slider, here.hand, path, pose=here.pose, model=model, tile=64)
 
@@ -345,5 +359,7 @@ def test_only_new_shapes_are_compiled():
             call()
         return len(made) - before
 
-    assert compiled_by(lambda: other(1.0), lambda: many(128)) > 0
-    assert compiled_by(lambda: other(1.01), lambda: many(320), lambda: many(1000)) == 0
+    calls = (other, slope, grasp, solved)
+    assert all(compiled_by(lambda call=call: call(1.0)) > 0 for call in (*calls, lambda _: many(128)))
+    assert [compiled_by(lambda call=call: call(1.01)) for call in calls] == [0] * len(calls)
+    assert compiled_by(lambda: many(320), lambda: many(1000)) == 0

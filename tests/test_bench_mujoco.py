@@ -2,14 +2,17 @@
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import pushjax as pj
 from pushjax.bench import grasps, tasks
+from pushjax.bench.measure import both_dtypes
 from pushjax.bench.peers import coulomb, grasp, mujoco, rows
 from pushjax.bench.peers.mujoco import error_mm, fan, push
 from pushjax.bench.peers.scene import Scene, Settings, build
@@ -103,6 +106,37 @@ def test_smaller_steps_converge_and_cost_more():
         mujoco.largest(found, 1e-12)
 
 
+@pytest.mark.parametrize("threshold", [0.0102, 0.0119, 0.0141])
+def test_the_largest_timestep_is_bisected(threshold):
+    """Found within a step of the bisection, whatever the grid."""
+    tried = []
+
+    def at(timestep):
+        tried.append(timestep)
+        return mujoco.StepError(timestep, 0.09 if timestep <= threshold else 0.11, 1.0)
+
+    found = mujoco.refined([at(0.01 * 2**k) for k in (1.0, 0.5, 0.0, -0.5)], at)
+    assert len(tried) == 4 + mujoco.BISECTIONS
+    assert [row.timestep for row in found] == sorted(tried, reverse=True)
+    resolution = 2 ** (0.5 / 2**mujoco.BISECTIONS)
+    assert threshold / resolution < mujoco.largest(found).timestep <= threshold
+
+
+def test_no_timestep_above_a_bad_one():
+    """One that is right by accident, where a smaller one is not."""
+
+    def at(timestep):
+        return mujoco.StepError(timestep, 0.2 if 0.011 < timestep < 0.013 or timestep > 0.015 else 0.05, 1.0)
+
+    found = mujoco.refined([at(step) for step in (0.02, 0.014, 0.012, 0.01)], at)
+    assert found[1].error_mm < 0.1
+    assert 0.0108 < mujoco.largest(found).timestep <= 0.011
+    good = [row for row in found if row.timestep < 0.011]
+    assert mujoco.refined(good, at) == good  # nothing bad to look below
+    with pytest.raises(ValueError, match="at no timestep"):
+        mujoco.refined([at(0.02)], at)
+
+
 def test_grasps_turn_the_square_as_far_as_it_must():
     """At the end both fingers touch, and the angle is geometry; what they sink in counts 2.6 times."""
     scene, poses = Scene(FOUR, friction_tip=grasps.FRICTION), grasps.fan()[[0, 10, 17, 26]]
@@ -124,6 +158,65 @@ def test_rows_are_compared_with_their_own():
     assert mine[1]["peer_ratio"] is None
 
 
+def peer(name, supports, each, **more):
+    table = [{"timestep": h, "error_mm": e, "us_per_push": 1e3} for h, e in ((0.02, 0.3), (0.01, 0.05))]
+    row = {"of": "push_quartic", "peer": name, "supports": supports, "timestep_s": 0.01, "error_mm": 0.05}
+    row |= {"exact_error_mm": 0.15, "slip_um": [4.0, 11.0], "by_timestep": table}
+    return row | {"processor_s_each": each, "processor_s_range": [each, each]} | more
+
+
+def test_slip_and_errors_are_of_the_steps_of_the_row(monkeypatch, tmp_path):
+    """What is compared, printed and drawn; the slow parts are only asked with what."""
+    asked = []
+    monkeypatch.setattr(rows, "slip_um", lambda dtype, steps: asked.append((dtype, steps)) or [0.006, 0.09])
+    monkeypatch.setattr(rows, "same_fan_error_mm", lambda dtype, steps: asked.append((dtype, steps)) or 0.024)
+    drawn = {}
+    monkeypatch.setattr(
+        "pushjax.plot.speed_figure", lambda curves, allowed: drawn.update(curves) or plt.figure(figsize=(1, 1))
+    )
+    push_row = {"case": "push_quartic", "dtype": "float32", "batch": 10, "processor_s": 2e-4, "steps": 7.99}
+    push_row |= {"pose_error_mm": 0.06, "peer": None, "peer_ratio": None}
+    other = push_row | {"case": "grasp_two_fingers", "steps": 6.0}
+    theirs = [peer("mujoco", "three", 4e-3), peer("mujoco", "four", 3e-3), peer("mjx", "four", 9e-3)]
+    rows.compare([push_row, other], theirs)
+    assert asked == [("float32", 8), ("float32", 8)]
+    assert (push_row["peer"], push_row["peer_ratio"]) == ("mujoco", pytest.approx(150))
+    assert other["peer_ratio"] is None
+
+    printed = "\n".join(rows.summary(theirs, [push_row, other]))
+    assert "slip 0.006 and 0.09 um; 0.024 mm over the pushes of MuJoCo's" in printed
+    assert "mjx: 9.00 ms of a processor, four supports, 10 ms steps (0.050 mm), 0.15 mm from exact friction" in printed
+    assert "grasp" not in printed
+
+    by_steps = [push_row | {"steps": float(n)} for n in (4, 8)]
+    path = rows.draw({"by_steps": by_steps, "peers": [*theirs, {"of": "fit_quartic"}]}, tmp_path)
+    assert Path(path).stat().st_size > 0
+    assert set(drawn) == {"pushjax, float32", "MuJoCo, three supports", "MuJoCo, four supports", "MJX, four supports"}
+    assert drawn["MJX, four supports"] == [(1e-3, 0.3), (1e-3, 0.05)]
+
+
+def test_fewer_steps_slip_more():
+    """So it matters that it is measured at the row's: 8 steps, which still stick."""
+    with both_dtypes():
+        few, many = (max(rows.slip_um("float64", steps=steps)) for steps in (8, 50))
+    assert 10 * many < few < 1.0
+
+
+def test_pushjax_converges_over_the_pushes_of_mujoco():
+    with both_dtypes():
+        errors = [rows.same_fan_error_mm("float64", steps) for steps in (4, 8, 16)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[2] < errors[1] / 2.5  # second order, but for where sticking turns to sliding
+    assert errors[1] < tasks.ALLOWED_MM
+
+
+def test_each_is_timed_three_times():
+    times = iter((0.4, 0.1, 0.2))
+    found, each = rows._repeated(lambda: mujoco.Pushed(np.zeros((2, 3)), np.zeros(2), 1.0, next(times)), 2)
+    assert found.processor == 0.4
+    assert each == {"processor_s_each": 0.1, "processor_s_range": [0.05, 0.2]}
+
+
 def test_threads_change_nothing():
     scene = Scene(THREE)
     starts, ends = fan(scene)
@@ -135,9 +228,23 @@ def test_mjx_ends_where_mujoco_does():
     mjx = pytest.importorskip("pushjax.bench.peers.mjx")
     scene = Scene(THREE, travel=0.02)
     starts, ends = fan(scene)
-    batch = mjx.Batch(scene, mjx.SETTINGS, mjx.TIMESTEP, starts, ends)
+    batch = mjx.Batch(scene, mjx.SETTINGS, 0.005, starts, ends)
     assert batch.compile_seconds > 0
-    assert error_mm(batch.pushed().pose, push(scene, Settings(), FINE, starts, ends).pose).max() < 0.15
+    same = batch.pushed(settings=replace(mjx.SETTINGS, impedance=Settings().impedance))
+    assert error_mm(same.pose, push(scene, Settings(), FINE, starts, ends).pose).max() < 0.15
+
+
+def test_mjx_converges_with_softened_contacts():
+    """And another step is the same compiled program."""
+    mjx = pytest.importorskip("pushjax.bench.peers.mjx")
+    scene, settings = Scene(FOUR, travel=0.02), mjx.softened(0.01)
+    batch = mjx.Batch(scene, mjx.SETTINGS, 0.005, *fan(scene))
+    coarse, converged = (batch.pushed(step, settings) for step in (0.01, FINE))
+    assert 0 < error_mm(coarse.pose, converged.pose).max() < 0.1
+    assert np.abs(converged.slip[:3]).max() < 3e-5
+    assert error_mm(converged.pose, exact(scene, range(8))).max() < 0.2
+    with pytest.raises(ValueError, match="two timesteps"):
+        batch.pushed(0.01)
 
 
 def test_mjx_says_what_it_cannot_do():

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax.bench import grasps, tasks
-from pushjax.bench.peers.mujoco import AWAY, StepError
+from pushjax.bench import grasps
+from pushjax.bench.peers.mujoco import AWAY, StepError, by_timestep
 from pushjax.bench.peers.scene import Scene, Settings, engine, options, pair, slider_body, supported
 
 SUPPORTED = Settings(
@@ -114,12 +114,11 @@ def _settled(model: Any, data: Any) -> float:
 def accuracy(
     scene: Scene, settings: Settings, fingers: Fingers, timesteps: tuple[float, ...] = TIMESTEPS
 ) -> tuple[list[StepError], np.ndarray]:
-    """Rows of the fan of `bench.grasps`, from the largest timestep to the smallest, against which the errors are and
-    which is left out; and the poses of that."""
+    """`mujoco.by_timestep` of the fan of `bench.grasps`."""
     poses = grasps.fan()
-    runs = [grasp(scene, settings, fingers, each, poses) for each in sorted(timesteps, reverse=True)]
-    rows = [
-        StepError(step, float(tasks.error_mm(run.pose, runs[-1].pose).max()), 1e6 * run.processor / len(poses))
-        for step, run in zip(sorted(timesteps, reverse=True)[:-1], runs[:-1], strict=True)
-    ]
-    return rows, runs[-1].pose
+
+    def run(timestep: float) -> tuple[np.ndarray, float]:
+        found = grasp(scene, settings, fingers, timestep, poses)
+        return found.pose, found.processor
+
+    return by_timestep(run, timesteps)

@@ -4,6 +4,7 @@ MuJoCo and MJX each at their largest step within 0.1 mm of their own converged a
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.bench import cases, grasps, tasks
-from pushjax.bench.peers import contacts, fits, grasp, mjx, mujoco
+from pushjax.bench.peers import contacts, coulomb, fits, grasp, mjx, mujoco
 from pushjax.bench.peers.scene import Scene, Settings, engine
 
 HALF = tasks.SIDE / 2
@@ -24,6 +25,9 @@ SUPPORTS = {
 STICKS = (0.004, 0.01)  # m off the middle of the side
 TIMED, BATCH = 40, 64
 FITS, PROBLEMS, MOST_CONTACTS = 20, 100, 4
+REPEATS = 3  # each is timed as often
+NAMES = {"mujoco": "MuJoCo", "mjx": "MJX"}
+ALIKE = {"grasp_surfaces": "grasp_two_fingers"}  # for others these are the same
 
 
 def check(case: Sequence[str]) -> None:
@@ -37,14 +41,15 @@ def check(case: Sequence[str]) -> None:
 
 
 def rows(case: Sequence[str]) -> list[dict[str, Any]]:
-    """Each with `of`, the name of the rows that it is compared with, and seconds of processor for one of these."""
+    """Each with `of`, the name of the rows that it is compared with, and seconds of processor for one of these: the
+    median of `REPEATS`, and their range."""
     return [found for name in case if name in PEERS for found in PEERS[name]()]
 
 
 def _pushes() -> list[dict[str, Any]]:
     """Of MuJoCo on three supports and on four, and of MJX on four; also how far a finger that sticks slips."""
     found = [_mujoco(name) for name in SUPPORTS]
-    return [*found, _mjx("four", found[-1])]
+    return [*found, _mjx("four")]
 
 
 def _grasps() -> list[dict[str, Any]]:
@@ -53,7 +58,7 @@ def _grasps() -> list[dict[str, Any]]:
     table, pose = grasp.accuracy(scene, grasp.SUPPORTED, grasp.Fingers())
     at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
     poses = np.resize(grasps.fan(), (TIMED, 3))
-    timed = grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses).processor / TIMED
+    _, each = _repeated(lambda: grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses), TIMED)
     both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])
     return [
         {
@@ -63,9 +68,9 @@ def _grasps() -> list[dict[str, Any]]:
             "timestep_s": at.timestep,
             "error_mm": at.error_mm,
             "rigid_error_mm": float(1e3 * tasks.LENGTH * np.abs(both).max()),
-            "processor_s_each": timed,
             "by_timestep": [row._asdict() for row in table],
         }
+        | each
     ]
 
 
@@ -73,14 +78,14 @@ def _fits() -> list[dict[str, Any]]:
     found = []
     for degree, name in ((4, "fit_quartic"), (2, "fit_ellipsoid")):
         wrench, twist, length = (np.asarray(part) for part in cases.pairs("float64", FITS))
-        theirs = fits.fit(wrench, twist, length, degree)
+        theirs, each = _repeated(lambda these=(wrench, twist, length, degree): fits.fit(*these), FITS)
         ratio = {}
         for dtype in ("float32", "float64"):
             work = cases.fit(dtype, FITS, degree)
             loss = np.asarray(jax.jit(work.function)(*work.args)[1].loss, float)
             ratio[dtype] = float((loss / theirs.loss).max())
-        each = {"of": name, "peer": "cvxpy", "processor_s_each": theirs.processor / FITS}
-        found.append(each | {"clipped": theirs.clipped, "loss_over_theirs": ratio})
+        each |= {"of": name, "peer": "cvxpy", "clipped": theirs.clipped, "loss_over_theirs": ratio}
+        found.append(each)
     return found
 
 
@@ -92,10 +97,17 @@ def _problems() -> list[dict[str, Any]]:
         surface, problem = work.args
         moving = np.flatnonzero(np.any(np.asarray(jax.jit(work.function)(*work.args)) != 0, axis=1))[:PROBLEMS]
         kept = jax.tree.map(lambda leaf, k=moving: leaf[k], problem)
-        theirs = contacts.solve(surface.coefficients[moving], surface.length[moving], kept)
-        each = {"of": f"solve_{m}", "peer": "scipy", "processor_s_each": theirs.processor / len(moving)}
-        found.append(each | {"found": float(theirs.found.mean())})
+        these = surface.coefficients[moving], surface.length[moving], kept
+        theirs, each = _repeated(lambda these=these: contacts.solve(*these), len(moving))
+        found.append(each | {"of": f"solve_{m}", "peer": "scipy", "found": float(theirs.found.mean())})
     return found
+
+
+def _repeated(run: Callable[[], Any], count: int) -> tuple[Any, dict[str, Any]]:
+    """What it finds, and what each of its `count` takes of a processor. run: of something with `processor`, seconds."""
+    found = [run() for _ in range(REPEATS)]
+    each = [one.processor / count for one in found]
+    return found[0], {"processor_s_each": float(np.median(each)), "processor_s_range": [min(each), max(each)]}
 
 
 PEERS: dict[str, Callable[[], list[dict[str, Any]]]] = {
@@ -110,42 +122,55 @@ def _mujoco(name: str) -> dict[str, Any]:
     scene, settings = Scene(SUPPORTS[name]), Settings()
     table = mujoco.accuracy(scene, settings)
     at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
-    timestep = at.timestep
-    return {
+    found, each = _repeated(lambda: mujoco.timed(scene, settings, at.timestep, TIMED), TIMED)
+    return each | {
         "of": "push_quartic",
         "peer": "mujoco",
         "supports": name,
-        "timestep_s": timestep,
+        "timestep_s": at.timestep,
         "error_mm": at.error_mm,
-        "processor_s_each": mujoco.timed(scene, settings, timestep, TIMED),
-        "slip_um": _um(mujoco.push(scene, settings, timestep, *_straight(scene, STICKS)).slip),
+        "exact_error_mm": _exact_error_mm(name, found.pose),
+        "slip_um": _um(mujoco.push(scene, settings, at.timestep, *_straight(scene, STICKS)).slip),
         "by_timestep": [row._asdict() for row in table],
     }
 
 
-def _mjx(name: str, converged: dict[str, Any]) -> dict[str, Any]:
-    """Its error is that of the fan against MuJoCo's at a tenth of the step."""
+def _mjx(name: str) -> dict[str, Any]:
     scene = Scene(SUPPORTS[name])
-    starts, ends = mujoco.fan(scene)
-    many_starts, many_ends = (np.resize(part, (BATCH, 2)) for part in (starts, ends))
-    batch = mjx.Batch(scene, mjx.SETTINGS, mjx.TIMESTEP, many_starts, many_ends)
-    pose = batch.pushed().pose[: len(starts)]
-    exact = mujoco.push(scene, mjx.SETTINGS, mjx.TIMESTEP / 10, starts, ends).pose
-    return {
+    starts, ends = (np.resize(part, (BATCH, 2)) for part in mujoco.fan(scene))
+    batch = mjx.Batch(scene, mjx.SETTINGS, mjx.CONVERGED, starts, ends)
+    table = mjx.accuracy(batch)
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    found, each = _repeated(lambda: batch.pushed(at.timestep, mjx.softened(at.timestep)), BATCH)
+    return each | {
         "of": "push_quartic",
         "peer": "mjx",
         "supports": name,
-        "timestep_s": mjx.TIMESTEP,
-        "error_mm": float(np.max(tasks.error_mm(pose, exact))),
-        "processor_s_each": batch.pushed().processor / BATCH,
+        "timestep_s": at.timestep,
+        "error_mm": at.error_mm,
+        "exact_error_mm": _exact_error_mm(name, found.pose),
         "compile_s": batch.compile_seconds,
         "batch": BATCH,
         "dtype": "float64",
-        "slip_um": None,
-        "by_timestep": [],
+        "slip_um": _um(found.slip[[mujoco.PUSHES.index((offset, 0.0)) for offset in STICKS]]),
+        "by_timestep": [row._asdict() for row in table],
     }
 
 
+def _exact_error_mm(name: str, pose: np.ndarray) -> float:
+    """Of poses (at least one a push, 3) that MuJoCo's pushes end in, the worst, against exact Coulomb friction."""
+    exact = _exact(name)
+    return float(tasks.error_mm(pose[: len(exact)], exact).max())
+
+
+@cache
+def _exact(name: str) -> np.ndarray:
+    scene = Scene(SUPPORTS[name])
+    points = np.array(scene.supports)
+    return np.array([coulomb.push(points, *each)[0] for each in zip(*mujoco.fan(scene), strict=True)])
+
+
+@cache
 def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) -> list[float]:
     """How far the tip of pushjax's own straight pushes slides along the side, all that it does not roll: um.
 
@@ -153,12 +178,32 @@ def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) ->
     """
     here = tasks.task("quartic", dtype)
     offset = jnp.asarray(offsets, dtype)
-    push = jax.vmap(here.push)(tasks.paths(offset, jnp.zeros_like(offset), steps))
+    push = jax.jit(jax.vmap(here.push))(tasks.paths(offset, jnp.zeros_like(offset), steps))
     for off, mode in zip(offsets, np.asarray(push.mode), strict=True):
         if not np.all(mode == pj.ContactMode.STICKING):
             raise ValueError(f"a push {1e3 * off:g} mm off the middle does not stick")
     scene = Scene(SUPPORTS["four"])
     return _um(mujoco.slip(scene, np.asarray(push.pose[:, -1], float), *_straight(scene, offsets)))
+
+
+@cache
+def same_fan_error_mm(dtype: str, steps: int) -> float:
+    """pushjax's own worst error over the pushes of MuJoCo's, on its four supports, against the converged answer."""
+    return float(tasks.error_mm(_same_fan(dtype, steps), _same_fan("float64", tasks.REFERENCE_STEPS)).max())
+
+
+def _same_fan(dtype: str, steps: int) -> np.ndarray:
+    """(pushes, 3) final poses."""
+    here = tasks.task("quartic", dtype)._replace(slider=tasks.cast(_on_four(), dtype))
+    offset, angle = (jnp.asarray(part, dtype) for part in np.array(mujoco.PUSHES).T)
+    return np.asarray(jax.jit(jax.vmap(here.push))(tasks.paths(offset, angle, steps)).pose[:, -1], float)
+
+
+@cache
+def _on_four() -> pj.Slider:
+    """The square on the four supports, as nearly as a quartic has their limit surface."""
+    pairs = pj.Support.points(np.array(SUPPORTS["four"])).wrench_twist_pairs(jax.random.key(0), 400)
+    return pj.Slider(tasks.square("quartic").shape, pj.fit_limit_surface(*pairs, degree=4))
 
 
 def _straight(scene: Scene, offsets: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -173,15 +218,17 @@ def _um(slip: np.ndarray) -> list[float]:
 
 def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
     """Write into rows how many times as many a processor does, beside the fastest of the others; into those of pushes
-    also how far a finger that sticks slips."""
+    also how far a finger that sticks slips in as many steps, and the error over the very pushes that MuJoCo's is of."""
     for row in rows:
-        same = [peer for peer in peers if peer["of"] == row["case"]]
+        same = [peer for peer in peers if peer["of"] == ALIKE.get(row["case"], row["case"])]
         if same:
             best = min(same, key=lambda peer: peer["processor_s_each"])
             row["peer"] = best["peer"]
             row["peer_ratio"] = best["processor_s_each"] * row["batch"] / row["processor_s"]
             if row["case"] == "push_quartic":
-                row["slip_um"] = slip_um(row["dtype"])
+                steps = round(row["steps"])
+                row["slip_um"] = slip_um(row["dtype"], steps=steps)
+                row["same_fan_error_mm"] = same_fan_error_mm(row["dtype"], steps)
 
 
 def draw(record: dict[str, Any], out: Path) -> str:
@@ -196,7 +243,7 @@ def draw(record: dict[str, Any], out: Path) -> str:
         # the last is what the others are compared with
         points = [(1e-6 * row["us_per_push"], row["error_mm"]) for row in peer["by_timestep"] if row["error_mm"] > 0]
         if points:
-            curves[f"MuJoCo, {peer['supports']} supports"] = points
+            curves[f"{NAMES[peer['peer']]}, {peer['supports']} supports"] = points
     return str(plot.save(plot.speed_figure(curves, tasks.ALLOWED_MM), out / "bench.png"))
 
 
@@ -211,6 +258,8 @@ def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str
             each = 1e6 * row["processor_s"] / row["batch"]
             more = "" if row["pose_error_mm"] is None else f" ({row['steps']:.3g} steps, {row['pose_error_mm']:.3f} mm)"
             slip = f"; slip {' and '.join(f'{x:.1g}' for x in row['slip_um'])} um" if "slip_um" in row else ""
+            if "same_fan_error_mm" in row:
+                slip += f"; {row['same_fan_error_mm']:.3f} mm over the pushes of MuJoCo's"
             lines.append(
                 f"  {row['case']}, pushjax, {row['dtype']}, batch {row['batch']}: {each:.2f} us of a processor{more}, "
                 f"1/{row['peer_ratio']:.0f} of {row['peer']}'s{slip}"
@@ -222,6 +271,8 @@ def _more(peer: dict[str, Any]) -> str:
     said = ""
     if "timestep_s" in peer:
         said += f", {peer['supports']} supports, {1e3 * peer['timestep_s']:.3g} ms steps ({peer['error_mm']:.3f} mm)"
+    if "exact_error_mm" in peer:
+        said += f", {peer['exact_error_mm']:.2f} mm from exact friction"
     if "rigid_error_mm" in peer:
         said += f", {peer['rigid_error_mm']:.2f} mm from rigid contact"
     if peer.get("slip_um"):

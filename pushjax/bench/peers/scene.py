@@ -50,7 +50,7 @@ class Scene:
 
     supports: where the table carries it; of three the loads follow from statics, of more from equal stiffness.
     outline: (vertices) of a convex polygon about the centre of mass; a square of `side` unless given.
-    travel: of the pushes in `largest_step` and `timed`. speed: the tip's.
+    travel: of the pushes of `mujoco.fan`. speed: the tip's.
 
     Raises ValueError for fewer than three supports or anything not positive.
     """
