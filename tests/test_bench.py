@@ -131,6 +131,9 @@ def test_traffic_counts_rounds():
     assert once == (2000, 8000, 1)
     assert often.flops == pytest.approx(7 * once.flops, rel=0.01)  # and the loop's own counting
     assert 7 * once.bytes <= often.bytes < 7.2 * once.bytes + 8000  # and a copy of what begins
+    # of what is read and written in place, a row
+    rows = jax.jit(lambda x: jax.lax.map(lambda row: 2 * row, x)).lower(jnp.ones((50, 1000), jnp.float32)).compile()
+    assert 50 * 8000 <= traffic(rows.as_text()).bytes < 50 * 8000 * 3
     product = traffic(jax.jit(lambda x: x @ x.T).lower(jnp.ones((40, 30))).compile().as_text())
     assert product.flops == pytest.approx(2 * 40 * 40 * 30)
 

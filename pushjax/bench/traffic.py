@@ -2,7 +2,7 @@
 
 XLA's own cost analysis counts a loop's body once. Here a loop whose rounds the compiler knows counts with these, any
 other one (such as a root's, which ends when all have landed) once; so figures are from below. A kernel moves its
-operands and its result, as if nothing stayed in a cache: from above, where it needs a part of an operand only.
+operands and its result, as if nothing stayed in a cache; of what it slices or updates in place, the part.
 """
 
 import math
@@ -24,6 +24,7 @@ _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.-]+) = (\(.*?\)|\S+) ([\w-]+)\(
 _ARRAY = re.compile(r"([a-z]+\d*)\[([\d,]*)\]")
 _CALLED = re.compile(r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
+_COMMENT = re.compile(r"/\*.*?\*/")
 _ROUNDS = re.compile(r'known_trip_count":\{"n":"(\d+)"')
 
 
@@ -59,12 +60,53 @@ def traffic(text: str) -> Traffic:
                 moved += each.rounds * sum(b for _, b in inner)
             elif each.opcode not in MOVES_NOTHING:
                 operands = [here[operand].shape for operand in each.operands if operand in here]
-                moved += sum(map(_size, (each.shape, *operands)))
-                flops += sum(f for f, _ in inner) if each.opcode == "fusion" else _flops(each, operands)
+                if each.opcode == "fusion":
+                    flops += sum(f for f, _ in inner)
+                    moved += _of_kernel(computations[each.called[0]])
+                else:
+                    flops += _flops(each, operands)
+                    moved += _of_one(each, operands)
         return flops, moved
 
     flops, moved = total(entry)
     return Traffic(flops, moved, sum(each.opcode == "fusion" for each in _outside_kernels(computations)))
+
+
+SLICES, UPDATES = ("dynamic-slice", "slice", "gather"), ("dynamic-update-slice", "scatter")
+
+
+def _of_one(each: _Instruction, operands: list[str]) -> int:
+    """Bytes."""
+    if each.opcode in SLICES:
+        return 2 * _size(each.shape)
+    if each.opcode in UPDATES:
+        return 2 * _size(operands[-1 if each.opcode == "scatter" else 1])
+    return sum(map(_size, (each.shape, *operands)))
+
+
+def _of_kernel(inside: dict[str, _Instruction]) -> int:
+    """Bytes. An array that is only sliced is read as far as that; one that is only updated, written as far."""
+    users: dict[str, list[tuple[int, _Instruction]]] = {}
+    for each in inside.values():
+        for place, operand in enumerate(each.operands):
+            users.setdefault(operand, []).append((place, each))
+    moved = 0
+    for name, each in inside.items():
+        if each.opcode != "parameter":
+            continue
+        mine = users.get(name, [])
+        if mine and all(place == 0 and user.opcode in SLICES for place, user in mine):
+            moved += sum(_size(user.shape) for _, user in mine)
+        elif not (mine and all(place == 0 and user.opcode in UPDATES for place, user in mine)):
+            moved += _size(each.shape)
+    last = list(inside.values())[-1]
+    while last.opcode in MOVES_NOTHING and last.opcode != "tuple" and last.operands and last.operands[0] in inside:
+        last = inside[last.operands[0]]
+    results = [inside[name] for name in last.operands if name in inside] if last.opcode == "tuple" else [last]
+    for result in results:
+        new = inside.get(result.operands[1]) if result.opcode in UPDATES and len(result.operands) > 1 else None
+        moved += _size((new or result).shape)
+    return moved
 
 
 def _flops(each: _Instruction, operands: list[str]) -> float:
@@ -92,7 +134,7 @@ def _parsed(text: str) -> tuple[dict[str, dict[str, _Instruction]], str]:
     """Computations by name, and the name of the first."""
     computations: dict[str, dict[str, _Instruction]] = {}
     entry, here = "", {}
-    for line in text.splitlines():
+    for line in _COMMENT.sub("", text).splitlines():
         if opening := _COMPUTATION.match(line):
             here = computations[opening[2]] = {}
             entry = opening[2] if opening[1] else entry
