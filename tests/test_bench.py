@@ -253,6 +253,11 @@ with measure.both_dtypes():
 def test_tiles_change_nothing(monkeypatch):
     monkeypatch.setattr(cases, "TILE", 16)
     work = cases.push("float64", 40)
+    assert " while(" in jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(cases, "on_cpu", lambda: False)
+        whole = jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
+    assert " while(" not in whole
     tiled = np.asarray(jax.jit(work.function)(*work.args))
     monkeypatch.setattr(cases, "TILE", 64)
     np.testing.assert_array_equal(tiled, np.asarray(jax.jit(cases.push("float64", 40).function)(*work.args)))
