@@ -63,6 +63,8 @@ def measured(case: str) -> list[float]:
     """`COLUMNS` of one case."""
     import jax
 
+    from pushjax.bench.traffic import traffic
+
     jax.config.update("jax_enable_x64", arguments.x64)
     jax.config.update("jax_enable_compilation_cache", False)
     function, args = work(case, "float64" if arguments.x64 else "float32")
@@ -81,7 +83,6 @@ def measured(case: str) -> list[float]:
     first = perf_counter() - begin
 
     text = compiled.as_text() or ""
-    kernels = len(re.findall(r"= .*\bfusion\(", text))
     instructions = len(re.findall(r"^ +(?:ROOT )?%?[\w.-]+ = ", text, re.MULTILINE))
     runs = []
     for _ in range(RUNS):
@@ -89,7 +90,7 @@ def measured(case: str) -> list[float]:
         jax.block_until_ready(compiled(*args))
         runs.append(1e3 * (perf_counter() - begin_run))
     seconds = [round(x, 2) for x in (then - begin, later - then, end - later, first)]
-    return [*seconds, kernels, instructions, round(median(runs), 2)]
+    return [*seconds, traffic(text).kernels, instructions, round(median(runs), 2)]
 
 
 def work(case: str, dtype: str) -> tuple:
@@ -102,17 +103,13 @@ def work(case: str, dtype: str) -> tuple:
 
     if case in ("push", "gradient"):
         one, args = cases.each_push("quartic", dtype, arguments.batch, STEPS)
-        pushes = jax.vmap(lambda *each: one(*each).pose[-1])
-        if case == "gradient":
-            return jax.grad(lambda *args: jnp.sum(pushes(*args)), argnums=(0, 1, 2)), args
-        return pushes, args
-    made = cases.grasp(dtype, arguments.batch, STEPS)
-    if case == "two_fingers":
-        return made.function, made.args
-    slider, hand = tasks.task("quartic", dtype).slider, tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype)
-    friction = jnp.asarray(grasps.FRICTION, dtype)
-    one = lambda pose, path: pj.rollout(slider, hand, path, pose=pose, friction=friction).pose[-1]  # noqa: E731
-    return jax.vmap(one), made.args
+    else:
+        hand = grasps.hand(dtype) if case == "two_fingers" else tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype)
+        one, args = cases.each_grasp(hand, dtype, arguments.batch, STEPS)
+    final = jax.vmap(lambda *each: one(*each).pose[-1])
+    if case == "gradient":
+        return jax.grad(lambda *args: jnp.sum(final(*args)), argnums=(0, 1, 2)), args
+    return final, args
 
 
 if __name__ == "__main__":

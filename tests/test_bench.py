@@ -129,6 +129,7 @@ def test_traffic_counts_rounds():
 
     once, often = of(lambda x: x * 2.5 + 1.5), of(lambda x: jax.lax.fori_loop(0, 7, lambda k, x: x * 2.5 + 1.5, x))
     assert once == (2000, 8000, 1)
+    assert once.times(3) == (6000, 24000, 1)
     assert often.flops == pytest.approx(7 * once.flops, rel=0.01)  # and the loop's own counting
     assert 7 * once.bytes <= often.bytes < 7.2 * once.bytes + 8000  # and a copy of what begins
     # of what is read and written in place, a row

@@ -60,20 +60,15 @@ def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False
     """Two fingers close on the square, askew, and turn it; final poses. varied: each has a surface of its own."""
     by_steps = grasps.errors(dtype) if steps is None else {}
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
-    slider, hand = tasks.task("quartic", dtype).slider, grasps.hand(dtype)
-    friction = jnp.asarray(grasps.FRICTION, dtype)
-    poses = grasps.random_poses(jax.random.key(1), batch, dtype)
-    args = poses, grasps.paths(poses, steps)
-
-    def one(pose: Any, path: Any, surface: Any = slider.surface) -> Any:
-        return pj.rollout(pj.Slider(slider.shape, surface), hand, path, pose=pose, friction=friction).pose[-1]
+    one, args = each_grasp(grasps.hand(dtype), dtype, batch, steps)
 
     def final(*args):
-        return in_tiles(one, args, batch)
+        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
 
     name = "grasp_two_fingers"
     if varied:
-        name, args = "grasp_surfaces", (*args, _surfaces(slider.surface, jax.random.key(0), batch))
+        surface = tasks.task("quartic", dtype).slider.surface
+        name, args = "grasp_surfaces", (*args, _surfaces(surface, jax.random.key(0), batch))
     return Work(name, dtype, batch, steps, final, args, None, by_steps.get(steps))
 
 
@@ -154,6 +149,18 @@ def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[
         uniform(keys[1], -tasks.REACH, tasks.REACH), uniform(keys[2], -tasks.STEEPEST, tasks.STEEPEST), steps
     )
     return one, (surface, path, uniform(keys[3], 0.15, 0.35))
+
+
+def each_grasp(hand: pj.Hand, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
+    """What makes one, of one surface unless a third argument gives another; and pose and path of each. hand: whose
+    last coordinate is the opening."""
+    slider, friction = tasks.task("quartic", dtype).slider, jnp.asarray(grasps.FRICTION, dtype)
+
+    def one(pose: Any, path: Any, surface: Any = slider.surface) -> pj.Trajectory:
+        return pj.rollout(pj.Slider(slider.shape, surface), hand, path, pose=pose, friction=friction)
+
+    poses = grasps.random_poses(jax.random.key(1), batch, dtype)
+    return one, (poses, grasps.paths(poses, steps))
 
 
 def _surfaces(surface: pj.LimitSurface, key: Array, batch: int) -> pj.LimitSurface:

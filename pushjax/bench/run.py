@@ -103,6 +103,7 @@ def run(
             if "push" in case:
                 record["by_steps"] = [_row(cases.push(kind, BATCH, steps=n))[0] for kind in dtype for n in CURVE]
                 record["pictures"] = [] if out is None else [others.draw(record, out)]
+            keep(record)
             progress(total, total)
     if before is not None:
         record["slower"], record["new"] = slower(rows, before)
@@ -122,9 +123,11 @@ def _beside_one(make: Make, dtype: str, batch: int, devices: int) -> Rows:
     works = [make(dtype, batch), sharding.sharded(make, dtype, batch, devices)]
     programs = [compiled(work.function, *work.args) for work in works]
     timings, top = _timed({str(k): program for k, program in enumerate(programs)}, dtype)
-    rows = [_figures(*each, timings[str(k)], timings, top) for k, each in enumerate(zip(works, programs, strict=True))]
-    rows[1] |= {"devices": devices, "speedup": timings["0"].median / timings["1"].median}
-    return rows, top
+    one, several = (
+        _figures(work, program, timings[str(k)], top, on)
+        for k, (work, program, on) in enumerate(zip(works, programs, (1, devices), strict=True))
+    )
+    return [one, several | {"speedup": timings["0"].median / timings["1"].median}], top
 
 
 def _use(cores: int) -> None:
@@ -139,7 +142,7 @@ def _use(cores: int) -> None:
 def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
     program = (called if work.host else compiled)(work.function, *work.args)
     timings, top = _timed({"it": program}, work.dtype)
-    return _figures(work, program, timings["it"], timings, top), top
+    return _figures(work, program, timings["it"], top), top
 
 
 def _timed(programs: dict[str, Program], dtype: str) -> tuple[dict[str, Timing], dict[str, float]]:
@@ -150,16 +153,16 @@ def _timed(programs: dict[str, Program], dtype: str) -> tuple[dict[str, Timing],
 
 
 def _figures(
-    work: cases.Work, program: Program, mine: Timing, timings: dict[str, Timing], top: dict[str, float]
+    work: cases.Work, program: Program, mine: Timing, top: dict[str, float], devices: int = 1
 ) -> dict[str, Any]:
     steps = work.batch * work.steps
-    made = program.traffic
-    multiply_add = timings["multiply_add"].processor / (ceiling(work.dtype).flops / 2)
+    made = program.traffic and program.traffic.times(devices)  # the program is that of one of them
+    multiply_add = 2e-9 / top["multiply_add_gflops"]
     row: dict[str, Any] = {
         "case": work.case,
         "dtype": work.dtype,
         "batch": work.batch,
-        "devices": 1,
+        "devices": devices,
         "steps": work.steps,
         "compile_s": program.compile_s,
         "run_s": mine.median,
@@ -193,9 +196,9 @@ def kept(path: Path, cores: int | None) -> dict[str, Any]:
         record = json.loads(path.read_text())
         if record["experiment"] != "bench" or not isinstance(record["rows"], list):
             raise KeyError
+        there = record["settings"]["cores"]
     except (json.JSONDecodeError, KeyError, TypeError):
         raise ValueError(f"--baseline: {path} holds no record of pushjax bench") from None
-    there = record.get("settings", {}).get("cores")
     if there != cores:
         raise ValueError(f"--baseline: {path} is of --cores {there or 'all'}; got {cores or 'all'}")
     return record

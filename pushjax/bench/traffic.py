@@ -7,7 +7,6 @@ operands and its result, as if nothing stayed in a cache; of what it slices or u
 
 import math
 import re
-from collections.abc import Iterator
 from functools import cache
 from typing import NamedTuple
 
@@ -20,7 +19,7 @@ MOVES_NOTHING = frozenset("after-all bitcast constant get-tuple-element opt-barr
 BYTES = {"pred": 1, "s8": 1, "u8": 1, "s16": 2, "u16": 2, "f16": 2, "bf16": 2, "f64": 8, "s64": 8, "u64": 8}
 
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.-]+) \(.*\{\s*$")
-_INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?([\w.-]+) = (\(.*?\)|\S+) ([\w-]+)\((.*)$")
+_INSTRUCTION = re.compile(r"^\s+(ROOT )?%?([\w.-]+) = (\(.*?\)|\S+) ([\w-]+)\((.*)$")
 _ARRAY = re.compile(r"([a-z]+\d*)\[([\d,]*)\]")
 _CALLED = re.compile(r"(?:calls|to_apply|body|condition|true_computation|false_computation)=%?([\w.-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
@@ -35,8 +34,13 @@ class Traffic(NamedTuple):
     bytes: float
     kernels: int
 
+    def times(self, count: int) -> "Traffic":
+        """Of as many runs."""
+        return self._replace(flops=count * self.flops, bytes=count * self.bytes)
+
 
 class _Instruction(NamedTuple):
+    root: bool
     shape: str
     opcode: str
     operands: tuple[str, ...]
@@ -68,8 +72,8 @@ def traffic(text: str) -> Traffic:
                     moved += _of_one(each, operands)
         return flops, moved
 
-    flops, moved = total(entry)
-    return Traffic(flops, moved, sum(each.opcode == "fusion" for each in _outside_kernels(computations)))
+    kernels = sum(each.opcode == "fusion" for here in computations.values() for each in here.values())
+    return Traffic(*total(entry), kernels)
 
 
 SLICES, UPDATES = ("dynamic-slice", "slice", "gather"), ("dynamic-update-slice", "scatter")
@@ -99,7 +103,7 @@ def _of_kernel(inside: dict[str, _Instruction]) -> int:
             moved += sum(_size(user.shape) for _, user in mine)
         elif not (mine and all(place == 0 and user.opcode in UPDATES for place, user in mine)):
             moved += _size(each.shape)
-    last = list(inside.values())[-1]
+    last = next(each for each in inside.values() if each.root)
     while last.opcode in MOVES_NOTHING and last.opcode != "tuple" and last.operands and last.operands[0] in inside:
         last = inside[last.operands[0]]
     results = [inside[name] for name in last.operands if name in inside] if last.opcode == "tuple" else [last]
@@ -117,19 +121,6 @@ def _flops(each: _Instruction, operands: list[str]) -> float:
     return float(_count(each.shape)) if each.opcode in ARITHMETIC and re.match(r"b?f\d", each.shape) else 0.0
 
 
-def _outside_kernels(computations: dict[str, dict[str, _Instruction]]) -> Iterator[_Instruction]:
-    inside = {
-        called
-        for each in computations.values()
-        for instruction in each.values()
-        if instruction.opcode == "fusion"
-        for called in instruction.called
-    }
-    for name, each in computations.items():
-        if name not in inside:
-            yield from each.values()
-
-
 def _parsed(text: str) -> tuple[dict[str, dict[str, _Instruction]], str]:
     """Computations by name, and the name of the first."""
     computations: dict[str, dict[str, _Instruction]] = {}
@@ -139,13 +130,13 @@ def _parsed(text: str) -> tuple[dict[str, dict[str, _Instruction]], str]:
             here = computations[opening[2]] = {}
             entry = opening[2] if opening[1] else entry
         elif found := _INSTRUCTION.match(line):
-            name, shape, opcode, rest = found.groups()
+            root, name, shape, opcode, rest = found.groups()
             arguments, _, attributes = rest.partition(")")
             operands = tuple(word.split()[-1].lstrip("%") for word in arguments.split(",") if word.strip())
             branches = [branch for group in _BRANCHES.findall(attributes) for branch in group.split(",")]
             called = (*_CALLED.findall(attributes), *(branch.strip().lstrip("%") for branch in branches))
             rounds = _ROUNDS.search(attributes)
-            here[name] = _Instruction(shape, opcode, operands, called, int(rounds[1]) if rounds else 1)
+            here[name] = _Instruction(bool(root), shape, opcode, operands, called, int(rounds[1]) if rounds else 1)
     return computations, entry
 
 
