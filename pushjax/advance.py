@@ -1,4 +1,4 @@
-"""One step of all fingers, in scalars.
+"""One step of all fingers, or a part of one, in scalars.
 
 Within it (body frame, after turning the hand's displacement by the slider's angle):
 
@@ -14,8 +14,13 @@ leaves does not add up (the paper's open problem 2: Zhou et al. 2017, section VI
 The slider is moved so that its contact point (of several, their middle weighted by force) goes exactly where the
 contact problem says, in the world, and the rest turns about it. Where a finger sticks, slip is then zero to rounding,
 not to the order of the scheme; and so is that of a hand that pushes flat and straight.
+
+All of that is true of contacts that were seen before the step, and of angles that are small against the outline's
+corners. Whether the answer is one is judged afterwards, by the depth of every finger in the slider (`deepest`), from
+the whole outline. `substeps` divides a step that is too long.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -23,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._vec import Scalar, Vec2, Vec3, each_of, select, settle, turn
-from pushjax.contacts import FAR, Meeting, Placement, Touch, choose, count, meet, overlap, places, taken
+from pushjax.contacts import DEEPEST_OVERLAP, FAR, Placement, Touch, choose, count, meet, overlap, places, taken
 from pushjax.hands import Finger, Hand, Pad
 from pushjax.limit_surface import Form
 from pushjax.shapes import Outline
@@ -31,15 +36,19 @@ from pushjax.solve import Contact, ContactSolver, SeveralMotion, StickingSolver
 from pushjax.solve.contacts import motion_under
 from pushjax.status import ContactMode, Status
 
-# rad: a step that turns the slider farther is not an answer. What touches it, and where, was seen at the start.
+# rad: a step, or a part of one, that turns the slider farther is not an answer: what touches it, and where, was seen at
+# its start, and what it passes on the way is not looked at.
 FARTHEST_TURN = 0.5
 # A finger holds a jammed slider if it is nearer than this, in units of the length, or than the hand goes in four steps:
 # a jam is found before the last gap is closed, and the slider swings faster than the fingers close.
 HOLDING = 1e-4
+# After a step a finger may be this deep in the slider, as a share of how far the fingers go in it, if it was not deeper
+# before: the midpoint rule leaves that much at a corner. The floor is in units of the length, for rounding.
+TOLERATED, FLOOR = 0.1, 1e-5
 
 
 class Record(NamedTuple):
-    """A step's outcome in scalars: what the scan stacks."""
+    """A step's outcome in scalars: what the scan stacks. overlap: the deepest at its end, m; zero until judged."""
 
     pose: Vec3
     twist: Vec3
@@ -47,6 +56,7 @@ class Record(NamedTuple):
     force: tuple[Vec2, ...]
     mode: tuple[Int[Array, ""], ...]
     status: Int[Array, ""]
+    overlap: Scalar
 
 
 class Placed(NamedTuple):
@@ -92,6 +102,14 @@ class Grip(NamedTuple):
             raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centres")
         return Placement(center, settle(turn(self.angle + share * self.turning), center.x).unrotate(slider.angle))
 
+    def part(self, begin: Scalar, size: Scalar) -> "Grip":
+        """That part of the step."""
+        angle, turning = self.angle, self.turning
+        if angle is not None and turning is not None:
+            angle, turning = angle + begin * turning, size * turning
+        center = self.center + self.path.scale(begin)
+        return Grip(self.finger, self.friction, center, self.path.scale(size), angle, turning)
+
     def motion(self, slider: Placed, point: Vec2, center: Vec2, rest: Scalar, first: Bool[Array, ""]) -> Vec2:
         """How far the finger's material at the slider's `point` goes in the last `rest` of its step, slider's frame.
 
@@ -107,26 +125,30 @@ class Grip(NamedTuple):
 
 
 def advance(
-    form: Form, outline: Outline, grips: tuple[Grip, ...], solver: ContactSolver | StickingSolver | None, pose: Vec3
+    form: Form,
+    outline: Outline,
+    grips: tuple[Grip, ...],
+    solver: ContactSolver | StickingSolver | None,
+    pose: Vec3,
+    before: Scalar,
+    reach: Scalar,
 ) -> Record:
-    """One step of all fingers."""
+    """One step of all fingers, or a part of one. before: the deepest overlap at its beginning. reach: m, how near a
+    finger holds what is jammed."""
     start = Placed.at(pose)
-    begin, overlapping = jnp.ones_like(pose.x), jnp.zeros((), bool)
+    begin = jnp.ones_like(pose.x)
 
-    def first_contact(grip: Grip) -> Meeting:
+    def first_contact(grip: Grip) -> Scalar:
         at, path = settle((grip.seen(start, jnp.zeros_like(pose.x)), grip.path.unrotate(start.angle)), pose.x)
         return meet(grip.finger, outline, at, path, form.length)
 
     for met in each_of(first_contact, grips):
-        begin, overlapping = jnp.minimum(begin, met.start), overlapping | met.overlapping
+        begin = jnp.minimum(begin, met)
     begin = settle(begin, pose.x)
     rest = 1 - begin
     counts = [count(grip.finger, outline) for grip in grips]
     zero = jnp.zeros_like(pose.x)
     on = (jnp.ones((), bool),) * sum(counts)
-    reach = HOLDING * form.length
-    for grip in grips:
-        reach = jnp.maximum(reach, jax.lax.stop_gradient(4 * (jnp.abs(grip.path.x) + jnp.abs(grip.path.y))))
 
     def stage(carry, share):
         """Solve the contacts as they are when `share` of the last stage's motion is done."""
@@ -137,7 +159,7 @@ def advance(
         def contacts_of(gripped: tuple[Grip, tuple[Int[Array, ""], ...], tuple[Touch, ...]]):
             grip, chosen, begun = gripped
             at = settle(grip.seen(there, begin + rest * share), pose.x)
-            touches = settle(places(grip.finger, outline, at, form.length), pose.x)
+            touches = settle(places(grip.finger, outline, at, grip.path.unrotate(there.angle), form.length), pose.x)
             mine = tuple(
                 jnp.where(first, new, old)
                 for new, old in zip(choose(touches, form.length, outline), chosen, strict=True)
@@ -177,7 +199,8 @@ def advance(
     status = jnp.where((status == Status.JAMMED) & holds, Status.GRASPED, status)
     too_far = (status == Status.MOVING) & (jnp.abs(twist.z) > FARTHEST_TURN)
     status = jnp.where(too_far, Status.NOT_CONVERGED, status)
-    status = jnp.where(overlapping & (status != Status.INVALID), Status.OVERLAPPING, status).astype(jnp.int8)
+    overlapping = (before > DEEPEST_OVERLAP * form.length) & (status != Status.INVALID)
+    status = jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
     return _guarded(motion, moved, pose, status)
 
 
@@ -223,6 +246,7 @@ def _guarded(motion: SeveralMotion, moved: Vec3, pose: Vec3, status: Int[Array, 
         kept(motion.force),
         tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in motion.mode),
         status,
+        jnp.zeros_like(pose.x),
     )
 
 
@@ -231,9 +255,29 @@ def columns(poses: Array) -> tuple[tuple[Array, ...], ...]:
     return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
 
 
-def deepest(outline: Outline, grips: tuple[Grip, ...], pose: Vec3) -> Scalar:
-    """By how much the deepest finger overlaps the slider at the beginning, m."""
-    start, most = Placed.at(pose), jnp.full_like(pose.x, -jnp.inf)
-    for grip in grips:
-        most = jnp.maximum(most, overlap(grip.finger, outline, grip.seen(start, jnp.zeros_like(pose.x))))
-    return most
+def deepest(outline: Outline, grips: tuple[Grip, ...], pose: Vec3, share: float) -> Scalar:
+    """By how much the deepest finger overlaps the slider after a share of the step, m; negative where all are apart.
+    A constant to every derivative."""
+    outline, grips, pose = jax.lax.stop_gradient((outline, grips, pose))
+    there = Placed.at(pose)
+
+    def of(grip: Grip) -> Scalar:
+        return overlap(grip.finger, outline, settle(grip.seen(there, jnp.full_like(pose.x, share)), pose.x))
+
+    return functools.reduce(jnp.maximum, each_of(of, grips))
+
+
+def farthest(grips: tuple[Grip, ...]) -> Scalar:
+    """How far the finger that goes farthest goes, m, straight."""
+    ways = [jnp.abs(grip.path.x) + jnp.abs(grip.path.y) for grip in grips]
+    return jax.lax.stop_gradient(functools.reduce(jnp.maximum, ways))
+
+
+def holding(grips: tuple[Grip, ...], length: Scalar) -> Scalar:
+    """How near a finger holds what is jammed, m."""
+    return jnp.maximum(HOLDING * length, 4 * farthest(grips))
+
+
+def tolerated(grips: tuple[Grip, ...], length: Scalar) -> Scalar:
+    """How deep a finger may be in the slider after a step, m, if it was not deeper before."""
+    return jnp.maximum(FLOOR * length, TOLERATED * farthest(grips))

@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._autodiff import keep_found
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, instance, non_negative, shaped, traced
 from pushjax._programs import compiled
-from pushjax._vec import Scalar, Vec3, select, settle
-from pushjax.advance import Record, advance, columns, deepest, grips_of
+from pushjax._vec import Scalar, Vec3
+from pushjax.advance import Record, advance, columns, deepest, grips_of, holding
 from pushjax.contacts import DEEPEST_OVERLAP, count
 from pushjax.hands import Hand, checked_path
 from pushjax.limit_surface import Form, LimitSurface, WarpedForm
@@ -26,6 +26,7 @@ from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
 from pushjax.status import Status
+from pushjax.substeps import divided
 from pushjax.table import Table
 
 OVERLAPS = 4096  # poses that are looked at together
@@ -49,7 +50,13 @@ class Step(eqx.Module):
     along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
     halfway; zero and SEPARATED where nothing pushes. Contacts are in the order of the fingers: one of a round finger,
     two on an outline that is not convex; two of a pad, one on a disk. The pose after is that before moved
-    by the twist to the second order (the contact point goes straight), not its exponential. status: `Status`.
+    by the twist to the second order (the contact point goes straight), not its exponential. Of a step that was divided
+    (`pushjax.substeps`), the twist is the sum over its parts, and wrench, force and mode are those of the last part in
+    which the slider moved. status: `Status`. overlap: how deep the deepest finger is inside the slider after the step,
+    m, by the whole outline; negative where all are apart. It is a constant to derivatives.
+
+    MOVING, FREE, JAMMED and GRASPED promise that no finger is deeper inside than before, or than a tenth of how far the
+    fingers go in the step (a hundred thousandth of the surface's length, if that is more).
     """
 
     pose: Float[Array, "3"]
@@ -58,13 +65,15 @@ class Step(eqx.Module):
     force: Float[Array, "contacts 2"]
     mode: Int[Array, "contacts"]
     status: Int[Array, ""]
+    overlap: Float[Array, ""]
 
 
 class Trajectory(eqx.Module):
     """A push, step by step; fields as in `Step`, with a leading axis of steps (pose: steps + 1, the start included).
 
-    configuration: where the hand really was: the path, up to a jam. There the hand stops, and status says JAMMED, or
-    GRASPED if every finger holds the slider, at this step and every one after it; nothing moves any more.
+    configuration: where the hand really was: the path, up to a jam. There the hand stops, at the beginning of that step
+    or, if it was divided, of a part of it; and status says JAMMED, or GRASPED if every finger holds the slider, at this
+    step and every one after it; nothing moves any more.
     """
 
     pose: Float[Array, "steps+1 3"]
@@ -74,6 +83,7 @@ class Trajectory(eqx.Module):
     force: Float[Array, "steps contacts 2"]
     mode: Int[Array, "steps contacts"]
     status: Int[Array, "steps"]
+    overlap: Float[Array, "steps"]
 
     @property
     def failed(self) -> Bool[Array, "steps"]:
@@ -106,6 +116,7 @@ def _world(record: Record, length: Scalar) -> Step:
         force=jnp.stack([jnp.stack(force, axis=-1) for force in record.force], axis=-2),
         mode=jnp.stack(record.mode, axis=-1),
         status=record.status,
+        overlap=record.overlap,
     )
 
 
@@ -171,7 +182,7 @@ def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> 
     """By how much the deepest finger overlaps the slider, m, of each pose."""
     where = columns(hand.poses(configuration))
     grips = grips_of(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)
-    return jax.vmap(lambda pose: deepest(slider.shape.outline(), grips, Vec3.of(pose)))(poses)
+    return jax.vmap(lambda pose: deepest(slider.shape.outline(), grips, Vec3.of(pose), 0.0))(poses)
 
 
 def check_opening(hand: Hand, path: Array) -> None:
@@ -216,10 +227,10 @@ def step(
 
 @compiled
 def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
-    outline = slider.shape.outline()
-    form, mu = ground(slider.surface, friction)
-    grips = grips_of(hand, mu, columns(hand.poses(q0)), columns(hand.poses(q1)))
-    return _world(advance(form, outline, grips, solver, Vec3.of(pose)), form.length)
+    grounded = ground(slider.surface, friction)
+    push = scan(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, lambda step, pose: grounded)
+    fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
+    return Step(**fields)
 
 
 def rollout(
@@ -287,46 +298,44 @@ def scan(
 ) -> Trajectory:
     """The rollout itself. `grounded` gives a step's surface and friction, by its index and the pose before it; all are
     of one length."""
-    outline = shape.outline()
-    fingers = columns(hand.poses(path))
-    one = sum(count(finger, outline) for finger in hand.fingers) == 1  # which cannot jam
+    outline, poses, steps = shape.outline(), hand.poses(path), len(path) - 1
+    start = Vec3.of(pose)
 
-    def body(carry, along):
-        (pose, stopped), (step, ends) = carry, along
+    def grips_at(step: Array, mu: Array):
+        before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
+        return grips_of(hand, mu, columns(before), columns(after))
+
+    if sum(count(finger, outline) for finger in hand.fingers) == 1:
+        records, share = _undivided(outline, steps, grips_at, solver, start, grounded), jnp.zeros_like(start.x)
+    else:
+        records, share = divided(outline, steps, grips_at, solver, start, grounded)
+    done = _world(records, grounded(jnp.zeros((), jnp.int32), start)[0].length)
+    stopped = _first(_stops(done.status))
+    status, overlap = done.status, done.overlap
+    reached = jnp.where(stopped >= 0, stopped, steps)
+    index = jnp.arange(steps + 1)
+    # in a step that was divided the hand stops on the way
+    onward = jax.lax.stop_gradient(share) * (path[jnp.minimum(reached + 1, steps)] - path[reached])
+    configuration = path[jnp.minimum(index, reached)] + jnp.where(index > reached, 1.0, 0.0)[:, None] * onward[None]
+    poses = jnp.concatenate([pose[None], done.pose])
+    return Trajectory(poses, configuration, done.twist, done.wrench, done.force, done.mode, status, overlap)
+
+
+def _undivided(outline, steps, grips_at, solver, start, grounded) -> Record:
+    """The record of every step of a round finger on a convex outline, whose one contact is all there is to see."""
+
+    def body(pose: Vec3, step: Array):
         form, mu = grounded(step, pose)
-        record = advance(form, outline, grips_of(hand, mu, *ends), solver, pose)
-        if not one:
-            record, stopped = _frozen(record, pose, stopped)
-        return (record.pose, stopped), record
+        grips = grips_at(step, mu)
+        before = deepest(outline, grips, pose, 0.0)  # what detection begins with
+        record = advance(form, outline, grips, solver, pose, before, holding(grips, form.length))
+        return record.pose, record._replace(overlap=before)
 
-    ends = tuple(
-        jax.tree.map(lambda column, cut=cut: column[cut], fingers) for cut in (slice(None, -1), slice(1, None))
-    )
-    # Only poses, and what searches found, are kept for reverse mode, and a step is worked out again there: writing out
-    # everything a step computes, and reading it back, took twice as long as computing it again.
     body = jax.checkpoint(body, prevent_cse=False, policy=keep_found)
-    indices = jnp.arange(len(path) - 1)
-    _, records = jax.lax.scan(body, (Vec3.of(pose), jnp.zeros((), jnp.int8)), (indices, ends))
-    steps = _world(records, grounded(indices[0], Vec3.of(pose))[0].length)
-    poses = jnp.concatenate([pose[None], steps.pose])
-    stopped = _first(_stops(steps.status))
-    reached = jnp.where(stopped >= 0, stopped, len(path) - 1)
-    configuration = path[jnp.minimum(jnp.arange(len(path)), reached)]
-    return Trajectory(poses, configuration, steps.twist, steps.wrench, steps.force, steps.mode, steps.status)
-
-
-def _frozen(record: Record, pose: Vec3, stopped: Int[Array, ""]) -> tuple[Record, Int[Array, ""]]:
-    """Once jammed, nothing moves any more: the hand is held where it is, and says why at every step."""
-    held = settle(stopped != 0, pose.x)
-
-    def still(value):
-        return jax.tree.map(lambda entry: jnp.where(held, jnp.zeros((), entry.dtype), entry), value)
-
-    status = jnp.where(held, stopped, record.status)
-    stopped = jnp.where(_stops(status), status, 0).astype(jnp.int8)
-    rest = still((record.twist, record.wrench, record.force, record.mode))
-    twist, wrench, force, mode = rest
-    return Record(select(held, pose, record.pose), twist, wrench, force, mode, status), stopped
+    last, records = jax.lax.scan(body, start, jnp.arange(steps))
+    grips = grips_at(jnp.asarray(steps - 1), grounded(jnp.asarray(steps - 1), last)[1])
+    final = deepest(outline, grips, last, 1.0)
+    return records._replace(overlap=jnp.concatenate([records.overlap[1:], final[None]]))
 
 
 def _stops(status: Array) -> Array:

@@ -20,10 +20,10 @@ class Status(IntEnum):
     """Outcome of a contact problem, or of one step of a rollout.
 
     MOVING: the slider moves. FREE: nothing pushes it. JAMMED: no twist satisfies every contact. NOT_CONVERGED: no
-    answer was found, or (rollouts only) one that turns the slider by more than half a radian in one step, which is too
-    coarse for it; the slider is left where it is. GRASPED: jammed with every finger on the slider (rollouts
-    only). OVERLAPPING: the hand is too deep inside the slider for contact to mean anything; the slider is left
-    where it is (rollouts only). INVALID: an input was NaN, infinite or outside its domain where it could not be
+    answer was found, or (rollouts only) none that leaves every finger outside the slider, however small the parts into
+    which the step was divided; the slider is left where it is. GRASPED: jammed with every finger on the slider
+    (rollouts only). OVERLAPPING: the hand is too deep inside the slider for contact to mean anything; the slider is
+    left where it is (rollouts only). INVALID: an input was NaN, infinite or outside its domain where it could not be
     refused because it was traced; the slider is left where it is.
     """
 

@@ -89,7 +89,7 @@ def test_meets_where_brute_force_does(name, rng):
     for _ in range(25):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
         at, path = placed(aside, 0.04, turn), Vec2(jnp.asarray(rng.uniform(-0.01, 0.01)), jnp.asarray(-0.05))
-        start = float(met(at, path).start)
+        start = float(met(at, path))
         shares, begin, way = np.linspace(0, 1, 101), np.array([aside, 0.04]), np.array([float(path.x), float(path.y)])
         depth = np.array([inside(points, bounds, begin + share * way, turn) for share in shares])
         first = shares[np.argmax(depth > 0)] if (depth > 0).any() else 1.0
@@ -106,7 +106,8 @@ def test_meets_where_brute_force_does(name, rng):
 def test_places_are_at_their_distance(name):
     """A pad over the outline: contacts lie on the outline, and as far from the pad as they say, along the normal."""
     shape, finger = shapes()[name], pad()
-    seen = jax.jit(lambda at: places(finger, shape.outline(), at, jnp.asarray(LENGTH)))
+    still = Vec2(jnp.zeros(()), jnp.zeros(()))
+    seen = jax.jit(lambda at: places(finger, shape.outline(), at, still, jnp.asarray(LENGTH)))
     deep = jax.jit(lambda at: overlap(finger, shape.outline(), at))
     for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
         at = placed(aside, 0.025, turn)

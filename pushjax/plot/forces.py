@@ -72,7 +72,8 @@ def _touches(shape: Shape, hand: Hand, pose: jax.Array, configuration: jax.Array
         there = Placed.at(Vec3.of(pose))
         found = []
         for grip in grips_of(hand, jnp.zeros(len(hand.fingers), pose.dtype), columns(before), columns(after)):
-            touches = places(grip.finger, outline, grip.seen(there, half), size)
+            at, path = grip.seen(there, half), grip.path.unrotate(there.angle)
+            touches = places(grip.finger, outline, at, path, size)
             found += taken(touches, choose(touches, size, outline))
         return tuple(
             jnp.stack([v.array() for v in part]) for part in zip(*((t.point, t.normal) for t in found), strict=True)

@@ -16,6 +16,7 @@ from pushjax.plot.parts import hand_at, outline, placed, vertices
 from pushjax.plot.style import BETWEEN, BLUE, END, MM, ORANGE, START, STYLE, legend_below, legend_of_moments, row
 from pushjax.rollout import Trajectory
 from pushjax.shapes import Shape
+from pushjax.status import Status
 
 
 def push_figure(
@@ -25,7 +26,7 @@ def push_figure(
     the centre's trace.
 
     pushes: by name, a trajectory and the path (steps + 1, 2) of the finger's centre, m. radius: m, the finger's.
-    frames: how many moments between start and end.
+    frames: how many moments between start and end. A push with a step that failed says so in its title.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(pushes), 4.0, 4.2, shared=True)
@@ -37,7 +38,7 @@ def push_figure(
                 outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
-            axes.set(title=name, xlabel="x / mm", ylabel="y / mm", aspect="equal")
+            axes.set(title=_titled(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
         return figure
 
@@ -46,7 +47,7 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
     """Grasps side by side: slider and fingers at the start black, at the end red, between grey; the centre's trace.
 
     Pushes by any hand can be drawn so, too. frames: how many moments between start and end, of those in which the
-    slider moves.
+    slider moves. A grasp with a step that failed says so in its title.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(grasps), 3.1, 3.9, shared=True)
@@ -63,10 +64,16 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
                 outline(axes, shape, pose[k], color, width)
                 hand_at(axes, hand, fingers[k], color, width)
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
-            axes.set(title=name.replace(": ", ":\n"), xlabel="x / mm", aspect="equal")
+            axes.set(title=_titled(name.replace(": ", ":\n"), grasp), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         legend_of_moments(figure, all_axes[0])
         return figure
+
+
+def _titled(name: str, push: Trajectory) -> str:
+    """The title of a push; if a step failed, with its status, since what is drawn after it is no answer."""
+    first = int(push.first_failure)
+    return name if first < 0 else f"{name}\n{Status(int(push.status[first])).name} from step {first}"
 
 
 class RealPush(NamedTuple):

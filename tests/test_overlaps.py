@@ -1,0 +1,252 @@
+"""No finger inside a slider that says MOVING: random pushes and grasps judged by shapely, and one test for each cause.
+
+`benchmarks/overlaps.py` is the same survey, of every shape and hand.
+"""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax import plot
+from pushjax._vec import Vec2, Vec3, turn
+from pushjax.advance import Placed, deepest, grips_of
+from pushjax.contacts import FAR, Placement, overlap, places
+from pushjax.hands import Pad, RoundFinger
+from pushjax.substeps import SMALLEST
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+shapely = pytest.importorskip("shapely")
+import overlaps as survey  # noqa: E402
+
+STARTS = 60
+
+
+@pytest.mark.parametrize(
+    ("hand", "shape", "steps", "dtype"),
+    [
+        ("jaw", "L", 300, np.float64),
+        ("jaw", "U", 60, np.float32),
+        ("two", "T", 60, np.float64),
+        ("two", "bean", 300, np.float32),
+        ("one", "star", 60, np.float64),
+    ],
+)
+def test_no_finger_is_inside(hand, shape, steps, dtype):
+    pushes = survey.run(shape, hand, STARTS, steps, dtype)
+    found = survey.judged(pushes, steps)
+    assert found["wrong"] == 0, found["steps_wrong"]
+    assert found["failed"] == 0, found["failures"]
+    # what is recorded is what the judge sees
+    depth, own = survey.overlaps(pushes)[:, 1:], pushes.push.overlap
+    deep = np.maximum(depth, own) > 1e-6
+    assert deep.any()
+    np.testing.assert_allclose(own[deep], depth[deep], atol=1e-6 if dtype == np.float64 else 2e-5, rtol=0.05)
+    moved = np.any(pushes.push.status == pj.Status.MOVING, axis=1)
+    assert moved.mean() > 0.3
+
+
+# --- the depth itself ---
+
+
+def random_polygon(rng, corners: int) -> np.ndarray:
+    """One that does not cross itself, convex or not."""
+    angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    while np.max(np.diff(np.append(angle, angle[0] + 2 * np.pi))) > 2.5:
+        angle = np.sort(rng.uniform(0, 2 * np.pi, corners))
+    return rng.uniform(0.02, 0.06, corners)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def test_depth_is_shapelys(rng):
+    """Of a round finger and a pad, apart, touching, right across: to rounding, or half where edges only cross."""
+    finger, pad = RoundFinger(0.006), Pad(pj.Polygon.rectangle(0.05, 0.01))
+    cases = 400
+    vertices = np.stack([random_polygon(rng, 7) for _ in range(cases)])
+    at, angle = rng.uniform(-0.07, 0.07, (cases, 2)), rng.uniform(-np.pi, np.pi, cases)
+
+    @jax.jit
+    @jax.vmap
+    def depth(vertices, at, angle):
+        outline = pj.Polygon(vertices).outline()
+        there = Placement(Vec2.of(at), turn(angle))
+        return overlap(finger, outline, there), overlap(pad, outline, there)
+
+    of_finger, of_pad = (np.asarray(each) for each in depth(vertices, at, angle))
+    kinds = set()
+    for k in range(cases):
+        body, center = shapely.Polygon(vertices[k]), shapely.Point(at[k])
+        signed = body.exterior.distance(center) * (-1 if body.contains(center) else 1)
+        assert abs(of_finger[k] - (0.006 - signed)) < 1e-12
+        c, s = np.cos(angle[k]), np.sin(angle[k])
+        corners = at[k] + np.asarray(pad.shape.vertices) @ np.array([[c, s], [-s, c]])
+        other = shapely.Polygon(corners)
+        if not body.intersects(other):
+            assert abs(of_pad[k] + body.distance(other)) < 1e-12
+            kinds.add("apart")
+            continue
+        inside = [body.exterior.distance(shapely.Point(p)) for p in corners if body.contains(shapely.Point(p))]
+        inside += [other.exterior.distance(shapely.Point(p)) for p in vertices[k] if other.contains(shapely.Point(p))]
+        corner = max(inside, default=0.0)
+        assert of_pad[k] >= corner - 1e-12
+        if not inside:
+            shared = body.intersection(other)
+            width = shapely.maximum_inscribed_circle(shared, tolerance=1e-6).length
+            assert of_pad[k] >= width / 2 - 1e-5
+        kinds.add("corners" if inside else "across")
+    assert kinds == {"apart", "corners", "across"}
+
+
+# --- the causes, one by one ---
+
+L = np.array([(0, 0), (120, 0), (120, 40), (40, 40), (40, 80), (0, 80)]) * 1e-3 - np.array([0.05, 0.03])
+JAW = pj.Hand.parallel_jaw(width=0.05, thickness=0.01)
+
+
+def surface(length: float = 0.04) -> pj.Ellipsoid:
+    return pj.Ellipsoid(np.eye(3), length)
+
+
+def test_an_inner_corner_touches_no_pad():
+    """It was taken for a place deep in the pad that lies above it, and pushed the slider half a pad away."""
+    outline = pj.Polygon(L).outline()
+    lower = Placement(Vec2(jnp.asarray(0.02), jnp.asarray(0.016)), turn(jnp.asarray(-0.11)))
+    pad = JAW.fingers[0]
+    touches = places(pad, outline, lower, Vec2(jnp.zeros(()), jnp.zeros(())), jnp.asarray(0.04))
+    inner = 4 + 3  # behind the pad's four corners, the outline's fourth
+    np.testing.assert_allclose([touches.point.x[inner], touches.point.y[inner]], (-0.01, 0.01))
+    assert touches.distance[inner] > FAR / 2
+    slider = pj.Slider(pj.Polygon(L), surface())
+    path = pj.line((0, 0, 0, 0.18), (0, 0, 0, 0.03), 300)
+    push = pj.rollout(slider, JAW, path, pose=(0, 0.005, np.radians(20)), friction=0.3)
+    assert int(push.first_failure) == -1
+    assert pj.Status(int(push.status[-1])) == pj.Status.GRASPED
+    assert float(jnp.max(push.overlap)) <= 0.1 * 0.25e-3 + 1e-9
+    assert float(jnp.max(jnp.abs(jnp.diff(push.pose[:, 2])))) < 0.1
+
+
+# Two fingers turn a rectangle so far in the last of these steps that its corner would pass into one of them.
+SLIDER = pj.Slider(pj.Polygon.rectangle(0.09, 0.06), surface(0.03))
+TWO = pj.Hand.two_fingers(0.008)
+TURNING = pj.line((0, 0, 0, 0.105), (0, 0, 0, 0.0765), 4)
+START = (0.012, 0.002, 0.6)
+
+
+def turned(x) -> pj.Trajectory:
+    """x: friction, pose, how far the hand closes."""
+    path = TURNING.at[-1, 3].set(x[4])
+    return pj.rollout(SLIDER, TWO, path, pose=x[1:4], friction=x[0])
+
+
+def whole_step(push: pj.Trajectory, path, friction: float) -> pj.Trajectory:
+    """The last step by as many small ones: where it should end."""
+    fine = pj.line(path[-2], path[-1], 256)
+    return pj.rollout(SLIDER, TWO, fine, pose=push.pose[-2], friction=friction)
+
+
+def test_a_step_that_is_too_long_is_divided():
+    push = turned(jnp.array([0.2, *START, 0.0765]))
+    assert set(np.asarray(push.status).tolist()) == {pj.Status.MOVING}
+    farthest = np.abs(np.diff(TURNING[:, 3])).max() / 2
+    assert float(jnp.max(push.overlap)) <= 0.1 * farthest
+    fine = whole_step(push, TURNING, 0.2)
+    off = pj.deviation(push.pose[-1], fine.pose[-1], 0.03)
+    assert float(off) < 1e-3, "the parts are as exact as steps of their size"
+    # the twist is the whole step's: the slider turned so far in it
+    np.testing.assert_allclose(push.twist[-1, 2], push.pose[-1, 2] - push.pose[-2, 2], rtol=1e-12)
+    assert float(jnp.max(jnp.abs(push.wrench[-1]))) > 0
+    alone = pj.step(SLIDER, TWO, TURNING[-2], TURNING[-1], pose=push.pose[-2], friction=0.2)
+    np.testing.assert_allclose(alone.pose, push.pose[-1], atol=1e-12)
+    np.testing.assert_allclose(alone.overlap, push.overlap[-1], atol=1e-12)
+
+
+def test_pushes_of_a_batch_divide_their_own_steps():
+    """Some divide, some end early, some never touch: each goes as it goes alone."""
+    rows = np.array([[0.2, *START, 0.0765], [0.2, *START, 0.1], [0.5, 0, 0, 0, 0.06], [0.3, 0.5, 0, 0, 0.0765]])
+    together = jax.jit(jax.vmap(turned))(jnp.asarray(rows))
+    for k, row in enumerate(rows):
+        alone = jax.tree.map(lambda leaf, k=k: leaf[k], together)
+        for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(turned(jnp.asarray(row))), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-9)
+    assert pj.Status.GRASPED in np.asarray(together.status[2])
+    nested = jax.jit(jax.vmap(jax.vmap(turned)))(jnp.asarray(rows.reshape(2, 2, -1)))
+    np.testing.assert_allclose(nested.pose.reshape(together.pose.shape), together.pose, atol=1e-9)
+
+
+def test_derivatives_of_a_divided_step():
+    """By friction, start and hand; forward, reverse, and central differences."""
+    x, h = jnp.array([0.2, *START, 0.0765]), 1e-6
+    final = lambda x: turned(x).pose[-1]  # noqa: E731
+    forward, reverse = jax.jit(jax.jacfwd(final))(x), jax.jit(jax.jacrev(final))(x)
+    ends = jax.jit(jax.vmap(final))(x[None] + h * jnp.concatenate([jnp.eye(5), -jnp.eye(5)]))
+    central = (ends[:5] - ends[5:]).T / (2 * h)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(forward, central, rtol=1e-5, atol=1e-6 * np.abs(central).max())
+    assert np.abs(forward[:, 0]).max() > 1e-4
+
+
+def test_a_step_that_cannot_be_divided_is_the_first_failure():
+    """Fingers without friction on parallel faces: nothing holds the slider where it lies flat, and nothing proves it.
+
+    The slider stays where that step began, in the picture of it too, and the hand goes on into it.
+    """
+    path = pj.line((0, 0, 0, 0.1), (0, 0, 0, 0.05), 40)
+    push = pj.rollout(SLIDER, TWO, path, pose=(0.002, 0, 0.1), friction=0.0)
+    k = int(push.first_failure)
+    assert k > 0
+    assert pj.Status(int(push.status[k])) == pj.Status.NOT_CONVERGED
+    assert bool(jnp.all(push.pose[k + 1] == push.pose[k]))
+    farthest = 0.05 / 40 / 2
+    assert float(jnp.max(push.overlap[:k])) <= 0.1 * farthest
+    assert float(push.overlap[k]) > 0.1 * farthest
+    assert bool(jnp.all(jnp.isfinite(push.overlap)))
+    failing = jax.jit(jax.jacrev(lambda pose: pj.rollout(SLIDER, TWO, path, pose=pose, friction=0.0).pose[-1]))
+    assert np.all(np.isfinite(failing(jnp.array([0.002, 0, 0.1]))))
+    assert SMALLEST < 0.01
+
+
+def test_hands_of_ones_own_and_smooth_sliders():
+    """A pad that turns by kinematics of its own onto a disk and a curve, which have no corners."""
+
+    def swinging(q):
+        return jnp.stack([jnp.stack([q[0], q[1], q[2]])])
+
+    hand = pj.Hand((pj.Polygon.rectangle(0.05, 0.01),), swinging, 3)
+    angle = 2 * np.pi * np.arange(16) / 16
+    radius = 0.045 + 0.014 * np.cos(2 * angle) - 0.012 * np.sin(angle)
+    bean = pj.Curve.through(radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    for shape in (pj.Disk(0.04), bean):
+        slider = pj.Slider(shape, surface())
+        push = pj.rollout(slider, hand, pj.line((0, 0.08, 0), (0.01, 0.0, 1.0), 40), pose=(0, 0, 0.3), friction=0.3)
+        body = survey.outline_of(shape)
+        pushes = survey.Survey(hand, shape, None, None, None, jax.tree.map(lambda leaf: np.asarray(leaf)[None], push))
+        assert body.is_valid
+        assert int(push.first_failure) == -1
+        assert pj.Status.MOVING in np.asarray(push.status)
+        assert np.max(survey.overlaps(pushes)) < 0.1 * 0.0022
+
+
+def deepest_of(push, friction):
+    """As the judge of a step has it, of the last pose."""
+    where = TWO.poses(push.configuration[-1])
+    ends = tuple(tuple(row) for row in where)
+    return deepest(SLIDER.shape.outline(), grips_of(TWO, friction, ends, ends), Vec3.of(push.pose[-1]), 1.0)
+
+
+def test_overlap_is_no_variable():
+    x = jnp.array([0.2, *START, 0.0765])
+    assert not np.any(jax.jacfwd(lambda x: turned(x).overlap)(x))
+    push = turned(x)
+    np.testing.assert_allclose(deepest_of(push, jnp.array([0.2, 0.2])), push.overlap[-1], atol=1e-12)
+    assert Placed.at(Vec3.of(push.pose[-1])).pose.x == push.pose[-1, 0]
+
+
+def test_pictures_name_the_step_that_failed():
+    path = pj.line((0, 0, 0, 0.1), (0, 0, 0, 0.05), 40)
+    failing, fine = (pj.rollout(SLIDER, TWO, path, pose=(0.002, 0, 0.1), friction=mu) for mu in (0.0, 0.3))
+    figure = plot.grasp_figure(SLIDER.shape, TWO, {"slippery": failing, "rough": fine})
+    titles = [axes.get_title() for axes in figure.axes]
+    assert titles == [f"slippery\nNOT_CONVERGED from step {int(failing.first_failure)}", "rough"]
