@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 
 import pushjax as pj
+from pushjax.hands import Pad, RoundFinger
 
 MM = 1e-3
 # Vertices of a polygon in place of a smooth outline: its chords are within 0.2 um of it.
@@ -66,13 +67,6 @@ SHAPES = (*POLYGONS, *SMOOTH)
 HANDS = ("one", "two", "three", "jaw")
 FINGER = 8 * MM
 PAD = (50 * MM, 10 * MM)
-
-
-class Setting(NamedTuple):
-    """A hand and a way to draw paths for it: (rng, starts, steps) to (starts, steps + 1, dof); and what it moves by."""
-
-    hand: pj.Hand
-    ends: tuple[tuple[float, ...], tuple[float, ...]]
 
 
 def shape_of(name: str) -> pj.Polygon | pj.Curve | pj.Ellipse | pj.Disk:
@@ -157,16 +151,18 @@ def overlaps(survey: Survey) -> np.ndarray:
     for k, finger in enumerate(survey.hand.fingers):
         away = where[..., k, :2] - pose[..., :2]
         local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
-        if isinstance(finger, pj.hands.Pad):
+        if isinstance(finger, Pad):
             turn = where[..., k, 2] - pose[..., 2]
             corners = np.asarray(finger.shape.vertices, float)
             cs, sn = np.cos(turn)[..., None], np.sin(turn)[..., None]
             placed = np.stack([cs * corners[:, 0] - sn * corners[:, 1], sn * corners[:, 0] + cs * corners[:, 1]], -1)
             depth = _pads(body, edge, placed + local[..., None, :])
-        else:
+        elif isinstance(finger, RoundFinger):
             centers = shapely.points(local)
             distance = shapely.distance(edge, centers)
             depth = float(finger.radius) - np.where(shapely.contains(body, centers), -distance, distance)
+        else:
+            raise TypeError(f"not a finger: {finger!r}")
         deepest = np.maximum(deepest, depth)
     return deepest
 
@@ -176,7 +172,7 @@ def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
     share is where no corner is."""
     shape = corners.shape[:-2]
     flat = corners.reshape(-1, *corners.shape[-2:])
-    pads = shapely.polygons(flat)
+    pads = np.asarray(shapely.polygons(flat))
     depth = np.zeros(len(flat))
     near = np.flatnonzero(shapely.intersects(body, pads))
     points = shapely.points(flat[near])
