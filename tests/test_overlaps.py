@@ -30,8 +30,7 @@ STARTS = 60
     ("hand", "shape", "steps", "dtype"),
     [
         ("jaw", "L", 300, np.float64),
-        ("jaw", "U", 60, np.float32),
-        ("two", "T", 60, np.float64),
+        ("two", "T", 60, np.float32),
         ("two", "bean", 300, np.float32),
         ("one", "star", 60, np.float64),
     ],

@@ -46,6 +46,7 @@ def slid(steps: int = 6, turn: float = 0.4, dof: int = 2) -> pj.Trajectory:
         force=jnp.tile(jnp.array([[1.0, 0.0]]), (steps, 1, 1)),
         mode=jnp.full((steps, 1), pj.ContactMode.STICKING, jnp.int8),
         status=jnp.zeros(steps, jnp.int8),
+        overlap=jnp.zeros(steps),
     )
 
 

@@ -1,6 +1,7 @@
 """Motion: what a frame shows, where forces act, and that the files play."""
 
 import base64
+import dataclasses
 import importlib.util
 import io
 import re
@@ -88,7 +89,7 @@ def trajectory(pose, configuration, wrench, force) -> pj.Trajectory:
     steps, contacts = force.shape[:2]
     mode = jnp.full((steps, contacts), pj.ContactMode.STICKING, jnp.int8)
     parts = (jnp.asarray(part) for part in (pose, configuration, np.zeros((steps, 3)), wrench, force))
-    return pj.Trajectory(*parts, mode=mode, status=jnp.zeros(steps, jnp.int8))
+    return pj.Trajectory(*parts, mode=mode, status=jnp.zeros(steps, jnp.int8), overlap=jnp.zeros(steps))
 
 
 def test_forces_of_pads_in_whatever_order(block):
@@ -198,9 +199,7 @@ def test_pads_and_words_of_several_contacts(block):
     mode = np.zeros((35, 4), np.int8)
     mode[4] = pj.ContactMode.STICKING, pj.ContactMode.SLIDING_LEFT, pj.ContactMode.SLIDING_LEFT, 0
     status = np.where(np.arange(35) < 5, pj.Status.MOVING, pj.Status.GRASPED).astype(np.int8)
-    given = pj.Trajectory(
-        given.pose, given.configuration, given.twist, given.wrench, given.force, jnp.asarray(mode), jnp.asarray(status)
-    )
+    given = dataclasses.replace(given, mode=jnp.asarray(mode), status=jnp.asarray(status))
     moving = plot.animate(block, jaw, given, forces=False, frames=7)
     (axes,) = moving.figure.axes
     moving.draw(5)
