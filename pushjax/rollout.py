@@ -26,7 +26,7 @@ from pushjax.shapes import Shape
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.solve.contacts import ground
 from pushjax.status import Status
-from pushjax.substeps import divided
+from pushjax.substeps import divided, stopping
 from pushjax.table import Table
 
 OVERLAPS = 4096  # poses that are looked at together
@@ -56,7 +56,8 @@ class Step(eqx.Module):
     m, by the whole outline; negative where all are apart. It is a constant to derivatives.
 
     MOVING, FREE, JAMMED and GRASPED promise that no finger is deeper inside than before, or than a tenth of how far the
-    fingers go in the step (a hundred thousandth of the surface's length, if that is more).
+    fingers go in the step (a hundred thousandth of the surface's length, if that is more). A step of one round finger
+    on a convex outline is not tried again: its overlap is recorded, and was less than that in all that was measured.
     """
 
     pose: Float[Array, "3"]
@@ -93,7 +94,7 @@ class Trajectory(eqx.Module):
     @property
     def stopped(self) -> Int[Array, ""]:
         """Index of the step at which the hand jammed or grasped, or -1."""
-        return _first(_stops(self.status))
+        return _first(stopping(self.status))
 
     @property
     def first_failure(self) -> Int[Array, ""]:
@@ -310,15 +311,14 @@ def scan(
     else:
         records, share = divided(outline, steps, grips_at, solver, start, grounded)
     done = _world(records, grounded(jnp.zeros((), jnp.int32), start)[0].length)
-    stopped = _first(_stops(done.status))
-    status, overlap = done.status, done.overlap
+    stopped = _first(stopping(done.status))
     reached = jnp.where(stopped >= 0, stopped, steps)
     index = jnp.arange(steps + 1)
     # in a step that was divided the hand stops on the way
     onward = jax.lax.stop_gradient(share) * (path[jnp.minimum(reached + 1, steps)] - path[reached])
     configuration = path[jnp.minimum(index, reached)] + jnp.where(index > reached, 1.0, 0.0)[:, None] * onward[None]
     poses = jnp.concatenate([pose[None], done.pose])
-    return Trajectory(poses, configuration, done.twist, done.wrench, done.force, done.mode, status, overlap)
+    return Trajectory(poses, configuration, done.twist, done.wrench, done.force, done.mode, done.status, done.overlap)
 
 
 def _undivided(outline, steps, grips_at, solver, start, grounded) -> Record:
@@ -336,7 +336,3 @@ def _undivided(outline, steps, grips_at, solver, start, grounded) -> Record:
     grips = grips_at(jnp.asarray(steps - 1), grounded(jnp.asarray(steps - 1), last)[1])
     final = deepest(outline, grips, last, 1.0)
     return records._replace(overlap=jnp.concatenate([records.overlap[1:], final[None]]))
-
-
-def _stops(status: Array) -> Array:
-    return (status == Status.JAMMED) | (status == Status.GRASPED)

@@ -106,7 +106,7 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
     depth = deepest(outline, part, pose, 1.0)
     # in a step that is divided, a jam is found to its smallest part: what squirts turns far in one step
     final = (trial.part == 1) | (trial.part < 2 * SMALLEST)
-    stops = final & ((record.status == Status.JAMMED) | (record.status == Status.GRASPED))
+    stops = final & stopping(record.status)
     goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
     clear = depth <= jnp.maximum(trial.before, trial.part * tolerance)
     accepted, stops = settle((goes & clear & ~gives_up, stops & ~gives_up), pose.x)
@@ -138,12 +138,11 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
     ended = select(stops, held, ended)
 
     stopped = jnp.where(stops, record.status, trial.stopped).astype(jnp.int8)
-    ended_pose = ended.pose
     onward = settle(accepted & ~ends, pose.x)
     anew = (ends & ~stops) | (given_up != 0)
     following = Trial(
-        pose=select(ends, ended_pose, select(onward, pose, trial.pose)),
-        origin=select(ends, ended_pose, trial.origin),
+        pose=select(ends, ended.pose, select(onward, pose, trial.pose)),
+        origin=select(ends, ended.pose, trial.origin),
         step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
         done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
         part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(2 * trial.part, 1 - done), smaller)),
@@ -152,10 +151,15 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
         stopped=stopped,
         given_up=given_up,
         failed=jnp.where(ends, gives_up, trial.failed),
-        so_far=select(ends, _still(record, ended_pose), select(onward, so_far, trial.so_far)),
+        so_far=select(ends, _still(record, ended.pose), select(onward, so_far, trial.so_far)),
     )
     following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, trial)
     return following, (ended, ends, trial.step)
+
+
+def stopping(status: Array) -> Bool[Array, "..."]:
+    """Whether the hand stops for good."""
+    return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
 def _still(record: Record, pose: Vec3) -> Record:
