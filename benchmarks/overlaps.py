@@ -3,13 +3,14 @@
 Random starts and frictions of every hand on outlines of many kinds, convex or not, with corners or without, in fine
 and coarse steps and both floating types. A step is wrong if its status says MOVING, FREE, JAMMED or GRASPED, and a
 finger is deeper inside than it was before, and than 0.1 mm (300 steps) or a fifth of the hand's displacement in the
-step (60 steps).
+step (60 steps). An end that says GRASPED or JAMMED is confirmed: see `unconfirmed`.
 
     python benchmarks/overlaps.py --starts 500 --hands jaw two --shapes L T --steps 300 --dtype float64
 """
 
 import argparse
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
+from scipy.optimize import linprog
 
 import pushjax as pj
 from pushjax.hands import Pad, RoundFinger
@@ -24,6 +26,7 @@ from pushjax.hands import Pad, RoundFinger
 MM = 1e-3
 # Vertices of a polygon in place of a smooth outline: its chords are within 0.2 um of it.
 FINE = 4000
+FINER = 256
 
 
 def _around(radius, count: int = 16) -> np.ndarray:
@@ -108,11 +111,15 @@ class Survey(NamedTuple):
     """The pushes of one cell: hand and slider, starts, and what became of them."""
 
     hand: pj.Hand
-    shape: object
+    slider: pj.Slider
     path: np.ndarray
     pose: np.ndarray
     friction: np.ndarray
     push: pj.Trajectory
+
+    @property
+    def shape(self):
+        return self.slider.shape
 
 
 def surface_of(shape, key) -> pj.LimitSurface:
@@ -135,7 +142,29 @@ def run(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: i
     push = jax.jit(jax.vmap(lambda path, pose, mu: pj.rollout(slider, hand, path, pose=pose, friction=mu)))(
         path, pose, friction
     )
-    return Survey(hand, shape, path, pose, friction, jax.tree.map(np.asarray, push))
+    return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push))
+
+
+def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
+    """Of each finger, in the slider's frame, its centre (..., 1, 2), or a pad's corners (..., corners, 2)."""
+    where = np.asarray(hand.poses(jnp.asarray(configurations)), float)
+    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    found = []
+    for k, finger in enumerate(hand.fingers):
+        away = where[..., k, :2] - poses[..., :2]
+        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
+        placed = local[..., None, :]
+        if isinstance(finger, Pad):
+            turn = where[..., k, 2] - poses[..., 2]
+            corners = np.asarray(finger.shape.vertices, float)
+            cs, sn = np.cos(turn)[..., None], np.sin(turn)[..., None]
+            placed = placed + np.stack(
+                [cs * corners[:, 0] - sn * corners[:, 1], sn * corners[:, 0] + cs * corners[:, 1]], axis=-1
+            )
+        elif not isinstance(finger, RoundFinger):
+            raise TypeError(f"not a finger: {finger!r}")
+        found.append(placed)
+    return found
 
 
 def overlaps(survey: Survey) -> np.ndarray:
@@ -145,24 +174,16 @@ def overlaps(survey: Survey) -> np.ndarray:
     edge = body.exterior
     shapely.prepare(edge)
     pose = np.asarray(survey.push.pose, float)
-    where = np.asarray(jax.vmap(survey.hand.poses)(jnp.asarray(survey.push.configuration)), float)
-    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     deepest = np.full(pose.shape[:-1], -np.inf)
-    for k, finger in enumerate(survey.hand.fingers):
-        away = where[..., k, :2] - pose[..., :2]
-        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
-        if isinstance(finger, Pad):
-            turn = where[..., k, 2] - pose[..., 2]
-            corners = np.asarray(finger.shape.vertices, float)
-            cs, sn = np.cos(turn)[..., None], np.sin(turn)[..., None]
-            placed = np.stack([cs * corners[:, 0] - sn * corners[:, 1], sn * corners[:, 0] + cs * corners[:, 1]], -1)
-            depth = _pads(body, edge, placed + local[..., None, :])
-        elif isinstance(finger, RoundFinger):
-            centers = shapely.points(local)
+    for finger, placed in zip(
+        survey.hand.fingers, seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration)), strict=True
+    ):
+        if isinstance(finger, RoundFinger):
+            centers = shapely.points(placed[..., 0, :])
             distance = shapely.distance(edge, centers)
             depth = float(finger.radius) - np.where(shapely.contains(body, centers), -distance, distance)
         else:
-            raise TypeError(f"not a finger: {finger!r}")
+            depth = _pads(body, edge, placed)
         deepest = np.maximum(deepest, depth)
     return deepest
 
@@ -193,11 +214,104 @@ def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
     return depth.reshape(shape)
 
 
+def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
+    """Ends that say GRASPED or JAMMED and are not: which, and why.
+
+    GRASPED promises every finger within reach: four of its steps, or 1e-4 of the surface's length. And of what is in
+    reach forces have to exist, in their friction cones, that come to nothing and on which the hand works: found by a
+    linear program, on polygons. The hand stops where the step began in which it jams; where nothing holds the slider
+    there yet, that step is done in `FINER` parts, and has to jam in one of them, with such forces.
+    """
+    status = survey.push.status[:, -1]
+    ended = np.flatnonzero((status == pj.Status.GRASPED) | (status == pj.Status.JAMMED)).tolist()
+    body, found = outline_of(survey.shape), []
+    where = np.asarray(survey.hand.poses(jnp.asarray(survey.path)), float)
+    for i in ended:
+        at = int(np.argmax(survey.push.status[i] == status[i]))
+        step = where[i, at + 1, :, :2] - where[i, at, :, :2]
+        reach = max(1e-4 * float(survey.slider.surface.length), 4 * float(np.max(np.abs(step).sum(axis=-1))))
+        pose = np.asarray(survey.push.pose[i, -1], float)
+        fingers = seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration[i, -1]))
+        solid = [_solid(f, placed) for f, placed in zip(survey.hand.fingers, fingers, strict=True)]
+        away = [body.distance(each) for each in solid]
+        if status[i] == pj.Status.GRASPED and max(away) > 1.01 * reach:
+            found.append((int(i), f"a finger is {1e3 * max(away):.3f} mm away"))
+        elif isinstance(survey.shape, pj.Polygon):
+            mu = float(survey.friction[i])
+            if not _jams(body, solid, _turned(step, pose), mu, reach) and not _jams_later(survey, body, i, at, reach):
+                found.append((int(i), "nothing holds it"))
+    return found
+
+
+def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return steps @ np.array([[c, -s], [s, c]])
+
+
+def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
+    path = pj.line(survey.path[i, at], survey.path[i, at + 1], FINER)
+    push = _finer(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i])
+    stopped = int(push.stopped)
+    if stopped < 0:
+        return False
+    pose = np.asarray(push.pose[-1], float)
+    fingers = seen_by_slider(survey.hand, pose, np.asarray(push.configuration[-1]))
+    solid = [_solid(f, placed) for f, placed in zip(survey.hand.fingers, fingers, strict=True)]
+    where = np.asarray(survey.hand.poses(path[stopped : stopped + 2]), float)[..., :2]
+    # where exactly it jams is known to a part; of friction that makes little
+    return _jams(body, solid, _turned(where[1] - where[0], pose), 1.05 * float(survey.friction[i]), reach)
+
+
+@jax.jit
+def _finer(slider, hand, path, pose, friction) -> pj.Trajectory:
+    return pj.rollout(slider, hand, path, pose=pose, friction=friction)
+
+
+def _solid(finger, placed: np.ndarray) -> shapely.Polygon:
+    if isinstance(finger, RoundFinger):
+        return shapely.Point(placed[0]).buffer(float(finger.radius), quad_segs=64)
+    return shapely.Polygon(placed)
+
+
+def _jams(body: shapely.Polygon, fingers: list, steps: np.ndarray, mu: float, reach: float) -> bool:
+    """Whether forces within friction cones at places in reach balance, and the fingers' steps do work on them."""
+    wrenches, works = [], []
+    for finger, step in zip(fingers, steps, strict=True):
+        for point, normal in _places(body, finger, reach) + [(p, -n) for p, n in _places(finger, body, reach)]:
+            tangent = np.array([-normal[1], normal[0]])
+            for force in (normal + mu * tangent, normal - mu * tangent):
+                wrenches.append([*force, (point[0] * force[1] - point[1] * force[0]) / 0.05])
+                works.append(force @ step)
+    if not wrenches:
+        return False
+    columns = np.array(wrenches).T
+    balance = np.vstack([columns, np.ones(columns.shape[1])])  # forces that come to nothing, but are not all nothing
+    best = linprog(-np.array(works), A_eq=balance, b_eq=[0, 0, 0, 1], bounds=(0, None))
+    return best.success and -best.fun > 0
+
+
+def _places(body: shapely.Polygon, finger: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where vertices of a finger are within reach of an edge of the body: the point, and the normal into the body."""
+    ring = np.asarray(shapely.geometry.polygon.orient(body).exterior.coords)
+    tips = np.asarray(finger.exterior.coords)[:-1]
+    found = []
+    for a, b in pairwise(ring):
+        size = np.linalg.norm(b - a)
+        along = (b - a) / size
+        normal = np.array([-along[1], along[0]])  # inward of a ring that runs counter-clockwise
+        height, at = (tips - a) @ normal, (tips - a) @ along
+        near = (np.abs(height) <= reach) & (at >= -reach) & (at <= size + reach)
+        if near.any() and len(tips) > 100:  # of a circle only the nearest
+            near &= height == height[near].max()
+        found += [(a + along * at[k], normal) for k in np.flatnonzero(near)]
+    return found
+
+
 def allowed(survey: Survey, steps: int) -> float:
     """How deep, m: see the header."""
     if steps >= 300:
         return 0.1 * MM
-    where = np.asarray(jax.vmap(survey.hand.poses)(jnp.asarray(survey.path)), float)[..., :2]
+    where = np.asarray(survey.hand.poses(jnp.asarray(survey.path)), float)[..., :2]
     return 0.2 * float(np.max(np.linalg.norm(np.diff(where, axis=1), axis=-1)))
 
 
@@ -218,13 +332,15 @@ def judged(survey: Survey, steps: int) -> dict:
                         for i in bad][:40],
         "failed": len(failed),
         "failures": [(int(i), k, pj.Status(int(status[i, k])).name) for i, k in zip(failed, first, strict=True)][:40],
+        "unconfirmed": unconfirmed(survey),
         "ends": {s.name: int(np.sum(status[:, -1] == s)) for s in pj.Status if np.any(status[:, -1] == s)},
     }  # fmt: skip
 
 
 def _line(row: dict) -> str:
     cell = f"{row['hand']:6}{row['shape']:10}{row['steps']:4} {row['dtype']}"
-    counts = f"{row['wrong']:3} wrong, deepest {row['deepest_mm']:.3f} mm; {row['failed']:3} failed"
+    counts = f"{row['wrong']:3} wrong, deepest {row['deepest_mm']:.3f} mm; {row['failed']:3} failed, "
+    counts += f"{len(row['unconfirmed'])} unconfirmed"
     return f"{cell}: {counts}; {row['ends']}"
 
 
@@ -247,8 +363,9 @@ def main() -> None:
                     found = judged(run(shape, hand, asked.starts, steps, np.dtype(dtype), asked.seed), steps)
                     rows.append({"hand": hand, "shape": shape, "steps": steps, "dtype": dtype} | found)
                     print(_line(rows[-1]), flush=True)
-                    if found["wrong"] or found["failed"]:
-                        print("      ", found["steps_wrong"][:6], found["failures"][:6], flush=True)
+                    told = [found[kind][:6] for kind in ("steps_wrong", "failures", "unconfirmed")]
+                    if any(told):
+                        print("      ", *told, flush=True)
                     if asked.json:
                         asked.json.write_text(json.dumps(rows, indent=1))
                 jax.clear_caches()

@@ -15,6 +15,8 @@ The slider is moved so that its contact point (of several, their middle weighted
 contact problem says, in the world, and the rest turns about it. Where a finger sticks, slip is then zero to rounding,
 not to the order of the scheme; and so is that of a hand that pushes flat and straight.
 
+Where the hand may touch in more places than are solved together (`working_set`), those are the most urgent.
+
 All of that is true of contacts that were seen before the step, and of angles that are small against the outline's
 corners. Whether the answer is one is judged afterwards, by the depth of every finger in the slider (`deepest`), from
 the whole outline. `substeps` divides a step that is too long.
@@ -28,13 +30,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._vec import Scalar, Vec2, Vec3, each_of, select, settle, turn
-from pushjax.contacts import DEEPEST_OVERLAP, FAR, Placement, Touch, choose, count, meet, overlap, places, taken
+from pushjax.contacts import DEEPEST_OVERLAP, FAR, Placement, Touch, choose, count, meet, overlap, places, still, taken
 from pushjax.hands import Finger, Hand, Pad
 from pushjax.limit_surface import Form
 from pushjax.shapes import Outline
 from pushjax.solve import Contact, ContactSolver, SeveralMotion, StickingSolver
 from pushjax.solve.contacts import motion_under
 from pushjax.status import ContactMode, Status
+from pushjax.working_set import Urgency, WorkingSet, together, violated
 
 # rad: a step, or a part of one, that turns the slider farther is not an answer: what touches it, and where, was seen at
 # its start, and what it passes on the way is not looked at.
@@ -132,9 +135,10 @@ def advance(
     pose: Vec3,
     before: Scalar,
     reach: Scalar,
-) -> Record:
-    """One step of all fingers, or a part of one. before: the deepest overlap at its beginning. reach: m, how near a
-    finger holds what is jammed."""
+    urgency: Urgency | None = None,
+) -> tuple[Record, Urgency | None]:
+    """One step of all fingers, or a part of one, and how urgent each contact is after it. before: the deepest overlap
+    at its beginning. reach: m, how near a finger holds what is jammed. urgency: see `working_set`."""
     start = Placed.at(pose)
     begin = jnp.ones_like(pose.x)
 
@@ -148,7 +152,8 @@ def advance(
     rest = 1 - begin
     counts = [count(grip.finger, outline) for grip in grips]
     zero = jnp.zeros_like(pose.x)
-    on = (jnp.ones((), bool),) * sum(counts)
+    working = WorkingSet.most_urgent(urgency, together(counts))
+    on = (jnp.ones((), bool),) * together(counts)
 
     def stage(carry, share):
         """Solve the contacts as they are when `share` of the last stage's motion is done."""
@@ -159,11 +164,11 @@ def advance(
         def contacts_of(gripped: tuple[Grip, tuple[Int[Array, ""], ...], tuple[Touch, ...]]):
             grip, chosen, begun = gripped
             at = settle(grip.seen(there, begin + rest * share), pose.x)
-            touches = settle(places(grip.finger, outline, at, grip.path.unrotate(there.angle), form.length), pose.x)
-            mine = tuple(
-                jnp.where(first, new, old)
-                for new, old in zip(choose(touches, form.length, outline), chosen, strict=True)
-            )
+            path = grip.path.unrotate(there.angle)
+            touches = settle(places(grip.finger, outline, at, path, form.length), pose.x)
+            nearest = choose(touches, form.length, outline, path.scale(rest))
+            same = still(touches, chosen, begun, grip.finger, outline)
+            mine = tuple(jnp.where(first, new, old) for new, old in zip(nearest, same, strict=True))
             each, fresh, near = [], [], jnp.zeros((), bool)
             for touch, before in zip(taken(touches, mine), begun, strict=True):
                 before = select(first, touch, before)
@@ -182,26 +187,28 @@ def advance(
         each, holds = sum(made, ()), jnp.ones((), bool)
         for one in near:
             holds &= one
-        motion = motion_under(form, each, on, solver, margin=False)
+        motion = motion_under(form, working.of(each), on, solver, margin=False)
+        motion = working.spread(motion, len(each))
+        missed = None if urgency is None else violated(each, motion.twist, motion.force)
         # A failed prediction must show, whatever the correction made of it
         status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
         where = _center(each, motion.force)
-        return (motion.twist, where, there.angle, status, fresh, picked, holds), motion
+        return (motion.twist, where, there.angle, status, fresh, picked, holds), (motion, missed)
 
-    still = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
+    unmoved = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
     none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
     nowhere = Touch(zero, Vec2(zero, zero), Vec2(zero, zero))
-    carry = (*still, tuple((nowhere,) * n for n in counts), none, jnp.zeros((), bool))
-    carry, motions = jax.lax.scan(stage, carry, jnp.array([0.0, 0.5], zero.dtype))
+    carry = (*unmoved, tuple((nowhere,) * n for n in counts), none, jnp.zeros((), bool))
+    carry, answers = jax.lax.scan(stage, carry, jnp.array([0.0, 0.5], zero.dtype))
     twist, point, angle, status, _, _, holds = carry
-    motion: SeveralMotion = jax.tree.map(lambda leaf: leaf[-1], motions)
+    motion, missed = jax.tree.map(lambda leaf: leaf[-1], answers)
     moved = start.moved(point, twist, angle).pose
     status = jnp.where((status == Status.JAMMED) & holds, Status.GRASPED, status)
     too_far = (status == Status.MOVING) & (jnp.abs(twist.z) > FARTHEST_TURN)
     status = jnp.where(too_far, Status.NOT_CONVERGED, status)
     overlapping = (before > DEEPEST_OVERLAP * form.length) & (status != Status.INVALID)
     status = jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
-    return _guarded(motion, moved, pose, status)
+    return _guarded(motion, moved, pose, status), missed
 
 
 def _center(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...]) -> Vec2:

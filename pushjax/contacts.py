@@ -5,10 +5,11 @@ through the slider nor meet the extension of an edge past its corner. From there
 slider may touch is a contact with its own gap, closed or not: contacts that are made within the step are the contact
 problem's to find.
 
-A round finger has one such place, or two on an outline that is not convex. A pad against a polygon has two: of all
-corners of either, seen from the other's outline, the two nearest in different places (an edge flat on an edge rests
-on the two ends of what they share). So it has against a smooth outline, of the places that `_smooth_pads` finds. All
-are chosen anew in each step, and stay the same within it.
+A round finger has one such place, or two on an outline that is not convex. A pad against a convex polygon has two: of
+all corners of either, seen from the other's outline, the two nearest in different places (an edge flat on an edge rests
+on the two ends of what they share). So it has against a smooth outline, of the places that `_smooth_pads` finds.
+Against a polygon that is not convex it has three: the nearest, and those that bind most of what that one leaves free.
+All are chosen anew in each step, and stay the same within it.
 """
 
 import functools
@@ -16,12 +17,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 from pushjax import _smooth_pads
 from pushjax._smooth_pads import Seen
 from pushjax._vec import Scalar, Vec2, select, settle
-from pushjax.hands import Finger, RoundFinger
+from pushjax.hands import Finger, Pad, RoundFinger
 from pushjax.shapes import DiskOutline, Outline, PolygonOutline
 from pushjax.shapes._base import rounding
 from pushjax.shapes.polygon import Edge
@@ -36,11 +37,13 @@ BLUNT = 0.3
 # lie on each other to rounding (a pad's, whose side rests on an arm, and that of the arm's end) would else both be past
 # the other's edge, and touch nowhere.
 LOOSE = {4: 2e-5, 8: 1e-6}
+# In units of the length: how far an edge goes on past an inner corner, inside the slider, so that what sinks into one
+# of its edges still lies beside the other.
+PAST = 0.05
 FAR = 1e3  # m, out of any reach
 # Two places nearer to each other than this, in the same unit, are one: of a polygon, and of a smooth outline, where a
 # pad's corner and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
-SAME_WAY = 0.9  # cosine between normals, above which two places in one are one
 
 
 class Placement(NamedTuple):
@@ -108,30 +111,43 @@ def _beside(outline: Outline, corner: Corner, path: Vec2, length: Scalar) -> tup
     Not the closest point: a corner that is a little inside, next to the other's corner, may be closest to the wrong
     edge, and one that is past an edge's end touches nothing, though it is near.
     """
-    found: tuple[tuple[Touch, Scalar, Scalar], tuple[Touch, Scalar, Scalar]] | None = None
+    found: tuple[tuple[Touch, Scalar, Scalar, Array], tuple[Touch, Scalar, Scalar, Array]] | None = None
     # an inner corner touches nothing that is straight
     outer = corner.onward.cross(corner.back) >= -rounding(jnp.ones_like(corner.point.x))
-    for edge in edges(outline):
+    sides = edges(outline)
+    for k, edge in enumerate(sides):
         rel = corner.point - edge.start
         along, height = rel.dot(edge.along), edge.normal.dot(rel)
         loose = LOOSE[edge.length.dtype.itemsize] * edge.length
+        begin, end = -loose, edge.length + loose
+        past = jnp.zeros(along.shape, bool)
+        if _cornered(outline):
+            # at an inner corner an edge goes on: what is past it there is inside, beyond this edge and the next
+            before, after = sides[k - 1].along, sides[(k + 1) % len(sides)].along
+            past = (along < begin) | (along > end)
+            begin -= jnp.where(before.cross(edge.along) < 0, PAST * length, 0.0)
+            end += jnp.where(edge.along.cross(after) < 0, PAST * length, 0.0)
         points = (corner.onward.dot(edge.normal) >= -BLUNT) & (corner.back.dot(edge.normal) >= -BLUNT) & outer
         # deeper than this it is on the far side of another edge
-        beside = points & (along >= -loose) & (along <= edge.length + loose) & (height > -2 * DEEPEST_OVERLAP * length)
+        beside = points & (along >= begin) & (along <= end) & (height > -2 * DEEPEST_OVERLAP * length)
         touch = Touch(jnp.where(beside, height, FAR), corner.point - edge.normal.scale(height), -edge.normal)
         away = jnp.maximum(jnp.abs(touch.distance), loose)
         pressed = jnp.broadcast_to(-edge.normal.dot(path), away.shape)
-        this = touch, away, pressed
+        this = touch, away, pressed, past
         if found is None:
             far = touch._replace(distance=jnp.full_like(away, FAR))
-            found = this, (far, jnp.full_like(away, FAR), pressed)
+            found = this, (far, jnp.full_like(away, FAR), pressed, past)
             continue
         first, second = found
         nearer = (away < first[1]) | ((away == loose) & (first[1] <= loose) & (pressed > first[2]))
         nearer, next_ = settle((nearer, away < second[1]), corner.point.x)
         found = select(nearer, this, first), select(nearer, first, select(next_, this, second))
     assert found is not None
-    return found[0][0], found[1][0]
+    (nearest, *_, past), (next_, *_, beyond) = found
+    # next to an outer corner, what is inside is pushed out by the nearest edge alone
+    outside = next_.distance >= -LOOSE[length.dtype.itemsize] * length
+    both = settle(outside | past | beyond, corner.point.x)
+    return nearest, next_._replace(distance=jnp.where(both, next_.distance, FAR))
 
 
 def facing(finger: Finger, outline: Outline, at: Placement) -> Seen | None:
@@ -158,38 +174,92 @@ def _beside_smooth(
 
 
 def count(finger: Finger, outline: Outline) -> int:
-    """How many contacts a finger takes part in: known before anything is."""
+    """How many contacts a finger may take part in: known before anything is.
+
+    Of a pad two, on an outline that is not convex three: that is all that an edge between two corners can rest on.
+    """
     zero = jnp.zeros(())
     still = Vec2(zero, zero)
     found = jax.eval_shape(lambda: places(finger, outline, Placement(still, still), still, zero))
-    return 2 if isinstance(found, Touch) else len(found)
+    return (3 if _cornered(outline) else 2) if isinstance(found, Touch) else len(found)
 
 
-def choose(touches: Touches, length: Scalar, outline: Outline) -> tuple[Int[Array, ""] | int, ...]:
-    """Which places are contacts: of an array the nearest and the nearest elsewhere, the same one twice if there is
-    none; else all."""
+def _cornered(outline: Outline) -> bool:
+    return isinstance(outline, PolygonOutline) and not outline.convex
+
+
+def choose(touches: Touches, length: Scalar, outline: Outline, path: Vec2) -> tuple[Int[Array, ""] | int, ...]:
+    """Which places are contacts, the likeliest first: of an array the nearest and the nearest elsewhere, the first one
+    again if there is none; else all. On a polygon that is not convex it counts how near they are after `path`, and
+    there is a third."""
     if not isinstance(touches, Touch):
         return tuple(range(len(touches)))
-    distance = jax.lax.stop_gradient(touches.distance)
+    touches, path = jax.lax.stop_gradient((touches, path))
+    if _cornered(outline):
+        touches = touches._replace(distance=touches.distance - touches.normal.dot(path))
+        return _apart(touches, length)
+    distance = touches.distance
     first = jnp.argmin(distance)
     nearest = _at(touches, first)
     apart = touches.point - nearest.point
     same = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
     elsewhere = apart.dot(apart) > (same * length) ** 2
-    if isinstance(outline, PolygonOutline) and not outline.convex:
-        elsewhere |= touches.normal.dot(nearest.normal) < SAME_WAY
     elsewhere = settle(elsewhere & (distance < nearest.distance + 1e3 * length), length)
     second = jnp.where(jnp.any(elsewhere), jnp.argmin(jnp.where(elsewhere, distance, jnp.inf)), first)
     return first.astype(jnp.int32), second.astype(jnp.int32)
 
 
+def _apart(touches: Touch, length: Scalar) -> tuple[Int[Array, ""], ...]:
+    """The nearest place and the two that bind most of what it leaves free: a pad that lies flat across two arms rests
+    on its outermost places, and in an inner corner on both edges, not on places side by side."""
+    chosen = [jnp.argmin(touches.distance).astype(jnp.int32)]
+    nearest = _at(touches, chosen[0])
+    elsewhere, reach = touches.distance < nearest.distance + 1e3 * length, jnp.zeros_like(touches.distance)
+    last = nearest
+    for _ in range(2):
+        free, far = _beyond(touches, last, length)
+        elsewhere, reach = settle((elsewhere & free, jnp.maximum(reach, far)), length)
+        best = jnp.argmin(jnp.where(elsewhere, reach, jnp.inf))
+        chosen.append(jnp.where(jnp.any(elsewhere), best, chosen[0]).astype(jnp.int32))
+        last = _at(touches, chosen[-1])
+    return tuple(chosen)
+
+
+def _beyond(touches: Touch, last: Touch, length: Scalar) -> tuple[Bool[Array, " places"], Scalar]:
+    """Which places bind another motion than the last one does, and how far a slider that stays on that one has to move,
+    m, until it is on them."""
+    lever = (touches.point - last.point).cross(touches.normal) / length
+    shared = touches.normal.dot(last.normal)
+    free = jnp.sqrt(jnp.maximum(1 - jnp.maximum(shared, 0) ** 2, 0) + lever**2)
+    gap = jnp.maximum(touches.distance - shared * last.distance, 0) + SAME_PLACE * length
+    return free > SAME_PLACE, gap / jnp.maximum(free, SAME_PLACE)
+
+
 def taken(touches: Touches, chosen: tuple[Any, ...]) -> tuple[Touch, ...]:
-    """The chosen places; the second, where there is none but the first, is out of reach."""
+    """The chosen places; one that is chosen again is out of reach."""
     if not isinstance(touches, Touch):
         return touches
-    first, second = (_at(touches, index) for index in chosen)
-    alone = chosen[0] == chosen[1]
-    return first, second._replace(distance=second.distance + jnp.where(alone, 1.0, 0.0))
+    first, *others = (_at(touches, index) for index in chosen)
+    again = [index == chosen[0] for index in chosen[1:]]
+    far = [jnp.where(same, 1.0, 0.0).astype(first.distance.dtype) for same in again]
+    return first, *(one._replace(distance=one.distance + off) for one, off in zip(others, far, strict=True))
+
+
+def still(
+    touches: Touches, chosen: tuple[Any, ...], begun: tuple[Touch, ...], finger: Finger, outline: Outline
+) -> tuple[Any, ...]:
+    """The same places a little later, when `places` may have another order: which edge a corner is nearest to changes
+    in an inner corner. begun: as they were."""
+    if not isinstance(finger, Pad) or not isinstance(touches, Touch) or not _cornered(outline):
+        return chosen
+    corners = len(edges(finger.shape.outline()))
+    other = touches.distance.size - corners  # from a corner against its nearest edge to it against the next
+    found = []
+    for index, before in zip(chosen, begun, strict=True):
+        twin = jnp.where(index < corners, index + other, jnp.where(index >= other, index - other, index))
+        now, then = (_at(touches, k).normal.dot(before.normal) for k in (index, twin))
+        found.append(jnp.where(settle(then > now + SAME_PLACE, now), twin, index))
+    return tuple(found)
 
 
 def _at(touches: Touch, index: Int[Array, ""]) -> Touch:
@@ -238,15 +308,14 @@ def overlap(finger: Finger, outline: Outline, at: Placement) -> Scalar:
 def _across(pad: PolygonOutline, corner: Vec2) -> Scalar:
     """How deep in the pad the middle is of what it cuts off an edge between two of these corners; negative where it
     cuts off nothing. The middle of a chord is at least half as deep as its deepest point: depth is concave."""
-    after = jax.tree.map(lambda entry: jnp.roll(entry, -1), corner)
+    begins = [-side.normal.dot(corner - side.start) for side in edges(pad)]
+    depths = settle([(first, jnp.roll(first, -1)) for first in begins], corner.x[0])
     enter, leave = jnp.zeros_like(corner.x), jnp.ones_like(corner.x)
-    depths = []
-    for side in edges(pad):
-        first, last = (-side.normal.dot(end - side.start) for end in (corner, after))
-        depths.append((first, last))
+    for first, last in depths:
         crossing = first / jnp.where(first != last, first - last, 1.0)
         enter = jnp.where((first < 0) & (last > first), jnp.maximum(enter, crossing), enter)
         leave = jnp.where((last < 0) & (first > last), jnp.minimum(leave, crossing), leave)
+    enter, leave = settle((enter, leave), corner.x[0])
     middle = (enter + leave) / 2
     depth = functools.reduce(jnp.minimum, [first + middle * (last - first) for first, last in depths])
     return jnp.max(jnp.where(enter < leave, depth, -jnp.inf))

@@ -49,8 +49,9 @@ class Step(eqx.Module):
     pose: (3,), world, after the step. twist: (3,), the slider's over the step, and wrench: (3,), force: (contacts, 2)
     along normal and tangent (N, on H = 1), mode: (contacts,) are those of the contact halfway, in the body frame
     halfway; zero and SEPARATED where nothing pushes. Contacts are in the order of the fingers: one of a round finger,
-    two on an outline that is not convex; two of a pad, one on a disk. The pose after is that before moved
-    by the twist to the second order (the contact point goes straight), not its exponential. Of a step that was divided
+    two on an outline that is not convex; two of a pad, one on a disk, three on a polygon that is not convex. The pose
+    after is that before moved by the twist to the second order (the contact point goes straight), not its exponential.
+    Of a step that was divided
     (`pushjax.substeps`), the twist is the sum over its parts, and wrench, force and mode are those of the last part in
     which the slider moved. status: `Status`. overlap: how deep the deepest finger is inside the slider after the step,
     m, by the whole outline; negative where all are apart. It is a constant to derivatives.
@@ -214,7 +215,7 @@ def step(
     `solve_contacts`.
 
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a hand closed on itself,
-    where they are not traced, for more than eight contacts, and more than the solver solves. A traced value that is not
+    where they are not traced, and for more contacts than the solver solves. A traced value that is not
     finite or a negative friction, and a finger inside the slider, show in the step's status.
     """
     slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, q0, q1)
@@ -328,7 +329,7 @@ def _undivided(outline, steps, grips_at, solver, start, grounded) -> Record:
         form, mu = grounded(step, pose)
         grips = grips_at(step, mu)
         before = deepest(outline, grips, pose, 0.0)  # what detection begins with
-        record = advance(form, outline, grips, solver, pose, before, holding(grips, form.length))
+        record, _ = advance(form, outline, grips, solver, pose, before, holding(grips, form.length))
         return record.pose, record._replace(overlap=before)
 
     body = jax.checkpoint(body, prevent_cse=False, policy=keep_found)

@@ -3,7 +3,9 @@
 A step is too long where its answer leaves a finger in the slider: the slider turned so far that another of its corners
 came to touch, or slid past the end of what a finger rests on, which no contact seen at the beginning can tell. Such a
 step is taken back and tried again by half, down to a part of `SMALLEST`; parts that succeed are followed by ones of
-twice the size. Where the smallest part fails, the step is NOT_CONVERGED, and the slider stays where it began.
+twice the size. Before that, a place that the answer violates and that was not solved for joins the contact problem
+(`working_set`), and it is solved again. Where the smallest part fails, the step is NOT_CONVERGED, and the slider stays
+where it began.
 
 Every push of a batch goes at its own pace: each round of one loop is the next trial of every push, of whichever step it
 has come to. So a push that divides its steps holds up the others only at the end, and no trial is made for who has
@@ -21,24 +23,31 @@ from jaxtyping import Array, Bool, Int
 from pushjax._autodiff import keep_found
 from pushjax._vec import Scalar, Vec3, select, settle
 from pushjax.advance import Grip, Record, advance, deepest, holding, tolerated
+from pushjax.contacts import count
 from pushjax.limit_surface import Form
 from pushjax.shapes import Outline
 from pushjax.solve import ContactSolver, StickingSolver
 from pushjax.status import Status
+from pushjax.working_set import LOADED, Urgency, likeliest
 
 SMALLEST = 1 / 256  # of a step
 # Trials of a path, per step and in all, after which what is left of it is NOT_CONVERGED: a grasp of a slider of many
 # corners takes one and a tenth a step.
-TRIALS_A_STEP, TRIALS = 2, 48
+TRIALS_A_STEP, TRIALS = 3, 64
+SWAPS = 3  # of the working set, before a part is divided
+# A place that is not solved for may be violated by so much, as a share of what is tolerated of the whole.
+MISSED = 0.01
 
 
 class Trial(NamedTuple):
     """A push under way, and what is tried next.
 
     pose: now. origin: at the beginning of the step. step: its index, past the last one once the push has ended. done:
-    the share of it that is done, and part: the one that is tried next. overlap: the deepest now, and before: at the
-    beginning of the step. stopped: the status that stopped the hand, or zero. given_up: the status of a step that is
-    given up, or zero. failed: whether the step before was. so_far: of the parts that are done.
+    the share of it that is done, and part: the one that is tried next. halved: whether it is as large as it is because
+    twice that failed. urgency: of each contact, and swaps: how often the working set of this part has changed. overlap:
+    the deepest now, and before: at the beginning of the step. stopped: the status that stopped the hand, or zero.
+    given_up: the status of a step that is given up, or zero. failed: whether the step before was. so_far: of the parts
+    that are done.
     """
 
     pose: Vec3
@@ -46,6 +55,9 @@ class Trial(NamedTuple):
     step: Int[Array, ""]
     done: Scalar
     part: Scalar
+    halved: Bool[Array, ""]
+    urgency: Urgency | None
+    swaps: Int[Array, ""]
     overlap: Scalar
     before: Scalar
     stopped: Int[Array, ""]
@@ -69,17 +81,22 @@ def divided(
     grips = grips_at(first, mu)
     most = TRIALS_A_STEP * steps + TRIALS
     overlap = deepest(outline, grips, pose, 0.0)
-    nothing = _nothing(form, outline, grips, solver, pose)
-    zero, one, none = jnp.zeros_like(pose.x), jnp.ones_like(pose.x), jnp.zeros((), jnp.int8)
-    begin = Trial(pose, pose, first, zero, one, overlap, overlap, none, none, jnp.zeros((), bool), nothing)
+    zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
+    none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+    urgency = likeliest([count(grip.finger, outline) for grip in grips], pose.x)
+    nothing = _nothing(form, outline, grips, solver, pose, urgency)
+    begin = Trial(pose, pose, first, zero, one, no, urgency, none, overlap, overlap, none, none, no, nothing)
 
     def next_trial(trial: Trial) -> tuple[Trial, tuple[Record, Bool[Array, ""], Int[Array, ""]]]:
         form, mu = grounded(trial.step, trial.origin)
         grips = grips_at(trial.step, mu)
         reach, tolerance = holding(grips, form.length), tolerated(grips, form.length)
         part = tuple(grip.part(trial.done, trial.part) for grip in grips)
-        record = advance(form, outline, part, solver, trial.pose, trial.overlap, reach)
-        return _judged(trial, record, outline, part, tolerance, steps)
+        record, missed = advance(form, outline, part, solver, trial.pose, trial.overlap, reach, trial.urgency)
+        following, found = _judged(trial, record, missed, outline, part, tolerance, steps)
+        if missed is not None and urgency is not None:
+            following = following._replace(urgency=jnp.where(following.swaps > 0, missed, urgency))
+        return following, found
 
     def skipped(trial: Trial):
         return trial, (nothing, jnp.zeros((), bool), trial.step)
@@ -99,7 +116,15 @@ def divided(
     return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[at], records, rest), last.done
 
 
-def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ...], tolerance: Scalar, steps: int):
+def _judged(
+    trial: Trial,
+    record: Record,
+    missed: Urgency | None,
+    outline: Outline,
+    part: tuple[Grip, ...],
+    tolerance: Scalar,
+    steps: int,
+):
     """The trial after, the record of the step, whether it has ended with this one, and its index."""
     gives_up = settle(trial.given_up != 0, trial.pose.x)
     pose = select(gives_up, trial.origin, record.pose)
@@ -109,7 +134,11 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
     stops = final & stopping(record.status)
     goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
     clear = depth <= jnp.maximum(trial.before, trial.part * tolerance)
-    accepted, stops = settle((goes & clear & ~gives_up, stops & ~gives_up), pose.x)
+    swaps = jnp.zeros((), bool)
+    if missed is not None:
+        worst = jnp.max(jnp.where(missed < LOADED, missed, -jnp.inf))
+        swaps = goes & ~gives_up & (trial.swaps < SWAPS) & (worst > MISSED * trial.part * tolerance)
+    accepted, stops, swaps = settle((goes & clear & ~gives_up & ~swaps, stops & ~gives_up, swaps), pose.x)
     ongoing = trial.step < steps
 
     moves = settle(record.status == Status.MOVING, pose.x)
@@ -122,7 +151,7 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
     # a slider that was left behind in the step before is not tried by parts again
     hopeless = (smaller < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
     reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
-    given_up = jnp.where(hopeless & ~accepted & ~stops & ~gives_up, reason, 0)
+    given_up = jnp.where(hopeless & ~accepted & ~stops & ~gives_up & ~swaps, reason, 0)
     # where nothing has moved, and the hand was at the step's end, no more need be looked at
     at_once = (given_up != 0) & ~goes & (trial.part == 1)
     gives_up = settle(gives_up | at_once, pose.x)
@@ -140,12 +169,17 @@ def _judged(trial: Trial, record: Record, outline: Outline, part: tuple[Grip, ..
     stopped = jnp.where(stops, record.status, trial.stopped).astype(jnp.int8)
     onward = settle(accepted & ~ends, pose.x)
     anew = (ends & ~stops) | (given_up != 0)
+    smaller = jnp.where(swaps, trial.part, smaller)
+    larger = jnp.where(trial.halved, trial.part, 2 * trial.part)
     following = Trial(
         pose=select(ends, ended.pose, select(onward, pose, trial.pose)),
         origin=select(ends, ended.pose, trial.origin),
         step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
         done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
-        part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(2 * trial.part, 1 - done), smaller)),
+        part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
+        halved=jnp.where(swaps, trial.halved, ~(anew | accepted)),
+        urgency=trial.urgency,
+        swaps=jnp.where(swaps, trial.swaps + 1, 0).astype(jnp.int8),
         overlap=jnp.where(ends, ended.overlap, jnp.where(accepted, depth, trial.overlap)),
         before=jnp.where(ends, ended.overlap, trial.before),
         stopped=stopped,
@@ -168,7 +202,7 @@ def _still(record: Record, pose: Vec3) -> Record:
     return rest._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
-def _nothing(form, outline, grips, solver, pose) -> Record:
-    shapes = jax.eval_shape(lambda: advance(form, outline, grips, solver, pose, pose.x, pose.x))
+def _nothing(form, outline, grips, solver, pose, urgency) -> Record:
+    shapes = jax.eval_shape(lambda: advance(form, outline, grips, solver, pose, pose.x, pose.x, urgency)[0])
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return _still(blank, pose)

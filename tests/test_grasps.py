@@ -345,14 +345,6 @@ def test_hands_refuse_bad_input(make, message):
         make()
 
 
-def test_no_hand_makes_more_contacts_than_are_supported():
-    hand = pj.Hand((0.005,) * 5, lambda q: jnp.stack([q + 0.02 * k for k in range(5)]), 2)
-    notched = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0.05, 0.02], [0, 0.1]])
-    slider = pj.Slider(pj.Polygon(notched), pj.Ellipsoid(np.eye(3), 0.03))
-    with pytest.raises(ValueError, match="from one to 8 are supported; got 10"):
-        pj.rollout(slider, hand, pj.line((-0.1, 0.3), (0.0, 0.3), 3), pose=np.zeros(3), friction=0.3)
-
-
 def test_grasps_refuse_bad_input():
     slider = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), pj.Ellipsoid(np.eye(3), 0.017))
     jaw, still = pj.Hand.parallel_jaw(0.027, 0.01), {"pose": jnp.zeros(3), "friction": 0.2}

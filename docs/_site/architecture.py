@@ -26,6 +26,7 @@ ROOMS = {
     "friction_model": (4, 2, FRICTION),
     "fit": (5, 2, FRICTION),
     "advance": (1, 3, PUSHES),
+    "working_set": (2, 3, CONTACT),
     "substeps": (1, 4, PUSHES),
     "rollout": (2, 4, PUSHES),
     "random_rollout": (2.45, 5, PUSHES),

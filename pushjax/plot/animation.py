@@ -37,7 +37,8 @@ def animate(
     seconds: float = 4.0,
 ) -> Animation:
     """Pushes or grasps in motion, side by side: the slider (its start grey), the fingers, the trace of its centre, the
-    contacts with the forces on the slider as arrows, and the step's status and contact modes in words.
+    contacts with the forces on the slider as arrows, and the step's status and contact modes in words; from a step that
+    failed on, its status and number in red.
 
     pushes: one, or several by name: trajectories of `rollout`, or recordings (`Recorded`, shown without forces), all of
     that shape and hand. measured: poses (points, 3) by a push's name, world, m and rad, shown dashed over it. forces:
@@ -157,6 +158,7 @@ class _Panel:
         if track.measured is not None:
             self.measured.set_data(*track.measured[round(share * (len(track.measured) - 1))].T)
         self.words.set_text(track.words[k])
+        self.words.set_color(END if 0 <= track.failed < k else "0.3")
         acts = np.linalg.norm(track.force[k], axis=1) > self.weakest
         self.contacts.set_data(*track.contact[k][acts].T)
         if self.arrows is not None:

@@ -1,7 +1,7 @@
 """Where the forces of a trajectory act.
 
 A trajectory keeps forces along normal and tangent of each contact, not the contacts' places. These are found again,
-halfway through each step, where the forces are stated. A pad's two contacts come in an order that a step chose as it
+halfway through each step, where the forces are stated. A pad's contacts come in an order that a step chose as it
 began; of all orders that one is right with which the forces add up to the step's wrench.
 """
 
@@ -74,7 +74,7 @@ def _touches(shape: Shape, hand: Hand, pose: jax.Array, configuration: jax.Array
         for grip in grips_of(hand, jnp.zeros(len(hand.fingers), pose.dtype), columns(before), columns(after)):
             at, path = grip.seen(there, half), grip.path.unrotate(there.angle)
             touches = places(grip.finger, outline, at, path, size)
-            found += taken(touches, choose(touches, size, outline))
+            found += taken(touches, choose(touches, size, outline, path))
         return tuple(
             jnp.stack([v.array() for v in part]) for part in zip(*((t.point, t.normal) for t in found), strict=True)
         )

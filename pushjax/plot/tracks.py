@@ -43,6 +43,7 @@ class Track(NamedTuple):
     contact: np.ndarray
     force: np.ndarray
     words: list[str]
+    failed: int
 
     @property
     def largest(self) -> float:
@@ -55,12 +56,17 @@ def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None,
     if len(fingers[0]) != len(pose):
         raise ValueError(f"push has {len(pose)} poses, but {len(fingers[0])} configurations")
     contact, force, words = np.zeros((len(pose), 0, 2)), np.zeros((len(pose), 0, 2)), [""] * len(pose)
+    failed = -1
     if isinstance(push, Trajectory):
         words = ["", *(_words(int(s), m) for s, m in zip(push.status, np.asarray(push.mode), strict=True))]
         if forces:
             contact, force = _in_world(pose, *contact_forces(shape, hand, push))
+        failed = int(push.first_failure)
+        if failed >= 0:  # what is drawn from here on is no answer
+            name = _plain(Status(int(push.status[failed])))
+            words = [*words[: failed + 1], *[f"{name} at step {failed}"] * (len(pose) - failed - 1)]
     over = None if measured is None else placed(body, np.asarray(measured, float))
-    return Track(placed(body, pose), fingers, MM * pose[:, :2], over, contact, force, words)
+    return Track(placed(body, pose), fingers, MM * pose[:, :2], over, contact, force, words, failed)
 
 
 def _in_world(pose: np.ndarray, point: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
