@@ -176,7 +176,7 @@ def _beside_smooth(
 def count(finger: Finger, outline: Outline) -> int:
     """How many contacts a finger may take part in: known before anything is.
 
-    Of a pad two, on an outline that is not convex three: that is all that an edge between two corners can rest on.
+    Of a pad two; three on a polygon that is not convex, since three places bind every motion in the plane.
     """
     zero = jnp.zeros(())
     still = Vec2(zero, zero)
@@ -252,11 +252,11 @@ def still(
     in an inner corner. begun: as they were."""
     if not isinstance(finger, Pad) or not isinstance(touches, Touch) or not _cornered(outline):
         return chosen
-    corners = len(edges(finger.shape.outline()))
-    other = touches.distance.size - corners  # from a corner against its nearest edge to it against the next
+    tips = len(edges(finger.shape.outline()))
+    other = touches.distance.size - tips  # from a corner against its nearest edge to it against the next
     found = []
     for index, before in zip(chosen, begun, strict=True):
-        twin = jnp.where(index < corners, index + other, jnp.where(index >= other, index - other, index))
+        twin = jnp.where(index < tips, index + other, jnp.where(index >= other, index - other, index))
         now, then = (_at(touches, k).normal.dot(before.normal) for k in (index, twin))
         found.append(jnp.where(settle(then > now + SAME_PLACE, now), twin, index))
     return tuple(found)

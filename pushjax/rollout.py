@@ -51,10 +51,9 @@ class Step(eqx.Module):
     halfway; zero and SEPARATED where nothing pushes. Contacts are in the order of the fingers: one of a round finger,
     two on an outline that is not convex; two of a pad, one on a disk, three on a polygon that is not convex. The pose
     after is that before moved by the twist to the second order (the contact point goes straight), not its exponential.
-    Of a step that was divided
-    (`pushjax.substeps`), the twist is the sum over its parts, and wrench, force and mode are those of the last part in
-    which the slider moved. status: `Status`. overlap: how deep the deepest finger is inside the slider after the step,
-    m, by the whole outline; negative where all are apart. It is a constant to derivatives.
+    Of a step that was divided (`pushjax.substeps`), the twist is the sum over its parts, and wrench, force and mode are
+    those of the last part in which the slider moved. status: `Status`. overlap: how deep the deepest finger is inside
+    the slider after the step, m, by the whole outline; negative where all are apart. It is a constant to derivatives.
 
     MOVING, FREE, JAMMED and GRASPED promise that no finger is deeper inside than before, or than a tenth of how far the
     fingers go in the step (a hundred thousandth of the surface's length, if that is more). A step of one round finger
@@ -215,8 +214,8 @@ def step(
     `solve_contacts`.
 
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a hand closed on itself,
-    where they are not traced, and for more contacts than the solver solves. A traced value that is not
-    finite or a negative friction, and a finger inside the slider, show in the step's status.
+    where they are not traced, and for more contacts than the solver solves. A traced value that is not finite or a
+    negative friction, and a finger inside the slider, show in the step's status.
     """
     slider, hand, start, mu, dtype = arguments(slider, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype), as_float(q1, dtype)

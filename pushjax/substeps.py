@@ -2,10 +2,10 @@
 
 A step is too long where its answer leaves a finger in the slider: the slider turned so far that another of its corners
 came to touch, or slid past the end of what a finger rests on, which no contact seen at the beginning can tell. Such a
-step is taken back and tried again by half, down to a part of `SMALLEST`; parts that succeed are followed by ones of
-twice the size. Before that, a place that the answer violates and that was not solved for joins the contact problem
-(`working_set`), and it is solved again. Where the smallest part fails, the step is NOT_CONVERGED, and the slider stays
-where it began.
+step is taken back and tried again by half, down to a part of `SMALLEST`. A part that succeeds is followed by one of
+twice the size, or, right after a failure, first by one of its own size. Before a part is halved, a place that the
+answer violates and that was not solved for joins the contact problem (`working_set`), and it is solved again. Where the
+smallest part fails, the step is NOT_CONVERGED, and the slider stays where it began.
 
 Every push of a batch goes at its own pace: each round of one loop is the next trial of every push, of whichever step it
 has come to. So a push that divides its steps holds up the others only at the end, and no trial is made for who has

@@ -34,7 +34,8 @@ class Moved(Protocol):
 
 class Track(NamedTuple):
     """A push as it is drawn, mm: outlines (points, vertices, 2), of each finger (points, vertices, 2), centres (points,
-    2); over it measured outlines; of each point the contacts and forces of the step that led there, N, and words."""
+    2); over it measured outlines; of each point the contacts and forces of the step that led there, N, and words.
+    failed: the first step that did, or -1."""
 
     outline: np.ndarray
     fingers: list[np.ndarray]
