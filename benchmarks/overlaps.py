@@ -139,10 +139,13 @@ def run(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: i
     t = np.linspace(0, 1, steps + 1)[:, None]
     path = (ends[:, :1] * (1 - t) + ends[:, 1:] * t).astype(dtype)
     pose, friction = pose.astype(dtype), friction.astype(dtype)
-    push = jax.jit(jax.vmap(lambda path, pose, mu: pj.rollout(slider, hand, path, pose=pose, friction=mu)))(
-        path, pose, friction
-    )
+    push = jax.jit(jax.vmap(_rollout, (None, None, 0, 0, 0)))(slider, hand, path, pose, friction)
     return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push))
+
+
+# the slider is an argument: polygons of as many vertices share a program in the compilation cache
+def _rollout(slider, hand, path, pose, friction) -> pj.Trajectory:
+    return pj.rollout(slider, hand, path, pose=pose, friction=friction)
 
 
 def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
@@ -231,14 +234,13 @@ def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
         step = where[i, at + 1, :, :2] - where[i, at, :, :2]
         reach = max(1e-4 * float(survey.slider.surface.length), 4 * float(np.max(np.abs(step).sum(axis=-1))))
         pose = np.asarray(survey.push.pose[i, -1], float)
-        fingers = seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration[i, -1]))
-        solid = [_solid(f, placed) for f, placed in zip(survey.hand.fingers, fingers, strict=True)]
-        away = [body.distance(each) for each in solid]
+        fingers = _placed(survey, pose, np.asarray(survey.push.configuration[i, -1]))
+        away = [finger.away(body) for finger in fingers]
         if status[i] == pj.Status.GRASPED and max(away) > 1.01 * reach:
             found.append((int(i), f"a finger is {1e3 * max(away):.3f} mm away"))
         elif isinstance(survey.shape, pj.Polygon):
             mu = float(survey.friction[i])
-            if not _jams(body, solid, _turned(step, pose), mu, reach) and not _jams_later(survey, body, i, at, reach):
+            if not _jams(body, fingers, _turned(step, pose), mu, reach) and not _jams_later(survey, body, i, at, reach):
                 found.append((int(i), "nothing holds it"))
     return found
 
@@ -250,34 +252,74 @@ def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
     path = pj.line(survey.path[i, at], survey.path[i, at + 1], FINER)
-    push = _finer(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i])
+    push = jax.jit(_rollout)(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i])
     stopped = int(push.stopped)
     if stopped < 0:
         return False
     pose = np.asarray(push.pose[-1], float)
-    fingers = seen_by_slider(survey.hand, pose, np.asarray(push.configuration[-1]))
-    solid = [_solid(f, placed) for f, placed in zip(survey.hand.fingers, fingers, strict=True)]
+    fingers = _placed(survey, pose, np.asarray(push.configuration[-1]))
     where = np.asarray(survey.hand.poses(path[stopped : stopped + 2]), float)[..., :2]
-    # where exactly it jams is known to a part; of friction that makes little
-    return _jams(body, solid, _turned(where[1] - where[0], pose), 1.05 * float(survey.friction[i]), reach)
+    # It jams within that part, or while an overlap is pushed out, and turns meanwhile as it did before.
+    if stopped > 0:
+        turns = np.ptp(push.pose[stopped - 1 : stopped + 1, 2])
+    else:
+        way = np.max(np.linalg.norm(where[1] - where[0], axis=-1))  # of a part
+        turns = np.ptp(survey.push.pose[i, at - 1 : at + 1, 2]) * max(1.0, survey.push.overlap[i, at - 1] / way) / FINER
+    friction = 1.01 * float(survey.friction[i]) + float(turns)
+    return _jams(body, fingers, _turned(where[1] - where[0], pose), friction, reach)
 
 
-@jax.jit
-def _finer(slider, hand, path, pose, friction) -> pj.Trajectory:
-    return pj.rollout(slider, hand, path, pose=pose, friction=friction)
+class Disc(NamedTuple):
+    """A round finger in the slider's frame."""
+
+    center: np.ndarray
+    radius: float
+
+    def away(self, body: shapely.Polygon) -> float:
+        return body.distance(shapely.Point(self.center)) - self.radius
+
+    def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Where it is within reach of the body, an edge or a vertex: the point, and the normal into the body."""
+        found = []
+        for a, b in pairwise(_ring(body)):
+            along = (b - a) / np.linalg.norm(b - a)
+            feet = [(a, a - self.center)]
+            if 0 < (self.center - a) @ along < np.linalg.norm(b - a):
+                foot = a + along * ((self.center - a) @ along)
+                feet.append((foot, foot - self.center))
+            for point, off in feet:
+                size = float(np.linalg.norm(off))
+                if abs(size - self.radius) <= reach and size > 0:
+                    found.append((point, off / size))
+        return found
 
 
-def _solid(finger, placed: np.ndarray) -> shapely.Polygon:
-    if isinstance(finger, RoundFinger):
-        return shapely.Point(placed[0]).buffer(float(finger.radius), quad_segs=64)
-    return shapely.Polygon(placed)
+class Plate(NamedTuple):
+    """A pad in the slider's frame."""
+
+    solid: shapely.Polygon
+
+    def away(self, body: shapely.Polygon) -> float:
+        return body.distance(self.solid)
+
+    def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """As of a disc: corners of either near an edge of the other."""
+        return _corners(body, self.solid, reach) + [(p, -n) for p, n in _corners(self.solid, body, reach)]
+
+
+def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disc | Plate]:
+    seen = seen_by_slider(survey.hand, np.asarray(pose, float), np.asarray(configuration))
+    return [
+        Disc(where[0], float(finger.radius)) if isinstance(finger, RoundFinger) else Plate(shapely.Polygon(where))
+        for finger, where in zip(survey.hand.fingers, seen, strict=True)
+    ]
 
 
 def _jams(body: shapely.Polygon, fingers: list, steps: np.ndarray, mu: float, reach: float) -> bool:
     """Whether forces within friction cones at places in reach balance, and the fingers' steps do work on them."""
     wrenches, works = [], []
     for finger, step in zip(fingers, steps, strict=True):
-        for point, normal in _places(body, finger, reach) + [(p, -n) for p, n in _places(finger, body, reach)]:
+        for point, normal in finger.places(body, reach):
             tangent = np.array([-normal[1], normal[0]])
             for force in (normal + mu * tangent, normal - mu * tangent):
                 wrenches.append([*force, (point[0] * force[1] - point[1] * force[0]) / 0.05])
@@ -290,19 +332,21 @@ def _jams(body: shapely.Polygon, fingers: list, steps: np.ndarray, mu: float, re
     return best.success and -best.fun > 0
 
 
-def _places(body: shapely.Polygon, finger: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Where vertices of a finger are within reach of an edge of the body: the point, and the normal into the body."""
-    ring = np.asarray(shapely.geometry.polygon.orient(body).exterior.coords)
-    tips = np.asarray(finger.exterior.coords)[:-1]
+def _ring(body: shapely.Polygon) -> np.ndarray:
+    """Its vertices, counter-clockwise, the first again at the end."""
+    return np.asarray(shapely.geometry.polygon.orient(body).exterior.coords)
+
+
+def _corners(body: shapely.Polygon, other: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where corners of the other are within reach of an edge of the body: the point, and the normal into the body."""
+    tips = np.asarray(other.exterior.coords)[:-1]
     found = []
-    for a, b in pairwise(ring):
+    for a, b in pairwise(_ring(body)):
         size = np.linalg.norm(b - a)
         along = (b - a) / size
-        normal = np.array([-along[1], along[0]])  # inward of a ring that runs counter-clockwise
+        normal = np.array([-along[1], along[0]])
         height, at = (tips - a) @ normal, (tips - a) @ along
         near = (np.abs(height) <= reach) & (at >= -reach) & (at <= size + reach)
-        if near.any() and len(tips) > 100:  # of a circle only the nearest
-            near &= height == height[near].max()
         found += [(a + along * at[k], normal) for k in np.flatnonzero(near)]
     return found
 

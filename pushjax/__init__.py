@@ -1,6 +1,7 @@
 """Quasi-static planar pushing in JAX."""
 
 from pushjax import se2 as se2
+from pushjax._internal.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from pushjax.fit import FitReport as FitReport
 from pushjax.fit import fit_limit_surface as fit_limit_surface
 from pushjax.fit import mean_twist_angle as mean_twist_angle

@@ -5,7 +5,8 @@ checked, values are not, and what goes wrong shows up as a status. Every message
 given and what is allowed.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -13,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import ArrayLike
+
+from pushjax._programs import outermost
 
 Numeric = ArrayLike | Sequence[Any]  # what a caller may give for an array: also lists and tuples of numbers
 
@@ -26,10 +29,36 @@ def concrete(value: Any) -> np.ndarray | None:
 
 def as_float(value: Any, dtype: Any = None) -> jax.Array:
     """`value` as a floating array: its own floating dtype, else the default one (float32 unless x64 is on)."""
-    array = jnp.asarray(value)
+    array = value
+    if not isinstance(value, jax.Array):
+        held = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+        array = jnp.asarray(value) if held else np.asarray(value)
     if dtype is None:
-        dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
+        own = jnp.issubdtype(array.dtype, jnp.floating)
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype) if own else jnp.result_type(float)
+    if isinstance(array, np.ndarray):
+        return on_device(array.astype(dtype))
     return array.astype(dtype)
+
+
+def on_device(array: np.ndarray) -> jax.Array:
+    """`array` for JAX. By itself `jnp.asarray` would compile a program for every shape."""
+    return jax.device_put(array) if outermost() else jnp.asarray(array)
+
+
+def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function(np, *arrays)` by numpy where all arrays are known, which compiles nothing; else by `jax.numpy`. What is
+    given by name is passed on as it is."""
+
+    @functools.wraps(function)
+    def call(*arrays: jax.Array, **static: Any) -> Any:
+        known = [concrete(array) for array in arrays]
+        if any(array is None for array in known):
+            return function(jnp, *arrays, **static)
+        dtype = jnp.result_type(*arrays)
+        return jax.tree.map(lambda found: on_device(np.asarray(found, dtype)), function(np, *known, **static))
+
+    return call
 
 
 def common_dtype(*values: Any) -> Any:
@@ -80,7 +109,7 @@ def non_negative(name: str, value: Any) -> None:
 
 def weights_of(weights: Any, count: int, dtype: Any) -> jax.Array:
     """The argument `weights` as (count,) numbers, none negative and not all zero; ones for None."""
-    value = jnp.ones(count, dtype) if weights is None else as_float(weights, dtype)
+    value = as_float(np.ones(count) if weights is None else weights, dtype)
     shaped("weights", value, (count,))
     finite("weights", value)
     non_negative("weights", value)

@@ -1,6 +1,8 @@
 """The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax identify LOG…`, `pushjax bench CASE`."""
 
+import logging
 import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
@@ -9,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
+from pushjax._internal.compilation_cache import enable_compilation_cache
 from pushjax._options import option
 from pushjax.datasets import find_data
 from pushjax.experiments import identify_logs
@@ -27,7 +30,15 @@ class Common:
 
 
 @dataclass
-class Demo(Common):
+class Cached(Common):
+    """Options of commands that compile what they compiled before."""
+
+    cache: bool = True
+    """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
+
+
+@dataclass
+class Demo(Cached):
     """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result."""
 
 
@@ -51,7 +62,7 @@ Method = Literal["ideal", "wrench_twist", "identified"]
 
 
 @dataclass
-class Reproduce(Common):
+class Reproduce(Cached):
     """Reproduce an experiment of the paper beside the paper's own figures.
 
     - table1: eleven objects on two surfaces, pushed by a robot; predicted against measured final poses.
@@ -93,7 +104,7 @@ class Reproduce(Common):
 
 
 @dataclass
-class Identify(identify_logs.Options, Common):
+class Identify(identify_logs.Options, Cached):
     """Find friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
 
     Logs are CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units, world; blank where
@@ -280,6 +291,36 @@ def _bench_contacts(seed: int, given: dict[str, Any], progress: Progress, keep: 
     return record, contacts.summary(record)
 
 
+def _keep_compiled(cache: bool) -> None:
+    """Turns the cache of compiled programs on or off. What it cannot do is said once, not for every program."""
+    import jax
+
+    if not cache:
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    folder = enable_compilation_cache()
+    # XLA's loader calls two tuning flags of AVX-512 processors unsupported, in a line for every program that it then
+    # loads and runs (jax-ml/jax#38445). Python's loggers stay as they are.
+    loggers = [(logger, logger.level) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
+    jax.config.update("jax_logging_level", "CRITICAL")
+    for logger, level in loggers:
+        logger.setLevel(level)
+    show, told = warnings.showwarning, []
+
+    def show_once(message, *where, **more):
+        if "persistent compilation cache" not in str(message):
+            show(message, *where, **more)
+        elif not told:
+            told.append(message)
+            print(
+                f"pushjax: compiled programs cannot be kept in {folder} on this machine, and are compiled anew: "
+                f"{message} (--no-cache does without)",
+                file=sys.stderr,
+            )
+
+    warnings.showwarning = show_once
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Entry point. Bad input ends with one line on standard error and exit status 1."""
     if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
@@ -300,6 +341,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     from pushjax._progress import progress_bar
 
+    if isinstance(command, Cached):
+        _keep_compiled(command.cache)
     try:
         with progress_bar() as progress:
             if isinstance(command, Reproduce):

@@ -115,6 +115,7 @@ def _beside(outline: Outline, corner: Corner, path: Vec2, length: Scalar) -> tup
     # an inner corner touches nothing that is straight
     outer = corner.onward.cross(corner.back) >= -rounding(jnp.ones_like(corner.point.x))
     sides = edges(outline)
+    inside = settle(_inside(sides, corner.point), corner.point.x)
     for k, edge in enumerate(sides):
         rel = corner.point - edge.start
         along, height = rel.dot(edge.along), edge.normal.dot(rel)
@@ -128,8 +129,9 @@ def _beside(outline: Outline, corner: Corner, path: Vec2, length: Scalar) -> tup
             begin -= jnp.where(before.cross(edge.along) < 0, PAST * length, 0.0)
             end += jnp.where(edge.along.cross(after) < 0, PAST * length, 0.0)
         points = (corner.onward.dot(edge.normal) >= -BLUNT) & (corner.back.dot(edge.normal) >= -BLUNT) & outer
-        # deeper than this it is on the far side of another edge
-        beside = points & (along >= begin) & (along <= end) & (height > -2 * DEEPEST_OVERLAP * length)
+        # behind an edge, and not inside, it is on the far side of another; so it is deeper than the limit
+        behind = (height >= -loose) | (inside & (height > -2 * DEEPEST_OVERLAP * length))
+        beside = points & (along >= begin) & (along <= end) & behind
         touch = Touch(jnp.where(beside, height, FAR), corner.point - edge.normal.scale(height), -edge.normal)
         away = jnp.maximum(jnp.abs(touch.distance), loose)
         pressed = jnp.broadcast_to(-edge.normal.dot(path), away.shape)
@@ -148,6 +150,16 @@ def _beside(outline: Outline, corner: Corner, path: Vec2, length: Scalar) -> tup
     outside = next_.distance >= -LOOSE[length.dtype.itemsize] * length
     both = settle(outside | past | beyond, corner.point.x)
     return nearest, next_._replace(distance=jnp.where(both, next_.distance, FAR))
+
+
+def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
+    """Whether points lie inside a polygon: a ray along x crosses its outline an odd number of times."""
+    inside = jnp.zeros(point.x.shape, bool)
+    for k, edge in enumerate(sides):
+        below, next_below = edge.start.y <= point.y, sides[(k + 1) % len(sides)].start.y <= point.y
+        left = edge.normal.dot(point - edge.start) < 0
+        inside ^= (below != next_below) & (left == below)
+    return inside
 
 
 def facing(finger: Finger, outline: Outline, at: Placement) -> Seen | None:

@@ -25,7 +25,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped, weights_of
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax._vec import Vec3
 from pushjax.limit_surface import MONOMIALS, Ellipsoid, LimitSurface, Quartic, angle_between
 from pushjax.limit_surface.sums import TERMS, near_ball, of_lower, squared_quadratics
@@ -183,7 +183,7 @@ def _check(wrench: Array, twist: Array, length: Array, weights: Array, degree: i
         raise ValueError("wrench: all pairs are zero")
 
 
-@compiled
+@quickly_compiled
 def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, terms: int):
     """Coefficients in wrench units, and the report."""
     share = weights / jnp.sum(weights)

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._autodiff import undifferentiated
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax._wishart import lower_of, wishart
 from pushjax.limit_surface import Ellipsoid, LimitSurface, Quartic
 from pushjax.limit_surface._dense import Cholesky, Lower, combined, entry
@@ -187,7 +187,7 @@ class _GramQuartic(RandomSurface):
     dof: Float[Array, ""]
 
     @staticmethod
-    @compiled
+    @quickly_compiled
     def of(mean: Quartic, dof: Array) -> "_GramQuartic":
         form = mean.form()
         size = jax.lax.stop_gradient(form.c[0] + form.c[1] + form.c[2])
@@ -237,7 +237,7 @@ class TermsQuartic(RandomSurface):
 
     @staticmethod
     def of(mean: Quartic, dof: Array) -> "TermsQuartic":
-        terms = compiled(split)(mean.coefficients)
+        terms = quickly_compiled(split)(mean.coefficients)
         error = concrete(terms.error)
         if error is not None and not error < SPLIT_TOLERANCE:
             raise ValueError(

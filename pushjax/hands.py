@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, in_numpy, non_negative, shaped
 from pushjax.shapes import Polygon
 
 Kinematics = Callable[[Array], Array]
@@ -147,8 +147,13 @@ def line(start: Numeric, end: Numeric, steps: int) -> Float[Array, "{steps}+1 do
     shaped("end", b, (a.shape[0],))
     finite("start", a)
     finite("end", b)
-    t = jnp.arange(steps + 1, dtype=dtype)[:, None] / steps
-    return a[None] * (1 - t) + b[None] * t  # exact at both ends
+    return _line(a, b, steps=steps)
+
+
+@in_numpy
+def _line(xp: Any, start: Array, end: Array, *, steps: int) -> Array:
+    t = xp.arange(steps + 1, dtype=start.dtype)[:, None] / steps
+    return start[None] * (1 - t) + end[None] * t  # exact at both ends
 
 
 def through(configurations: Numeric, steps: int | Sequence[int]) -> Float[Array, "points dof"]:

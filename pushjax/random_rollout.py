@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._checks import Numeric
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.friction_model import FrictionModel, RandomSurface
 from pushjax.hands import Hand
 from pushjax.limit_surface import LimitSurface
@@ -96,7 +96,7 @@ def random_rollout(
     return _random_rollout(key, model.around(slider.surface), slider.shape, hand, p, start, model, solver)
 
 
-@compiled
+@quickly_compiled
 def _random_rollout(key, around, shape, hand, path, pose, model, solver) -> RandomRollout:
     draws = draw(key, around, model, len(path) - 1)
     return RandomRollout(push_under(draws, shape, hand, path, pose, solver, model.every), draws)

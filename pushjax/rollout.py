@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._autodiff import keep_found
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, instance, non_negative, shaped, traced
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax._vec import Scalar, Vec3
 from pushjax.advance import Record, advance, columns, deepest, grips_of, holding
 from pushjax.contacts import DEEPEST_OVERLAP, count
@@ -178,7 +178,7 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
         )
 
 
-@compiled
+@quickly_compiled
 def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
     """By how much the deepest finger overlaps the slider, m, of each pose."""
     where = columns(hand.poses(configuration))
@@ -226,7 +226,7 @@ def step(
     return _step(slider, hand, *ends, start, mu, solver)
 
 
-@compiled
+@quickly_compiled
 def _step(slider, hand, q0, q1, pose, friction, solver) -> Step:
     grounded = ground(slider.surface, friction)
     push = scan(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, lambda step, pose: grounded)
@@ -276,7 +276,7 @@ def rollout(
     return _rollout(slider, hand, p, start, mu, solver, table)
 
 
-@compiled
+@quickly_compiled
 def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
     form, mu = ground(slider.surface, friction)
     if table is None:

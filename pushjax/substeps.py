@@ -10,6 +10,10 @@ smallest part fails, the step is NOT_CONVERGED, and the slider stays where it be
 Every push of a batch goes at its own pace: each round of one loop is the next trial of every push, of whichever step it
 has come to. So a push that divides its steps holds up the others only at the end, and no trial is made for who has
 ended. Trials that are taken back leave nothing in a derivative, which is that of the parts that were accepted.
+
+A jam is proved to first order: within a long step the slider may turn out of it. So a whole step that jams is divided
+too, its first part being of `CONFIRMED`. If a part of that size jams, the hand stops where the step began; if all of
+its parts move, so does the step.
 """
 
 from collections.abc import Callable
@@ -31,6 +35,7 @@ from pushjax.status import Status
 from pushjax.working_set import LOADED, Urgency, likeliest
 
 SMALLEST = 1 / 256  # of a step
+CONFIRMED = 1 / 16  # of a step that jams as a whole: the part that has to jam, too
 # Trials of a path, per step and in all, after which what is left of it is NOT_CONVERGED: a grasp of a slider of many
 # corners takes one and a tenth a step.
 TRIALS_A_STEP, TRIALS = 3, 64
@@ -44,10 +49,10 @@ class Trial(NamedTuple):
 
     pose: now. origin: at the beginning of the step. step: its index, past the last one once the push has ended. done:
     the share of it that is done, and part: the one that is tried next. halved: whether it is as large as it is because
-    twice that failed. urgency: of each contact, and swaps: how often the working set of this part has changed. overlap:
-    the deepest now, and before: at the beginning of the step. stopped: the status that stopped the hand, or zero.
-    given_up: the status of a step that is given up, or zero. failed: whether the step before was. so_far: of the parts
-    that are done.
+    twice that failed. jammed: whether the step as a whole jams. urgency: of each contact, and swaps: how often the
+    working set of this part has changed. overlap: the deepest now, and before: at the beginning of the step. stopped:
+    the status that stopped the hand, or zero. given_up: the status of a step that is given up, or zero. failed: whether
+    the step before was. so_far: of the parts that are done.
     """
 
     pose: Vec3
@@ -56,6 +61,7 @@ class Trial(NamedTuple):
     done: Scalar
     part: Scalar
     halved: Bool[Array, ""]
+    jammed: Bool[Array, ""]
     urgency: Urgency | None
     swaps: Int[Array, ""]
     overlap: Scalar
@@ -85,7 +91,7 @@ def divided(
     none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
     urgency = likeliest([count(grip.finger, outline) for grip in grips], pose.x)
     nothing = _nothing(form, outline, grips, solver, pose, urgency)
-    begin = Trial(pose, pose, first, zero, one, no, urgency, none, overlap, overlap, none, none, no, nothing)
+    begin = Trial(pose, pose, first, zero, one, no, no, urgency, none, overlap, overlap, none, none, no, nothing)
 
     def next_trial(trial: Trial) -> tuple[Trial, tuple[Record, Bool[Array, ""], Int[Array, ""]]]:
         form, mu = grounded(trial.step, trial.origin)
@@ -130,7 +136,9 @@ def _judged(
     pose = select(gives_up, trial.origin, record.pose)
     depth = deepest(outline, part, pose, 1.0)
     # in a step that is divided, a jam is found to its smallest part: what squirts turns far in one step
-    final = (trial.part == 1) | (trial.part < 2 * SMALLEST)
+    smallest = jnp.where(trial.jammed, CONFIRMED, SMALLEST)
+    # a slider that was left behind in the step before is not tried by parts again
+    final = (trial.part < 2 * smallest) | trial.failed
     stops = final & stopping(record.status)
     goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
     clear = depth <= jnp.maximum(trial.before, trial.part * tolerance)
@@ -148,7 +156,6 @@ def _judged(
 
     done = trial.done + trial.part
     smaller = trial.part / 2
-    # a slider that was left behind in the step before is not tried by parts again
     hopeless = (smaller < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
     reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
     given_up = jnp.where(hopeless & ~accepted & ~stops & ~gives_up & ~swaps, reason, 0)
@@ -162,22 +169,26 @@ def _judged(
     status = jnp.where(gives_up, reason, record.status).astype(jnp.int8)
     ended = nothing._replace(status=status, overlap=depth)
     ended = select(settle(accepted, pose.x), so_far, ended)
-    # the hand stops where this part began
+    # the hand stops where this part began; if the step jams as a whole, where that did
     held = trial.so_far._replace(pose=trial.pose, status=status, overlap=trial.overlap)
+    as_a_whole = settle(trial.jammed, pose.x)
+    held = select(as_a_whole, nothing._replace(status=status, overlap=trial.before), held)
     ended = select(stops, held, ended)
 
     stopped = jnp.where(stops, record.status, trial.stopped).astype(jnp.int8)
     onward = settle(accepted & ~ends, pose.x)
     anew = (ends & ~stops) | (given_up != 0)
-    smaller = jnp.where(swaps, trial.part, smaller)
+    jams = (trial.part == 1) & stopping(record.status)
+    smaller = jnp.where(swaps, trial.part, jnp.where(jams, CONFIRMED, smaller))
     larger = jnp.where(trial.halved, trial.part, 2 * trial.part)
     following = Trial(
         pose=select(ends, ended.pose, select(onward, pose, trial.pose)),
         origin=select(ends, ended.pose, trial.origin),
         step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
-        done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
+        done=jnp.where(anew | (stops & as_a_whole), 0.0, jnp.where(accepted, done, trial.done)),
         part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
-        halved=jnp.where(swaps, trial.halved, ~(anew | accepted)),
+        halved=jnp.where(swaps, trial.halved, ~(anew | accepted | jams)),
+        jammed=(trial.jammed | jams) & ~(ends | anew),
         urgency=trial.urgency,
         swaps=jnp.where(swaps, trial.swaps + 1, 0).astype(jnp.int8),
         overlap=jnp.where(ends, ended.overlap, jnp.where(accepted, depth, trial.overlap)),

@@ -22,12 +22,14 @@ from pushjax._checks import (
     common_dtype,
     concrete,
     finite,
+    in_numpy,
     non_negative,
+    on_device,
     positive,
     shaped,
     weights_of,
 )
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.shapes import Shape
 
 FACET_SHARE = 0.1  # of the wrench-twist pairs
@@ -75,7 +77,7 @@ class Support(eqx.Module):
         shaped("load", total, ())
         finite("load", total)
         positive("load", total)
-        return Support(array, total * share / jnp.sum(share))
+        return Support(array, in_numpy(_shares)(total, share))
 
     @staticmethod
     def tripod(point: Numeric, load: Numeric = 1.0, center: Numeric = (0.0, 0.0)) -> "Support":
@@ -115,10 +117,10 @@ class Support(eqx.Module):
         """
         if points < 1:
             raise ValueError(f"points must be at least 1; got {points}")
-        corners = concrete(jnp.stack(shape.bounds))
-        if corners is None:
+        low, high = (concrete(corner) for corner in shape.bounds)
+        if low is None or high is None:
             raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
-        low, high = corners.astype(np.float64)
+        dtype, low, high = low.dtype, low.astype(np.float64), high.astype(np.float64)
         # The area fixes the spacing but for the cut cells, which make it coarser; look around it, the nearest first.
         around = np.linspace(-0.1, 0.4, 26)
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
@@ -127,14 +129,14 @@ class Support(eqx.Module):
         best: tuple[np.ndarray, np.ndarray] | None = None
         for samples, middles in grids:
             padded = np.concatenate([samples, np.broadcast_to(low, (most - len(samples), 2))])
-            inside = np.asarray(_inside(shape, jnp.asarray(padded, corners.dtype)))[: len(samples)]
+            inside = np.asarray(_inside(shape, on_device(padded.astype(dtype))))[: len(samples)]
             found = _covered(samples, middles, inside)
             if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
                 best = found
             if len(best[0]) == points:
                 break
         assert best is not None
-        return Support.points(jnp.asarray(best[0], corners.dtype), best[1].astype(corners.dtype), load)
+        return Support.points(best[0].astype(dtype), best[1].astype(dtype), load)
 
     @staticmethod
     def rim(shape: Shape, points: int = 64, load: Numeric = 1.0) -> "Support":
@@ -146,18 +148,17 @@ class Support(eqx.Module):
     @property
     def load(self) -> Float[Array, ""]:
         """mu m g, N: the largest force without rotation that the support resists."""
-        return jnp.sum(self.limit)
+        return in_numpy(lambda xp, limit: xp.sum(limit))(self.limit)
 
     @property
     def center(self) -> Float[Array, "2"]:
         """Centre of pressure, m."""
-        return jnp.sum(self.limit[:, None] * self.point, axis=0) / self.load
+        return in_numpy(_center)(self.point, self.limit)
 
     @property
     def radius_of_gyration(self) -> Float[Array, ""]:
         """Root mean square distance of the pressure from its centre, m."""
-        squared = jnp.sum((self.point - self.center[None]) ** 2, axis=1)
-        return jnp.sqrt(jnp.sum(self.limit * squared) / self.load)
+        return in_numpy(_gyration)(self.point, self.limit)
 
     def wrench(self, twist: Numeric, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
         """The wrench (3,) in N, N m with which a hand balances friction while the slider moves with `twist` (3,).
@@ -196,16 +197,34 @@ class Support(eqx.Module):
         """
         if pairs < 1:
             raise ValueError(f"pairs must be at least 1; got {pairs}")
-        gyration = self.radius_of_gyration
-        rounding = 16 * jnp.finfo(gyration.dtype).eps * jnp.max(jnp.abs(self.point))
-        rho = jnp.where(gyration > rounding, gyration, 1.0) if length is None else as_float(length, gyration.dtype)
+        rho = in_numpy(_length)(self.point, self.limit) if length is None else as_float(length, self.point.dtype)
         shaped("length", rho, ())
         finite("length", rho)
         positive("length", rho)
         return _pairs(self, key, pairs, rho)
 
 
-@compiled
+def _shares(xp, total, weights):
+    return total * weights / xp.sum(weights)
+
+
+def _center(xp, point, limit):
+    return xp.sum(limit[:, None] * point, axis=0) / xp.sum(limit)
+
+
+def _gyration(xp, point, limit):
+    squared = xp.sum((point - _center(xp, point, limit)[None]) ** 2, axis=1)
+    return xp.sqrt(xp.sum(limit * squared) / xp.sum(limit))
+
+
+def _length(xp, point, limit):
+    """The radius of gyration, or 1 m where that is nothing but rounding."""
+    gyration = _gyration(xp, point, limit)
+    rounding = 16 * xp.finfo(gyration.dtype).eps * xp.max(xp.abs(point))
+    return xp.where(gyration > rounding, gyration, 1.0)
+
+
+@quickly_compiled
 def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
     dtype = support.point.dtype
     k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
@@ -249,7 +268,7 @@ def _covered(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tu
     return mean[share > 0], share[share > 0]
 
 
-@compiled
+@quickly_compiled
 def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
     """1 inside, 0 outside, and one half on the outline, where rounding would decide."""
     low, high = shape.bounds

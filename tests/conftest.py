@@ -19,6 +19,8 @@ import pytest  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # commands would fill the user's own cache
+    jax.config.update("jax_enable_compilation_cache", False)
 
 from pushjax.datasets import find_data  # noqa: E402
 

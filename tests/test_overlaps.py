@@ -168,6 +168,28 @@ def test_a_corner_beside_two_edges_of_an_arm_touches_one():
         np.testing.assert_allclose(np.asarray(touches.normal.y)[near], -1)
 
 
+@pytest.mark.parametrize("past", [1e-4, 1e-6])
+@pytest.mark.parametrize("shape", ["rectangle", "T"])
+def test_a_corner_that_is_past_the_other_side_touches_no_side(shape, past):
+    """Beside a pad's end, and a hair past its back: that is not a pad's thickness behind its front. Nor is a pad's
+    corner that juts out over an arm's end an arm's width behind the arm's other side."""
+    outline, pad = survey.shape_of(shape).outline(), Pad(pj.Polygon.rectangle(0.05, 0.01))
+    right, top = np.max(np.asarray(survey.shape_of(shape).vertices), axis=0)
+    at = {
+        "rectangle": [-right - 0.025, -top + 0.005 + past],  # at the slider's left side, its lower corner behind it
+        "T": [0.015 + past - 0.025, top + 0.005],  # on the stem's end
+    }[shape]
+    there = Placement(Vec2(*jnp.asarray(at)), turn(jnp.asarray(0.0)))
+    for far in (0.0, 1e-5):
+        away = there._replace(
+            center=there.center + Vec2(*jnp.asarray([-far, 0.0] if shape == "rectangle" else [0.0, far]))
+        )
+        touches = places(pad, outline, away, Vec2(*jnp.zeros(2)), jnp.asarray(0.1))
+        near = np.asarray(touches.distance) < 1e-3
+        assert near.any()
+        np.testing.assert_allclose(np.asarray(touches.distance)[near], far, atol=1e-12)
+
+
 def test_a_pad_whose_end_lies_flush_with_an_arms_end():
     """Corner on corner: each is past the other's edge or not, by rounding, and touches it all the same."""
     slider = pj.Slider(survey.shape_of("T"), surface())
@@ -295,6 +317,19 @@ def test_hands_of_ones_own_and_smooth_sliders():
         assert int(push.first_failure) == -1
         assert pj.Status.MOVING in np.asarray(push.status)
         assert np.max(survey.overlaps(pushes)) < 0.1 * 0.0022
+
+
+def test_a_jam_is_confirmed_in_a_part_of_the_step():
+    """To first order the whole step jams, but in it the slider turns on, as it does in many small ones."""
+    shape = survey.shape_of("L")
+    slider, pose = pj.Slider(shape, survey.surface_of(shape, jax.random.key(0))), (0.01948941, 0.0082125, 3.0487692)
+    begin, end = jnp.array([0.0, 0.0, 0.0, 0.085]), jnp.array([0.0, 0.0, 0.0, 0.080])
+    whole = pj.step(slider, JAW, begin, end, pose=pose, friction=0.09509535)
+    fine = pj.rollout(slider, JAW, pj.line(begin, end, 256), pose=pose, friction=0.09509535)
+    assert pj.Status(int(whole.status)) == pj.Status.MOVING
+    assert pj.Status(int(fine.status[-1])) == pj.Status.MOVING
+    np.testing.assert_allclose(whole.pose, fine.pose[-1], atol=2e-3)
+    assert float(whole.pose[2]) - pose[2] > 0.03
 
 
 def deepest_of(push, friction):

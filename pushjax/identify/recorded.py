@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.datasets.pushes import Floats, rotation
 from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.identify.pushes import STEPS, Pushes
@@ -94,7 +94,7 @@ def _pairs(pushes: tuple[Recording, ...], poses: Floats, which: list[np.ndarray]
     return {"wrench": wrench, "twist": twist}
 
 
-@compiled
+@quickly_compiled
 def _feet(shape: Shape, points: jax.Array) -> jax.Array:
     """Of each point the nearest one of the outline: where a finger touches."""
     return jax.vmap(lambda point: shape.closest(point)[1])(points)

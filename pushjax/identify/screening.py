@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.datasets.pushes import LogError, nothing_usable, rotation
 from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.hands import Hand, RoundFinger
@@ -81,6 +81,6 @@ def _gaps(shape: Shape, hand: Hand, push: Recording) -> np.ndarray:
     return (distance - np.asarray(hand.radius)).min(axis=1)
 
 
-@compiled
+@quickly_compiled
 def _distances(shape: Shape, points: jax.Array) -> jax.Array:
     return jax.vmap(shape.signed_distance)(points)

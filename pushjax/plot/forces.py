@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax._vec import Vec3
 from pushjax.advance import Placed, columns, grips_of
 from pushjax.contacts import choose, count, places, taken
@@ -62,7 +62,7 @@ def _orders(counts: list[int]) -> list[list[int]]:
     return [list(chain(*order)) for order in product(*mine)]
 
 
-@compiled
+@quickly_compiled
 def _touches(shape: Shape, hand: Hand, pose: jax.Array, configuration: jax.Array, size: jax.Array):
     """Points and inward normals (steps, contacts, 2), body frame, halfway through each step."""
     outline, fingers = shape.outline(), hand.poses(configuration)

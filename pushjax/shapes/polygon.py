@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, positive, shaped
+from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, in_numpy, on_device, positive, shaped
 from pushjax._vec import Scalar, Vec2, select, settle
 from pushjax.shapes._base import Closest, Outline, Shape, check_simple, first_hit, rounding, signed_area
 
@@ -217,7 +217,7 @@ class Polygon(Shape):
         if known is not None:
             check_simple("vertices", known.astype(np.float64))
             if signed_area(known.astype(np.float64)) < 0:
-                array = jnp.roll(array[::-1], 1, axis=0)
+                array = on_device(np.roll(known[::-1], 1, axis=0))
         self.vertices = array
         self.convex = _is_convex(array, convex)
 
@@ -230,8 +230,7 @@ class Polygon(Shape):
             shaped(name, value, ())
             finite(name, value)
             positive(name, value)
-        signs = jnp.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype)
-        return Polygon(signs * jnp.stack([w / 2, h / 2])[None], convex=True)
+        return Polygon(_rectangle(w, h), convex=True)
 
     @staticmethod
     def regular(sides: int, circumradius: Numeric) -> "Polygon":
@@ -247,21 +246,15 @@ class Polygon(Shape):
 
     @property
     def area(self) -> Float[Array, ""]:
-        # relative to the first vertex, so that a polygon far from the origin does not lose its digits
-        a = self.vertices - self.vertices[:1]
-        b = jnp.roll(a, -1, axis=0)
-        return jnp.sum(a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]) / 2
+        return _area(self.vertices)
 
     @property
     def centroid(self) -> Float[Array, "2"]:
-        a = self.vertices - self.vertices[:1]  # as for the area
-        b = jnp.roll(a, -1, axis=0)
-        twice = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-        return self.vertices[0] + jnp.sum((a + b) * twice[:, None], axis=0) / (3 * jnp.sum(twice))
+        return _centroid(self.vertices)
 
     @property
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        return jnp.min(self.vertices, axis=0), jnp.max(self.vertices, axis=0)
+        return _bounds(self.vertices)
 
     @property
     def perimeter(self) -> Float[Array, ""]:
@@ -303,6 +296,33 @@ class Polygon(Shape):
             return PolygonOutline(edges, self.convex)
         each = tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(v)))
         return PolygonOutline(each, self.convex)
+
+
+@in_numpy
+def _rectangle(xp, width, height):
+    signs = xp.asarray([[-1, -1], [1, -1], [1, 1], [-1, 1]], width.dtype)
+    return signs * xp.stack([width / 2, height / 2])[None]
+
+
+@in_numpy
+def _area(xp, vertices):
+    # relative to the first vertex, so that a polygon far from the origin does not lose its digits
+    a = vertices - vertices[:1]
+    b = xp.roll(a, -1, axis=0)
+    return xp.sum(a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]) / 2
+
+
+@in_numpy
+def _centroid(xp, vertices):
+    a = vertices - vertices[:1]  # as for the area
+    b = xp.roll(a, -1, axis=0)
+    twice = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+    return vertices[0] + xp.sum((a + b) * twice[:, None], axis=0) / (3 * xp.sum(twice))
+
+
+@in_numpy
+def _bounds(xp, vertices):
+    return xp.min(vertices, axis=0), xp.max(vertices, axis=0)
 
 
 def _is_convex(vertices: Array, claimed: bool | None) -> bool:

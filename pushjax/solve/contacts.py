@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._checks import Numeric, as_float, common_dtype, concrete, finite, non_negative, shaped
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax._vec import Vec2, Vec3, entries
 from pushjax.limit_surface import Form, LimitSurface
 from pushjax.solve._contact_plane import Contact, LimitCurve
@@ -147,7 +147,7 @@ def _countable(contacts: int) -> None:
         raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {contacts}")
 
 
-@compiled
+@quickly_compiled
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     form, friction = ground(surface, contacts.friction)
     each = _in_scalars(contacts, friction)
