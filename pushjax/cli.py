@@ -13,6 +13,7 @@ import tyro
 
 from pushjax._internal.compilation_cache import enable_compilation_cache
 from pushjax._options import option
+from pushjax._progress import Reporter, progress_bar
 from pushjax.datasets import find_data
 from pushjax.experiments import identify_logs
 
@@ -226,10 +227,10 @@ def _reproduce(command: Reproduce, progress: Progress) -> Result:
     return record, f"{text}\nwrote {write_page(record, text, command.out / f'{name}.html')}"
 
 
-def _identify(command: Identify, progress: Progress) -> Result:
+def _identify(command: Identify, progress: Reporter) -> Result:
     from pushjax.page import write_page
 
-    record = identify_logs.run(list(command.logs), command, command.seed, command.out, progress)
+    record = identify_logs.run(list(command.logs), command, command.seed, command.out, progress, progress.say)
     text = identify_logs.summary(record)
     return record, f"{text}\nwrote {write_page(record, text, command.out / 'identify.html')}"
 
@@ -338,8 +339,6 @@ def main(arguments: list[str] | None = None) -> None:
     import matplotlib
 
     matplotlib.use("Agg")  # draws to files; there may be no screen
-
-    from pushjax._progress import progress_bar
 
     if isinstance(command, Cached):
         _keep_compiled(command.cache)

@@ -1,5 +1,6 @@
 """From log files to parameters: what is used, what is left out and why, and what the report says."""
 
+import contextlib
 import csv
 import json
 from dataclasses import replace
@@ -108,7 +109,8 @@ def arguments(log, out):
 @pytest.fixture(scope="module")
 def report(log, tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
-    cli.main(arguments(log, out))
+    with (out / "told.txt").open("w") as told, contextlib.redirect_stderr(told):
+        cli.main(arguments(log, out))
     return out, json.loads((out / "id.json").read_text())
 
 
@@ -130,6 +132,14 @@ def test_a_csv_tells_friction_and_inset(report):
     for name in ("identify_pushes.png", "identify_residuals.png", "identify_profiles.png", "identify.html"):
         assert (out / name).stat().st_size > 5000
     assert pj.Identified.load(record["identified"]).friction.shape == ()
+
+
+def test_it_says_what_it_is_doing(report):
+    """In a pipe, in lines: a bar is for terminals."""
+    out, _ = report
+    lines = (out / "told.txt").read_text().splitlines()
+    assert lines[0].startswith("pushjax: fitting to 16 pushes")
+    assert "pushjax: interval of friction" in lines
 
 
 def test_what_cannot_be_used_is_named_and_counted(report):

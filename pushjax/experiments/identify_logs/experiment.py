@@ -36,9 +36,12 @@ def run(
     seed: int = 0,
     out: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
-    """Raises LogError for a log that cannot be used, ValueError for options that do not fit."""
-    findings = find(logs, options, seed, progress)
+    """say: told what is done next.
+
+    Raises LogError for a log that cannot be used, ValueError for options that do not fit."""
+    findings = find(logs, options, seed, progress, say)
     found = findings.found
     pictures, saved = [], None
     if out is not None:
@@ -70,7 +73,13 @@ def run(
     )
 
 
-def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int, int], None]) -> Findings:
+def find(
+    logs: list[Path],
+    options: Options,
+    seed: int,
+    progress: Callable[[int, int], None],
+    say: Callable[[str], None],
+) -> Findings:
     if not logs:
         raise ValueError("PATH: expected at least one file of recorded pushes; got none")
     recordings, useless = _each(logs, load_recordings)
@@ -99,16 +108,19 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         marker=options.marker,
     )
     touching = options.touching
+    say(f"fitting to {count} pushes (the first time this compiles, for up to a minute)")
     found = pj.identify(pushes, slider, hand, unknowns, touching=touching)
     labels = list(scalars(found))
     total = len(labels) + 1
     progress(1, total)
     profiles: list[Profile] = []
     for label in labels:
+        say(f"interval of {label}")
         profiles.append(profile(found, pushes, slider, hand, label))
         progress(1 + len(profiles), total)
     noise = None
     if options.noise:
+        say("fitting how much friction scatters")
         # of pushes that were learned from too little is left over: every second about what the others tell
         odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
         others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns, touching=touching)
@@ -116,6 +128,7 @@ def find(logs: list[Path], options: Options, seed: int, progress: Callable[[int,
         noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]
     length = lengths[0] if lengths else float(found.length)
+    say("predicting the pushes again")
     predicted = found.predict(pushes, slider, hand)
     return Findings(problems, slider, hand, pushes, found, predicted, tuple(profiles), noise, length)
 
