@@ -4,11 +4,14 @@ import gc
 import signal
 import time
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import pushjax as pj
 from pushjax import _programs
-from pushjax._programs import compiled, uncollected
+from pushjax._programs import compiled, outermost, quickly_compiled, uncollected
 
 
 @pytest.fixture
@@ -124,3 +127,54 @@ def test_a_program_is_traced_once_for_all_values_of_arrays():
     assert float(power(jnp.asarray(2.0), 3)) == 8
     assert traces == [2, 3]
     assert power.__name__ == "power"
+
+
+@quickly_compiled
+def squared(x, power=2):
+    return {"value": x**power}
+
+
+def test_what_compiles_quickly_works_within_everything():
+    """By itself with options of its own, which JAX refuses within `jit`."""
+    plain = squared(jnp.array(3.0))["value"]
+    assert plain == 9
+    assert jax.jit(lambda x: squared(x)["value"])(3.0) == 9
+    assert jax.jit(lambda: squared(jnp.array(3.0))["value"])() == 9  # of a constant
+    assert jax.grad(lambda x: squared(x)["value"])(3.0) == 6
+    assert jax.jit(jax.hessian(lambda x: squared(x)["value"]))(3.0) == 2
+    assert jax.grad(jax.checkpoint(lambda x: squared(x)["value"]))(3.0) == 6
+    assert jax.vmap(lambda x: squared(x, power=3)["value"])(jnp.arange(3.0)).tolist() == [0, 1, 8]
+    last, _ = jax.lax.scan(lambda x, _: (squared(x)["value"], None), 3.0, length=2)
+    assert last == 81
+
+
+def test_whether_anything_is_traced():
+    seen = []
+
+    def look(x):
+        seen.append(outermost())
+        return x
+
+    look(1.0)
+    jax.jit(look)(1.0)
+    jax.grad(look)(1.0)
+    jax.vmap(look)(jnp.ones(2))
+    look(1.0)
+    assert seen == [True, False, False, False, True]
+
+
+def test_what_is_known_compiles_nothing(caplog):
+    """Shapes, supports and paths: op by op, each new shape of an array would compile programs."""
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        block = pj.Polygon.rectangle(0.0913, 0.0607)
+        pj.Polygon([(0, 0), (0.05, 0.05), (0.0917, 0)])
+        support = pj.Support.points(np.random.default_rng(0).uniform(size=(37, 2)), load=2.0)
+        assert float(support.radius_of_gyration) > 0
+        assert support.center.shape == (2,)
+        assert float(block.area) > 0
+        assert block.centroid.shape == (2,)
+        assert pj.line((0.0, 0.1, 0.2), (0.1, 0.2, 0.3), 37).shape == (38, 3)
+        known = list(caplog.records)
+        jax.jit(lambda x: x + 37)(1.0)
+    assert len(caplog.records) > len(known)
+    assert [record.getMessage() for record in known if "ompil" in record.getMessage()] == []
