@@ -7,7 +7,11 @@ from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
-from jax.extend.core import get_opaque_trace_state
+
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # JAX up to 0.9
+    from jax.core import get_opaque_trace_state  # pyright: ignore[reportAttributeAccessIssue]
 
 P = ParamSpec("P")
 R = TypeVar("R")
