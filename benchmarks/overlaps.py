@@ -282,12 +282,11 @@ class Disc(NamedTuple):
         """Where it is within reach of the body, an edge or a vertex: the point, and the normal into the body."""
         found = []
         for a, b in pairwise(_ring(body)):
-            along = (b - a) / np.linalg.norm(b - a)
-            feet = [(a, a - self.center)]
-            if 0 < (self.center - a) @ along < np.linalg.norm(b - a):
-                foot = a + along * ((self.center - a) @ along)
-                feet.append((foot, foot - self.center))
-            for point, off in feet:
+            length = np.linalg.norm(b - a)
+            along = (b - a) / length
+            at = (self.center - a) @ along
+            for point in (a, a + along * at) if 0 < at < length else (a,):
+                off = point - self.center
                 size = float(np.linalg.norm(off))
                 if abs(size - self.radius) <= reach and size > 0:
                     found.append((point, off / size))
@@ -308,14 +307,14 @@ class Plate(NamedTuple):
 
 
 def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disc | Plate]:
-    seen = seen_by_slider(survey.hand, np.asarray(pose, float), np.asarray(configuration))
+    seen = seen_by_slider(survey.hand, pose, configuration)
     return [
         Disc(where[0], float(finger.radius)) if isinstance(finger, RoundFinger) else Plate(shapely.Polygon(where))
         for finger, where in zip(survey.hand.fingers, seen, strict=True)
     ]
 
 
-def _jams(body: shapely.Polygon, fingers: list, steps: np.ndarray, mu: float, reach: float) -> bool:
+def _jams(body: shapely.Polygon, fingers: list[Disc | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:
     """Whether forces within friction cones at places in reach balance, and the fingers' steps do work on them."""
     wrenches, works = [], []
     for finger, step in zip(fingers, steps, strict=True):
