@@ -136,9 +136,11 @@ def advance(
     before: Scalar,
     reach: Scalar,
     urgency: Urgency | None = None,
+    ongoing: Bool[Array, ""] | bool = True,
 ) -> tuple[Record, Urgency | None]:
     """One step of all fingers, or a part of one, and how urgent each contact is after it. before: the deepest overlap
-    at its beginning. reach: m, how near a finger holds what is jammed. urgency: see `working_set`."""
+    at its beginning. reach: m, how near a finger holds what is jammed. urgency: see `working_set`. ongoing: False where
+    nothing is asked for: no contact problem is solved then."""
     start = Placed.at(pose)
     begin = jnp.ones_like(pose.x)
 
@@ -153,7 +155,7 @@ def advance(
     counts = [count(grip.finger, outline) for grip in grips]
     zero = jnp.zeros_like(pose.x)
     working = WorkingSet.most_urgent(urgency, together(counts))
-    on = (jnp.ones((), bool),) * together(counts)
+    on = (jnp.asarray(ongoing),) * together(counts)
 
     def stage(carry, share):
         """Solve the contacts as they are when `share` of the last stage's motion is done."""

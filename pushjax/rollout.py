@@ -3,7 +3,7 @@
 Time does not matter to quasi-static motion, so a step is a displacement of the hand; `advance` has its scheme. The
 pushed slider's pose is all the state there is.
 
-Where no motion satisfies every contact the hand has jammed: it stops at the beginning of that step, for good.
+Where no motion satisfies every contact the hand has jammed: it stops there, for good.
 """
 
 from collections.abc import Callable
@@ -72,9 +72,9 @@ class Step(eqx.Module):
 class Trajectory(eqx.Module):
     """A push, step by step; fields as in `Step`, with a leading axis of steps (pose: steps + 1, the start included).
 
-    configuration: where the hand really was: the path, up to a jam. There the hand stops, at the beginning of that step
-    or, if it was divided, of a part of it; and status says JAMMED, or GRASPED if every finger holds the slider, at this
-    step and every one after it; nothing moves any more.
+    configuration: where the hand really was: the path, up to a jam. There the hand stops, within a sixteenth of a step
+    before the jam; and status says JAMMED, or GRASPED if every finger holds the slider, at this step and every one
+    after it; nothing moves any more.
     """
 
     pose: Float[Array, "steps+1 3"]

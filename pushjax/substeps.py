@@ -12,7 +12,7 @@ has come to. So a push that divides its steps holds up the others only at the en
 ended. Trials that are taken back leave nothing in a derivative, which is that of the parts that were accepted.
 
 A jam is proved to first order: within a long step the slider may turn out of it. So a whole step that jams is divided
-too, its first part being of `CONFIRMED`. If a part of that size jams, the hand stops where the step began; if all of
+too, its first part being of `CONFIRMED`. If a part of that size jams, the hand stops where that part began; if all of
 its parts move, so does the step.
 """
 
@@ -98,7 +98,8 @@ def divided(
         grips = grips_at(trial.step, mu)
         reach, tolerance = holding(grips, form.length), tolerated(grips, form.length)
         part = tuple(grip.part(trial.done, trial.part) for grip in grips)
-        record, missed = advance(form, outline, part, solver, trial.pose, trial.overlap, reach, trial.urgency)
+        ongoing = trial.step < steps
+        record, missed = advance(form, outline, part, solver, trial.pose, trial.overlap, reach, trial.urgency, ongoing)
         following, found = _judged(trial, record, missed, outline, part, tolerance, steps)
         if missed is not None and urgency is not None:
             following = following._replace(urgency=jnp.where(following.swaps > 0, missed, urgency))
@@ -122,6 +123,46 @@ def divided(
     return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[at], records, rest), last.done
 
 
+class Outcome(NamedTuple):
+    """What a trial leads to: one of these, or else a smaller part is tried next.
+
+    accepted: the part is done. joins: a place that the answer violates joins the contact problem, for the same part.
+    stops: the hand stops where the part began. abandons: the step is given up; the next trial is of the whole step, for
+    the overlap of a slider that stays. fails: the step ends so, with the status `reason`.
+    """
+
+    accepted: Bool[Array, ""]
+    joins: Bool[Array, ""]
+    stops: Bool[Array, ""]
+    abandons: Bool[Array, ""]
+    fails: Bool[Array, ""]
+    reason: Int[Array, ""]
+
+
+def _outcome(trial: Trial, record: Record, missed: Urgency | None, depth: Scalar, tolerance: Scalar) -> Outcome:
+    """tolerance: how much deeper a finger may be after a whole step, m."""
+    fails = trial.given_up != 0
+    goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
+    clear = depth <= jnp.maximum(trial.before, trial.part * tolerance)
+    # in a step that is divided, a jam is found to its smallest part: what squirts turns far in one step
+    smallest = jnp.where(trial.jammed, CONFIRMED, SMALLEST)
+    # a slider that was left behind in the step before is not tried by parts again
+    final = (trial.part < 2 * smallest) | trial.failed
+    stops = final & stopping(record.status) & ~fails
+    joins = jnp.zeros((), bool)
+    if missed is not None:
+        worst = jnp.max(jnp.where(missed < LOADED, missed, -jnp.inf))
+        joins = goes & ~fails & (trial.swaps < SWAPS) & (worst > MISSED * trial.part * tolerance)
+    accepted, stops, joins = settle((goes & clear & ~fails & ~joins, stops, joins), trial.pose.x)
+    hopeless = (trial.part / 2 < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
+    abandons = hopeless & ~accepted & ~stops & ~fails & ~joins
+    # where nothing has moved, and the hand was at the step's end, no more need be looked at
+    at_once = abandons & ~goes & (trial.part == 1)
+    reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
+    reason = jnp.where(fails, trial.given_up, reason).astype(jnp.int8)
+    return Outcome(accepted, joins, stops, abandons & ~at_once, settle(fails | at_once, trial.pose.x), reason)
+
+
 def _judged(
     trial: Trial,
     record: Record,
@@ -132,73 +173,45 @@ def _judged(
     steps: int,
 ):
     """The trial after, the record of the step, whether it has ended with this one, and its index."""
-    gives_up = settle(trial.given_up != 0, trial.pose.x)
-    pose = select(gives_up, trial.origin, record.pose)
+    pose = select(settle(trial.given_up != 0, trial.pose.x), trial.origin, record.pose)
     depth = deepest(outline, part, pose, 1.0)
-    # in a step that is divided, a jam is found to its smallest part: what squirts turns far in one step
-    smallest = jnp.where(trial.jammed, CONFIRMED, SMALLEST)
-    # a slider that was left behind in the step before is not tried by parts again
-    final = (trial.part < 2 * smallest) | trial.failed
-    stops = final & stopping(record.status)
-    goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
-    clear = depth <= jnp.maximum(trial.before, trial.part * tolerance)
-    swaps = jnp.zeros((), bool)
-    if missed is not None:
-        worst = jnp.max(jnp.where(missed < LOADED, missed, -jnp.inf))
-        swaps = goes & ~gives_up & (trial.swaps < SWAPS) & (worst > MISSED * trial.part * tolerance)
-    accepted, stops, swaps = settle((goes & clear & ~gives_up & ~swaps, stops & ~gives_up, swaps), pose.x)
-    ongoing = trial.step < steps
+    outcome = _outcome(trial, record, missed, depth, tolerance)
+    accepted, stops, fails = outcome.accepted, outcome.stops, outcome.fails
 
     moves = settle(record.status == Status.MOVING, pose.x)
     so_far = select(moves, record, trial.so_far)
     so_far = so_far._replace(twist=trial.so_far.twist + record.twist, pose=pose, overlap=depth)
     so_far = so_far._replace(status=jnp.where(moves, record.status, trial.so_far.status))
-
     done = trial.done + trial.part
-    smaller = trial.part / 2
-    hopeless = (smaller < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
-    reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
-    given_up = jnp.where(hopeless & ~accepted & ~stops & ~gives_up & ~swaps, reason, 0)
-    # where nothing has moved, and the hand was at the step's end, no more need be looked at
-    at_once = (given_up != 0) & ~goes & (trial.part == 1)
-    gives_up = settle(gives_up | at_once, pose.x)
-    given_up = jnp.where(at_once, 0, given_up).astype(jnp.int8)
-    reason = jnp.where(at_once, reason, trial.given_up).astype(jnp.int8)
-    ends = ongoing & (gives_up | stops | (accepted & (done >= 1)))
-    nothing = _still(record, trial.origin)
-    status = jnp.where(gives_up, reason, record.status).astype(jnp.int8)
-    ended = nothing._replace(status=status, overlap=depth)
-    ended = select(settle(accepted, pose.x), so_far, ended)
-    # the hand stops where this part began; if the step jams as a whole, where that did
-    held = trial.so_far._replace(pose=trial.pose, status=status, overlap=trial.overlap)
-    as_a_whole = settle(trial.jammed, pose.x)
-    held = select(as_a_whole, nothing._replace(status=status, overlap=trial.before), held)
-    ended = select(stops, held, ended)
+    ends = (trial.step < steps) & (fails | stops | (accepted & (done >= 1)))
+    failed = _still(record, trial.origin)._replace(status=outcome.reason, overlap=depth)
+    held = trial.so_far._replace(pose=trial.pose, status=record.status, overlap=trial.overlap)
+    ended = select(stops, held, select(accepted, so_far, failed))
 
-    stopped = jnp.where(stops, record.status, trial.stopped).astype(jnp.int8)
+    # from where, and how large a part
     onward = settle(accepted & ~ends, pose.x)
-    anew = (ends & ~stops) | (given_up != 0)
+    anew = (ends & ~stops) | outcome.abandons
     jams = (trial.part == 1) & stopping(record.status)
-    smaller = jnp.where(swaps, trial.part, jnp.where(jams, CONFIRMED, smaller))
+    smaller = jnp.where(outcome.joins, trial.part, jnp.where(jams, CONFIRMED, trial.part / 2))
     larger = jnp.where(trial.halved, trial.part, 2 * trial.part)
     following = Trial(
         pose=select(ends, ended.pose, select(onward, pose, trial.pose)),
         origin=select(ends, ended.pose, trial.origin),
         step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
-        done=jnp.where(anew | (stops & as_a_whole), 0.0, jnp.where(accepted, done, trial.done)),
+        done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
         part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
-        halved=jnp.where(swaps, trial.halved, ~(anew | accepted | jams)),
+        halved=jnp.where(outcome.joins, trial.halved, ~(anew | accepted | jams)),
         jammed=(trial.jammed | jams) & ~(ends | anew),
         urgency=trial.urgency,
-        swaps=jnp.where(swaps, trial.swaps + 1, 0).astype(jnp.int8),
+        swaps=jnp.where(outcome.joins, trial.swaps + 1, 0).astype(jnp.int8),
         overlap=jnp.where(ends, ended.overlap, jnp.where(accepted, depth, trial.overlap)),
         before=jnp.where(ends, ended.overlap, trial.before),
-        stopped=stopped,
-        given_up=given_up,
-        failed=jnp.where(ends, gives_up, trial.failed),
+        stopped=jnp.where(stops, record.status, trial.stopped).astype(jnp.int8),
+        given_up=jnp.where(outcome.abandons, outcome.reason, 0).astype(jnp.int8),
+        failed=jnp.where(ends, fails, trial.failed),
         so_far=select(ends, _still(record, ended.pose), select(onward, so_far, trial.so_far)),
     )
-    following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, trial)
+    following = jax.tree.map(lambda new, old: jnp.where(trial.step < steps, new, old), following, trial)
     return following, (ended, ends, trial.step)
 
 

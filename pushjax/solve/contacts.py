@@ -16,6 +16,7 @@ from pushjax.solve._contact_plane import Contact, LimitCurve
 from pushjax.solve._several import ContactSolver, SeveralMotion, assemble
 from pushjax.solve.exhaustive import Exhaustive
 from pushjax.solve.single import solve_single
+from pushjax.solve.single_first import single_first
 from pushjax.solve.sticking import ScalarRoot, StickingSolver
 
 MAX_CONTACTS = 8
@@ -175,6 +176,8 @@ def motion_under(
     """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`). margin: whether it is
     asked for; else it is infinite wherever there is a motion, and takes no time."""
     _countable(len(contacts))  # a hand's too
+    if solver is None and len(contacts) > 1 and not margin:
+        return single_first(form, contacts, active)
     if solver is None:
         solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
     if not isinstance(solver, StickingSolver):
