@@ -278,8 +278,8 @@ def deepest(outline: Outline, grips: tuple[Grip, ...], pose: Vec3, share: float)
 
 def farthest(grips: tuple[Grip, ...]) -> Scalar:
     """How far the finger that goes farthest goes, m, straight."""
-    ways = [jnp.abs(grip.path.x) + jnp.abs(grip.path.y) for grip in grips]
-    return jax.lax.stop_gradient(functools.reduce(jnp.maximum, ways))
+    paths = jax.lax.stop_gradient([grip.path for grip in grips])
+    return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
 
 
 def holding(grips: tuple[Grip, ...], length: Scalar) -> Scalar:

@@ -211,7 +211,7 @@ def step(
     """Move the hand from configuration `q0` (dof,) to `q1` (dof,), world, m: the one step that `rollout` scans.
 
     pose: (3,), the slider's, world. friction: mu between fingers and slider, a scalar or (fingers,). solver: as in
-    `solve_contacts`.
+    `rollout`.
 
     Raises ValueError for arguments of the wrong shape, not finite, a negative friction, or a hand closed on itself,
     where they are not traced, and for more contacts than the solver solves. A traced value that is not finite or a
@@ -248,8 +248,10 @@ def rollout(
 
     path: (steps + 1, dof), world, m (`line`, `resample` or any recording); the step's size sets the accuracy. pose:
     (3,), the slider's at the start, world, m and rad. friction: mu between fingers and slider, a scalar or (fingers,).
-    solver: as in `solve_contacts`. table: one whose friction depends on direction or place; None for an even one. There
-    is no other state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
+    solver: of contact problems. By default the contact that is pressed most is solved alone, and several together only
+    where another does not come apart (`pushjax.solve.single_first`). `Exhaustive()` gives, of several motions, the one
+    of largest power. table: one whose friction depends on direction or place; None for an even one. There is no other
+    state: a push goes on with `rollout(..., rest_of_path, pose=push.pose[-1])`.
 
     Differentiable, forward and reverse, in slider, hand, path, pose, friction and table. Batches come from `vmap`.
 

@@ -79,13 +79,15 @@ def _alone(problem: Problem) -> tuple[Bool[Array, ""], SeveralMotion]:
         main, most = select(more, contact, main), jnp.where(more, its, most)
         mine = (*(own & ~more for own in mine), more)
     one = solve_single(form, main, ScalarRoot())
-    twist, length = jax.lax.stop_gradient((one.twist, form.length))
+    twist, length, given = jax.lax.stop_gradient((one.twist, form.length, contacts))
     size = jnp.abs(twist.x) + jnp.abs(twist.y) + length * jnp.abs(twist.z)
+    for contact in given:
+        goes = jnp.abs(contact.displacement.x) + jnp.abs(contact.displacement.y)
+        size = jnp.maximum(size, jnp.maximum(goes, -contact.gap))
     clear, still, known = (jnp.ones((), bool),) * 3
-    for contact, its, own in zip(contacts, pressed, mine, strict=True):
+    for contact, its, own in zip(given, pressed, mine, strict=True):
         away = contact.normal.dot(twist.xy + contact.point.perp().scale(twist.z))
-        fastest = jnp.abs(contact.displacement.x) + jnp.abs(contact.displacement.y) + jnp.abs(main.gap)
-        clear &= (away - its > CLEAR * clean(its.dtype) * (size + fastest)) | own
+        clear &= (away - its > CLEAR * clean(its.dtype) * size) | own
         still &= its <= 0
         known &= contact.friction >= 0
     enough = settle(known & ((clear & (one.status == Status.MOVING)) | still), form.length)
