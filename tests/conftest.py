@@ -31,6 +31,7 @@ gc.set_threshold(100_000, 50, 100)
 # Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
 LONG = (
     "docs",
+    "overlaps",
     "table1",
     "random_contacts",
     "commands",
@@ -47,6 +48,7 @@ LONG = (
     "several_contacts",
     "monte_carlo",
     "rollout",
+    "single_first",
 )
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"

@@ -71,13 +71,12 @@ def solved(problem, solver, displacement):
     return found.twist.array(), found.status, found.unique
 
 
-@pytest.mark.parametrize("contacts", [2, 4])
-def test_the_same_motion_or_a_second_one(contacts):
+def test_the_same_motion_or_a_second_one():
     """Of random problems: the answer and its derivative are those of `Exhaustive`, which says so where another motion
     is one too."""
     count = 400
-    keys = jax.random.split(jax.random.key(contacts), count)
-    problems = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=contacts, degree=4)))(keys)
+    keys = jax.random.split(jax.random.key(4), count)
+    problems = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=4, degree=4)))(keys)
 
     def both(problem, solver):
         twist, status, unique = solved(problem, solver, problem.contacts.displacement)
