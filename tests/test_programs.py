@@ -165,7 +165,7 @@ def test_whether_anything_is_traced():
 
 def test_what_is_known_compiles_nothing(caplog):
     """Shapes, supports and paths: op by op, each new shape of an array would compile programs."""
-    with jax.log_compiles(), caplog.at_level("WARNING"):
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
         block = pj.Polygon.rectangle(0.0913, 0.0607)
         pj.Polygon([(0, 0), (0.05, 0.05), (0.0917, 0)])
         support = pj.Support.points(np.random.default_rng(0).uniform(size=(37, 2)), load=2.0)
