@@ -173,6 +173,7 @@ def _judged(
     steps: int,
 ):
     """The trial after, the record of the step, whether it has ended with this one, and its index."""
+    ongoing = trial.step < steps
     pose = select(settle(trial.given_up != 0, trial.pose.x), trial.origin, record.pose)
     depth = deepest(outline, part, pose, 1.0)
     outcome = _outcome(trial, record, missed, depth, tolerance)
@@ -183,7 +184,7 @@ def _judged(
     so_far = so_far._replace(twist=trial.so_far.twist + record.twist, pose=pose, overlap=depth)
     so_far = so_far._replace(status=jnp.where(moves, record.status, trial.so_far.status))
     done = trial.done + trial.part
-    ends = (trial.step < steps) & (fails | stops | (accepted & (done >= 1)))
+    ends = ongoing & (fails | stops | (accepted & (done >= 1)))
     failed = _still(record, trial.origin)._replace(status=outcome.reason, overlap=depth)
     held = trial.so_far._replace(pose=trial.pose, status=record.status, overlap=trial.overlap)
     ended = select(stops, held, select(accepted, so_far, failed))
@@ -211,7 +212,7 @@ def _judged(
         failed=jnp.where(ends, fails, trial.failed),
         so_far=select(ends, _still(record, ended.pose), select(onward, so_far, trial.so_far)),
     )
-    following = jax.tree.map(lambda new, old: jnp.where(trial.step < steps, new, old), following, trial)
+    following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, trial)
     return following, (ended, ends, trial.step)
 
 

@@ -117,6 +117,8 @@ def test_frozen_and_finite_after_a_jam(grasps, reruns, fingers):
         after = stop + 1  # on the way to there the hand stops
         for frozen in (runs.pose[k, after:], runs.configuration[k, after:]):
             np.testing.assert_array_equal(frozen, np.tile(frozen[0], (STEPS + 1 - after, 1)))
+        way = np.linalg.norm(np.diff(runs.configuration[k], axis=0), axis=1)
+        assert way[stop] < way[stop - 1]
         assert len(np.unique(np.asarray(runs.status[k, stop:]))) == 1
         assert not np.any(np.asarray(runs.force[k, after:]))
     for leaf in jax.tree.leaves(runs):

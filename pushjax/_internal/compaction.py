@@ -38,7 +38,7 @@ def _of_batch(work: Callable[..., Any], size: int, batched: Any, needed, instead
     """What `custom_vmap` asks for: the outcome of a batch, and which of its leaves are batched."""
 
     def spread(tree, which):
-        return jax.tree.map(lambda x, own: x if own else jnp.broadcast_to(x, (size, *jnp.shape(x))), tree, which)
+        return jax.tree.map(lambda x, is_own: x if is_own else jnp.broadcast_to(x, (size, *jnp.shape(x))), tree, which)
 
     own = batched[2]
 
@@ -78,13 +78,13 @@ def _in_tiles(work: Callable[..., Any], own: Any, needed, instead, args):
     count = jnp.sum(needed.astype(jnp.int32))
     # those in need first; past them out of range, where nothing is written
     order = jnp.nonzero(needed, size=size + tile, fill_value=size)[0].astype(jnp.int32)
-    axes = jax.tree.map(lambda own: 0 if own else None, own)
+    axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
 
     def next_tile(state):
         begin, found = state
         at = jax.lax.dynamic_slice(order, (begin,), (tile,))
         which = jnp.minimum(at, size - 1)
-        mine = jax.tree.map(lambda x, own: x[which] if own else x, args, own)
+        mine = jax.tree.map(lambda x, is_own: x[which] if is_own else x, args, own)
         done = jax.vmap(work, in_axes=axes, axis_size=tile)(*mine)
         found = jax.tree.map(lambda old, new: old.at[at].set(new, mode="drop"), found, done)
         return begin + tile, found

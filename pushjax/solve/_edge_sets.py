@@ -38,9 +38,9 @@ class Found(NamedTuple):
     hasty: Bool[Array, ""]
 
 
-def nothing(problem: Several) -> Found:
+def nothing(like: Scalar) -> Found:
     """Before any set has been tried."""
-    zero = jnp.zeros_like(problem.speed)
+    zero = jnp.zeros_like(like)
     none, no = jnp.full(zero.shape, NONE, jnp.int32), jnp.zeros(zero.shape, bool)
     still = Vec3(zero, zero, zero)
     return Found((none, none, none), still, still, zero, no, no, no)

@@ -174,11 +174,12 @@ def motion_under(
     margin: bool,
 ) -> SeveralMotion:
     """`solve_contacts` in scalars. One that is not active must be out of reach (`_in_scalars`). margin: whether it is
-    asked for; else it is infinite wherever there is a motion, and takes no time."""
+    asked for; else it is infinite wherever there is a motion, and takes no time, and several contacts are by default
+    solved one first."""
     _countable(len(contacts))  # a hand's too
-    if solver is None and len(contacts) > 1 and not margin:
-        return single_first(form, contacts, active)
     if solver is None:
+        if len(contacts) > 1 and not margin:
+            return single_first(form, contacts, active)
         solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
     if not isinstance(solver, StickingSolver):
         return solver.solve(assemble(form, contacts, active, margin=margin))

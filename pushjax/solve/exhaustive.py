@@ -43,7 +43,7 @@ class Exhaustive(ContactSolver):
 
 def enumerate_sets(problem: Several) -> Found:
     """The solution of largest power on H = 1, of equal ones the smallest twist. Not differentiable."""
-    found = nothing(problem)
+    found = nothing(problem.speed)
     m = problem.count
     found = _over(lambda found, e: one_edge(problem, found, *e), found, [(e,) for e in range(2 * m)])
     slides = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]

@@ -109,7 +109,7 @@ def _finished(problem: Several, forces: tuple[Vec2, ...]) -> Found:
         weights += [jnp.maximum((force.x + side) / 2, 0), jnp.maximum((force.x - side) / 2, 0)]
     first = _heaviest(weights, ())
     second = _heaviest(weights, (first,))
-    found = one_edge(problem, nothing(problem), first)
+    found = one_edge(problem, nothing(problem.speed), first)
     found = two_edges(problem, found, jnp.minimum(first, second), jnp.maximum(first, second))
     if problem.count == 1:
         return found

@@ -60,15 +60,17 @@ def _differentiable(problem: Problem) -> SeveralMotion:
 
 
 def _search(enough: Bool[Array, ""], problem: Problem) -> Found:
-    several = assemble(*problem, margin=False)
-    return only_where(
-        ~enough, lambda problem: enumerate_sets(assemble(*problem, margin=False)), nothing(several), problem
-    )
+    form, *_ = problem
+    return only_where(~enough, _enumerated, nothing(form.length), problem)
+
+
+def _enumerated(problem: Problem) -> Found:
+    return enumerate_sets(assemble(*problem, margin=False))
 
 
 def _alone(problem: Problem) -> tuple[Bool[Array, ""], SeveralMotion]:
-    """Whether the contact that is pressed most moves the slider away from all others, or nothing is pressed; and that
-    motion."""
+    """The motion under the contact that is pressed most, and whether it is an answer: it moves the slider away from all
+    others, or none is pressed."""
     form, contacts, active = problem
     contacts = tuple(contact.where(a) for contact, a in zip(contacts, active, strict=True))
     pressed = tuple(contact.approach().x for contact in contacts)
