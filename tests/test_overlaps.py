@@ -279,6 +279,33 @@ def test_derivatives_of_a_divided_step():
     assert np.abs(forward[:, 0]).max() > 1e-4
 
 
+@pytest.mark.parametrize(
+    ("shape", "opening", "poses", "friction", "status"),
+    [
+        # the waist is 64 mm wide between the fingers' outer sides
+        (
+            "peanut",
+            0.065,
+            [(-8.0375e-4, -5.0178e-4, 0.01843504), (2.2443e-3, 3.7954e-4, 0.0471798)],
+            (0.07139, 0.07072),
+            4,
+        ),
+        ("comb", 0.07, [(-0.01244619, -0.00076171, -0.2869193)], (0.11646,), 0),
+    ],
+)
+def test_a_step_whose_parts_go_past_a_jam_is_begun_anew(shape, opening, poses, friction, status):
+    """Squeezed, the slider turns the faster the nearer it comes to where it jams or slips out."""
+    outline, hand, end = survey.shape_of(shape), survey.hand_of("two"), opening - 0.005
+    slider = pj.Slider(outline, survey.surface_of(outline, jax.random.key(0)))
+    path = pj.line((0, 0, 0, opening), (0, 0, 0, end), 1)
+    push = jax.jit(jax.vmap(lambda pose, mu: pj.rollout(slider, hand, path, pose=pose, friction=mu)))
+    found = push(np.array(poses), np.array(friction))
+    np.testing.assert_array_equal(found.status[:, -1], status)
+    assert float(jnp.max(found.overlap)) <= 0.1 * 0.0025
+    wanted = 0.064 if status == pj.Status.GRASPED else end
+    np.testing.assert_allclose(found.configuration[:, -1, 3], wanted, atol=2e-5)
+
+
 def test_a_step_that_cannot_be_divided_is_the_first_failure():
     """Fingers without friction on parallel faces: nothing holds the slider where it lies flat, and nothing proves it.
 
