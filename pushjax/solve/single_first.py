@@ -32,6 +32,9 @@ CLEAR = 4
 Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
 
 
+# `jit`, here and below: a loop's body is traced and batched again until it is known what in it is batched, but what is
+# under `jit` only once for each answer. The compiler writes it out.
+@jax.jit
 def single_first(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array, ""], ...]) -> SeveralMotion:
     """The motion of a slider under two or more contacts; its derivatives are those of the solution."""
     return _answered((form, contacts, active))
@@ -48,6 +51,7 @@ def _answered_jvp(primals, tangents):
     return eqx.filter_jvp(_differentiable, primals, tangents)
 
 
+@jax.jit
 def _together(problem: Problem) -> SeveralMotion:
     return Exhaustive().solve(assemble(*problem, margin=False))
 
@@ -64,6 +68,7 @@ def _search(enough: Bool[Array, ""], problem: Problem) -> Found:
     return only_where(~enough, _enumerated, nothing(form.length), problem)
 
 
+@jax.jit
 def _enumerated(problem: Problem) -> Found:
     return enumerate_sets(assemble(*problem, margin=False))
 
