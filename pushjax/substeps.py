@@ -5,8 +5,7 @@ came to touch, or slid past the end of what a finger rests on, which no contact 
 step is taken back and tried again by half, down to a part of `SMALLEST`. A part that succeeds is followed by one of
 twice the size, or, right after a failure, first by one of its own size. Before a part is halved, a place that the
 answer violates and that was not solved for joins the contact problem (`working_set`), and it is solved again. Where the
-smallest part fails, a part before it may have gone past a jam: the step is begun anew, in parts of `CAUTIOUS` at most.
-Where that fails too, or already the first part did, the step is NOT_CONVERGED, and the slider stays where it began.
+smallest part fails, the step is NOT_CONVERGED, and the slider stays where it began.
 
 Every push of a batch goes at its own pace: each round of one loop is the next trial of every push, of whichever step it
 has come to. So a push that divides its steps holds up the others only at the end, and no trial is made for who has
@@ -36,9 +35,7 @@ from pushjax.status import Status
 from pushjax.working_set import LOADED, Urgency, likeliest
 
 SMALLEST = 1 / 256  # of a step
-LENIENT = 1 / 8  # of what is tolerated of a step: how deep the smallest part may leave a finger, others by their size
 CONFIRMED = 1 / 16  # of a step that jams as a whole: the part that has to jam, too
-CAUTIOUS = 1 / 32  # of a step that is begun anew: its largest part
 # Trials of a path, per step and in all, after which what is left of it is NOT_CONVERGED: a grasp of a slider of many
 # corners takes one and a tenth a step.
 TRIALS_A_STEP, TRIALS = 4, 64
@@ -52,10 +49,10 @@ class Trial(NamedTuple):
 
     pose: now. origin: at the beginning of the step. step: its index, past the last one once the push has ended. done:
     the share of it that is done, and part: the one that is tried next. halved: whether it is as large as it is because
-    twice that failed. jammed: whether the step as a whole jams. cautious: whether it was begun anew. urgency: of each
-    contact, and swaps: how often the working set of this part has changed. overlap: the deepest now, and before: at the
-    beginning of the step. stopped: the status that stopped the hand, or zero. given_up: the status of a step that is
-    given up, or zero. failed: whether the step before was. so_far: of the parts that are done.
+    twice that failed. jammed: whether the step as a whole jams. urgency: of each contact, and swaps: how often the
+    working set of this part has changed. overlap: the deepest now. stopped: the status that stopped the hand, or zero.
+    given_up: the status of a step that is given up, or zero. failed: whether the step before was. so_far: of the parts
+    that are done.
     """
 
     pose: Vec3
@@ -65,11 +62,9 @@ class Trial(NamedTuple):
     part: Scalar
     halved: Bool[Array, ""]
     jammed: Bool[Array, ""]
-    cautious: Bool[Array, ""]
     urgency: Urgency | None
     swaps: Int[Array, ""]
     overlap: Scalar
-    before: Scalar
     stopped: Int[Array, ""]
     given_up: Int[Array, ""]
     failed: Bool[Array, ""]
@@ -95,7 +90,7 @@ def divided(
     none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
     urgency = likeliest([count(grip.finger, outline) for grip in grips], pose.x)
     nothing = _nothing(form, outline, grips, solver, pose, urgency)
-    begin = Trial(pose, pose, first, zero, one, no, no, no, urgency, none, overlap, overlap, none, none, no, nothing)
+    begin = Trial(pose, pose, first, zero, one, no, no, urgency, none, overlap, none, none, no, nothing)
 
     def next_trial(trial: Trial) -> tuple[Trial, tuple[Record, Bool[Array, ""], Int[Array, ""]]]:
         form, mu = grounded(trial.step, trial.origin)
@@ -131,15 +126,13 @@ class Outcome(NamedTuple):
     """What a trial leads to: one of these, or else a smaller part is tried next.
 
     accepted: the part is done. joins: a place that the answer violates joins the contact problem, for the same part.
-    stops: the hand stops where the part began. restarts: the step is begun anew, cautiously. abandons: the step is
-    given up; the next trial is of the whole step, for the overlap of a slider that stays. fails: the step ends so, with
-    the status `reason`.
+    stops: the hand stops where the part began. abandons: the step is given up; the next trial is of the whole step, for
+    the overlap of a slider that stays. fails: the step ends so, with the status `reason`.
     """
 
     accepted: Bool[Array, ""]
     joins: Bool[Array, ""]
     stops: Bool[Array, ""]
-    restarts: Bool[Array, ""]
     abandons: Bool[Array, ""]
     fails: Bool[Array, ""]
     reason: Int[Array, ""]
@@ -149,7 +142,8 @@ def _outcome(trial: Trial, record: Record, missed: Urgency | None, depth: Scalar
     """tolerance: how much deeper a finger may be after a whole step, m."""
     fails = trial.given_up != 0
     goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
-    share = jnp.where(trial.part < 2 * SMALLEST, LENIENT, trial.part)
+    # overlaps do not add up, for the next part pushes them out: so the smallest part may leave as much as a whole step
+    share = jnp.where(trial.part < 2 * SMALLEST, 1.0, trial.part)
     clear = depth <= jnp.maximum(trial.overlap, share * tolerance)
     # in a step that is divided, a jam is found to its smallest part: what squirts turns far in one step
     smallest = jnp.where(trial.jammed, CONFIRMED, SMALLEST)
@@ -162,14 +156,12 @@ def _outcome(trial: Trial, record: Record, missed: Urgency | None, depth: Scalar
         joins = goes & ~fails & (trial.swaps < SWAPS) & (worst > MISSED * trial.part * tolerance)
     accepted, stops, joins = settle((goes & clear & ~fails & ~joins, stops, joins), trial.pose.x)
     hopeless = (trial.part / 2 < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
-    hopeless &= ~accepted & ~stops & ~fails & ~joins
-    restarts = hopeless & (trial.done > 0) & ~trial.cautious
-    abandons = hopeless & ~restarts
+    abandons = hopeless & ~accepted & ~stops & ~fails & ~joins
     # where nothing has moved, and the hand was at the step's end, no more need be looked at
     at_once = abandons & ~goes & (trial.part == 1)
     reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
     reason = jnp.where(fails, trial.given_up, reason).astype(jnp.int8)
-    return Outcome(accepted, joins, stops, restarts, abandons & ~at_once, settle(fails | at_once, trial.pose.x), reason)
+    return Outcome(accepted, joins, stops, abandons & ~at_once, settle(fails | at_once, trial.pose.x), reason)
 
 
 def _judged(
@@ -199,32 +191,26 @@ def _judged(
     ended = select(stops, held, select(accepted, so_far, failed))
 
     # from where, and how large a part
-    onward, restarts = settle((accepted & ~ends, outcome.restarts), pose.x)
-    anew = (ends & ~stops) | restarts | outcome.abandons
-    cautious = (trial.cautious | restarts) & ~ends
+    onward = settle(accepted & ~ends, pose.x)
+    anew = (ends & ~stops) | outcome.abandons
     jams = (trial.part == 1) & stopping(record.status)
     smaller = jnp.where(outcome.joins, trial.part, jnp.where(jams, CONFIRMED, trial.part / 2))
     larger = jnp.where(trial.halved, trial.part, 2 * trial.part)
-    larger = jnp.minimum(jnp.where(cautious, jnp.minimum(larger, CAUTIOUS), larger), 1 - done)
     following = Trial(
-        pose=select(ends, ended.pose, select(onward, pose, select(restarts, trial.origin, trial.pose))),
+        pose=select(ends, ended.pose, select(onward, pose, trial.pose)),
         origin=select(ends, ended.pose, trial.origin),
         step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
         done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
-        part=jnp.where(anew, jnp.where(restarts, CAUTIOUS, 1.0), jnp.where(accepted, larger, smaller)),
+        part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
         halved=jnp.where(outcome.joins, trial.halved, ~(anew | accepted | jams)),
         jammed=(trial.jammed | jams) & ~(ends | anew),
-        cautious=cautious,
         urgency=trial.urgency,
         swaps=jnp.where(outcome.joins, trial.swaps + 1, 0).astype(jnp.int8),
-        overlap=jnp.where(
-            ends, ended.overlap, jnp.where(accepted, depth, jnp.where(restarts, trial.before, trial.overlap))
-        ),
-        before=jnp.where(ends, ended.overlap, trial.before),
+        overlap=jnp.where(ends, ended.overlap, jnp.where(accepted, depth, trial.overlap)),
         stopped=jnp.where(stops, record.status, trial.stopped).astype(jnp.int8),
         given_up=jnp.where(outcome.abandons, outcome.reason, 0).astype(jnp.int8),
         failed=jnp.where(ends, fails, trial.failed),
-        so_far=select(ends | restarts, _still(record, ended.pose), select(onward, so_far, trial.so_far)),
+        so_far=select(ends, _still(record, ended.pose), select(onward, so_far, trial.so_far)),
     )
     following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, trial)
     return following, (ended, ends, trial.step)

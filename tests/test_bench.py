@@ -95,7 +95,7 @@ def test_rows(tmp_path):
         # as compiled, which works out some things more than once; moved between kernels, not between memory and them
         assert row["flops_needed_per_step"] < row["flops_per_step"] < 10 * row["flops_needed_per_step"]
         assert 1000 < row["bytes_per_step"] < 100_000
-        assert row["near_copy_fraction"] > 0  # of two timings: beside other programs it may be more than one
+        assert 0 < row["near_copy_fraction"] < 1
         assert row["per_processor_s"] == pytest.approx(batch / row["processor_s"])
     lines = run.summary(record).splitlines()
     assert lines[1].split()[:4] == ["push_quartic", "float32", "64", "8"]

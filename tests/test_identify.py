@@ -152,6 +152,20 @@ def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     assert abs(share - 0.99) < 4 * np.sqrt(0.99 * 0.01 / 2000)
 
 
+def test_float32_where_float64_is_enabled(square, expected, hand):
+    """Of sets of noisy pushes whose minimum lies at a change of contact mode, or where rounding hides any descent."""
+    slider, single = pj.Slider(square, expected), lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
+    for seed in (1, 6):
+        rng = np.random.default_rng(seed)
+        starts, paths = planned(rng, 40)
+        ends = pushed(slider, hand, MU, jnp.asarray(starts), jnp.asarray(paths))
+        noisy = np.asarray(ends) + rng.normal(size=(40, 3)) * [2e-4, 2e-4, 5e-3]
+        found = pj.identify(single(pj.Pushes(starts, paths, noisy)), single(slider), single(hand))
+        assert found.friction.dtype == jnp.float32
+        assert int(found.status) == pj.Status.MOVING
+        assert abs(float(found.friction) - MU) < 0.005
+
+
 def test_conditions_share_the_calibration(square, hand):
     """Two sliders on two tables, one robot that goes farther than it says with a finger that is thinner."""
     rng = np.random.default_rng(5)

@@ -288,12 +288,12 @@ def test_derivatives_of_a_divided_step():
             0.065,
             [(-8.0375e-4, -5.0178e-4, 0.01843504), (2.2443e-3, 3.7954e-4, 0.0471798)],
             (0.07139, 0.07072),
-            4,
+            pj.Status.GRASPED,
         ),
-        ("comb", 0.07, [(-0.01244619, -0.00076171, -0.2869193)], (0.11646,), 0),
+        ("comb", 0.07, [(-0.01244619, -0.00076171, -0.2869193)], (0.11646,), pj.Status.MOVING),
     ],
 )
-def test_a_step_whose_parts_go_past_a_jam_is_begun_anew(shape, opening, poses, friction, status):
+def test_parts_of_a_step_that_come_near_a_jam(shape, opening, poses, friction, status):
     """Squeezed, the slider turns the faster the nearer it comes to where it jams or slips out."""
     outline, hand, end = survey.shape_of(shape), survey.hand_of("two"), opening - 0.005
     slider = pj.Slider(outline, survey.surface_of(outline, jax.random.key(0)))

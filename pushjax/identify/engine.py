@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from pushjax._checks import Numeric, as_float, common_dtype, finite, instance, non_negative, positive, shaped
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.hands import Hand, RoundFinger
 from pushjax.identify.fit import ROUNDS, Effort, Fit, Held, fit, whitened
 from pushjax.identify.identified import Identified
@@ -91,12 +91,12 @@ def identify(
     origin = jnp.einsum("cn,cni->i", several.weight, several.start[..., :2]) / total
     prior = _prior(unknowns, surface, mu, origin)
     setup = Setup(slider.shape, hand, surface, prior, metric, touching)
-    start = prior.start
     pairs = several.wrench.shape[-2] > 0
     known = jnp.array([sigma is not None, not pairs, not touching])
     sigmas = jnp.stack([first, *(jnp.asarray(value, dtype) for value in (DIRECTION, GAP))])
     effort = Effort.of(dtype, 1 if sigma is not None and not (pairs or touching) else ROUNDS)
-    found = program(setup, several, start, jnp.asarray(True), sigmas, known, Held.none(start), effort, robust=robust)
+    start = _best_start(setup, several, sigmas, robust=robust)
+    found = program(setup, several, start, sigmas, known, Held.none(start), effort, robust=robust)
     status = jnp.where(found.converged, Status.MOVING, Status.NOT_CONVERGED).astype(jnp.int8)
     last = 3 * len(several.rows)
     residual = found.residual[..., last - 3 : last] * len(several.rows) ** 0.5
@@ -121,19 +121,19 @@ def identify(
     )
 
 
-_prior = compiled(Prior.of)
+_prior = quickly_compiled(Prior.of)
 
 
-@compiled
+@quickly_compiled
 def program(
-    setup: Setup, pushes: Pushes, start, fresh, sigma, known, held: Held, effort: Effort, *, robust: float | None
+    setup: Setup, pushes: Pushes, start, sigma, known, held: Held, effort: Effort, *, robust: float | None
 ) -> Fit:
-    """One compiled program for everything that is fitted. fresh: look for a better start than `start`."""
-    start = jax.lax.cond(fresh, lambda: _best_start(setup, pushes, sigma, robust), lambda: start)
+    """One compiled program for everything that is fitted."""
     return fit(setup, pushes, start, sigma, robust, known, held, effort)
 
 
-def _best_start(setup: Setup, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
+@quickly_compiled
+def _best_start(setup: Setup, pushes: Pushes, sigma: Array, *, robust: float | None) -> Array:
     """Everything else at its mean, the friction with which that explains most: of each condition, or of all."""
     z, layout = setup.prior.start, setup.prior.layout
     if "friction" not in layout.names:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy.stats import norm
 
-from pushjax._programs import compiled
+from pushjax._programs import quickly_compiled
 from pushjax.hands import Hand
 from pushjax.identify.model import Body, moved, smaller, trajectories
 from pushjax.identify.pushes import Pushes
@@ -174,7 +174,7 @@ class Identified(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[0], several) if self.single else several
 
 
-_trajectories = compiled(trajectories)
+_trajectories = quickly_compiled(trajectories)
 
 
 def surfaces(prior: Prior, theta: Physical) -> LimitSurface:

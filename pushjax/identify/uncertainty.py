@@ -68,8 +68,8 @@ def profile(
         z, last = z + (apart[k] - last) * along, apart[k]
         held = Held(jnp.arange(len(z)) == index, z)
         effort = Effort.of(z.dtype, 1, ENOUGH)
-        again, known = jnp.asarray(False), jnp.array([True, True, True])
-        fitted = program(setup, several, z, again, _sigma(found), known, held, effort, robust=found.robust)
+        known = jnp.array([True, True, True])
+        fitted = program(setup, several, z, _sigma(found), known, held, effort, robust=found.robust)
         z, loss[k] = fitted.z, float(fitted.loss)
         values[k] = _value(found, fitted.z, label)
     rise = (loss - loss.min()) / 2

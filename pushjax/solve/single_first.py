@@ -32,8 +32,8 @@ CLEAR = 4
 Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
 
 
-# `jit`, here and below: a loop's body is traced and batched again until it is known what in it is batched, but what is
-# under `jit` only once for each answer. The compiler writes it out.
+# `jit`, here and below, saves tracing: a loop traces and batches its body again until it is known what in it is
+# batched, and a `jit` in the body remembers what came of it. The compiler inlines it.
 @jax.jit
 def single_first(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array, ""], ...]) -> SeveralMotion:
     """The motion of a slider under two or more contacts; its derivatives are those of the solution."""
@@ -98,8 +98,8 @@ def _alone(problem: Problem) -> tuple[Bool[Array, ""], SeveralMotion]:
         still &= its <= 0
         known &= contact.friction >= 0
     enough = settle(known & ((clear & (one.status == Status.MOVING)) | still), form.length)
-    nothing = jnp.zeros_like(most)
-    force = tuple(select(own, one.force, Vec2(nothing, nothing)) for own in mine)
+    zero = jnp.zeros_like(most)
+    force = tuple(select(own, one.force, Vec2(zero, zero)) for own in mine)
     mode = tuple(jnp.where(own, one.mode, ContactMode.SEPARATED).astype(jnp.int8) for own in mine)
     motion = SeveralMotion(one.twist, one.wrench, force, mode, one.status, jnp.full_like(most, jnp.inf), one.unique)
     return enough, motion
