@@ -239,7 +239,7 @@ def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
         if status[i] == pj.Status.GRASPED and max(away) > 1.01 * reach:
             found.append((int(i), f"a finger is {1e3 * max(away):.3f} mm away"))
         elif isinstance(survey.shape, pj.Polygon):
-            mu = 1.01 * float(survey.friction[i])
+            mu = float(survey.friction[i])
             if not _jams(body, fingers, _turned(step, pose), mu, reach) and not _jams_later(survey, body, i, at, reach):
                 found.append((int(i), "nothing holds it"))
     return found
