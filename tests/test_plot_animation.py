@@ -171,6 +171,21 @@ def test_nothing_leaves_the_range_or_is_cut_off(block, finger, push):
     assert len({picture.size for picture in pictures}) == 1
 
 
+def test_one_push_in_a_flat_panel_has_its_legend_and_words_whole(block, finger, push):
+    away = np.linspace(0, 0.12, 8)[:, None] * np.array([1.0, 0.0, 0.0])
+    moving = plot.animate(block, finger, push, measured={"": away})
+    figure = moving.figure
+    (axes,) = figure.axes
+    assert np.ptp(axes.get_xlim()) > 2 * np.ptp(axes.get_ylim())
+    moving.pictures()
+    boxes = [part.get_window_extent() for part in (*figure.legends, *axes.texts, axes.xaxis.label)]
+    for box in boxes:
+        assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1
+        assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1
+    for one, other in pairwise(boxes):
+        assert not one.overlaps(other)
+
+
 def test_a_recording_beside_its_simulation(block, finger, push):
     """Both go from their start to their end, whatever the number of points; a recording has no forces and no words."""
     real = recorded(points=8)

@@ -23,6 +23,7 @@ from pushjax.shapes import Shape
 LONGEST = 0.4  # of the slider's size, the arrow of the largest force
 WEAKEST = 1e-3  # of the largest: a force that is not drawn
 WIDE, AROUND = 3.8, 1.2  # in, a panel, and what is above and below it
+NARROW = 0.2  # in: the legend below one panel alone has one more row
 RIM = 0.04  # of what is shown, the empty rim around it
 
 
@@ -66,7 +67,7 @@ def animate(
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         _whole(figure, all_axes, tracks)
-        _legend(figure, all_axes, bool(over), largest)
+        _legend(figure, all_axes[0], bool(over), largest)
 
     def draw(frame: int) -> None:
         for panel in panels:
@@ -193,8 +194,9 @@ def _whole(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:
     parts += [track.measured for track in tracks if track.measured is not None]
     _range(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
-    figure.set_layout_engine("compressed", h_pad=0.12)
-    figure.set_size_inches(WIDE * len(all_axes) + 0.5, float(np.clip(WIDE * high / wide, 1.5, 5.5)) + AROUND)
+    figure.set_layout_engine("compressed", h_pad=0.06)
+    around = AROUND + (NARROW if len(all_axes) == 1 else 0.0)
+    figure.set_size_inches(WIDE * len(all_axes) + 0.5, float(np.clip(WIDE * high / wide, 1.5, 5.5)) + around)
 
 
 def _range(axes: Axes, points: list[np.ndarray]) -> None:
@@ -203,10 +205,9 @@ def _range(axes: Axes, points: list[np.ndarray]) -> None:
     axes.set(xlim=(low[0] - rim, high[0] + rim), ylim=(low[1] - rim, high[1] + rim))
 
 
-def _legend(figure: Figure, all_axes: list[Axes], measured: bool, largest: float) -> None:
-    axes = all_axes[0]
+def _legend(figure: Figure, axes: Axes, measured: bool, largest: float) -> None:
     if largest > 0:
         axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest:.2g} N")
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
     shown = {label: handle for label, handle in handles.items() if measured or label != "measured"}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(all_axes) == 1 else 3)
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(figure.axes) == 1 else 3)
