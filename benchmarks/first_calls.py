@@ -1,23 +1,46 @@
-"""What a first call takes: a rollout, its gradient, a grasp by two fingers and by a parallel jaw (four contacts).
+"""What a first call takes.
 
     python benchmarks/first_calls.py [CASE …] [--rounds 3] [--batch 2000] [--x64] [--option NAME=VALUE …]
 
+Programs: pushes of a square, their gradient, pushes of a T, grasps by two fingers and by a parallel jaw (four
+contacts). Sessions, timed from after the import to the end: the README's example, 1000 random pushes of an L, and the
+whole command `pushjax identify` on the log of "Getting started".
+
 Each call is in a process of its own, without a cache of compiled programs, the cases in turns. Prints the seconds of
-tracing, lowering and compiling, the kernels and instructions of the compiled program, and the median of nine runs after
-the first; then the medians of all rounds. `--option` is one of XLA's, as in `jax.jit(compiler_options=...)`. Leave the
-machine alone meanwhile: compiling uses all cores.
+tracing, lowering and compiling, the equations traced, the kernels and instructions of the compiled program, the memory
+maps that it added to the process (Linux allows 65 530), and the median of nine runs after the first; then the medians
+of all rounds. `--option` is one of XLA's, as in `jax.jit(compiler_options=...)`. Leave the machine alone meanwhile:
+compiling uses all cores.
 """
 
 import argparse
+import os
 import re
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 from statistics import median
-from time import perf_counter
+from time import perf_counter, process_time
 
-STEPS, RUNS = 8, 9
-CASES = ("push", "gradient", "two_fingers", "jaw")
-COLUMNS = ("trace_s", "lower_s", "compile_s", "first_call_s", "kernels", "instructions", "run_ms")
+STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000
+PROGRAMS = ("push", "gradient", "t", "two_fingers", "jaw")
+SESSIONS = ("example", "random_l", "identify")
+CASES = PROGRAMS + SESSIONS
+COLUMNS = (
+    "trace_s",
+    "lower_s",
+    "compile_s",
+    "first_call_s",
+    "processor_s",
+    "equations",
+    "kernels",
+    "instructions",
+    "maps",
+    "run_ms",
+)
+LAYOUT = "{:>12}" + " {:>12}" * len(COLUMNS)
+DOCS = Path(__file__).resolve().parent.parent
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES), default=CASES)
@@ -38,29 +61,67 @@ def main() -> None:
     from _measure import header
 
     print(header())
-    row = "{:>12}" + " {:>12}" * len(COLUMNS)
-    print(row.format("", *COLUMNS))
+    print(LAYOUT.format("", *COLUMNS))
     found = {case: [] for case in arguments.cases}
     for _ in range(arguments.rounds):
         for case in arguments.cases:
             found[case].append(in_process_of_its_own(case))
-            print(row.format(case, *(f"{x:g}" for x in found[case][-1])), flush=True)
+            print(LAYOUT.format(case, *(f"{x:g}" for x in found[case][-1])), flush=True)
     print("medians")
     for case, rows in found.items():
-        print(row.format(case, *(f"{median(column):g}" for column in zip(*rows, strict=True))))
+        print(LAYOUT.format(case, *(f"{median(column):g}" for column in zip(*rows, strict=True))))
 
 
 def in_process_of_its_own(case: str) -> list[float]:
     given = [f"--option={option}" for option in arguments.option] + ["--x64"] * arguments.x64
     command = [sys.executable, __file__, case, "--alone", "--batch", str(arguments.batch), *given]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    with tempfile.TemporaryDirectory() as folder:
+        if case == "identify":  # its log is not part of what is timed
+            _checked([sys.executable, "-c", log_script()], folder)
+            command = [sys.executable, "-m", "pushjax.cli", *identify_arguments(), "--no-cache"]
+            begin = perf_counter()
+            processor = _checked(command, folder)[1]
+            return session(perf_counter() - begin, processor)
+        return [float(word) for word in _checked(command, folder)[0].split()]
+
+
+def _checked(command: list[str], folder: str) -> tuple[str, float]:
+    """What the command prints, and the processor seconds it took."""
+    before = os.times()
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    after = os.times()
     if done.returncode:
         raise SystemExit(done.stderr)
-    return [float(word) for word in done.stdout.split()]
+    used = after.children_user + after.children_system - before.children_user - before.children_system
+    return done.stdout, used
+
+
+def session(seconds: float, processor: float) -> list[float]:
+    """`COLUMNS`, of which only the times of a whole session are known."""
+    known = {"first_call_s": round(seconds, 2), "processor_s": round(processor, 2)}
+    return [known.get(column, float("nan")) for column in COLUMNS]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """The code of that language on a page of the documentation."""
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+
+
+def log_script() -> str:
+    """The code of "Getting started" up to the one that writes the log of pushes."""
+    code = blocks("docs/getting-started.md", "python")
+    return "\n".join(code[: next(k for k, block in enumerate(code) if "pushes.csv" in block) + 1])
+
+
+def identify_arguments() -> list[str]:
+    (command,) = [line for line in blocks("docs/getting-started.md", "sh") if line.startswith("pushjax identify")]
+    return command.split()[1:]
 
 
 def measured(case: str) -> list[float]:
     """`COLUMNS` of one case."""
+    if case in SESSIONS:
+        return in_session(case)
     import jax
 
     from pushjax.bench.traffic import traffic
@@ -72,6 +133,7 @@ def measured(case: str) -> list[float]:
     options = dict(option.split("=", 1) for option in arguments.option)
     program = jax.jit(function, compiler_options=options)
 
+    maps, busy = memory_maps(), process_time()
     begin = perf_counter()
     traced = program.trace(*args)
     then = perf_counter()
@@ -81,6 +143,7 @@ def measured(case: str) -> list[float]:
     end = perf_counter()
     jax.block_until_ready(compiled(*args))
     first = perf_counter() - begin
+    busy, maps = process_time() - busy, memory_maps() - maps
 
     text = compiled.as_text() or ""
     instructions = len(re.findall(r"^ +(?:ROOT )?%?[\w.-]+ = ", text, re.MULTILINE))
@@ -89,8 +152,45 @@ def measured(case: str) -> list[float]:
         begin_run = perf_counter()
         jax.block_until_ready(compiled(*args))
         runs.append(1e3 * (perf_counter() - begin_run))
-    seconds = [round(x, 2) for x in (then - begin, later - then, end - later, first)]
-    return [*seconds, traffic(text).kernels, instructions, round(median(runs), 2)]
+    seconds = [round(x, 2) for x in (then - begin, later - then, end - later, first, busy)]
+    counts = [equations(traced.jaxpr.jaxpr), traffic(text).kernels, instructions, maps]
+    return [*seconds, *counts, round(median(runs), 2)]
+
+
+def memory_maps() -> int:
+    """Of this process; zero where the system does not list them."""
+    listed = Path("/proc/self/maps")
+    return len(listed.read_text().splitlines()) if listed.exists() else 0
+
+
+def equations(jaxpr) -> int:
+    """Of a traced program, with those of its loops and inner calls."""
+    from jax.extend.core import jaxprs_in_params
+
+    return sum(1 + sum(map(equations, jaxprs_in_params(each.params))) for each in jaxpr.eqns)
+
+
+def in_session(case: str) -> list[float]:
+    import jax
+    import jax.numpy as jnp
+
+    import pushjax as pj
+
+    jax.config.update("jax_enable_x64", arguments.x64)
+    jax.config.update("jax_enable_compilation_cache", False)
+    begin, busy = perf_counter(), process_time()
+    if case == "example":
+        exec(blocks("README.md", "python")[0], {})
+    else:
+        corners = [(-0.05, -0.05), (0.05, -0.05), (0.05, 0.0), (0.0, 0.0), (0.0, 0.05), (-0.05, 0.05)]
+        shape = pj.Polygon(corners)
+        pairs = pj.Support.uniform(shape, points=64).wrench_twist_pairs(jax.random.key(0), 400)
+        slider = pj.Slider(shape, pj.fit_limit_surface(*pairs, degree=4))
+        path = pj.line((-0.06, 0.0), (-0.02, 0.01), 40)
+        model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
+        hand, key = pj.Hand.finger(0.005), jax.random.key(1)
+        pj.monte_carlo(key, RANDOM_PUSHES, slider, hand, path, pose=jnp.zeros(3), model=model).summary()
+    return session(perf_counter() - begin, process_time() - busy)
 
 
 def work(case: str, dtype: str) -> tuple:
@@ -103,6 +203,9 @@ def work(case: str, dtype: str) -> tuple:
 
     if case in ("push", "gradient"):
         one, args = cases.each_push("quartic", dtype, arguments.batch, STEPS)
+    elif case == "t":
+        one, (_, path, friction) = cases.each_push("quartic", dtype, arguments.batch, STEPS)
+        one, args = push_of_t(dtype), (path, friction)
     else:
         hand = grasps.hand(dtype) if case == "two_fingers" else tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype)
         one, args = cases.each_grasp(hand, dtype, arguments.batch, STEPS)
@@ -110,6 +213,21 @@ def work(case: str, dtype: str) -> tuple:
     if case == "gradient":
         return jax.grad(lambda *args: jnp.sum(final(*args)), argnums=(0, 1, 2)), args
     return final, args
+
+
+def push_of_t(dtype: str):
+    """What makes a push of a T as large as the square, against the bar."""
+    import numpy as np
+
+    import pushjax as pj
+    from pushjax.bench import tasks
+
+    bar, stem = -tasks.SIDE / 4, tasks.SIDE / 8
+    upper = [(tasks.SIDE / 2, stem), (bar, stem), (bar, tasks.SIDE / 2), (-tasks.SIDE / 2, tasks.SIDE / 2)]
+    shape = pj.Polygon(np.array(upper + [(x, -y) for x, y in reversed(upper)]))
+    task = tasks.task("quartic", dtype)
+    task = task._replace(slider=pj.Slider(tasks.cast(shape, dtype), task.slider.surface))
+    return lambda path, friction: task.push(path, friction)
 
 
 if __name__ == "__main__":
