@@ -1,4 +1,4 @@
-"""Random pushes and grasps, and how their derivatives are compared with differences."""
+"""Random pushes and grasps, and the comparison of their derivatives with central differences."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,11 +10,14 @@ import numpy as np
 import pushjax as pj
 
 RADIUS, LENGTH = 0.005, 0.035
+# Half-width of the central differences, that of the finer ones, and the error above which these are used too.
 H, FINE, TOLERANCE = 1e-5, 1e-7, 1e-5
-EDGE = 1e-9  # sine between a normal and an edge's, below which the edge is touched
+# A contact is on an edge if the sine of the angle between the contact's normal and the edge's normal is below this.
+EDGE = 1e-9
 
 
 def fitted(block: pj.Polygon, dtype: Any) -> pj.Quartic:
+    """Return the quartic of uniform pressure on 64 points of `block`, with `LENGTH` as its length."""
     points = pj.Support.uniform(block, points=64)
     pairs = points.wrench_twist_pairs(jax.random.key(0), 400)
     surface: Any = pj.fit_limit_surface(pairs.wrench, pairs.twist, length=LENGTH)
@@ -22,10 +25,17 @@ def fitted(block: pj.Polygon, dtype: Any) -> pj.Quartic:
 
 
 class Case(NamedTuple):
-    """Random pushes. end: from numbers of order one (inputs,) to the final pose, angles and lengths of order one, and
-    whatever must be the same for two of them to be pushes of one kind. inputs: (pushes, inputs). along: named
-    directions in which they are differentiated. size: of a batch. The kind begins with the
-    status of each of the steps."""
+    """Random pushes or grasps to differentiate.
+
+    Attributes:
+        end: Function from the inputs of one push, (inputs,), to the final pose, (3,), and the kind of the push. Inputs
+            and pose are scaled to numbers of order one. The kind is an array of whatever must be equal for two pushes
+            to be compared; it begins with the status of each step.
+        inputs: Inputs of all pushes, (pushes, inputs).
+        along: Directions in which the pushes are differentiated, by name, (inputs,) each.
+        size: Number of pushes in a batch.
+        steps: Number of steps of each push.
+    """
 
     end: Callable
     inputs: np.ndarray
@@ -35,7 +45,15 @@ class Case(NamedTuple):
 
 
 def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
-    """Of every second push the mean, of the others drawn around it; in units of the largest coefficient."""
+    """Return the surfaces of `n` pushes: every second one is the mean, the others are drawn around it.
+
+    Args:
+        mean: Mean of the surfaces.
+        n: Number of pushes.
+
+    Returns:
+        Coefficients, (n, 15), in units of the mean's largest coefficient.
+    """
     model = pj.FrictionModel(dof=20.0, friction=0.3)
     drawn: Any = jax.jit(jax.vmap(model.around(mean).sample))(jax.random.split(jax.random.key(3), n)).surface
     each = np.where(np.arange(n)[:, None] % 2, drawn.coefficients, mean.coefficients)
@@ -43,7 +61,16 @@ def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
 
 
 def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[str, np.ndarray]:
-    """Each of the first inputs by itself; two random ones within each of `drawn`."""
+    """Return the directions in which pushes are differentiated.
+
+    Args:
+        names: Names of the first inputs. Each of these inputs is a direction.
+        width: Number of inputs.
+        drawn: Groups of inputs by name. Two random directions are drawn within each group.
+
+    Returns:
+        The directions by name, (width,) each.
+    """
     rng, found = np.random.default_rng(4), dict(zip(names, np.eye(width), strict=False))
     for name, where in drawn.items():
         for k in (1, 2):
@@ -53,7 +80,14 @@ def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[st
 
 
 def one_finger(n: int, steps: int = 60) -> Case:
-    """A pentagon each, pushed 60 mm from anywhere towards anywhere inside it; some slip off, some miss."""
+    """Return pushes of random pentagons by one finger: 60 mm, from any side towards any place in the pentagon.
+
+    Some fingers slip off, some miss.
+
+    Args:
+        n: Number of pushes.
+        steps: Number of steps of each push.
+    """
     rng, mean = np.random.default_rng(2), fitted(pj.Polygon.rectangle(0.09, 0.09), float)
     scale, hand_names = float(jnp.max(mean.coefficients)), ["start x", "start y", "direction", "travel"]
 
@@ -82,12 +116,23 @@ def one_finger(n: int, steps: int = 60) -> Case:
 
 
 def scaled(run: pj.Trajectory) -> jax.Array:
+    """Return the final pose, (3,), with positions in units of `LENGTH`."""
     return run.pose[-1] / jnp.array([LENGTH, LENGTH, 1.0], run.pose.dtype)
 
 
 def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
-    """2 k at edge k, 2 k + 1 at the corner after it, -1 at none: told from the normal, which turns the contact's force
-    (normal, tangential) into the wrench's."""
+    """Return the edge or vertex that is touched in each step.
+
+    It is found from the direction of the contact's normal, by the rotation between the contact's force (normal,
+    tangential) and the force of the wrench.
+
+    Args:
+        run: A push by one finger.
+        vertices: Vertices of the slider, (vertices, 2), m.
+
+    Returns:
+        Numbers, (steps,): 2 k for edge k, 2 k + 1 for the vertex after it, -1 for no contact.
+    """
     (a, b), (x, y) = run.force[:, 0].T, run.wrench[:, :2].T
     outward = -jnp.stack([x * a + y * b, y * a - x * b], axis=-1)
     outward = outward / jnp.maximum(jnp.linalg.norm(outward, axis=-1, keepdims=True), 1e-300)
@@ -102,7 +147,15 @@ def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
 
 
 def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray], size: int) -> Case:
-    """Pushed or grasped by two fingers. given: friction (2), pose (3), first and last configuration (4)."""
+    """Return pushes or grasps of `block` by a hand of two fingers.
+
+    Args:
+        hand: The hand.
+        block: Outline of the slider.
+        steps: Number of steps.
+        given: Friction (n, 2), start pose (n, 3), first and last configuration (n, 4).
+        size: Number of pushes in a batch.
+    """
     mean = fitted(block, float)
     scale, unit = float(jnp.max(mean.coefficients)), np.array([LENGTH, LENGTH, 1.0, LENGTH])
 
@@ -121,7 +174,7 @@ def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray
 
 
 def two_fingers(n: int) -> Case:
-    """A square pushed 50 mm by two fingers that turn and close or open on the way."""
+    """Return `n` pushes of a square, 50 mm, by two fingers that turn and close or open on the way."""
     rng, zero = np.random.default_rng(5), np.zeros(n)
     pose = np.stack([np.full(n, 0.072), rng.uniform(-0.02, 0.02, n), rng.uniform(-3, 3, n)], axis=-1)
     first = np.stack([zero, zero, zero, rng.uniform(0.02, 0.06, n)], axis=-1)
@@ -131,7 +184,12 @@ def two_fingers(n: int) -> Case:
 
 
 def grasps(jaw: bool, n: int) -> Case:
-    """A 50 x 35 mm rectangle between two fingers, or the pads of a jaw, that close and shift until they hold it."""
+    """Return `n` grasps of a 50 x 35 mm rectangle by two fingers, or by a jaw, that close and shift until they hold it.
+
+    Args:
+        jaw: Whether the hand is a parallel jaw with two pads instead of two round fingers.
+        n: Number of grasps.
+    """
     rng, zero = np.random.default_rng(6), np.zeros(n)
     pose = np.stack([*rng.uniform(-0.005, 0.005, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
     hand = pj.Hand.parallel_jaw(0.027, 0.01) if jaw else pj.Hand.two_fingers(RADIUS)
@@ -146,7 +204,7 @@ def grasps(jaw: bool, n: int) -> Case:
 
 
 class Batched:
-    """A program of so many rows at a time, compiled once."""
+    """A function of rows, compiled once for batches of `size` rows and called with any number of them."""
 
     def __init__(self, function: Callable, size: int):
         self.program, self.size = jax.jit(jax.vmap(function)), size
@@ -161,8 +219,16 @@ class Batched:
 
 
 class Compared(NamedTuple):
-    """Of every push and direction: whether the two sides are pushes of one kind, the error where they are (else zero),
-    and against finer differences where that was large. finite, status: of every push."""
+    """The result of `compare`.
+
+    Attributes:
+        same: Whether the pushes on both sides are of the same kind as the push itself, (pushes, directions).
+        error: Relative error against extrapolated differences where `same`, else zero, (pushes, directions).
+        fine: Relative error against differences of width FINE where `error` exceeds TOLERANCE, else zero, (pushes,
+            directions).
+        finite: Whether all derivatives are finite, (pushes,).
+        status: Status of each step, (pushes, steps).
+    """
 
     same: np.ndarray
     error: np.ndarray
@@ -172,6 +238,7 @@ class Compared(NamedTuple):
 
 
 def compare(case: Case) -> Compared:
+    """Compare derivatives in reverse mode with central differences, for each push and direction."""
     ends = Batched(case.end, case.size)
     backs = Batched(lambda x, weight: jax.vjp(case.end, x, has_aux=True)[1](weight)[0], case.size)
     x, along = case.inputs, np.stack(list(case.along.values()))

@@ -1,4 +1,4 @@
-"""Timing for the scripts, as `pushjax.bench.measure` does it; and a line on the machine."""
+"""Timing of functions for the scripts, on top of `benchmarks.timing`, and a line on the machine."""
 
 import os
 import platform
@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 
-from pushjax.bench import measure
+from benchmarks import timing
 
 
 def header() -> str:
-    """One line on the machine and the versions, to print above any figure."""
+    """Return one line on the machine and the versions, to print above any figure."""
     cpu = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo") as info:
@@ -24,16 +24,24 @@ def header() -> str:
 
 
 def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
-    """The jitted function, compiled for `args`, and the seconds that tracing and compiling took."""
-    program = measure.compiled(function, *args)
+    """Return the jitted function, compiled for `args`, and the seconds that tracing and compiling took."""
+    program = timing.compiled(function, *args)
     return program.call, program.compile_s
 
 
-def alternate(programs: dict[str, tuple[Callable, tuple]], repeats: int = measure.REPEATS) -> dict[str, float]:
-    """Median run time in s of each program, run in turn (`measure.alternate`)."""
+def alternate(programs: dict[str, tuple[Callable, tuple]], repeats: int = timing.REPEATS) -> dict[str, float]:
+    """Return the median run time of each program, with the programs run in turns (`timing.alternate`).
+
+    Args:
+        programs: Programs by name, each with its arguments.
+        repeats: Number of turns.
+
+    Returns:
+        Median times by name, in s.
+    """
 
     def run(program: Callable, args: tuple) -> Callable[[], Any]:
         return lambda: jax.block_until_ready(program(*args))
 
-    timings = measure.alternate({name: run(*each) for name, each in programs.items()}, repeats)
+    timings = timing.alternate({name: run(*each) for name, each in programs.items()}, repeats)
     return {name: timing.median for name, timing in timings.items()}

@@ -1,27 +1,39 @@
-"""Error of a push against its step, and the deepest penetration, over a fan of pushes of a square.
+"""Error and penetration depth of pushes as functions of the step.
 
-    python benchmarks/accuracy.py
+    python -m benchmarks accuracy
 
-221 pushes of 50 mm: every 5 mm across a side of a 90 mm square, every 10 degrees up to 60 from its normal, mu 0.25;
-some slide off a corner. float64; the reference has 6400 steps.
+A 90 mm square is pushed 221 times by 50 mm. The pushes start every 5 mm across a side and go every 10 degrees up to 60
+degrees from its normal; mu is 0.25. Some slide off a corner. All is computed in float64; the reference has 6400 steps.
 """
+
+import argparse
 
 import jax
 
+argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
 jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-from _measure import header  # noqa: E402
 
 import pushjax as pj  # noqa: E402
-from pushjax import se2  # noqa: E402
+from benchmarks._measure import header  # noqa: E402
+from pushjax.geometry import se2  # noqa: E402
 
 LENGTH, FRICTION, GAP, REFERENCE = 0.05, 0.25, 0.0005, 6400
 
 
 def fan(slider: pj.Slider, radius: float, steps: int) -> tuple[np.ndarray, float]:
-    """Final poses (pushes, 3), and the deepest penetration in m at the end of any step."""
+    """Simulate the fan of pushes.
+
+    Args:
+        slider: The square.
+        radius: Radius of the finger, m.
+        steps: Number of steps of each push.
+
+    Returns:
+        The final poses, (pushes, 3), and the largest penetration depth at the end of any step, m.
+    """
     offsets, angles = np.meshgrid(np.linspace(-0.04, 0.04, 17), np.radians(np.linspace(-60, 60, 13)))
 
     def one(offset, angle):

@@ -1,8 +1,9 @@
-"""One contact: the scalar root against the Hessian iteration, on the random problems of `pushjax.problems`.
+"""Time and agreement of the two solvers of a single contact.
 
-    python benchmarks/contact.py [--problems 100000] [--x64]
+    python -m benchmarks contact [--problems 100000] [--x64]
 
-Prints time per problem, rounds, and whether the two agree on the mode of every problem.
+`ScalarRoot` and `HessianIteration` solve the random problems of `pushjax.testing.problems`. Prints the time per
+problem, the iterations of `HessianIteration`, and the number of problems in which the two differ in the mode.
 """
 
 import argparse
@@ -18,15 +19,17 @@ if arguments.x64:
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-from _measure import alternate, compiled, header  # noqa: E402
 
 import pushjax as pj  # noqa: E402
-from pushjax._vec import Vec2  # noqa: E402
-from pushjax.problems import ContactProblem, random_contact_problem  # noqa: E402
-from pushjax.solve import Contact, LimitCurve, solve_single  # noqa: E402
+from benchmarks._measure import alternate, compiled, header  # noqa: E402
+from pushjax._math.vec import Vec2  # noqa: E402
+from pushjax.contact.contact_plane import Contact, LimitCurve  # noqa: E402
+from pushjax.contact.single import solve_single  # noqa: E402
+from pushjax.testing.problems import ContactProblem, random_contact_problem  # noqa: E402
 
 
 def contact_of(problem: ContactProblem) -> Contact:
+    """Return the contact of `problem`, without a gap, as the solvers of one contact take it."""
     point, normal, displacement = (Vec2.of(v) for v in (problem.point, problem.normal, problem.displacement))
     return Contact(point, normal, displacement, problem.friction, jnp.zeros_like(problem.friction))
 

@@ -1,17 +1,19 @@
-"""Derivatives of pushes: what they cost, whether they are those of differences, and where there are none.
+"""Cost of the derivatives of pushes and their agreement with finite differences.
 
-    python benchmarks/derivatives.py [PART ...] [--quick] [--json FILE] [--picture FILE]
+    python -m benchmarks derivatives [PART ...] [--quick] [--json FILE] [--picture FILE]
 
-cost       reverse and forward mode beside the push alone: 200 steps, float32; all in turn in one run
-memory     what reverse mode stores (the compiler's own count), and ways of storing less
-agreement  float64, against central differences, of random pushes: relative error |derivative - difference| /
-           max(1, |difference|), lengths in units of the surface's. Differences of two widths, H and H / 4, are
-           extrapolated, so that neither cutting off (1e-20 of a fifth derivative) nor rounding (1e-10) matters. Judged
-           is where modes, status and, of one finger, the edge or corner touched are the same at every step on both
-           sides; where the error is large anyway it is looked at again with differences of FINE.
-grasps     the same of random grasps
-random     d E[f] by dof and by the range of friction through `random_rollout`, against differences of means
-picture    final angle and derivative along three lines: friction, where a push starts, how a jaw finds it
+cost       Time of reverse and forward mode beside the push alone: 200 steps, float32, timed in turns in one run.
+memory     Memory that reverse mode needs, as counted by the compiler, and ways to need less.
+agreement  Relative error |derivative - difference| / max(1, |difference|) of random pushes against central differences,
+           in float64, with lengths in units of the surface's. Differences of two widths, H and H / 4, are extrapolated,
+           so that neither the truncation error (1e-20 times the fifth derivative) nor roundoff (1e-10) matters.
+           A push is compared where the modes, the status and, for one finger, the touched edge or vertex are the same
+           in every step on both sides, because elsewhere there may be no derivative. Where the error is still large, it
+           is computed once more with differences of width FINE.
+grasps     The same for random grasps.
+random     Derivatives of E[f] by `dof` and by the range of friction through `random_rollout`, against differences of
+           means.
+picture    The final angle and its derivative along three lines: friction, start of a push, start angle in a jaw.
 """
 
 import argparse
@@ -22,11 +24,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _derivative_cases import LENGTH, RADIUS, TOLERANCE, Batched, Case, compare, fitted, grasps, one_finger, two_fingers
-from _measure import alternate, compiled, header
 
 import pushjax as pj
-from pushjax.report import envelope, write_json
+from benchmarks._derivative_cases import (
+    LENGTH,
+    RADIUS,
+    TOLERANCE,
+    Batched,
+    Case,
+    compare,
+    fitted,
+    grasps,
+    one_finger,
+    two_fingers,
+)
+from benchmarks._measure import alternate, compiled, header
+from pushjax._internal.record import result_record, write_json
 
 PARTS = ("cost", "memory", "agreement", "grasps", "random", "picture")
 MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
@@ -36,17 +49,31 @@ MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
 
 
 class Timed(NamedTuple):
-    """Pushes of 200 steps in float32 and a scalar of each; what it is differentiated by has a leading axis."""
+    """Pushes in float32 and a scalar of each.
+
+    Attributes:
+        scalar: Function from the friction, start pose and coefficients of one push to a scalar.
+        inputs: The inputs by which it is differentiated, with a leading axis of the batch.
+    """
 
     scalar: Callable
     inputs: tuple
 
     def total(self, *inputs):
+        """Return the sum of the scalars of all pushes."""
         return jnp.sum(jax.vmap(self.scalar)(*inputs))
 
 
 def pushes(fingers: int, batch: int, steps: int, stretch: int | None = None) -> Timed:
-    """stretch: steps after which a pose is kept, and from which the way back is worked out anew."""
+    """Return pushes of a square by one or two fingers.
+
+    Args:
+        fingers: Number of fingers, 1 or 2.
+        batch: Number of pushes.
+        steps: Number of steps of each push.
+        stretch: Number of steps between two poses that are stored; reverse mode recomputes the steps between them.
+            Default: reverse mode stores what it needs of every step.
+    """
     block, key = pj.Polygon.rectangle(0.09, 0.09), jax.random.key(1)
     mean = fitted(block, jnp.float32)
     one, two = jnp.array([-0.06, 0.01]), jnp.array([-0.06, 0.01, 0.0, 0.05])
@@ -73,6 +100,7 @@ def pushes(fingers: int, batch: int, steps: int, stretch: int | None = None) -> 
 
 
 def cost(quick: bool) -> list[dict[str, Any]]:
+    """Time the push, its gradient and its tangent, for one and two fingers."""
     batch, rows = 50 if quick else 2000, []
     for fingers, target in ((1, 4.0), (2, 6.0)):
         timed = pushes(fingers, batch, 200)
@@ -97,11 +125,12 @@ def cost(quick: bool) -> list[dict[str, Any]]:
 
 
 def stored(program: Any) -> int:
-    """Bytes that the program needs beside what goes in and comes out, as the compiler laid it out."""
+    """Return the bytes that the compiler reserved for the program in addition to its inputs and outputs."""
     return program.memory_analysis().temp_size_in_bytes
 
 
 def memory(quick: bool) -> list[dict[str, Any]]:
+    """Measure memory and time of the gradient, as it is and with three ways to need less memory."""
     batch, rows = 50 if quick else 2000, []
     timed, stretched = pushes(1, batch, 200), pushes(1, batch, 200, stretch=20)
     again = Timed(jax.checkpoint(timed.scalar), timed.inputs)
@@ -125,16 +154,19 @@ def memory(quick: bool) -> list[dict[str, Any]]:
 
 
 def agreement(quick: bool) -> list[dict[str, Any]]:
+    """Compare the derivatives of random pushes with central differences."""
     few, many = (QUICK, QUICK) if quick else (FEW, MANY)
     return judged({"one finger, pentagons": one_finger(many), "two fingers push": two_fingers(few)})
 
 
 def grasping(quick: bool) -> list[dict[str, Any]]:
+    """Compare the derivatives of random grasps with central differences."""
     few, fewer = (QUICK, QUICK) if quick else (GRASPS, JAWS)
     return judged({"two fingers grasp": grasps(False, few), "jaw grasps": grasps(True, fewer)})
 
 
 def judged(cases: dict[str, Case]) -> list[dict[str, Any]]:
+    """Compare each case with central differences, print the errors, and return one row for each case."""
     rows = []
     for name, case in cases.items():
         found = compare(case)
@@ -164,13 +196,16 @@ def judged(cases: dict[str, Case]) -> list[dict[str, Any]]:
 
 
 def random(quick: bool) -> list[dict[str, Any]]:
-    """Of the square of the README: means of x, theta and of theta's square about 0.4 rad below zero."""
+    """Compare derivatives of three means with differences of means, for pushes of the README's square.
+
+    The means are those of x / LENGTH, theta and (theta + 0.4 rad)^2 of the final pose.
+    """
     block, hand, n, rows = pj.Polygon.rectangle(0.09, 0.09), pj.Hand.finger(RADIUS), 1000 if quick else 20_000, []
     slider, path = pj.Slider(block, fitted(block, float)), pj.line((-0.06, 0.01), (-0.01, 0.01), 50)
     names, keys = ["dof", "lowest mu", "highest mu"], jax.random.split(jax.random.key(7), n)
     raw = np.asarray(jax.random.key_data(keys))
     programs: dict[str, tuple[Batched, Batched]] = {}
-    samplers: list[tuple[Any, float]] = [("gram", 50.0), ("gram", 20.0), ("gram", 12.0), ("terms", 20.0)]
+    samplers: list[tuple[Any, float]] = [("gram", 50.0), ("gram", 20.0), ("gram", 12.0), ("sum_of_squares", 20.0)]
     for sampler, dof in samplers:
 
         def moments(given, key, sampler=sampler):
@@ -201,7 +236,7 @@ def random(quick: bool) -> list[dict[str, Any]]:
 
 
 def lines(quick: bool) -> list[tuple[str, str, Callable, np.ndarray]]:
-    """Title, axis, final angle (deg) by one number, and its values."""
+    """Return the title, the axis, the final angle (deg) as a function of one number, and the numbers of each line."""
     block, jaw = pj.Polygon.rectangle(0.09, 0.09), pj.Hand.parallel_jaw(0.027, 0.01)
     square = pj.Slider(block, fitted(block, float))
     small = pj.Slider(pj.Polygon.rectangle(0.05, 0.035), square.surface)
@@ -236,6 +271,7 @@ def lines(quick: bool) -> list[tuple[str, str, Callable, np.ndarray]]:
 
 
 def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
+    """Draw the final angle and its derivative along each of `lines`, and save the figure to the path `to`."""
     import matplotlib.pyplot as plt
 
     from pushjax import plot
@@ -247,7 +283,7 @@ def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
             value, slope = both(jnp.asarray(at))
             central = np.gradient(np.asarray(value), at)
             above.plot(at, value, ".", color=plot.START, markersize=1.5)
-            below.plot(at, central, ".", color=plot.BETWEEN, markersize=4, label="difference of neighbours")
+            below.plot(at, central, ".", color=plot.BETWEEN, markersize=4, label="difference of neighbors")
             below.plot(at, slope, ".", color=plot.ORANGE, markersize=1.5, label="jax.jvp")
             low, high = np.quantile(slope, [0.005, 0.995])
             below.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
@@ -282,7 +318,9 @@ def main() -> None:
             print(f"{part}, {'float64' if part not in ('cost', 'memory') else 'float32'}", flush=True)
             rows[part] = made[part](arguments.quick)
     if arguments.json is not None:
-        write_json(envelope("derivatives", {"quick": arguments.quick, "parts": list(rows)}, **rows), arguments.json)
+        write_json(
+            result_record("derivatives", {"quick": arguments.quick, "parts": list(rows)}, **rows), arguments.json
+        )
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""What a first call takes.
+"""Time of first calls including tracing and compiling.
 
-    python benchmarks/first_calls.py [CASE …] [--rounds 3] [--batch 2000] [--x64] [--option NAME=VALUE …]
+    python -m benchmarks first_calls [CASE …] [--rounds 3] [--batch 2000] [--x64] [--option NAME=VALUE …]
 
-Programs: pushes of a square, their gradient, pushes of a T, grasps by two fingers and by a parallel jaw (four
-contacts). Sessions, timed from after the import to the end: the README's example, 1000 random pushes of an L, and the
-whole command `pushjax identify` on the log of "Getting started".
+The programs are pushes of a square, their gradient, pushes of a T, and grasps by two fingers and by a parallel jaw
+(four contacts). The sessions are the README's example and 1000 random pushes of an L, both timed from after the import
+to the end, and the whole command `pushjax identify` on the log of "Getting started".
 
-Each call is in a process of its own, without a cache of compiled programs, the cases in turns. Prints the seconds of
-tracing, lowering and compiling, the equations traced, the kernels and instructions of the compiled program, the memory
-maps that it added to the process (Linux allows 65 530), and the median of nine runs after the first; then the medians
-of all rounds. `--option` is one of XLA's, as in `jax.jit(compiler_options=...)`. Leave the machine alone meanwhile:
-compiling uses all cores.
+Each call runs in a process of its own, without a cache of compiled programs, with the cases in turns. Prints the
+seconds of tracing, lowering and compiling, the equations traced, the kernels and instructions of the compiled program,
+the memory maps that it added to the process (Linux allows 65 530), and the median time of nine runs after the first;
+then the medians of all rounds. `--option` sets an option of XLA, as in `jax.jit(compiler_options=...)`. Run nothing
+else on the machine meanwhile, because compiling uses all cores.
 """
 
 import argparse
@@ -40,7 +40,7 @@ COLUMNS = (
     "run_ms",
 )
 LAYOUT = "{:>12}" + " {:>12}" * len(COLUMNS)
-DOCS = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parent.parent
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES), default=CASES)
@@ -58,7 +58,7 @@ def main() -> None:
     if arguments.alone:
         print(*measured(arguments.cases[0]))
         return
-    from _measure import header
+    from benchmarks._measure import header
 
     print(header())
     print(LAYOUT.format("", *COLUMNS))
@@ -73,12 +73,13 @@ def main() -> None:
 
 
 def in_process_of_its_own(case: str) -> list[float]:
+    """Return `COLUMNS` of one case, measured in a new process."""
     given = [f"--option={option}" for option in arguments.option] + ["--x64"] * arguments.x64
-    command = [sys.executable, __file__, case, "--alone", "--batch", str(arguments.batch), *given]
+    command = [sys.executable, "-m", "benchmarks.first_calls", case, "--alone", "--batch", str(arguments.batch), *given]
     with tempfile.TemporaryDirectory() as folder:
-        if case == "identify":  # its log is not part of what is timed
+        if case == "identify":  # writing its log is not timed
             _checked([sys.executable, "-c", log_script()], folder)
-            command = [sys.executable, "-m", "pushjax.cli", *identify_arguments(), "--no-cache"]
+            command = [sys.executable, "-m", "pushjax", *identify_arguments(), "--no-cache"]
             begin = perf_counter()
             processor = _checked(command, folder)[1]
             return session(perf_counter() - begin, processor)
@@ -86,9 +87,18 @@ def in_process_of_its_own(case: str) -> list[float]:
 
 
 def _checked(command: list[str], folder: str) -> tuple[str, float]:
-    """What the command prints, and the processor seconds it took."""
+    """Run a command, and stop this process with its error output if it fails.
+
+    Args:
+        command: The command.
+        folder: Folder in which it runs.
+
+    Returns:
+        What the command prints, and the processor time that it took, in s.
+    """
     before = os.times()
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     after = os.times()
     if done.returncode:
         raise SystemExit(done.stderr)
@@ -97,34 +107,40 @@ def _checked(command: list[str], folder: str) -> tuple[str, float]:
 
 
 def session(seconds: float, processor: float) -> list[float]:
-    """`COLUMNS`, of which only the times of a whole session are known."""
+    """Return `COLUMNS` of a whole session, with NaN for all but its two times.
+
+    Args:
+        seconds: Wall time, in s.
+        processor: Processor time, in s.
+    """
     known = {"first_call_s": round(seconds, 2), "processor_s": round(processor, 2)}
     return [known.get(column, float("nan")) for column in COLUMNS]
 
 
 def blocks(page: str, language: str) -> list[str]:
-    """The code of that language on a page of the documentation."""
-    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(), re.DOTALL)
+    """Return the code blocks of one language on a page of the documentation."""
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), re.DOTALL)
 
 
 def log_script() -> str:
-    """The code of "Getting started" up to the one that writes the log of pushes."""
+    """Return the code of "Getting started" up to the block that writes the log of pushes."""
     code = blocks("docs/getting-started.md", "python")
     return "\n".join(code[: next(k for k, block in enumerate(code) if "pushes.csv" in block) + 1])
 
 
 def identify_arguments() -> list[str]:
+    """Return the arguments of `pushjax identify` in "Getting started"."""
     (command,) = [line for line in blocks("docs/getting-started.md", "sh") if line.startswith("pushjax identify")]
     return command.split()[1:]
 
 
 def measured(case: str) -> list[float]:
-    """`COLUMNS` of one case."""
+    """Return `COLUMNS` of one case, measured in this process."""
     if case in SESSIONS:
         return in_session(case)
     import jax
 
-    from pushjax.bench.traffic import traffic
+    from benchmarks.hlo import traffic
 
     jax.config.update("jax_enable_x64", arguments.x64)
     jax.config.update("jax_enable_compilation_cache", False)
@@ -158,19 +174,20 @@ def measured(case: str) -> list[float]:
 
 
 def memory_maps() -> int:
-    """Of this process; zero where the system does not list them."""
+    """Return the number of memory maps of this process, or zero where the system does not list them."""
     listed = Path("/proc/self/maps")
     return len(listed.read_text().splitlines()) if listed.exists() else 0
 
 
 def equations(jaxpr) -> int:
-    """Of a traced program, with those of its loops and inner calls."""
+    """Return the number of equations of a traced program, with those of its loops and inner calls."""
     from jax.extend.core import jaxprs_in_params
 
     return sum(1 + sum(map(equations, jaxprs_in_params(each.params))) for each in jaxpr.eqns)
 
 
 def in_session(case: str) -> list[float]:
+    """Return `COLUMNS` of a session that runs in this process, timed from after the import."""
     import jax
     import jax.numpy as jnp
 
@@ -194,12 +211,17 @@ def in_session(case: str) -> list[float]:
 
 
 def work(case: str, dtype: str) -> tuple:
-    """The function of the case, and its arguments."""
+    """Return the function of a program and its arguments.
+
+    Args:
+        case: One of `PROGRAMS`.
+        dtype: Floating type.
+    """
     import jax
     import jax.numpy as jnp
 
     import pushjax as pj
-    from pushjax.bench import cases, grasps, tasks
+    from benchmarks import cases, grasps, tasks
 
     if case in ("push", "gradient"):
         one, args = cases.each_push("quartic", dtype, arguments.batch, STEPS)
@@ -216,11 +238,11 @@ def work(case: str, dtype: str) -> tuple:
 
 
 def push_of_t(dtype: str):
-    """What makes a push of a T as large as the square, against the bar."""
+    """Return the function of one push of a T, which is as large as the square, against its bar."""
     import numpy as np
 
     import pushjax as pj
-    from pushjax.bench import tasks
+    from benchmarks import tasks
 
     bar, stem = -tasks.SIDE / 4, tasks.SIDE / 8
     upper = [(tasks.SIDE / 2, stem), (bar, stem), (bar, tasks.SIDE / 2), (-tasks.SIDE / 2, tasks.SIDE / 2)]

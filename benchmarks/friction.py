@@ -1,9 +1,9 @@
-"""A million random surfaces of each sampler: is every one convex, where is their mean, what is repaired.
+"""Convexity, mean and repairs of a million random surfaces of each sampler.
 
-    python benchmarks/friction.py [--n 1000000] [--certificates 200] [--x64]
+    python -m benchmarks friction [--n 1000000] [--certificates 200] [--x64]
 
-Convexity is judged by a sweep of the Hessian that knows nothing of the sampler's certificate, in float64; of a few by a
-Gram matrix that a semi-definite program finds (needs cvxpy).
+Convexity is judged in float64 by a sweep of the Hessian that does not use the sampler's certificate. For a few surfaces
+a semi-definite program also searches for a Gram matrix that proves it (needs cvxpy).
 """
 
 import argparse
@@ -21,25 +21,37 @@ if arguments.x64:
     jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
-from _measure import header  # noqa: E402
 
 import pushjax as pj  # noqa: E402
-from pushjax.limit_surface import MONOMIALS  # noqa: E402
-from pushjax.verify.convexity import least_curvatures  # noqa: E402
+from benchmarks._measure import header  # noqa: E402
+from pushjax.friction.quartic import MONOMIALS  # noqa: E402
+from pushjax.testing.convexity import least_curvatures  # noqa: E402
 
 CHUNK = 50_000
 DOFS = (10, 20, 50, 250)
-CONVEX = -1e-8 if arguments.x64 else -3e-7  # of the largest coefficient: rounding
+# Least curvature of a surface that counts as convex, relative to its largest coefficient. It is below zero by roundoff.
+CONVEX = -1e-8 if arguments.x64 else -3e-7
 
 
 @jax.jit
 def drawn(around, keys):
+    """Return the coefficients and the shrinkage of one sample for each key."""
     sample = jax.vmap(around.sample)(keys)
-    return sample.surface.coefficients, sample.pull
+    return sample.surface.coefficients, sample.shrinkage
 
 
 def draw(model: pj.FrictionModel, surface: pj.LimitSurface, n: int):
-    """Coefficients (n, 15) and pulls (n,), float64, and the seconds they took, without compiling."""
+    """Draw random surfaces in chunks.
+
+    Args:
+        model: Distribution of the friction.
+        surface: Mean of the surfaces.
+        n: Number of samples.
+
+    Returns:
+        The coefficients, (n, 15), and the shrinkage, (n,), in float64, and the time that sampling took without
+        compiling, in s.
+    """
     around = model.around(surface)
     keys = jax.random.split(jax.random.key(1), n)
     jax.block_until_ready(drawn(around, keys[:CHUNK]))
@@ -51,7 +63,13 @@ def draw(model: pj.FrictionModel, surface: pj.LimitSurface, n: int):
 
 
 def certified(coefficients: np.ndarray) -> int:
-    """How many have a positive semi-definite Gram matrix of z' hess H(F) z, to 1e-6, by a semi-definite program."""
+    """Count the quartics for which a semi-definite program proves that they are convex.
+
+    The proof is a Gram matrix of z' hess H(F) z that is positive semi-definite to 1e-6.
+
+    Args:
+        coefficients: Coefficients, (n, 15).
+    """
     import cvxpy as cp
 
     rng = np.random.default_rng(0)
@@ -71,7 +89,7 @@ def certified(coefficients: np.ndarray) -> int:
 
 
 def _bent(c: np.ndarray, f: np.ndarray, z: np.ndarray) -> float:
-    """z' hess H(F) z, as the second derivative of H(F + t z): a polynomial's, exactly."""
+    """Return z' hess H(F) z as the second derivative of the polynomial H(F + t z), which is exact."""
     t = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
     values = np.prod((f + t[:, None] * z)[:, None] ** MONOMIALS, axis=2) @ c
     return float(2 * np.polyfit(t, values, 4)[2])
@@ -87,7 +105,7 @@ def main() -> None:
     print(f"quartic of a square on 64 points, {surface.coefficients.dtype}, {n} samples each")
     rays = np.random.default_rng(0).normal(size=(1000, 3))
     products = np.prod(rays[:, None] ** MONOMIALS, axis=2)
-    for sampler in ("gram", "terms"):
+    for sampler in ("gram", "sum_of_squares"):
         for dof in DOFS:
             count = n if dof == 20 else max(n // 10, CHUNK)
             c, pull, seconds = draw(pj.FrictionModel(dof=dof, friction=0.3, sampler=sampler), surface, count)
@@ -100,9 +118,9 @@ def main() -> None:
             begun = time.perf_counter()
             curvature = least_curvatures(c)
             print(
-                f"{sampler:6} dof {dof:3}: {count:8} samples, {1e6 * seconds / count:5.1f} us each; "
+                f"{sampler:14} dof {dof:3}: {count:8} samples, {1e6 * seconds / count:5.1f} us each; "
                 f"{np.sum(~(curvature >= CONVEX))} not convex (least curvature {curvature.min():.1e}, "
-                f"{time.perf_counter() - begun:.0f} s of sweep); repaired {np.mean(pull > 0):.2%}, mean pull "
+                f"{time.perf_counter() - begun:.0f} s of sweep); repaired {np.mean(pull > 0):.2%}, mean shrinkage "
                 f"{pull[pull > 0].mean() if (pull > 0).any() else 0:.3f}; mean off {off.max():.1f} standard errors at "
                 f"worst before repair, {np.abs(shift).max():.2e} of the largest coefficient after; relative variance "
                 f"of H {spread:.3f} of 2 / dof",

@@ -1,11 +1,12 @@
-"""What identification finds when the truth is known: from pushes without noise, and how often its intervals hold it.
+"""How often the confidence intervals of `identify` contain a known truth.
 
-    python benchmarks/identification.py [--pushes 50] [--repetitions 200] [--noise 0.5]
+    python -m benchmarks identification [--pushes 50] [--repetitions 200] [--noise 0.5]
 
-A 90 mm square, pushed 30 mm by a 5 mm finger anywhere on its sides, up to 34 degrees from their normals, in 30 steps.
-Of every repetition friction (0.1 to 0.5), limit surface (dof 50 about uniform pressure), centre of pressure (3 mm) and
-inset of the outline (1 mm) are drawn anew, from what identification is told beforehand; final poses are measured with
-noise. All repetitions are one batch.
+A 90 mm square is pushed 30 mm, in 30 steps, by a finger of 5 mm radius that starts anywhere on a side and moves up to
+34 degrees from its normal. Each repetition has its own truth. The limit surface (dof 50 around uniform pressure), the
+center of pressure (3 mm) and the inset of the outline (1 mm) are drawn from the prior of the identification, and the
+friction uniformly from 0.1 to 0.5. The final poses are measured with noise; `--noise 0` gives exact ones. All
+repetitions are one batch.
 """
 
 import argparse
@@ -14,18 +15,26 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _measure import header
 
 import pushjax as pj
-from pushjax.identify.model import Body, trajectories
-from pushjax.identify.unknowns import Prior
+from benchmarks._measure import header
+from pushjax.identification.model import Scene, trajectories
+from pushjax.identification.unknowns import Prior
 
 HALF, RADIUS, TRAVEL, STEPS = 0.045, 0.005, 0.03, 30
 UNKNOWNS = pj.Unknowns((0.0, 1.0), dof=50, center=0.003, inset=0.001)
 
 
 def planned(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Starts (*shape, 3) and paths (*shape, STEPS + 1, 2)."""
+    """Draw random pushes of the square.
+
+    Args:
+        rng: Generator of the pushes.
+        shape: Shape of the array of pushes.
+
+    Returns:
+        Start poses, (*shape, 3), and paths of the finger, (*shape, STEPS + 1, 2), in float32.
+    """
     pose = np.concatenate([rng.uniform(-0.1, 0.1, (*shape, 2)), rng.uniform(-3, 3, (*shape, 1))], axis=-1)
     side = pose[..., 2] + rng.integers(4, size=shape) * np.pi / 2
     along = side + rng.uniform(-0.6, 0.6, shape)
@@ -39,7 +48,7 @@ def planned(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax.Array
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pushes", type=int, default=50)
     parser.add_argument("--repetitions", type=int, default=200)
     parser.add_argument("--noise", type=float, default=0.5, help="mm, of x, y and length * theta each")
@@ -61,7 +70,7 @@ def main() -> None:
     @jax.vmap
     def ends(z, start, path):
         pushes = pj.Pushes(start[None], path[None], start[None])
-        return trajectories(prior.physical(z), several, Body(square, hand, prior.origin), pushes).pose[0, :, -1]
+        return trajectories(prior.physical(z), several, Scene(square, hand, prior.origin), pushes).pose[0, :, -1]
 
     noise = 1e-3 * arguments.noise * rng.normal(size=starts.shape) / [1, 1, float(mean.length)]
     seen = ends(truth, starts, paths) + jnp.asarray(noise, jnp.float32)
@@ -77,7 +86,7 @@ def main() -> None:
     found = jax.block_until_ready(compiled(starts, paths, seen))
     took = time.perf_counter() - middle
     print(f"{count} x {arguments.pushes} pushes: compiled in {middle - begin:.0f} s, run in {took:.0f} s")
-    print(f"not converged: {int(np.sum(np.asarray(found.status) != 0))}; sigma {1e3 * np.median(found.sigma):.3f} mm")
+    print(f"not converged: {int(np.sum(~np.asarray(found.converged)))}; sigma {1e3 * np.median(found.sigma):.3f} mm")
     deviation = np.sqrt(np.diagonal(np.linalg.inv(np.asarray(found.precision, float)), axis1=1, axis2=2))
     off = np.abs(np.asarray(found.z) - np.asarray(truth)) / deviation
     for level, reach in ((0.5, 0.6745), (0.9, 1.6449)):

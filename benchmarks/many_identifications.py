@@ -1,17 +1,18 @@
-"""A thousand identifications in one `vmap`, beside the same one after another by semi-definite programs and a grid.
+"""A thousand identifications in one `vmap` beside as many semi-definite programs.
 
-    python benchmarks/many_identifications.py [--objects 1000] [--pushes 20] [--programs 100]
+    python -m benchmarks many_identifications [--objects 1000] [--pushes 20] [--programs 1000]
 
-Objects are squares of 90 mm with ellipsoids (dof 30 about uniform pressure) and frictions (0.1 to 0.5) of their own,
-each pushed 30 mm by a 5 mm finger, in 20 steps. Of every push the final pose is measured (0.3 mm in x, y and
-length * theta) and the mean direction of the wrench and of the motion in each of its halves (3 degrees).
+The objects are squares of 90 mm. Each has its own ellipsoid (dof 30 around uniform pressure) and friction (0.1 to 0.5),
+and is pushed 30 mm, in 20 steps, by a finger of 5 mm radius. Two things are measured in each push: the final pose, with
+noise of 0.3 mm in x, y and length * theta, and the mean directions of wrench and motion in each half of the push, with
+noise of 3 degrees.
 
-identify  friction and surface from poses and wrenches together, all objects in one `vmap`.
-convex    the surface from the pairs by a semi-definite program (cvxpy, the loss of `fit_limit_surface`), object by
-          object; then the friction from the final poses, on a grid of 21: all objects in one batch.
+identify  Friction and surface from poses and wrenches together, with all objects in one `vmap`.
+convex    The surface from the pairs by a semi-definite program (cvxpy, the loss of `fit_limit_surface`), one object
+          after another; then the friction from the final poses on a grid of 21 values, with all objects in one batch.
 
-Both know the same. Compared are final poses of other pushes of the same objects, without noise, the friction, and the
-wrenches of random twists.
+Both use the same data. They are compared by the final poses of other pushes of the same objects, without noise, by the
+friction, and by the wrenches of random twists.
 """
 
 import argparse
@@ -21,10 +22,10 @@ import cvxpy as cp
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _measure import header
-from identification import HALF, RADIUS, planned
 
 import pushjax as pj
+from benchmarks._measure import header
+from benchmarks.identification import HALF, RADIUS, planned
 
 PATH_STEPS, GRID, TEST = 20, np.linspace(0.05, 0.65, 21), 10
 POSE_NOISE, ANGLE_NOISE = 3e-4, np.radians(3.0)
@@ -34,7 +35,17 @@ Arrays = tuple[jax.Array, ...]
 
 @jax.jit
 def pushed(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
-    """Of all objects: (objects, pushes)."""
+    """Simulate the pushes of all objects.
+
+    Args:
+        surface: Limit surfaces, with a leading axis (objects,).
+        friction: Friction coefficients, (objects,).
+        starts: Start poses, (objects, pushes, 3).
+        paths: Paths of the finger, (objects, pushes, steps + 1, 2).
+
+    Returns:
+        Trajectories with leading axes (objects, pushes).
+    """
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
 
     def one(surface, mu, start, path):
@@ -44,11 +55,25 @@ def pushed(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
 
 
 def objects(rng: np.random.Generator, mean: pj.LimitSurface, count: int) -> tuple[pj.LimitSurface, jax.Array]:
+    """Draw the limit surfaces and the friction of `count` objects around the surface `mean`."""
     model = pj.FrictionModel(30, (0.1, 0.5))
     return jax.vmap(lambda key: model.sample(key, mean))(jax.random.split(jax.random.key(int(rng.integers(99))), count))
 
 
 def recorded(rng: np.random.Generator, surface, friction, length: float, count: int, pushes: int) -> pj.Pushes:
+    """Simulate the measured pushes of all objects, with noise.
+
+    Args:
+        rng: Generator of the pushes and of the noise.
+        surface: True limit surfaces, with a leading axis (count,).
+        friction: True friction coefficients, (count,).
+        length: Characteristic length of the surfaces, m.
+        count: Number of objects.
+        pushes: Number of pushes of each object.
+
+    Returns:
+        The pushes, with a leading axis (count,). Each has two wrench-twist pairs.
+    """
     starts, paths = short(rng, count, pushes)
     done = pushed(surface, friction, starts, paths)
     noise = rng.normal(size=(count, pushes, 3)) * POSE_NOISE / [1, 1, length]
@@ -66,17 +91,28 @@ def recorded(rng: np.random.Generator, surface, friction, length: float, count: 
 
 
 def short(rng: np.random.Generator, count: int, pushes: int) -> Arrays:
+    """Draw start poses, (count, pushes, 3), and paths of PATH_STEPS steps, (count, pushes, PATH_STEPS + 1, 2)."""
     starts, paths = planned(rng, (count, pushes))
     return starts, jax.vmap(jax.vmap(lambda path: pj.line(path[0], path[-1], PATH_STEPS)))(paths)
 
 
 def _astray(rng: np.random.Generator, vectors: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 3) with noise that turns their directions by ANGLE_NOISE, as a root mean square."""
     size = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors + ANGLE_NOISE / np.sqrt(2) * size * rng.normal(size=vectors.shape)
 
 
 def programmed(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
-    """The ellipsoid's matrix, by a semi-definite program: the loss of `fit_limit_surface`."""
+    """Fit an ellipsoid by a semi-definite program, with the loss of `fit_limit_surface`.
+
+    Args:
+        wrench: Wrenches, (pairs, 3). Pairs with a zero wrench or twist are ignored.
+        twist: Twists, (pairs, 3).
+        length: Characteristic length, m.
+
+    Returns:
+        The matrix of the ellipsoid, (3, 3).
+    """
     metric = np.array([1, 1, length])
     there = np.any(wrench != 0, axis=1) & np.any(twist != 0, axis=1)
     force, motion = wrench[there] / metric, twist[there] * metric
@@ -92,7 +128,16 @@ def programmed(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarr
 
 @jax.jit
 def on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
-    """The friction with which final poses are off least, of every object."""
+    """Find the friction on the grid for which the final poses of each object deviate least.
+
+    Args:
+        surface: Limit surfaces, with a leading axis (objects,).
+        pushes: Measured pushes, with a leading axis (objects,).
+        length: Characteristic length, m.
+
+    Returns:
+        Friction coefficients, (objects,).
+    """
 
     def off(mu):
         done = pushed(surface, jnp.full(len(pushes.weight), mu), pushes.start, pushes.path)
@@ -103,6 +148,16 @@ def on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
 
 
 def report(name: str, surface, friction, truth, tested: Arrays, length: float) -> None:
+    """Print the errors of identified objects.
+
+    Args:
+        name: Name of the method.
+        surface: Identified limit surfaces, with a leading axis (objects,).
+        friction: Identified friction coefficients, (objects,).
+        truth: True surfaces, true friction coefficients, and true final poses of the tested pushes.
+        tested: Start poses and paths of the tested pushes.
+        length: Characteristic length, m.
+    """
     real, mu, ends = truth
     done = pushed(surface, friction, *tested)
     off = 1e3 * np.asarray(pj.deviation(done.pose[:, :, -1], ends, length)).mean(axis=1)
@@ -117,6 +172,7 @@ def report(name: str, surface, friction, truth, tested: Arrays, length: float) -
 
 @jax.jit
 def angle(one, other) -> jax.Array:
+    """Return the mean angle between the wrenches of two surfaces over 100 random twists, rad, for each object."""
     twist = jax.random.normal(jax.random.key(5), (100, 3))
 
     def of(a, b):
@@ -160,7 +216,7 @@ def main() -> None:
     found = jax.block_until_ready(program(pushes))
     took = time.perf_counter() - middle
     print(f"identify: {given.objects} objects in {took:.1f} s, {1e3 * took / given.objects:.1f} ms each; compiled in "
-          f"{middle - begin:.0f} s; {int(np.sum(np.asarray(found.status) != 0))} not converged")  # fmt: skip
+          f"{middle - begin:.0f} s; {int(np.sum(~np.asarray(found.converged)))} not converged")  # fmt: skip
     surface = jax.vmap(lambda one: one.surface)(found)
     friction = jax.vmap(lambda one: one.friction)(found)
     report("identify", surface, friction, truth, tested, length)

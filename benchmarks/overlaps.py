@@ -1,11 +1,12 @@
-"""Whether any finger ends a step inside the slider, judged by shapely, which shares no code with the library.
+"""Check by shapely that no finger ends a step inside the slider.
 
-Random starts and frictions of every hand on outlines of many kinds, convex or not, with corners or without, in fine
-and coarse steps and both floating types. A step is wrong if its status says MOVING, FREE, JAMMED or GRASPED, and a
-finger is deeper inside than it was before, and than 0.1 mm (300 steps) or a fifth of the hand's displacement in the
-step (60 steps). An end that says GRASPED or JAMMED is confirmed: see `unconfirmed`.
+Shapely computes the penetration depth; it shares no code with the library. Every hand pushes outlines of many kinds,
+convex or not, with corners or without, from random starts and with random friction, in fine and coarse steps and in
+both floating types. A step is wrong if its status is MOVING, FREE, JAMMED or GRASPED, and a finger is deeper inside the
+slider than before the step and deeper than a limit. The limit is 0.1 mm with 300 steps, and a fifth of the hand's
+displacement in the step with 60 steps. A push that ends GRASPED or JAMMED has to be confirmed (see `unconfirmed`).
 
-    python benchmarks/overlaps.py --starts 500 --hands jaw two --shapes L T --steps 300 --dtype float64
+    python -m benchmarks overlaps --starts 500 --hands jaw two --shapes L T --steps 300 --dtype float64
 """
 
 import argparse
@@ -21,27 +22,29 @@ import shapely
 from scipy.optimize import linprog
 
 import pushjax as pj
-from pushjax.hands import Pad, RoundFinger
+from pushjax.simulation.hand import Pad, RoundFinger
 
 MM = 1e-3
-# Vertices of a polygon in place of a smooth outline: its chords are within 0.2 um of it.
+# Vertices of the polygon that replaces a smooth outline. Its chords are within 0.2 um of the outline.
 FINE = 4000
+# Parts into which the step of a jam is divided to confirm it.
 FINER = 256
 
 
 def _around(radius, count: int = 16) -> np.ndarray:
-    """Points, m, of the polar outline radius(angle) in mm."""
+    """Return `count` points (m) of the outline whose radius in mm is given as a function of the polar angle."""
     angle = 2 * np.pi * np.arange(count) / count
     return MM * radius(angle)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _comb() -> list[tuple[float, float]]:
-    """Three teeth of 18 mm with gaps of 24 mm."""
+    """Return the vertices, in mm, of a comb with three teeth of 18 mm and gaps of 24 mm."""
     tops = [(x + a, y) for x in (84, 42, 0) for a, y in ((18, 50), (0, 50), (0, 15), (-24, 15))][:-2]
     return [(0, 0), (102, 0), *tops]
 
 
 def _star() -> np.ndarray:
+    """Return the vertices, in mm, of a star with five points."""
     angle = np.pi * np.arange(10) / 5
     return np.where(np.arange(10) % 2, 28, 60)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -73,6 +76,7 @@ PAD = (50 * MM, 10 * MM)
 
 
 def shape_of(name: str) -> pj.Polygon | pj.Curve | pj.Ellipse | pj.Disk:
+    """Return the outline of that name, one of `SHAPES`; polygons have their centroid at the origin."""
     if name in SMOOTH:
         return SMOOTH[name]()
     vertices = MM * np.asarray(POLYGONS[name], float)
@@ -81,12 +85,13 @@ def shape_of(name: str) -> pj.Polygon | pj.Curve | pj.Ellipse | pj.Disk:
 
 
 def outline_of(shape) -> shapely.Polygon:
-    """The same for the judge."""
+    """Return the outline as a polygon of shapely, which judges overlaps."""
     points = shape.vertices if isinstance(shape, pj.Polygon) else shape.boundary(FINE)
     return shapely.Polygon(np.asarray(points, float))
 
 
 def hand_of(name: str) -> pj.Hand:
+    """Return the hand of that name, one of `HANDS`."""
     return {
         "one": lambda: pj.Hand.finger(FINGER),
         "two": lambda: pj.Hand.two_fingers(FINGER),
@@ -96,7 +101,16 @@ def hand_of(name: str) -> pj.Hand:
 
 
 def ends_of(name: str, rng: np.random.Generator, starts: int) -> np.ndarray:
-    """First and last configurations (starts, 2, dof)."""
+    """Return the first and the last configuration of each push.
+
+    Args:
+        name: Name of the hand.
+        rng: Generator of the pushes.
+        starts: Number of pushes.
+
+    Returns:
+        Configurations, (starts, 2, dof).
+    """
     if name == "one":
         angle, aside = rng.uniform(-np.pi, np.pi, starts), rng.uniform(-0.04, 0.04, starts)
         along, across = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)
@@ -108,7 +122,16 @@ def ends_of(name: str, rng: np.random.Generator, starts: int) -> np.ndarray:
 
 
 class Survey(NamedTuple):
-    """The pushes of one cell: hand and slider, starts, and what became of them."""
+    """The pushes of one outline by one hand, and their trajectories.
+
+    Attributes:
+        hand: The hand.
+        slider: The slider.
+        path: Configurations of the hand, (starts, steps + 1, dof).
+        pose: Start poses of the slider, (starts, 3).
+        friction: Friction coefficients, (starts,).
+        push: Trajectories, with a leading axis (starts,).
+    """
 
     hand: pj.Hand
     slider: pj.Slider
@@ -119,15 +142,27 @@ class Survey(NamedTuple):
 
     @property
     def shape(self):
+        """The outline of the slider."""
         return self.slider.shape
 
 
 def surface_of(shape, key) -> pj.LimitSurface:
+    """Return the quartic of uniform pressure on 64 points of the outline."""
     support = pj.Support.uniform(shape, points=64, load=1.0)
     return pj.fit_limit_surface(*support.wrench_twist_pairs(key, 400), degree=4)
 
 
 def run(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: int = 0) -> Survey:
+    """Simulate random pushes of one outline by one hand.
+
+    Args:
+        shape_name: One of `SHAPES`.
+        hand_name: One of `HANDS`.
+        starts: Number of pushes.
+        steps: Number of steps of each push.
+        dtype: Floating type.
+        seed: Seed of the pushes.
+    """
     shape, hand = shape_of(shape_name), hand_of(hand_name)
     seeds = (seed, SHAPES.index(shape_name), HANDS.index(hand_name))
     rng = np.random.default_rng(seeds)
@@ -143,13 +178,25 @@ def run(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: i
     return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push))
 
 
-# the slider is an argument: polygons of as many vertices share a program in the compilation cache
+# The slider is an argument so that polygons with the same number of vertices share a program in the compilation cache.
 def _rollout(slider, hand, path, pose, friction) -> pj.Trajectory:
     return pj.rollout(slider, hand, path, pose=pose, friction=friction)
 
 
 def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
-    """Of each finger, in the slider's frame, its centre (..., 1, 2), or a pad's corners (..., corners, 2)."""
+    """Return the place of each finger in the body frame of the slider.
+
+    Args:
+        hand: The hand.
+        poses: Poses of the slider, (..., 3).
+        configurations: Configurations of the hand, (..., dof).
+
+    Returns:
+        For each finger its center, (..., 1, 2), or the corners of a pad, (..., corners, 2), m.
+
+    Raises:
+        TypeError: If a finger is neither a `RoundFinger` nor a `Pad`.
+    """
     where = np.asarray(hand.poses(jnp.asarray(configurations)), float)
     c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     found = []
@@ -171,7 +218,14 @@ def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray)
 
 
 def overlaps(survey: Survey) -> np.ndarray:
-    """How deep a finger is inside the slider, m, at each of the poses (starts, steps + 1), by shapely."""
+    """Return the largest penetration depth of any finger at each pose, by shapely.
+
+    Args:
+        survey: The pushes.
+
+    Returns:
+        Depths, (starts, steps + 1), m.
+    """
     body = outline_of(survey.shape)
     shapely.prepare(body)
     edge = body.exterior
@@ -192,8 +246,11 @@ def overlaps(survey: Survey) -> np.ndarray:
 
 
 def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
-    """Of pads with these corners (…, corners, 2): how deep a corner of either is in the other, or how wide what they
-    share is where no corner is."""
+    """Return the penetration depths of pads with these corners, (…, corners, 2).
+
+    The depth is that of a corner of the body in the pad, or of the pad in the body. Where no corner lies in the other,
+    it is the width of their intersection.
+    """
     shape = corners.shape[:-2]
     flat = corners.reshape(-1, *corners.shape[-2:])
     pads = np.asarray(shapely.polygons(flat))
@@ -203,7 +260,7 @@ def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
     inside = shapely.contains(body, points)
     depth[near] = np.max(np.where(inside, shapely.distance(edge, points), 0.0), axis=1)
     theirs = np.asarray(body.exterior.coords)[:-1]
-    # the body's vertices in each pad: distances to the lines of the pad's edges
+    # Depth of the body's vertices in each pad, from their distances to the lines of the pad's edges.
     a, b = flat[near], np.roll(flat[near], -1, axis=1)
     along = (b - a) / np.linalg.norm(b - a, axis=-1, keepdims=True)
     for first in range(0, len(near), 500):
@@ -212,18 +269,26 @@ def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
         height = along[part, None, :, 0] * rel[..., 1] - along[part, None, :, 1] * rel[..., 0]
         depth[near[part]] = np.maximum(depth[near[part]], np.max(np.min(height, axis=-1), axis=1))
     shared = shapely.intersection(pads[near], body)
-    width = 2 * shapely.area(shared) / np.maximum(shapely.length(shared), 1e-12)  # at most what it is, at least half
+    width = 2 * shapely.area(shared) / np.maximum(shapely.length(shared), 1e-12)  # between half the width and the width
     depth[near] = np.maximum(depth[near], 2 * width * (width > 2 * depth[near]))
     return depth.reshape(shape)
 
 
 def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
-    """Ends that say GRASPED or JAMMED and are not: which, and why.
+    """Find pushes that end GRASPED or JAMMED although the slider is not held.
 
-    GRASPED promises every finger within reach: four of its steps, or 1e-4 of the surface's length. And of what is in
-    reach forces have to exist, in their friction cones, that come to nothing and on which the hand works: found by a
-    linear program, on polygons. The hand stops where the step began in which it jams; where nothing holds the slider
-    there yet, that step is done in `FINER` parts, and has to jam in one of them, with such forces.
+    GRASPED promises that every finger is within reach of the slider: within four times the largest displacement in the
+    step, or 1e-4 of the surface's length. A jam needs forces at the places in reach, inside their friction cones, that
+    balance each other and on which the hand does work. A linear program searches for them, for polygons only.
+
+    A hand that jams stops at the start of that step. If nothing holds the slider there yet, the step is repeated in
+    `FINER` parts. It has to jam in one of them, with such forces.
+
+    Args:
+        survey: The pushes.
+
+    Returns:
+        The number of each such push, and the reason.
     """
     status = survey.push.status[:, -1]
     ended = np.flatnonzero((status == pj.Status.GRASPED) | (status == pj.Status.JAMMED)).tolist()
@@ -246,11 +311,13 @@ def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
 
 
 def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the steps (fingers, 2) in the body frame of the slider."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return steps @ np.array([[c, -s], [s, c]])
 
 
 def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
+    """Return whether push `i` jams within step `at`, done in `FINER` parts."""
     path = pj.line(survey.path[i, at], survey.path[i, at + 1], FINER)
     push = jax.jit(_rollout)(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i])
     stopped = int(push.stopped)
@@ -259,27 +326,41 @@ def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: f
     pose = np.asarray(push.pose[-1], float)
     fingers = _placed(survey, pose, np.asarray(push.configuration[-1]))
     where = np.asarray(survey.hand.poses(path[stopped : stopped + 2]), float)[..., :2]
-    # It jams within that part, or while an overlap is pushed out, and turns meanwhile as it did before.
+    # It jams within that part, or while an overlap is pushed out. Until then the slider turns as it did before.
     if stopped > 0:
         turns = np.ptp(push.pose[stopped - 1 : stopped + 1, 2])
     else:
-        way = np.max(np.linalg.norm(where[1] - where[0], axis=-1))  # of a part
+        way = np.max(np.linalg.norm(where[1] - where[0], axis=-1))  # displacement in one part
         turns = np.ptp(survey.push.pose[i, at - 1 : at + 1, 2]) * max(1.0, survey.push.overlap[i, at - 1] / way) / FINER
     friction = 1.01 * float(survey.friction[i]) + float(turns)
     return _jams(body, fingers, _turned(where[1] - where[0], pose), friction, reach)
 
 
 class Disc(NamedTuple):
-    """A round finger in the slider's frame."""
+    """A round finger in the body frame of the slider.
+
+    Attributes:
+        center: Center, (2,), m.
+        radius: Radius, m.
+    """
 
     center: np.ndarray
     radius: float
 
     def away(self, body: shapely.Polygon) -> float:
+        """Return the distance from the body, m; not more than -radius if the center lies inside the body."""
         return body.distance(shapely.Point(self.center)) - self.radius
 
     def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Where it is within reach of the body, an edge or a vertex: the point, and the normal into the body."""
+        """Find the edges and vertices of the body that are within reach.
+
+        Args:
+            body: Outline of the slider.
+            reach: Largest distance from the finger, m.
+
+        Returns:
+            For each of them the closest point, (2,), m, and the normal from there into the body, (2,).
+        """
         found = []
         for a, b in pairwise(_ring(body)):
             length = np.linalg.norm(b - a)
@@ -294,19 +375,21 @@ class Disc(NamedTuple):
 
 
 class Plate(NamedTuple):
-    """A pad in the slider's frame."""
+    """A pad in the body frame of the slider."""
 
     solid: shapely.Polygon
 
     def away(self, body: shapely.Polygon) -> float:
+        """Return the distance from the body, m."""
         return body.distance(self.solid)
 
     def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """As of a disc: corners of either near an edge of the other."""
+        """Find the corners of pad and body within reach of an edge of the other; returns are those of `Disc.places`."""
         return _corners(body, self.solid, reach) + [(p, -n) for p, n in _corners(self.solid, body, reach)]
 
 
 def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disc | Plate]:
+    """Return the fingers in the body frame of the slider."""
     seen = seen_by_slider(survey.hand, pose, configuration)
     return [
         Disc(where[0], float(finger.radius)) if isinstance(finger, RoundFinger) else Plate(shapely.Polygon(where))
@@ -315,7 +398,15 @@ def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list
 
 
 def _jams(body: shapely.Polygon, fingers: list[Disc | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:
-    """Whether forces within friction cones at places in reach balance, and the fingers' steps do work on them."""
+    """Return whether forces at the places in reach can balance each other while the fingers do work on them.
+
+    Args:
+        body: Outline of the slider.
+        fingers: Fingers in the body frame.
+        steps: Displacements of the fingers in the body frame, (fingers, 2), m.
+        mu: Friction coefficient, which limits the forces to their friction cones.
+        reach: Distance within which a place counts as a contact, m.
+    """
     wrenches, works = [], []
     for finger, step in zip(fingers, steps, strict=True):
         for point, normal in finger.places(body, reach):
@@ -326,18 +417,18 @@ def _jams(body: shapely.Polygon, fingers: list[Disc | Plate], steps: np.ndarray,
     if not wrenches:
         return False
     columns = np.array(wrenches).T
-    balance = np.vstack([columns, np.ones(columns.shape[1])])  # forces that come to nothing, but are not all nothing
+    balance = np.vstack([columns, np.ones(columns.shape[1])])  # forces that balance and are not all zero
     best = linprog(-np.array(works), A_eq=balance, b_eq=[0, 0, 0, 1], bounds=(0, None))
     return best.success and -best.fun > 0
 
 
 def _ring(body: shapely.Polygon) -> np.ndarray:
-    """Its vertices, counter-clockwise, the first again at the end."""
+    """Return the vertices of a polygon, counter-clockwise, with the first one again at the end."""
     return np.asarray(shapely.geometry.polygon.orient(body).exterior.coords)
 
 
 def _corners(body: shapely.Polygon, other: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Where corners of the other are within reach of an edge of the body: the point, and the normal into the body."""
+    """Find corners of `other` within reach of an edge of `body`: the points on the edge, and the normals into it."""
     tips = np.asarray(other.exterior.coords)[:-1]
     found = []
     for a, b in pairwise(_ring(body)):
@@ -351,7 +442,7 @@ def _corners(body: shapely.Polygon, other: shapely.Polygon, reach: float) -> lis
 
 
 def allowed(survey: Survey, steps: int) -> float:
-    """How deep, m: see the header."""
+    """Return the largest penetration depth that is not wrong, m (see the header of this module)."""
     if steps >= 300:
         return 0.1 * MM
     where = np.asarray(survey.hand.poses(jnp.asarray(survey.path)), float)[..., :2]
@@ -359,7 +450,7 @@ def allowed(survey: Survey, steps: int) -> float:
 
 
 def judged(survey: Survey, steps: int) -> dict:
-    """What is wrong, and how often."""
+    """Return which pushes are wrong, failed or unconfirmed, and how many end with each status."""
     depth = overlaps(survey)
     status = survey.push.status
     told = np.isin(status, [pj.Status.MOVING, pj.Status.FREE, pj.Status.JAMMED, pj.Status.GRASPED])
@@ -381,6 +472,7 @@ def judged(survey: Survey, steps: int) -> dict:
 
 
 def _line(row: dict) -> str:
+    """Return the line that is printed for a row."""
     cell = f"{row['hand']:6}{row['shape']:10}{row['steps']:4} {row['dtype']}"
     counts = f"{row['wrong']:3} wrong, deepest {row['deepest_mm']:.3f} mm; {row['failed']:3} failed, "
     counts += f"{len(row['unconfirmed'])} unconfirmed"

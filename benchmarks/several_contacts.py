@@ -1,9 +1,10 @@
-"""One to eight contacts: the exhaustive solver, the projected one and that of a single contact, side by side.
+"""Time and success of the solvers of one to eight contacts.
 
-    python benchmarks/several_contacts.py [--problems 2000] [--degree 4] [--x64] [--most 8]
+    python -m benchmarks several_contacts [--problems 2000] [--degree 4] [--x64] [--most 8]
 
-The random problems of `pushjax.problems`. Prints time per problem, how many times one contact that is, how many of the
-problems with a motion each solver finds, and the time to trace and compile.
+`Exhaustive`, `Projected` and, for a single contact, `ScalarRoot` solve the random problems of
+`pushjax.testing.problems`. Prints the time per problem, its ratio to that of one contact by `ScalarRoot`, the fraction
+of the problems with a motion for which each solver finds one, and the time to trace and compile.
 """
 
 import argparse
@@ -20,10 +21,10 @@ if arguments.x64:
     jax.config.update("jax_enable_x64", True)
 
 import numpy as np  # noqa: E402
-from _measure import alternate, compiled, header  # noqa: E402
 
 import pushjax as pj  # noqa: E402
-from pushjax.problems import random_contacts_problem  # noqa: E402
+from benchmarks._measure import alternate, compiled, header  # noqa: E402
+from pushjax.testing.problems import random_contacts_problem  # noqa: E402
 
 
 def main() -> None:

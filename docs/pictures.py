@@ -1,8 +1,9 @@
-"""Make the documentation's pictures and animations, by the package itself.
+"""Draw the pictures and animations of the documentation.
 
     python docs/pictures.py [push grasp stochastic limit_surfaces motion_cone real] [--to FOLDER] [--suffix .gif]
 
-Two minutes, most of it compiling. Without a name, all of them; `real` needs PUSHJAX_DATA, and is left out without.
+Without a name, all are drawn; this takes two minutes, most of it for compiling. `real` needs PUSHJAX_DATA and is left
+out without it.
 """
 
 import argparse
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 
-mpl.use("Agg")  # draws to files; there may be no screen
+mpl.use("Agg")  # draws to files, because there may be no screen
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,7 @@ GRASPS = {"held flat": "grasped with offset", "wedged": "jammed"}
 
 
 def square(side: float = 0.09) -> tuple[pj.Support, pj.WrenchTwistPairs, pj.Slider]:
-    """A square on 64 points, with the quartic of its support."""
+    """Return a square of this side (m) on 64 points: its support, its wrench-twist pairs, and the slider."""
     block = pj.Polygon.rectangle(side, side)
     support = pj.Support.uniform(block, points=64)
     pairs = support.wrench_twist_pairs(jax.random.key(0), 400)
@@ -40,7 +41,7 @@ def square(side: float = 0.09) -> tuple[pj.Support, pj.WrenchTwistPairs, pj.Slid
 
 
 def push() -> plot.Animation:
-    """A square pushed aslant: a finger of little friction slides along its side, one of more sticks to it."""
+    """Draw oblique pushes of a square: with low friction the finger slides along its side, with high it sticks."""
     _, _, slider = square()
     hand, path = pj.Hand.finger(0.00475), pj.line((-0.052, 0.020), (0.018, -0.020), 120)
     pushes = {name: pj.rollout(slider, hand, path, pose=jnp.zeros(3), friction=mu) for name, mu in FRICTIONS.items()}
@@ -48,7 +49,7 @@ def push() -> plot.Animation:
 
 
 def grasp() -> plot.Animation:
-    """A parallel jaw closes on a rectangle from two start poses: one ends held flat, one wedged."""
+    """Draw a parallel jaw that closes on a rectangle from two start poses: one ends held flat, the other wedged."""
     block = pj.Polygon.rectangle(squeeze.WIDTH, squeeze.HEIGHT)
     pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 400)
     slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
@@ -63,7 +64,7 @@ def grasp() -> plot.Animation:
 
 
 def stochastic() -> plot.Animation:
-    """One push, 200 draws of the friction below the square and at the finger."""
+    """Draw one push with 200 samples of the friction under the square and at the finger."""
     slider, hand, path = stochastic_push.setting(0, 100)
     model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
     many = pj.monte_carlo(
@@ -74,7 +75,7 @@ def stochastic() -> plot.Animation:
 
 
 def limit_surfaces() -> Figure:
-    """The ellipsoid and the quartic of a square on four corners, with the twists of wrenches as arrows."""
+    """Draw the ellipsoid and the quartic of a square on four corners, with the twists of wrenches as arrows."""
     block = pj.Polygon.rectangle(demo.SIDE, demo.SIDE)
     support = pj.Support.points(block.vertices)
     pairs = support.wrench_twist_pairs(jax.random.key(0), 400)
@@ -83,13 +84,15 @@ def limit_surfaces() -> Figure:
 
 
 def motion_cone() -> Figure:
-    """One contact of a square, with its friction cone, its motion cone, and a push beyond it."""
+    """Draw one contact of a square with its friction cone, its motion cone, and a push outside the motion cone."""
     return plot.motion_cone_figure(*demo.motion_cone_setup(jax.random.key(0)))
 
 
 def real() -> Figure:
-    """Pushes of a triangle on three support points by a robot, and what the known points predict of them, without
-    anything learned from pushes: those at three percentiles of how far they are off."""
+    """Draw a robot's pushes of a triangle on three support points, with predictions from the known support points.
+
+    Nothing is fitted to the pushes. Three pushes are shown, at three percentiles of the deviation.
+    """
     data = find_data()
     if data is None:
         raise SystemExit("real: set PUSHJAX_DATA to the folder of real data")

@@ -1,6 +1,6 @@
-"""Shared by all tests: float64 is on (float32 is tested by passing float32), and where the data is.
+"""Settings and fixtures of all tests: float64 is enabled (tests of float32 pass float32), and the folders of data.
 
-The compiled programs are cached between runs and between pytest's workers where JAX_COMPILATION_CACHE_DIR is set.
+The compiled programs are cached between runs and between pytest's workers if JAX_COMPILATION_CACHE_DIR is set.
 """
 
 import gc
@@ -19,16 +19,16 @@ import pytest  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # commands would fill the user's own cache
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # commands would write to the user's own cache
     jax.config.update("jax_enable_compilation_cache", False)
 
 from pushjax.datasets import find_data  # noqa: E402
 
-# Tracing makes objects by the million that die young: a fifth of the time went into looking at the old ones again.
+# Tracing creates millions of objects that are soon deleted. A fifth of the time was spent in scans of the old ones.
 gc.freeze()
 gc.set_threshold(100_000, 50, 100)
 
-# Of several workers, whoever is free takes the next file: the long ones first, so that no one ends long after all.
+# Each free worker takes the next file. The long files come first, so that none of them ends long after the others.
 LONG = (
     "docs",
     "overlaps",
@@ -56,7 +56,7 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
-# Three that make programs of their own, a minute each.
+# Three notebooks that compile programs of their own, which takes a minute each.
 LONG_NOTEBOOKS = ("03_several_contacts", "04_stochastic_pushing", "06_planning")
 
 
@@ -75,10 +75,10 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module", autouse=True)
 def _programs_end_with_their_module():
-    """Compiled programs live no longer than the module that runs them.
+    """Drop compiled programs at the end of the module that runs them.
 
-    Each keeps several memory maps; a worker that holds those of the whole suite comes to the kernel's limit (65 530
-    maps by default) and dies in the compiler.
+    Each program keeps several memory maps. A worker that keeps those of the whole suite reaches the kernel's limit,
+    65 530 maps by default, and dies in the compiler.
     """
     yield
     jax.clear_caches()
@@ -94,7 +94,7 @@ def _figures_are_closed():
 
 @pytest.fixture(scope="session")
 def data():
-    """The folder of real data."""
+    """Return the folder of real data."""
     folder = find_data()
     if folder is None:
         pytest.skip("no real data: set PUSHJAX_DATA to its folder")
@@ -103,7 +103,7 @@ def data():
 
 @pytest.fixture(scope="session")
 def oracle(data):
-    """The folder of contact problems with known answers, beside the data."""
+    """Return the folder of contact problems with known answers, beside the data."""
     folder = data.parent / "oracle"
     if not folder.is_dir():
         pytest.skip(f"no recorded contact problems: {folder} does not exist")

@@ -1,4 +1,4 @@
-"""Contact problems: random batches, drawn by one compiled program for each degree, and a square."""
+"""Contact problems for tests: random batches, sampled by one compiled program for each degree, and a square."""
 
 import functools
 
@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.problems import ContactsProblem, random_contacts_problem
+from pushjax.testing.problems import ContactsProblem, random_contacts_problem
 
-# Compiling a program takes longer than any of them runs: so one size of batch everywhere.
+# Compiling a program takes longer than any of them runs, so all batches have the same size.
 BATCH = 2000
 MOST = 8
 
@@ -18,8 +18,10 @@ MOST = 8
 def problems(
     contacts: int, degree: int = 4, seed: int = 0, slots: int | None = None, condition: float = 1e3, gaps: float = 0.5
 ) -> ContactsProblem:
-    """`BATCH` problems of so many contacts each; slots beyond these hold what does not count, anywhere among them
-    where they are all eight, else at the end."""
+    """Return `BATCH` problems with this number of contacts, and padding in the other slots.
+
+    With all eight slots, the padding is anywhere among the contacts; with fewer, it is at the end.
+    """
     keys = jax.random.split(jax.random.key(seed), BATCH)
     surface, drawn = _program(degree)(keys, jnp.asarray(contacts), jnp.asarray(condition), jnp.asarray(gaps))
     if slots == MOST:
@@ -51,6 +53,6 @@ def flat_push(displacement=((0.001, 0.0), (0.001, 0.0))) -> pj.Contacts:
 
 @functools.cache
 def square(degree: int) -> pj.LimitSurface:
-    """That square's, under uniform pressure."""
+    """Return the limit surface of that square under uniform pressure."""
     support = pj.Support.uniform(pj.Polygon.rectangle(0.09, 0.09), points=64)
     return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(1), 300), degree=degree)

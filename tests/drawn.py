@@ -1,4 +1,4 @@
-"""What a picture shows, for tests of pictures."""
+"""Helpers that read what a figure shows, for tests of figures."""
 
 import re
 
@@ -11,21 +11,21 @@ SMALLEST = 7  # pt
 
 
 def in_world(pose, side=SIDE) -> np.ndarray:
-    """The corners of a square at a pose, mm, closed."""
+    """Return the corners of a square at a pose, mm, closed."""
     corners = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return MM * (corners @ np.array([[c, s], [-s, c]]) + np.asarray(pose)[:2])
 
 
 def legend(figure_or_axes) -> list[str]:
-    """Entries of an axes' legend, or of all legends of a figure."""
+    """Return the legend entries of an axes, or of all legends of a figure."""
     of = getattr(figure_or_axes, "legends", None)
     found = [figure_or_axes.get_legend()] if of is None else of
     return [text.get_text() for each in found for text in each.get_texts()]
 
 
 def legible(figure) -> None:
-    """A unit on every axis, nothing too small; and it draws."""
+    """Check that every axis has a unit, that no text is too small, and that the figure can be drawn."""
     figure.canvas.draw()
     for axes in figure.axes:
         for label in (axes.get_xlabel(), axes.get_ylabel()):
@@ -36,5 +36,5 @@ def legible(figure) -> None:
 
 
 def ends_of(axes, color) -> list[np.ndarray]:
-    """The data of all lines of a colour."""
+    """Return the data of all lines of a color."""
     return [line.get_xydata() for line in axes.lines if line.get_color() == color and len(line.get_xydata())]

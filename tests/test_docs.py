@@ -1,8 +1,8 @@
-"""The documentation: links, names, commands and examples are those of the code, and the site builds without a warning.
+"""The documentation agrees with the code (links, names, commands, examples), and the site builds without a warning.
 
-Python blocks of a page run one after another, in a process of their own and in float32, as a user would. A comment
-`# = 0.30` behind an expression is compared with its value, to the digits that are there. A block is not run where a
-comment `<!-- not run: why -->` stands above it.
+The Python blocks of a page run one after another, in their own process and in float32, as for a user. A comment `# =
+0.30` after an expression is compared with its value, to the digits that are written. A block is not run if a comment
+`<!-- not run: why -->` is above it.
 """
 
 import ast
@@ -15,7 +15,7 @@ import subprocess
 import sys
 import traceback
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ SHELL = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 VALUE = re.compile(r"#\s*=\s*([-+\d.e, ]+?)\s*$")
 NUMBER = re.compile(r"^[-+]?\d+(?:\.(\d+))?$")
-# Words that stand for something else in a command, as in `pushjax reproduce NAME`.
+# Placeholders in a command, as in `pushjax reproduce NAME`.
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…|\||\.\.\.")
 PAPER = {"Equations": [f"({k})" for k in range(1, 21)], "Figures": "12345678", "Tables": ["I", "II"]}
 
@@ -39,7 +39,7 @@ def label(path: Path) -> str:
 
 
 def text_of(path: Path) -> str:
-    """Without blocks of code."""
+    """Return the text of a page without blocks of code."""
     return FENCED.sub("", path.read_text())
 
 
@@ -55,7 +55,7 @@ def with_blocks() -> list[Path]:
 
 
 def anchors(path: Path) -> set[str]:
-    """As GitHub and mkdocs both make them of headings."""
+    """Return the anchors that GitHub and mkdocs make of headings."""
     found = set()
     for heading in re.findall(r"^#+ (.+)$", text_of(path), re.MULTILINE):
         plain = re.sub(r"[`*\[\]$\\]", "", heading).lower()
@@ -71,7 +71,7 @@ def test_links_lead_somewhere(path):
         file, _, anchor = target.partition("#")
         there = (path.parent / file).resolve() if file else path
         if there.suffix == ".ipynb":
-            there = ROOT / "notebooks" / there.name  # the site has them there, docs/ has not
+            there = ROOT / "notebooks" / there.name  # notebooks are below docs/ on the site, but not in the repository
         assert there.exists(), f"{target}: no such file"
         assert ROOT in there.parents, f"{target}: outside of the repository"
         if anchor and there.suffix == ".md":
@@ -79,7 +79,7 @@ def test_links_lead_somewhere(path):
 
 
 def test_notebooks_links_lead_somewhere():
-    """As they lie in the repository, or in the site, where they are below docs/."""
+    """Links work in the repository or on the site, where the notebooks are below docs/."""
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         cells = json.loads(path.read_text())["cells"]
         text = "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
@@ -99,7 +99,7 @@ def test_references_are_names_of_the_library(path):
 
 
 def resolve(name: str) -> Any:
-    """What a dotted name stands for: modules first, for a function may share its name with its room."""
+    """Return what a dotted name refers to; modules come first, since a function may share its name with its room."""
     parts = name.replace("pj.", "pushjax.", 1).split(".") if name.startswith("pj.") else name.split(".")
     for many in range(len(parts), 0, -1):
         try:
@@ -137,7 +137,7 @@ def test_names_in_backticks_exist(path):
 
 
 def reexported(room: str) -> list[str]:
-    """What the front door of a room gives, or that of the package."""
+    """Return the public names of a room, or of the package."""
     tree = ast.parse((ROOT / "pushjax" / room / "__init__.py").read_text())
     return [name.asname for node in tree.body if isinstance(node, ast.ImportFrom) for name in node.names if name.asname]
 
@@ -152,7 +152,7 @@ def test_every_public_name_is_in_the_reference_once():
     names += [f"plot.{name}" for name in reexported("plot") if not name.isupper()]
     assert len(names) > 60
     for name in names:
-        # a function that shares its name with its room is asked for by both
+        # a function that shares its name with its room appears with both
         times = found.count(f"pushjax.{name}") + found.count(f"pushjax.{name}.{name}")
         assert times == 1, f"pushjax.{name} is {times} times on the pages of docs/api, in a line `::: pushjax.{name}`"
     for name in found:
@@ -176,7 +176,7 @@ def test_statuses_are_all_in_the_table():
 
 def test_messages_are_those_of_the_code():
     sources = "\n".join(path.read_text() for path in sorted((ROOT / "pushjax").rglob("*.py")))
-    sources = re.sub(r'"\n\s*f?"', "", sources)  # strings written over several lines
+    sources = re.sub(r'"\n\s*f?"', "", sources)  # strings over several lines
     rows = re.findall(r"^\| (`[^|]+`) \|", (DOCS / "messages.md").read_text(), re.MULTILINE)
     parts = [part.strip() for row in rows for span in re.findall(r"`([^`]+)`", row) for part in span.split("…")]
     parts = [part for part in parts if len(part) > 5]
@@ -210,10 +210,10 @@ def commands() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize("command", sorted({command for _, command in commands()}))
 def test_commands_parse(command, capsys):
-    from pushjax import cli
+    from pushjax.cli import main as cli
 
     arguments = shlex.split(command)[1:]
-    if arguments == ["--version"]:  # which is looked at before anything is parsed
+    if arguments == ["--version"]:  # this is handled before anything is parsed
         cli.main(arguments)
         assert capsys.readouterr().out.startswith("pushjax ")
     elif "--help" in arguments:
@@ -227,29 +227,34 @@ def test_commands_parse(command, capsys):
 def parsed(arguments: list[str]) -> Any:
     import tyro
 
-    from pushjax import cli
+    from pushjax.cli import main as cli
 
     return tyro.cli(cli.Command, args=arguments, prog="pushjax")  # pyright: ignore[reportArgumentType]
 
 
 def test_scripts_in_commands_exist():
-    named = {
-        name for path in PAGES for name in re.findall(r"python ((?:benchmarks|docs)/[\w/]+\.py)", path.read_text())
-    }
+    named = {name for path in PAGES for name in re.findall(r"python (docs/[\w/]+\.py)", path.read_text())}
     assert named
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
 
 
+def test_benchmarks_in_commands_exist():
+    from benchmarks.__main__ import listing
+
+    cases = {line.split()[0] for line in listing().splitlines()}
+    named = {name for path in PAGES for name in re.findall(r"python -m benchmarks ([a-z]\w+)", path.read_text())}
+    assert named
+    assert named <= cases
+
+
 def test_options_are_all_in_the_command_line_page():
-    from pushjax import cli
+    from pushjax.cli import main as cli
     from pushjax.experiments.identify_logs import Options
 
     page = (DOCS / "command-line.md").read_text()
-    for command in (cli.Common, Options, cli.Bench):
+    for command in (cli.Common, Options):
         for name in command.__dataclass_fields__:
-            if name != "case":
-                assert f"--{name}" in page, name
-    assert [case for case in get_args(cli.BenchCase) if f"`{case}`" not in page] == []
+            assert re.search(rf"--(no-)?{name}\b", page), name
     reproduce = (DOCS / "experiments" / "index.md").read_text()
     for name, takes in cli.TAKES.items():
         row = re.search(rf"^\| `{name}` \|.*$", reproduce, re.MULTILINE)
@@ -262,7 +267,7 @@ def test_options_are_all_in_the_command_line_page():
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    """What became of each page: "" or the end of a traceback. All in one process: they share what is compiled."""
+    """Return for each page "" or the end of a traceback; one process runs all, to share compiled programs."""
     environment = os.environ | {"JAX_ENABLE_X64": "0", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
     command = [sys.executable, __file__, *map(str, with_blocks())]
     folder = tmp_path_factory.mktemp("pages")
@@ -308,7 +313,7 @@ def run_page(path: Path) -> None:
 
 
 def compare(value: Any, told: str, where: str) -> None:
-    """Numbers, to one unit of the last digit that is written."""
+    """Compare numbers to one unit of the last digit that is written."""
     numbers = [part.strip() for part in told.split(",")]
     values = np.ravel(np.asarray(value, float))
     assert len(values) == len(numbers), f"{where}: {told!r} against {values}"
@@ -319,14 +324,6 @@ def compare(value: Any, told: str, where: str) -> None:
 
 
 # The site
-
-
-def test_picture_of_the_architecture_is_that_of_the_imports(monkeypatch):
-    monkeypatch.syspath_prepend(DOCS / "_site")
-    architecture = importlib.import_module("architecture")
-    assert architecture.PICTURE.read_text() == architecture.picture()
-    rooms = re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", (DOCS / "architecture.md").read_text(), re.M)))
-    assert sorted(rooms) == sorted(architecture.ROOMS)
 
 
 @pytest.fixture(scope="module")

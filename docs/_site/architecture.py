@@ -1,147 +1,200 @@
-"""The picture of the rooms and what each is built on, from the imports themselves.
+"""The picture of the package's architecture, drawn from the imports. A room is a subpackage or module of `pushjax`.
 
     python docs/_site/architecture.py
 
-writes docs/architecture.svg. An arrow goes from a room to one that imports it, unless another way of arrows does so
-too (the transitive reduction). Where boxes stand is said below; a room that is missing there is an error.
+writes docs/architecture.svg. An arrow goes from a room to one that imports it, unless other arrows already lead there
+(the transitive reduction). Each room is drawn as low as possible, above everything that
+imports it, and arrows pass beside the boxes of the rows between.
 """
 
 import ast
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "pushjax"
 PICTURE = ROOT / "docs" / "architecture.svg"
-# Column (from the left) and row (from the top) of each room, and what it is for.
-GEOMETRY, FRICTION, CONTACT, PUSHES, LEARNING, SHELL = "#56B4E9", "#E69F00", "#009E73", "#0072B2", "#CC79A7", "#999999"
-ROOMS = {
-    "se2": (0, 3, GEOMETRY),
-    "shapes": (1, 0, GEOMETRY),
-    "status": (3, 0, CONTACT),
-    "support": (0, 1, FRICTION),
-    "limit_surface": (3, 1, FRICTION),
-    "hands": (1, 1, GEOMETRY),
-    "contacts": (1, 2, CONTACT),
-    "solve": (2, 2, CONTACT),
-    "table": (3, 2, FRICTION),
-    "friction_model": (4, 2, FRICTION),
-    "fit": (5, 2, FRICTION),
-    "advance": (1, 3, PUSHES),
-    "working_set": (2, 3, CONTACT),
-    "substeps": (1, 4, PUSHES),
-    "rollout": (2, 4, PUSHES),
-    "random_rollout": (2.45, 5, PUSHES),
-    "monte_carlo": (2.45, 6, PUSHES),
-    "scores": (0, 4, LEARNING),
-    "datasets": (0, 5, LEARNING),
-    "identify": (1, 6, LEARNING),
-    "plot": (1.55, 7.3, SHELL),
-    "report": (4, 6, SHELL),
-    "verify": (4, 4, CONTACT),
-    "problems": (5, 4, CONTACT),
-    "experiments": (3, 7.3, SHELL),
-    "bench": (5, 7.3, SHELL),
-    "page": (4, 8.3, SHELL),
-    "cli": (5, 8.3, SHELL),
-}
-WIDTH, HEIGHT, ACROSS, DOWN, MARGIN = 124, 30, 158, 66, 16
+# In order of imports: a room imports only those before it.
+ROOMS = (
+    "_internal",
+    "_math",
+    "geometry",
+    "metrics",
+    "friction",
+    "contact",
+    "simulation",
+    "datasets",
+    "identification",
+    "testing",
+    "plot",
+    "experiments",
+    "cli",
+)
+WIDTH, HEIGHT, ACROSS, DOWN, MARGIN = 124, 30, 150, 66, 16
+POINT = 40  # room for an arrow that passes a row
 
 
-def imports() -> dict[str, set[str]]:
-    """Of each room, the rooms that it imports: those whose names begin with an underscore serve all, and are left out.
+def modules() -> dict[str, set[str]]:
+    """Return, for each module of the package, the modules of the package that it imports, anywhere in its code.
 
-    A name taken from `pushjax` itself comes from the room that the package's own front door has it from.
+    A name from `pushjax` itself, also as `pj.NAME`, is assigned to the module that defines it.
+
+    Returns:
+        Names of the imported modules, by the name of the module.
     """
-    package = ROOT / "pushjax"
-    front = {
-        name.asname: node.module.split(".")[1]
-        for node in ast.parse((package / "__init__.py").read_text()).body
+    public = {
+        name.name: node.module
+        for node in ast.parse((PACKAGE / "__init__.py").read_text()).body
         if isinstance(node, ast.ImportFrom) and node.module and "." in node.module
         for name in node.names
     }
-    found: dict[str, set[str]] = {}
-    for path in sorted(package.rglob("*.py")):
-        room = path.relative_to(package).with_suffix("").parts[0]
-        if room.startswith("_"):
-            continue
-        source = path.read_text()
-        names = {front[part] for part in _used(source) if part in front}
-        for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pushjax":
-                parts = node.module.split(".")
-                names |= {parts[1]} if len(parts) > 1 else {front.get(a.name, a.name) for a in node.names}
-        found.setdefault(room, set()).update(n for n in names if n != room and not n.startswith("_"))
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        found[name] = _imported(ast.parse(path.read_text()), public) - {name}
+    del found["pushjax"], found["pushjax.__main__"]
     return found
 
 
-def _used(source: str) -> set[str]:
-    """What a file takes from `pj`."""
-    return {
-        node.attr
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "pj"
-    }
+def _imported(tree: ast.AST, public: dict[str, str]) -> set[str]:
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            node.body.clear()  # for type checkers only: nothing is imported
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "pj":
+            found |= {public[node.attr]} if node.attr in public else set()
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pushjax":
+            found |= {_module(node.module, name.name, public) for name in node.names}
+    return found - {"pushjax"}
 
 
-def above(found: dict[str, set[str]], room: str, seen: tuple[str, ...] = ()) -> set[str]:
-    """All that a room is built on. Raises ValueError where it is built on itself."""
-    if room in seen:
-        raise ValueError(f"imports go round: {' → '.join((*seen, room))}")
-    return found[room].union(*(above(found, other, (*seen, room)) for other in found[room]))
+def _module(source: str, name: str, public: dict[str, str]) -> str:
+    """Return the module that `from source import name` imports from: `source`, or a module in it."""
+    inside = ROOT.joinpath(*source.split("."), name)
+    if inside.is_dir() or inside.with_suffix(".py").exists():
+        return f"{source}.{name}"
+    return public.get(name, source) if source == "pushjax" else source
+
+
+def room(module: str) -> str:
+    """Return the room of a module."""
+    return module.split(".")[1]
+
+
+def rooms(found: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Return, for each room, the other rooms that it imports.
+
+    Args:
+        found: Imports of the modules, from `modules`.
+    """
+    built: dict[str, set[str]] = {room(module): set() for module in found}
+    for module, others in found.items():
+        built[room(module)] |= {room(other) for other in others} - {room(module)}
+    return built
+
+
+def above(found: dict[str, set[str]], one: str, seen: tuple[str, ...] = ()) -> set[str]:
+    """Return everything that a room or module imports, directly or indirectly.
+
+    Args:
+        found: Imports of the rooms or modules.
+        one: Name of the room or module.
+        seen: Names on the way to it, for the recursion.
+
+    Raises:
+        ValueError: If the imports form a cycle.
+    """
+    if one in seen:
+        raise ValueError(f"imports go round: {' → '.join((*seen[seen.index(one) :], one))}")
+    return found[one].union(*(above(found, other, (*seen, one)) for other in found[one]))
 
 
 def arrows(found: dict[str, set[str]]) -> list[tuple[str, str]]:
-    """(from, to) of the transitive reduction."""
+    """Return the arrows of the transitive reduction as pairs: the imported room and the room that imports it."""
     return [
-        (other, room)
-        for room, others in sorted(found.items())
+        (other, one)
+        for one, others in sorted(found.items())
         for other in sorted(others)
         if not any(other in above(found, between) for between in others if between != other)
     ]
 
 
-def _center(room: str) -> tuple[float, float]:
-    column, row, _ = ROOMS[room]
-    return MARGIN + WIDTH / 2 + column * ACROSS, MARGIN + HEIGHT / 2 + row * DOWN
+def rows(found: dict[str, set[str]]) -> dict[str, int]:
+    """Return the row of each room: as low as possible, above everything that is built on it."""
+    above_it: dict[str, int] = {}
+    for one in reversed(ROOMS):
+        above_it[one] = min((above_it[other] for other in ROOMS if one in found[other]), default=0) - 1
+    first = min(above_it.values())
+    return {one: row - first for one, row in above_it.items()}
 
 
-def _arrow(a: str, b: str) -> str:
-    """From below a box; from its side, where the way is far across."""
-    (x0, y0), (x1, y1) = _center(a), _center(b)
-    side = (x1 > x0) - (x1 < x0)
-    if abs(y1 - y0) < 1:
-        return f'<path d="M{x0 + side * WIDTH / 2:g},{y0:g} L{x1 - side * (WIDTH / 2 + 3):g},{y1:g}"/>'
-    y1 -= HEIGHT / 2 + 3
-    if abs(x1 - x0) > 0.7 * ACROSS and y1 - y0 > 1.2 * DOWN:
-        x0 += side * WIDTH / 2
-        return f'<path d="M{x0:g},{y0:g} C{x0 + side * 34:g},{y0:g} {x1:g},{y1 - 70:g} {x1:g},{y1:g}"/>'
-    y0 += HEIGHT / 2
-    bend = min((y1 - y0) * 0.6, 50)
-    return f'<path d="M{x0:g},{y0:g} C{x0:g},{y0 + bend:g} {x1:g},{y1 - bend:g} {x1:g},{y1:g}"/>'
+def ways(found: dict[str, set[str]], row: dict[str, int]) -> list[list[str]]:
+    """Return the arrows, each with a point, named after it, in every row that it passes."""
+    return [
+        [below, *(f"{below}>{one}@{k}" for k in range(row[below] + 1, row[one])), one] for below, one in arrows(found)
+    ]
+
+
+def places(row: dict[str, int], paths: list[list[str]]) -> dict[str, tuple[float, float]]:
+    """Return the middle of each box and of each point that an arrow passes.
+
+    Within a row they are ordered by the mean place of what they are connected to in the rows above and below.
+    """
+    at = dict(row) | {name: int(name.partition("@")[2]) for path in paths for name in path if "@" in name}
+    levels: list[list[str]] = [[] for _ in range(1 + max(at.values()))]
+    for name, k in at.items():
+        levels[k].append(name)
+    links = [pair for path in paths for pair in pairwise(path)]
+    x = {name: float(k) for level in levels for k, name in enumerate(level)}
+    for sweep in range(12):
+        for level in levels if sweep % 2 else reversed(levels):
+            near = {name: [x[a if b == name else b] for a, b in links if name in (a, b)] or [x[name]] for name in level}
+            level.sort(key=lambda name: (sum(near[name]) / len(near[name]), name))
+            widths = [POINT if "@" in name else ACROSS for name in level]
+            left = -sum(widths) / 2
+            for name, width in zip(level, widths, strict=True):
+                x[name], left = left + width / 2, left + width
+    leftmost = min(x.values())
+    return {name: (MARGIN + WIDTH / 2 + x[name] - leftmost, MARGIN + HEIGHT / 2 + k * DOWN) for name, k in at.items()}
+
+
+def _curve(points: list[tuple[float, float]]) -> str:
+    """Return a path from the bottom of the first box, through the points between, to the top of the last."""
+    parts = []
+    for (xa, ya), (xb, yb) in pairwise(points):
+        begin, end = ya + HEIGHT / 2, yb - HEIGHT / 2 - (3 if (xb, yb) == points[-1] else 0)
+        half = (end - begin) / 2
+        parts.append(f"{'L' if parts else 'M'}{xa:g},{begin:g}")
+        parts.append(f"C{xa:g},{begin + half:g} {xb:g},{end - half:g} {xb:g},{end:g}")
+    return f'<path d="{" ".join(parts)}"/>'
 
 
 def picture() -> str:
-    found = imports()
-    missing = sorted(found.keys() ^ ROOMS.keys())
-    if missing:
-        raise ValueError(f"no place, or no room: {', '.join(missing)}")
-    wide = max(column for column, _, _ in ROOMS.values()) * ACROSS + WIDTH + 2 * MARGIN
-    high = max(row for _, row, _ in ROOMS.values()) * DOWN + HEIGHT + 2 * MARGIN
+    """Return the picture as SVG. Raise ValueError for a room that the list lacks, or has too much."""
+    found = rooms(modules())
+    if found.keys() != set(ROOMS):
+        raise ValueError(f"not in the list of rooms, or no room: {', '.join(sorted(found.keys() ^ set(ROOMS)))}")
+    row = rows(found)
+    paths = ways(found, row)
+    center = places(row, paths)
+    wide, high = (max(at[axis] for at in center.values()) + MARGIN for axis in (0, 1))
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide:g} {high:g}" font-family="sans-serif" '
-        'font-size="13">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide + WIDTH / 2:g} {high + HEIGHT / 2:g}" '
+        'font-family="sans-serif" font-size="13">',
         '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path d="M0,0 L8,4 L0,8 z" fill="#777"/></marker></defs>',
-        f'<rect width="{wide:g}" height="{high:g}" fill="white"/>',
+        '<rect width="100%" height="100%" fill="white"/>',
         '<g fill="none" stroke="#777" stroke-width="1.2" marker-end="url(#tip)">',
-        *(_arrow(a, b) for a, b in arrows(found)),
+        *(_curve([center[name] for name in path]) for path in paths),
         "</g>",
     ]
-    for room, (_, _, colour) in ROOMS.items():
-        x, y = _center(room)
+    for one in ROOMS:
+        x, y = center[one]
         lines.append(
             f'<rect x="{x - WIDTH / 2:g}" y="{y - HEIGHT / 2:g}" width="{WIDTH}" height="{HEIGHT}" rx="5" fill="white" '
-            f'stroke="{colour}" stroke-width="2.5"/>'
-            f'<text x="{x:g}" y="{y + 4.5:g}" text-anchor="middle" fill="#222">{room}</text>'
+            f'stroke="#0072B2" stroke-width="2"/>'
+            f'<text x="{x:g}" y="{y + 4.5:g}" text-anchor="middle" fill="#222">{one}</text>'
         )
     return "\n".join([*lines, "</svg>", ""])
 

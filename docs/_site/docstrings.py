@@ -1,7 +1,7 @@
-"""Docstrings as the reference shows them; the sources stay as they are.
+"""A griffe extension that prepares docstrings for the reference. It does not change the sources.
 
 Classes whose arguments are their fields (equinox modules, named tuples, dataclasses) get a signature. Names in
-backticks become links. Columns set out by spaces stay columns, examples become code.
+backticks become links. Columns aligned by spaces stay columns.
 """
 
 import re
@@ -10,11 +10,21 @@ import griffe
 
 COLUMNS = re.compile(r"^\S+( \S+)* {3,}\S")
 NAME = re.compile(r"(?<![\[`])`([A-Z]\w+|[a-z]+(?:_[a-z]+)+|rollout|step|identify|line|through|resample)`(?![\]`])")
-ROOMS = ("identify", "monte_carlo", "random_rollout", "rollout")  # as in hooks.py
-BASES = ("Module", "NamedTuple", "Shape", "LimitSurface", "RandomSurface", "ContactSolver", "StickingSolver", "Outline")
+BASES = (
+    "Module",
+    "NamedTuple",
+    "Shape",
+    "LimitSurface",
+    "SurfaceDistribution",
+    "ContactSolver",
+    "StickingSolver",
+    "Outline",
+)
 
 
 class Readable(griffe.Extension):
+    """Extension that visits every object of the package."""
+
     def on_package(self, *, pkg, loader, **kwargs) -> None:
         public = {name for name, member in pkg.members.items() if member.is_alias and not name.startswith("_")}
         self._visit(pkg, public, set())
@@ -26,56 +36,33 @@ class Readable(griffe.Extension):
         if found.is_class:
             _signed(found)  # pyright: ignore[reportArgumentType]
         if found.docstring is not None:
-            text = _linked(_named(found.docstring.value, _arguments(found)), public)
-            found.docstring.value = _columns_kept(text)
+            found.docstring.value = _columns_kept(_linked(found.docstring.value, public))
         for member in found.members.values():
             if not member.is_alias:
                 self._visit(member, public, seen)  # pyright: ignore[reportArgumentType]
 
 
 def _linked(text: str, public: set[str]) -> str:
+    """Turn public names in backticks into links."""
+
     def link(name: re.Match) -> str:
-        room = f"{name[1]}." if name[1] in ROOMS else ""
-        return f"[`{name[1]}`][pushjax.{room}{name[1]}]" if name[1] in public or room else name[0]
+        return f"[`{name[1]}`][pushjax.{name[1]}]" if name[1] in public else name[0]
 
     return NAME.sub(link, text)
 
 
-def _arguments(found: griffe.Object) -> set[str]:
-    if found.is_class:
-        return {name for name, member in found.members.items() if member.is_attribute} | _arguments_of(
-            found.members.get("__init__")
-        )
-    return _arguments_of(found)
-
-
-def _arguments_of(found: griffe.Object | griffe.Alias | None) -> set[str]:
-    return {parameter.name for parameter in getattr(found, "parameters", [])}
-
-
-def _named(text: str, arguments: set[str]) -> str:
-    """What is said of arguments and fields begins with their names, which are set off."""
-
-    def bold(found: re.Match) -> str:
-        names = found[2].split(", ")
-        return f"{found[1]}**{found[2]}:**" if set(names) <= arguments else found[0]
-
-    return re.sub(r"(^|\n|[.;:] |\.\n)(\w+(?:, \w+)*):(?=\s)", bold, text)
-
-
 def _columns_kept(text: str) -> str:
-    """Paragraphs that are set out in columns, and examples, as blocks of code."""
+    """Turn paragraphs with aligned columns into blocks of code."""
     paragraphs = re.split(r"\n\s*\n", text)
     for k, paragraph in enumerate(paragraphs):
         lines = paragraph.split("\n")
-        if lines[0].startswith(">>>"):
-            paragraphs[k] = "\n".join(["```pycon", *lines, "```"])
-        elif sum(bool(COLUMNS.match(line)) for line in lines) >= 2:
+        if sum(bool(COLUMNS.match(line)) for line in lines) >= 2:
             paragraphs[k] = "\n".join("    " + line.replace("[`", "`").split("`][")[0] for line in lines)
     return "\n\n".join(paragraphs)
 
 
 def _signed(found: griffe.Class) -> None:
+    """Give a class without its own `__init__` a signature made of its fields."""
     bases = [str(base).rpartition(".")[2] for base in found.bases]
     found.bases = [base for base, name in zip(found.bases, bases, strict=True) if name not in ("Module", "NamedTuple")]
     if "__init__" in found.members:

@@ -1,7 +1,8 @@
-"""Work that only some examples of a batch need, done for those alone.
+"""Conditional computation under `vmap` that runs only for the examples of a batch that need it.
 
-`vmap` turns a condition into a selection: every example of a batch pays for both branches. Here the examples that need
-the work are gathered into tiles, worked on, and scattered back, so that a batch pays for what it needs.
+`vmap` turns a condition into a selection: both branches are computed for every example of the batch. Here the examples
+that need the computation are gathered into tiles, computed tile by tile, and scattered back. So the cost of a batch
+grows with the number of examples that need the computation.
 """
 
 from collections.abc import Callable
@@ -11,21 +12,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._vec import wherever
+from pushjax._internal.xla import update_if
 
-TILE = 128  # examples that are worked on together
+TILE = 128  # examples that are computed together
 
 
 def only_where(needed: Bool[Array, ""], work: Callable[..., Any], instead: Any, *args: Any) -> Any:
-    """`work(*args)` where it is needed, else `instead`, of the same structure.
+    """Return `work(*args)` where `needed` holds, else `instead`.
 
-    Of one example, or under `vmap`, however nested, of a batch. Not for derivatives. `work` must not close over
-    anything that is batched.
+    It handles one example, or a batch under any number of nested `vmap`. It cannot be differentiated.
+
+    Args:
+        needed: Whether this example needs the computation.
+        work: Function of `args`. It must not close over anything that is batched.
+        instead: Result where `needed` is False, of the same structure as the result of `work`.
+        *args: Arguments of `work`, pytrees of arrays.
     """
 
     @jax.custom_batching.custom_vmap
     def chosen(needed, instead, args):
-        return wherever(needed, lambda _: work(*args), instead)
+        return update_if(needed, lambda _: work(*args), instead)
 
     @chosen.def_vmap
     def _(size, batched, needed, instead, args):
@@ -35,7 +41,16 @@ def only_where(needed: Bool[Array, ""], work: Callable[..., Any], instead: Any, 
 
 
 def _of_batch(work: Callable[..., Any], size: int, batched: Any, needed, instead, args):
-    """What `custom_vmap` asks for: the outcome of a batch, and which of its leaves are batched."""
+    """Batching rule of `only_where`: return the result for a batch, and which of its leaves are batched (all are).
+
+    Args:
+        work: Function of one example's arguments.
+        size: Number of examples in the batch.
+        batched: For each of `needed`, `instead` and `args`, which of its leaves have a batch axis.
+        needed: Which examples need the computation.
+        instead: Results of the other examples.
+        args: Arguments of `work`.
+    """
 
     def spread(tree, which):
         return jax.tree.map(lambda x, is_own: x if is_own else jnp.broadcast_to(x, (size, *jnp.shape(x))), tree, which)
@@ -48,7 +63,8 @@ def _of_batch(work: Callable[..., Any], size: int, batched: Any, needed, instead
 
     @batch.def_vmap
     def _(outer, batched, needed, instead, args):
-        # a batch of batches is one longer batch
+        # A batch of batches is flattened into one longer batch. `ours` is whether an array has the axis of the inner
+        # `vmap`, `theirs` whether it has that of the outer one.
         def joined(x, ours, theirs):
             if not ours:
                 return jnp.repeat(x, size, axis=0) if theirs else x
@@ -72,11 +88,20 @@ def _of_batch(work: Callable[..., Any], size: int, batched: Any, needed, instead
 
 
 def _in_tiles(work: Callable[..., Any], own: Any, needed, instead, args):
-    """own: which leaves of the arguments have an axis of examples, in front."""
+    """Return the result for a batch, computed tile by tile for the examples that need it.
+
+    Args:
+        work: Function of one example's arguments.
+        own: Which leaves of `args` are batched, on axis 0. The other leaves are shared by all examples.
+        needed: (batch,), which examples need the computation.
+        instead: Results of the other examples, each leaf batched on axis 0.
+        args: Arguments of `work`.
+    """
     size = needed.shape[0]
     tile = min(TILE, size)
     count = jnp.sum(needed.astype(jnp.int32))
-    # those in need first; past them out of range, where nothing is written
+    # Indices of the examples that need the computation, then `size` as padding. A padded entry of a tile computes the
+    # last example again (`which`), and its result is dropped, because its index (`at`) is out of range.
     order = jnp.nonzero(needed, size=size + tile, fill_value=size)[0].astype(jnp.int32)
     axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
 

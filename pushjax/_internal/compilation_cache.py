@@ -1,4 +1,4 @@
-"""Compiled programs, kept on disk from one process to the next."""
+"""The on-disk cache of compiled programs, shared by successive processes."""
 
 import hashlib
 import platform
@@ -8,41 +8,45 @@ import jax
 import platformdirs
 from jax.experimental.compilation_cache import compilation_cache
 
-LARGEST = 2 << 30  # bytes; what was used least is deleted first
+MAX_BYTES = 2 << 30  # bytes; the least recently used programs are deleted first
 
 
 def enable_compilation_cache(folder: str | Path | None = None) -> Path:
-    """Keeps compiled programs on disk, so that a later process loads what this one compiled.
+    """Keep compiled programs on disk, so that a later process loads the programs that this one compiled.
 
-    JAX does the keeping, for all programs of the process and not only for those of this library. A program is found
-    again if it is the same, of the same shapes and types, compiled by the same version of JAX with the same flags.
-    The folder is limited to 2 GiB.
+    This enables JAX's own cache, for all programs of the process and not only for those of this library. A later
+    process loads a program if it is the same program with the same shapes and dtypes, compiled by the same version of
+    JAX with the same flags. The folder is limited to 2 GiB. If JAX already uses a folder and no other one is given,
+    nothing is changed, and the limit is the one that JAX has there.
 
     Args:
-        folder: Where to keep them. Default: where JAX keeps them already (`JAX_COMPILATION_CACHE_DIR`, or
+        folder: Folder of the cache. Default: the folder that JAX already uses (`JAX_COMPILATION_CACHE_DIR`, or
             `jax.config`), else a folder for this kind of processor in the user's cache folder.
 
     Returns:
-        The folder. It is created when the first program is written.
+        The folder. JAX creates it when it writes the first program.
     """
     known = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     if folder is None and known:
         return Path(known)
-    path = Path(folder).expanduser() if folder is not None else _users_folder()
+    path = Path(folder).expanduser() if folder is not None else _default_folder()
     jax.config.update("jax_compilation_cache_dir", str(path))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # also small ones: there are hundreds
-    jax.config.update("jax_compilation_cache_max_size", LARGEST)
-    compilation_cache.reset_cache()  # JAX looks once, at the first program, whether it is to keep any
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # small programs too: there are hundreds
+    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
+    compilation_cache.reset_cache()  # JAX chose its cache at the first program; this makes it choose again
     return path
 
 
-def _users_folder() -> Path:
-    """A home folder may be shared by machines of which one cannot run what another compiled."""
+def _default_folder() -> Path:
+    """Return the default folder, one for each kind of processor.
+
+    Machines that share a home folder may not be able to run each other's compiled programs.
+    """
     return platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / _processor()
 
 
 def _processor() -> str:
-    """Names the kind of processor, and what instructions it has."""
+    """Return a name for this kind of processor and its instruction set."""
     told = Path("/proc/cpuinfo")
     features = platform.processor()
     if told.is_file():

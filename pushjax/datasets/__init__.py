@@ -1,4 +1,4 @@
-"""Loaders of published push logs. Everything here is numpy, in SI units."""
+"""Loaders of published push logs. They use NumPy only and return SI units."""
 
 from pushjax.datasets.folder import find_data as find_data
 from pushjax.datasets.load import load_recordings as load_recordings

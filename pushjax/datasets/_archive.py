@@ -1,4 +1,4 @@
-"""Curated `.npz` archives: read whole, with one clear error for whatever is wrong with the file."""
+"""Read curated `.npz` archives as a whole, with one clear error for any fault of the file."""
 
 import zipfile
 import zlib
@@ -14,10 +14,22 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
-    """The `wanted` arrays of a file that `holds` what it is named for, "pushes" say. Raises LogError."""
+    """Read arrays of an `.npz` archive.
+
+    Args:
+        path: The archive.
+        wanted: Names of the arrays to read.
+        holds: What the archive contains, for error messages ("pushes", say).
+
+    Returns:
+        The arrays by name.
+
+    Raises:
+        LogError: If the file is missing, is no archive, is damaged, or lacks an array.
+    """
     names = list(wanted)
     try:
-        # Opened here, because np.load leaves a file open that turns out to be no archive.
+        # The file is opened here, because np.load does not close a file that is no archive.
         with path.open("rb") as file:
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -31,21 +43,37 @@ def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
     except OSError as error:
         reason = error.strerror or error
         raise LogError(path, f"expected an .npz archive, but cannot read the file: {reason}") from error
-    # a damaged archive may ask for a method of compression that does not exist, or for all the memory there is
+    # A damaged archive may request a compression method that does not exist, or more memory than there is.
     except (ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise LogError(path, f"expected an .npz archive of {holds}, found something else: {error}") from error
 
 
 def archive_names(path: Path, holds: str) -> frozenset[str]:
-    """Which arrays a file has. Raises LogError as `read_archive` does."""
-    read_archive(path, (), holds)  # says what is wrong with a file that is no archive
+    """Return the names of the arrays in an `.npz` archive.
+
+    Args:
+        path: The archive.
+        holds: What the archive contains, for error messages.
+
+    Raises:
+        LogError: If the file is missing, damaged or no archive, as in `read_archive`.
+    """
+    read_archive(path, (), holds)  # raises LogError if the file is no archive
     with np.load(path, allow_pickle=False) as archive:
         return frozenset(archive.files)
 
 
 def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """How many pushes the archive has: the rows of `push_index`, and of all in `shapes` (each row's shape). Raises
-    LogError where these differ."""
+    """Return the number of pushes in an archive, after checking that all arrays have this number of rows.
+
+    Args:
+        path: The archive, for error messages.
+        data: Its arrays; the length of `push_index` is the number of pushes.
+        shapes: Shape of one row of each array to check, by name.
+
+    Raises:
+        LogError: If an array has another number of rows or another row shape.
+    """
     count = len(data["push_index"]) if data["push_index"].ndim else -1
     for name, tail in shapes.items():
         if data[name].shape != (count, *tail):
@@ -54,12 +82,21 @@ def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -
 
 
 def check_shapes(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raises LogError for the first array that has another shape."""
+    """Check the shapes of arrays against those expected.
+
+    Args:
+        path: The archive, for error messages.
+        data: Its arrays.
+        shapes: Expected shape of each array to check, by name.
+
+    Raises:
+        LogError: For the first array that has another shape.
+    """
     for name, shape in shapes.items():
         if data[name].shape != shape:
             raise LogError(path, f"expected {name} of shape {shape}, found {data[name].shape}")
 
 
 def floats(array: NDArray[np.generic]) -> Floats:
-    """A copy in float64."""
+    """Return a copy of an array in float64."""
     return np.array(array, dtype=np.float64)

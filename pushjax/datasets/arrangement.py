@@ -1,8 +1,11 @@
-"""The aluminium triangle and the ways it was supported.
+"""Constants of the aluminum triangle that Zhou et al. 2017 pushed, and the ways in which it was supported.
 
-Source: the constants of the toolbox that processed the logs for Table 2 of Zhou et al. 2017
-(github.com/robinzhoucmu/PlanarManipulationToolBox). Its lengths are millimetres in the *corner frame*: origin
-at the right-angle corner, axes along the two legs.
+The constants come from the authors' toolbox. It has lengths in millimeters, and points in the *corner frame*: the
+origin of this frame is at the right-angle corner, and its axes are along the two legs. The functions here return points
+in meters in the body frame, whose origin is at the center of mass.
+
+Reference: Constants of the toolbox that processed the logs for Table 2 of Zhou et al. 2017
+(github.com/robinzhoucmu/PlanarManipulationToolBox).
 """
 
 import re
@@ -13,23 +16,25 @@ from numpy.typing import ArrayLike
 
 from pushjax.datasets.pushes import Floats
 
-# Calibration of the motion capture: the centre of mass in the corner frame, m (a third of each leg).
-CENTRE_OF_MASS = np.array([0.05, 0.05, 0.0])
-# Outline about the centre of mass, m; legs of 0.15 m.
-VERTICES = np.array([[0.0, 0.0], [0.0, 0.15], [0.15, 0.0]]) - CENTRE_OF_MASS[:2]
-# The paper's characteristic length: right-angle corner to centre of mass (not the radius of gyration).
-LENGTH = float(np.hypot(CENTRE_OF_MASS[0], CENTRE_OF_MASS[1]))
-# The toolbox's radius for the finger, m. (The forces set in about 1.6 mm later than it implies.)
+# Calibration of the motion capture: the center of mass in the corner frame, in m (a third of each leg).
+CENTER_OF_MASS = np.array([0.05, 0.05, 0.0])
+# Outline about the center of mass, in m, with legs of 0.15 m.
+VERTICES = np.array([[0.0, 0.0], [0.0, 0.15], [0.15, 0.0]]) - CENTER_OF_MASS[:2]
+# The paper's characteristic length, in m: right-angle corner to center of mass (not the radius of gyration).
+LENGTH = float(np.hypot(CENTER_OF_MASS[0], CENTER_OF_MASS[1]))
+# Radius of the finger in the toolbox, in m. A finger of this radius would touch about 1.6 mm of travel before the
+# measured forces begin.
 TIP_RADIUS = 0.001
-# Comments of the toolbox: mass in kg; the acceleration it computes with, m/s^2.
+# From comments in the toolbox: mass in kg, and the gravity that it computes with, in m/s^2.
 MASS, GRAVITY = 1.518, 9.8
-# The sensor's axes are turned by 45 degrees against the finger's, and seen from below (so a reflection). It
-# reads the reaction on the finger: the force on the object in the finger's frame is FORCE_SIGN * R_TOOL @
-# reading.
+# The sensor's axes are turned by 45 degrees from the finger's and are seen from below, so R_TOOL is a reflection. The
+# sensor measures the reaction on the finger. The force on the object, in the finger's frame, is therefore
+# FORCE_SIGN * R_TOOL @ reading.
 R_TOOL = np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
 FORCE_SIGN = -1.0
 
-# Support points in the corner frame, mm. The logs are named by these numbers, the three x before the three y.
+# Support points in the corner frame, in mm. Names of logs can contain these numbers: first the three x, then the three
+# y. "patch" has no points, because the whole face touches the surface.
 ARRANGEMENTS: dict[str, tuple[tuple[float, float], ...]] = {
     "3pts1": ((30.0, 30.0), (63.33, 43.33), (43.33, 63.33)),
     "3pts2": ((10.0, 10.0), (130.0, 10.0), (10.0, 130.0)),
@@ -42,40 +47,63 @@ _SIX_NUMBERS = re.compile(r"(?<![\d.])\d+(?:\.\d+)?(?:_\d+(?:\.\d+)?){5}(?![\d.]
 
 
 def support_points(arrangement: str) -> Floats:
-    """(p, 2) m, body: support points of a named arrangement, none for "patch"; ValueError for other names."""
+    """Return the support points of a named arrangement.
+
+    Args:
+        arrangement: A key of ARRANGEMENTS.
+
+    Returns:
+        (p, 2) support points, in m, body frame; none for "patch".
+
+    Raises:
+        ValueError: If the arrangement is unknown.
+    """
     if arrangement not in ARRANGEMENTS:
         raise ValueError(f"arrangement must be one of {', '.join(ARRANGEMENTS)}; got {arrangement!r}")
     return _body_from_corner(ARRANGEMENTS[arrangement])
 
 
 def support_force(points: ArrayLike) -> Floats:
-    """(p,) N: normal forces at `points` (p, 2), m, body, that carry the triangle's weight in equilibrium.
+    """Return the normal forces at the support points that carry the triangle's weight in equilibrium.
 
-    Only three points (or none, giving none) determine them. Raises ValueError for another number, for points
-    on one line, and where the centre of mass lies outside their triangle, so that the object would tip over.
+    Args:
+        points: (p, 2) support points, in m, body frame: three, or none, which gives no forces.
+
+    Returns:
+        (p,) normal forces, in N.
+
+    Raises:
+        ValueError: If there is another number of points, which would not determine the forces; if the points lie on one
+            line; or if the center of mass lies outside their triangle, so that the object would tip over.
     """
     where = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     if len(where) == 0:
         return np.empty(0)
     if len(where) != 3 or not np.isfinite(where).all():
         raise ValueError(f"support points must be three finite points, or none; got {where.tolist()}")
-    # Forces add up to the weight and have no moment about the body origin. Scaled by the length so that the
-    # condition number says whether the points lie on one line, whatever the unit.
+    # The forces add up to the weight and have no moment about the body origin. Points divided by LENGTH are
+    # dimensionless. So the condition number does not depend on the unit. It is large if the points lie on one line.
     balance = np.vstack([np.ones(3), where.T / LENGTH])
     if np.linalg.cond(balance) > 1e8:
         raise ValueError(f"support points must not lie on one line; got {where.tolist()}")
     force = np.linalg.solve(balance, np.array([MASS * GRAVITY, 0.0, 0.0]))
     if np.any(force < 0):
-        raise ValueError(f"the centre of mass must lie inside the support points; got {where.tolist()}")
+        raise ValueError(f"the center of mass must lie inside the support points; got {where.tolist()}")
     return force.astype(np.float64)
 
 
 def name_support(path: Path) -> tuple[str, Floats] | None:
-    """Arrangement and support points (p, 2), m, body, told from the file's and folder's names, or None.
+    """Determine the support arrangement from the names of a file and its folder.
 
-    Recognised are `3pts1` ... `3pts4`, `patch`, and six numbers such as `30_90_30_30_30_90`: millimetres in
-    the corner frame, x of the three points and then y. Numbers that match no known arrangement give it the
-    name "unknown".
+    Recognized are `3pts1` ... `3pts4`, `patch`, and six numbers such as `30_90_30_30_30_90`: millimeters in the corner
+    frame, first x of the three points and then y. Numbers of no known arrangement get the name "unknown".
+
+    Args:
+        path: The file.
+
+    Returns:
+        The name of the arrangement and its support points (p, 2), in m, body frame. None if neither the file's name nor
+        the folder's contains an arrangement.
     """
     for name in (path.name, path.parent.name):
         numbers = _SIX_NUMBERS.search(name)
@@ -91,9 +119,15 @@ def name_support(path: Path) -> tuple[str, Floats] | None:
 
 
 def name_surface(path: Path) -> str:
-    """The surface that the names of the file and of its folder tell: "plywood", "hardboard" or "unknown".
+    """Determine the surface from the names of a file and its folder.
 
-    The originals say `wood` in the folder for plywood, and nothing but the arrangement for hardboard.
+    The original logs have `wood` in the folder's name for plywood, and only the arrangement for hardboard.
+
+    Args:
+        path: The file.
+
+    Returns:
+        "plywood", "hardboard" or "unknown".
     """
     for name in (path.name, path.parent.name):
         if "wood" in name:
@@ -104,4 +138,5 @@ def name_surface(path: Path) -> str:
 
 
 def _body_from_corner(points: ArrayLike) -> Floats:
-    return np.asarray(points, dtype=np.float64).reshape(-1, 2) / 1000 - CENTRE_OF_MASS[:2]
+    """Convert points (p, 2) from the corner frame in mm to the body frame in m."""
+    return np.asarray(points, dtype=np.float64).reshape(-1, 2) / 1000 - CENTER_OF_MASS[:2]

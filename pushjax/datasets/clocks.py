@@ -1,4 +1,4 @@
-"""Streams that were sampled apart from each other, brought to the hand's samples."""
+"""Resample separately recorded streams at the times of the hand's samples."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,15 +9,23 @@ from numpy.typing import NDArray
 from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.recordings import Recording, bad_number, checked, interpolated
 
-# s; where the object goes unseen for longer, its pose is not interpolated. Sound logs have gaps of up to 0.39 s.
+# If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
 LONGEST_GAP = 0.5
-# s; stamps of the object that go back by more are no jitter of a tracker but another clock. Seen: 0.007 s.
+# If the object's time stamps go back by more than this (s), the cause is not jitter of the tracker but another clock.
+# The largest jitter seen is 0.007 s.
 MOST_JITTER = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """name: as in the file. columns: what its c values are called. time: (n,) s; values: (n, c)."""
+    """One recorded stream.
+
+    Attributes:
+        name: Name of the stream in the file.
+        columns: Names of its c values.
+        time: (n,) times, in s.
+        values: (n, c) values.
+    """
 
     name: str
     columns: tuple[str, ...]
@@ -25,27 +33,38 @@ class Stream:
     values: Floats
 
     def rows(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Stream":
+        """Return the stream of the selected rows, given as a mask or as indices."""
         return Stream(self.name, self.columns, self.time[which], self.values[which])
 
 
 def aligned(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording | LogError:
-    """The one push of a file from three streams whose stamps are of the same clock, or what is wrong with them.
+    """Combine three streams with time stamps of one clock into the one push of a file.
 
-    Of the hand (m, dof) the samples stay at which the object was seen, and those between. The object's pose and the
-    force on it are interpolated there, the pose's angle the short way. The object is not seen within gaps of its
-    stream longer than LONGEST_GAP; its samples that are all NaN do not count. Time starts at the hand's first sample.
+    The result has the hand's samples from the first to the last one at which the object is seen. The object's pose and
+    the force on it are interpolated at these samples; the angle of the pose takes the short way. The object counts as
+    unseen within gaps of its stream that are longer than LONGEST_GAP. Rows of its stream that are all NaN are ignored.
+    Time starts at the first sample of the hand's stream.
+
+    Args:
+        path: The file, for error messages.
+        hand: Configurations of the hand (n, dof).
+        body: Poses of the object (n, 3).
+        force: Forces on the object (n, 2).
+
+    Returns:
+        The recording, or the error that describes the first fault.
     """
     for stream, most_back, may_lack in ((hand, 0.0, False), (body, MOST_JITTER, True), (force, 0.0, False)):
         fault = _fault(stream, most_back, may_lack)
         if fault is not None:
             return LogError(path, fault, push=0)
-    # A tracker's stamps jitter, so that some fall behind the one before; interpolation needs them in order.
+    # A tracker's time stamps jitter, so some are earlier than the one before. Interpolation needs them in order.
     body = body.rows(np.argsort(body.time, kind="stable"))
     for other in (body, force):
         if hand.time[0] > other.time[-1] or other.time[0] > hand.time[-1]:
             return LogError(path, _apart(hand, other), push=0)
     body = body.rows(np.isfinite(body.values[:, 0]))
-    # Unix seconds use up most of a float64's digits.
+    # Unix times in s use most digits of a float64, so times are taken relative to the first one.
     time, seen_time, force_time = (stream.time - hand.time[0] for stream in (hand, body, force))
     pose = _poses(time, seen_time, body.values)
     seen = np.flatnonzero(np.isfinite(pose[:, 0]))
@@ -58,6 +77,7 @@ def aligned(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording 
 
 
 def _fault(stream: Stream, most_back: float, may_lack: bool) -> str | None:
+    """Describe the first fault of a stream whose stamps may go back by `most_back` (s); None if there is none."""
     if len(stream.time) < 2:
         return f"expected at least two samples in {stream.name}, found {len(stream.time)}"
     for names, values, lacks in ((("time",), stream.time[:, None], False), (stream.columns, stream.values, may_lack)):
@@ -74,7 +94,8 @@ def _fault(stream: Stream, most_back: float, may_lack: bool) -> str | None:
 
 
 def _apart(hand: Stream, other: Stream) -> str:
-    # Seconds after the hand's first stamp: differences of unix times can be read, the times themselves cannot.
+    """Describe two streams that do not overlap in time."""
+    # Times are given relative to the hand's first stamp, because unix times are hard to read.
     origin = hand.time[0]
     first, second = (
         f"{stream.name} from {stream.time[0] - origin:.3f} s to {stream.time[-1] - origin:.3f} s"
@@ -84,7 +105,7 @@ def _apart(hand: Stream, other: Stream) -> str:
 
 
 def _poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """(m, 3) the poses `known` (k, 3), interpolated; NaN outside of them and within their gaps."""
+    """Interpolate poses `known` (k, 3) at times (m,): an array (m, 3), NaN outside of them and within their gaps."""
     if len(known) == 0:
         return np.full((len(time), 3), np.nan)
     pose = interpolated(time, known_time, np.column_stack([known[:, :2], np.unwrap(known[:, 2])]))
@@ -93,7 +114,7 @@ def _poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
 
 
 def _within_gap(time: Floats, known: Floats) -> NDArray[np.bool_]:
-    """(m,) whether each time lies between two of the `known` ones that are too far apart."""
+    """Return a mask (m,) of the times between two `known` ones that are more than LONGEST_GAP apart."""
     before = np.clip(np.searchsorted(known, time, side="right") - 1, 0, None)
     after = np.clip(np.searchsorted(known, time, side="left"), None, len(known) - 1)
     return known[after] - known[before] > LONGEST_GAP

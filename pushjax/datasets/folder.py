@@ -1,4 +1,4 @@
-"""Where recorded pushes lie on this machine; none of them is part of the package."""
+"""Locate the folder of recorded pushes on this machine. The package contains no recordings."""
 
 import os
 from pathlib import Path
@@ -7,7 +7,14 @@ ENVIRONMENT_VARIABLE = "PUSHJAX_DATA"
 
 
 def find_data(name: str | None = None) -> Path | None:
-    """The folder that the environment variable PUSHJAX_DATA names, or `name` inside it; None where there is none."""
+    """Return the folder that the environment variable PUSHJAX_DATA names, or an entry of it.
+
+    Args:
+        name: File or folder inside that folder; None for the folder itself.
+
+    Returns:
+        The path, or None if the variable is not set or the path does not exist.
+    """
     given = os.environ.get(ENVIRONMENT_VARIABLE)
     if not given:
         return None

@@ -1,4 +1,4 @@
-"""Recorded pushes from a file of any of the known kinds."""
+"""Read recorded pushes from a file of any known kind."""
 
 from collections.abc import Callable
 from os import PathLike
@@ -14,31 +14,43 @@ from pushjax.datasets.triangle import load_triangle_log
 
 
 def load_recordings(path: str | PathLike[str]) -> Recordings:
-    """Reads the pushes of one file, of whichever of these kinds it is.
+    """Read the pushes of one file of any known kind.
 
-    `.csv`: a row per sample, one push after another; columns `push` (a number or name), `hand_x`, `hand_y`, `object_x`,
-        `object_y`, `object_theta`, and if known `hand_theta`, `hand_distance`, `time`, `force_x`, `force_y`, in any
-        order. The object's cells are blank where it was not seen, the force's where there was none.
-    `.npz` with `path` (n, k, dof), `start` and `end` (n, 3) or `pose` (n, k, 3), NaN where not seen, and if known
-        `force` (n, k, 2) and `time` (n, k).
-    `.npz` of the folders `three_point_push` and `mit_push_full`.
-    `.txt`, `.txt.gz`: an original log of the aluminium triangle.
-    `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install '.[hdf5]'` for the latter two).
+    Kinds of files:
 
-    Lengths are m, angles rad, forces N, times s; all in the world, forces on the object. How a file begins tells its
-    kind before its name does. What is wrong with single pushes is in `problems`. Raises LogError if the file is none
-    of these, or no push of it is usable.
+    - `.csv`: one row for each sample, one push after another. The columns are `push` (a number or name), `hand_x`,
+      `hand_y`, `object_x`, `object_y`, `object_theta` and, if known, `hand_theta`, `hand_distance`, `time`, `force_x`,
+      `force_y`, in any order. The cells of the object are blank where it was not seen, those of the force where there
+      was none.
+    - `.npz` with `path` (n, k, dof), either `start` and `end` (n, 3) or `pose` (n, k, 3), and, if known, `force`
+      (n, k, 2) and `time` (n, k). `pose` is NaN where the object was not seen.
+    - `.npz` of the folders `three_point_push` and `mit_push_full`.
+    - `.txt`, `.txt.gz`: an original log of the aluminum triangle.
+    - `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install '.[hdf5]'` for the latter two).
+
+    Lengths are in m, angles in rad, forces in N, times in s. All are in the world frame, and forces are those on the
+    object. The first bytes of a file determine its kind. If they do not, its suffix does.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The usable pushes. The field `problems` has an error for each push that cannot be used.
+
+    Raises:
+        LogError: If the file is of no known kind, or if no push of it is usable.
     """
     file = Path(path)
     return _loader(file)(file)
 
 
 def _load_triangle(path: Path) -> Recordings:
+    """Read an original triangle log."""
     return Recordings.of_log(load_triangle_log(path))
 
 
 def _load_npz(path: Path) -> Recordings:
-    """Reads an archive; the arrays in it tell its kind."""
+    """Read an archive of the kind that its arrays indicate."""
     names = archive_names(path, "pushes")
     if "path" in names:
         return load_plain_npz(path, names)
@@ -69,6 +81,11 @@ _SUFFIXES: dict[str, Loader] = {
 
 
 def _loader(path: Path) -> Loader:
+    """Select the loader by the first bytes of the file or else by its suffix.
+
+    Raises:
+        LogError: If the file is unreadable, empty or of no known kind.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(max(len(signature) for signature in _SIGNATURES))

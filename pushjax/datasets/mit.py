@@ -1,12 +1,15 @@
-"""Logs of the MIT pushing data set, and of others in its layout: one push per file, three streams of their own rates.
+"""Read logs of the MIT pushing data set and other logs in its layout: one push per file, three streams.
 
-Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016. A row of a stream is a time
-(s) and three numbers: the tip's x, y (m) and angle, the object's x, y, theta (m, rad), the wrench fx, fy (N), torque;
-all in the world. The wrench is the reaction on the tip, so the force on the object is minus it. The tip is round: its
-angle says nothing.
+The streams have separate rates. Each row has a time (s) and three numbers in the world frame:
 
-Some of the object's stamps fall behind the one before, by up to 7 ms, while those of tip and wrench never do. The poses
-are sorted by their stamps, as in the curated archives; at 0.1 m/s that moves a sample by less than a millimetre.
+- Tip: x, y (m) and angle. The tip is round, so its angle carries no information.
+- Object: x, y (m) and theta (rad).
+- Wrench: fx, fy (N) and torque. It is the reaction on the tip, so the force on the object is its negative.
+
+The object's time stamps sometimes go back, by up to 7 ms. The stamps of tip and wrench never go back. The poses are
+sorted by their stamps, as in the curated archives. At 0.1 m/s, this moves a sample by less than a millimeter.
+
+Reference: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016.
 """
 
 import json
@@ -24,15 +27,22 @@ from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recordings, gathere
 
 STREAMS = ("tip_pose", "object_pose", "ft_wrench")
 COLUMNS = 4
-# Arrays of the curated archives, stream by stream: those of times, and those of values with as many columns.
-ARRAYS = {"tip_t": ("tip_xy", 2), "object_t": ("object_pose", 3), "ft_t": ("ft_wrench", 3)}
-_ABOUT = ("vertices_body", "rho", "tip_radius")
+# Arrays of the curated archives, for each stream: its times, its values, and the number of columns of the values.
+ARCHIVE_ARRAYS = {"tip_t": ("tip_xy", 2), "object_t": ("object_pose", 3), "ft_t": ("ft_wrench", 3)}
+_OBJECT_ARRAYS = ("vertices_body", "rho", "tip_radius")
 
 
 def load_mit_json(path: Path) -> Recordings:
-    """Reads a `.json` of the data set: an object with the lists of rows `tip_pose`, `object_pose`, `ft_wrench`.
+    """Read a `.json` file of the data set, which maps `tip_pose`, `object_pose` and `ft_wrench` to lists of rows.
 
-    Raises LogError if the file is none, or its push cannot be used.
+    Args:
+        path: The file.
+
+    Returns:
+        Its one push.
+
+    Raises:
+        LogError: If the file is not a log of this form, or if its push cannot be used.
     """
     try:
         record = json.loads(path.read_bytes())
@@ -46,19 +56,26 @@ def load_mit_json(path: Path) -> Recordings:
 
 
 def load_mit_hdf5(path: Path) -> Recordings:
-    """Reads an HDF5 file with the datasets `tip_pose`, `object_pose` and `ft_wrench`, each (n, 4).
+    """Read an HDF5 file with the datasets `tip_pose`, `object_pose` and `ft_wrench`, each (n, 4).
 
-    Raises LogError if the file is none, its push cannot be used, or h5py is not installed.
+    Args:
+        path: The file.
+
+    Returns:
+        Its one push.
+
+    Raises:
+        LogError: If the file is not a log of this form, if its push cannot be used, or if h5py is not installed.
     """
     try:
         import h5py
     except ImportError as error:
         message = "expected the package h5py, which reads HDF5, found none: pip install '.[hdf5]'"
         raise LogError(path, message) from error
-    library: Any = h5py  # it has no types
+    library: Any = h5py  # h5py has no type annotations
     try:
         with library.File(path, "r") as file:
-            # Names alone: a file may hold much else, camera images for instance.
+            # Nothing is read here, because a file may hold much else, camera images for instance.
             record = {name: file[name] for name in file if isinstance(file[name], library.Dataset)}
             return _one_push(path, _tables(path, record, lambda rows: np.asarray(rows[()], dtype=np.float64)))
     except LogError:
@@ -68,16 +85,25 @@ def load_mit_hdf5(path: Path) -> Recordings:
 
 
 def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
-    """Reads a file of the `mit_push_full` folder, which holds the arrays `names`, with what it knows of the object.
+    """Read a curated archive from the folder `mit_push_full`, including what it says about the object.
 
-    Raises LogError if an array lacks, has the wrong shape or no numbers, or if the push cannot be used.
+    Args:
+        path: The archive.
+        names: Names of all arrays in it.
+
+    Returns:
+        Its one push, with outline, characteristic length and tip radius if the file has them.
+
+    Raises:
+        LogError: If an array is missing, has the wrong shape or is not numeric, if a number about the object is not
+            finite, or if the push cannot be used.
     """
-    values = [name for name, _ in ARRAYS.values()]
-    data = read_archive(path, [*ARRAYS, *values, *(name for name in _ABOUT if name in names)], "a push")
+    values = [name for name, _ in ARCHIVE_ARRAYS.values()]
+    data = read_archive(path, [*ARCHIVE_ARRAYS, *values, *(name for name in _OBJECT_ARRAYS if name in names)], "a push")
     _check_arrays(path, data)
     numbers = {name: floats(array) for name, array in data.items()}
-    tables = [np.column_stack([numbers[time], numbers[name]]) for time, (name, _) in ARRAYS.items()]
-    vertices, length, radius = (numbers.get(name) for name in _ABOUT)
+    tables = [np.column_stack([numbers[time], numbers[name]]) for time, (name, _) in ARCHIVE_ARRAYS.items()]
+    vertices, length, radius = (numbers.get(name) for name in _OBJECT_ARRAYS)
     return replace(
         _one_push(path, tables),
         vertices=vertices,
@@ -87,8 +113,13 @@ def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
+    """Check types and shapes, and that the numbers about the object are finite.
+
+    Raises:
+        LogError: For the first array that fails.
+    """
     shapes: dict[str, tuple[int, ...]] = {}
-    for time, (values, columns) in ARRAYS.items():
+    for time, (values, columns) in ARCHIVE_ARRAYS.items():
         count = data[time].size
         shapes |= {time: (count,), values: (count, columns)}
     corners = len(data["vertices_body"]) if "vertices_body" in data and data["vertices_body"].ndim else 0
@@ -102,7 +133,12 @@ def _check_arrays(path: Path, data: Arrays) -> None:
 
 
 def _numbers(rows: Any) -> Floats:
-    """Of what JSON gives for a stream. Raises ValueError, which names the first row that is something else."""
+    """Convert the rows of a JSON stream to an array (n, 4).
+
+    Raises:
+        ValueError: If `rows` is not a list, or if a row is not a list of four numbers. For a row that is no list or has
+            another length, the message names the first one.
+    """
     if not isinstance(rows, list):
         raise ValueError(f"a {type(rows).__name__}")
     for at, row in enumerate(rows):
@@ -112,7 +148,16 @@ def _numbers(rows: Any) -> Floats:
 
 
 def _tables(path: Path, record: Mapping[str, Any], numbers: Callable[[Any], Floats]) -> list[Floats]:
-    """The streams of a record, each (n, 4). Raises LogError for one that lacks or is something else."""
+    """Return the streams of a record in the order of STREAMS, each (n, 4).
+
+    Args:
+        path: The file, for error messages.
+        record: The streams by name.
+        numbers: Function that converts a stream to an array.
+
+    Raises:
+        LogError: If a stream is missing or is something else.
+    """
     missing = [name for name in STREAMS if name not in record]
     if missing:
         there = ", ".join(list(record)[:10]) or "nothing"
@@ -131,7 +176,7 @@ def _tables(path: Path, record: Mapping[str, Any], numbers: Callable[[Any], Floa
 
 
 def _one_push(path: Path, tables: list[Floats]) -> Recordings:
-    """Of the streams tip, object and wrench, each with its times in the first column."""
+    """Make a recording from the streams tip, object and wrench, each with its times in the first column."""
     tip, body, wrench = tables
     hand = Stream(STREAMS[0], HAND[:2], tip[:, 0], tip[:, 1:3])
     pose = Stream(STREAMS[1], OBJECT, body[:, 0], body[:, 1:])

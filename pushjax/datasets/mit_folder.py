@@ -1,16 +1,20 @@
-"""Straight pushes of one object on one surface, from the MIT pushing data set as it is published: a file for each push.
+"""Read the straight pushes of one object on one surface from the MIT pushing data set as published, one file per push.
 
-What comes of them has the form of the curated archives (`mit_pushes`), and differs in this. Which pushes are learned
-from is drawn at random. Pushes whose tracker jumps are left out. The angles at 10 and 90 % of the time need not be
-between those at the ends: that rule is of the toolbox, whose angles wrap. Nothing is smoothed, and no other program has
-predicted anything.
+The result has the form of the curated archives (`mit_pushes`), with these differences:
 
-Wrench and twist are averages over six equal parts of the time from 10 to 90 %. The finger touches at the place of the
-outline that is nearest to its centre. Parts are left out in which the object rests, or the force brakes it, is weak, or
-cannot be that of a finger pressing there.
+- The training pushes are drawn at random.
+- Pushes in which the tracker jumps are left out.
+- There is no rule that the object's angles at 10 and 90 % of the time lie between those at the ends. The toolbox of
+  Zhou, Bagnell, Mason, RSS 2017 needs such a rule, because its angles wrap.
+- Nothing is smoothed, and there are no predictions of another program.
+
+The time from 10 to 90 % is divided into six equal parts. Each part gives one wrench, the mean over its samples, and one
+twist, the displacement of the object. The contact is the point of the outline nearest to the center of the finger. A
+part is left out if the object rests, if the force brakes the object or is weak, or if the force cannot be that of a
+finger pressing at the contact.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -18,33 +22,52 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets.mit import load_mit_hdf5, load_mit_json
 from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushName, parse_push_name
-from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, nearest_turn
+from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, wrap_to_pi
 from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
 from pushjax.datasets.pushes import Floats, LogError, rotation
 from pushjax.datasets.recordings import interpolated
 
-LEAST = 10  # pushes, of which a few are learned from
-SAME_SPEED = 1e-5  # m/s; names have them in whole mm/s
-# Of the time. Before, the object may not be touched yet; after, the tip may have stopped.
+LEAST = 10  # smallest number of pushes, of which a few are used for training
+SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
+# Fractions of the time. Before the first, the finger may not touch the object yet. After the second, the tip may have
+# stopped.
 MIDDLE = (0.1, 0.9)
 PARTS = 6
-# While the tip goes so far, in m, no object that it pushes comes near to moving, in m and rad, by more than this.
+# While the tip travels JUMP_PATH (m), a pushed object moves by much less than JUMP (m) and turns by much less than
+# JUMP_TURN (rad).
 JUMP_PATH, JUMP, JUMP_TURN = 0.005, 0.020, np.deg2rad(30)
-# Parts that tell nothing of friction: m, N. Nor do forces off the contact's normal by more, rad: the tip slides at some
-# 15 deg. In a third of the logs of rect1 on plywood at 100 mm/s, the sensor is off by 1.6 N, touching something or not.
+# Parts of a push with less motion than LEAST_MOTION (m) or less force than LEAST_FORCE (N) carry no information about
+# friction. Neither do parts whose force is farther than WIDEST_CONE (rad) from the contact normal. The force of a
+# sliding tip is some 15 deg from it. A larger angle may come from an offset of the force sensor: in a third of the logs
+# of rect1 on plywood at 100 mm/s, the offset is 1.6 N, with or without contact.
 LEAST_MOTION, LEAST_FORCE, WIDEST_CONE = 0.0002, 0.1, np.deg2rad(30)
-# Of pushes whose tracker can be believed, the rules of the curated archives: m, m, m, rad, and of the median path.
+# The rules of the curated archives for pushes whose tracker can be trusted:
+# - At the start, the tip is less than MOST_GAP (m) from the outline, outside or inside.
+# - At the end, it is less than MOST_OVERLAP (m) inside the outline.
+# - The object moves farther than the tip by at most MOST_AHEAD (m).
+# - The object turns by less than MOST_TURN (rad).
+# - The path of the tip is longer than LEAST_PATH times the median path.
 MOST_GAP, MOST_OVERLAP, MOST_AHEAD, MOST_TURN, LEAST_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
 
 
 def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> list[tuple[PushName, Path]]:
-    """The files of one object's pushes in a folder and those below, sorted by acceleration, speed, side, fraction,
-    angle and repetition.
+    """Find the files of one object's pushes in a folder and the folders below it.
 
-    Of a push that is there twice, one file: JSON rather than HDF5. Files of other names are passed over. Raises
-    LogError if the folder is missing, or none of its files is of that object on that surface.
+    Of several files with the same name, JSON is preferred to HDF5. Files with names of another form are ignored.
+
+    Args:
+        folder: The folder.
+        surface: Name of the surface, as in the file names.
+        shape: Name of the object, as in the file names.
+
+    Returns:
+        Name and path of each push, sorted by acceleration, speed, side, fraction, angle and repetition.
+
+    Raises:
+        LogError: If the folder is missing, or if it has no file of that object on that surface.
     """
     return _named(Path(folder), surface, shape)[0]
 
@@ -58,20 +81,33 @@ def load_mit_folder(
     fast: float = 0.020,
     train_share: float = 0.3,
     seed: int = 0,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> tuple[MitPushes, tuple[LogError, ...]]:
-    """Reads the pushes of constant speed, and what is wrong with those left out, an error each.
+    """Read the pushes of constant speed of one object on one surface.
 
-    folder: of the `.json`, `.h5` or `.hdf5` files of the data set, unpacked; they may be in folders of their own.
-    surface, shape: as in the files' names; shape is one of MIT_SHAPES. speed, fast: m/s, of `whole` and of `fast`;
-    others are not read. train_share: of `whole`, to learn from, drawn with the `seed`; the rest is `middle`.
-    progress: called with how many files are read, of how many.
+    In the result, `index` is the position in `find_mit_pushes`. `repeats` pairs pushes of the same side, fraction and
+    angle, with the nearest repetition. `wrench` (N, N m) and `twist` (displacements in m, rad) are from valid training
+    pushes. `toolbox` is empty.
 
-    `index` counts in `find_mit_pushes`. `repeats` are pushes of the same side, fraction and angle, and of the nearest
-    repetition. `wrench` (N, N m) and `twist` (m, rad) are of valid pushes; `toolbox` is empty.
+    Args:
+        folder: Folder of the unpacked `.json`, `.h5` or `.hdf5` files of the data set, which may be in folders of their
+            own.
+        surface: Name of the surface, as in the file names.
+        shape: Name of the object, as in the file names; one of MIT_SHAPES.
+        speed: Speed of the pushes in `whole`, in m/s. Files with neither this speed nor `fast` are not read.
+        fast: Speed of the pushes in `fast`, in m/s.
+        train_share: Fraction of `whole` to use for training, drawn at random. The rest is `middle`.
+        seed: Seed of that draw.
+        progress: Called after each file with the number of files read and the number of files to read.
 
-    Raises LogError as `find_mit_pushes` does, and if fewer than ten pushes at `speed` can be used; ValueError for a
-    shape whose outline is not known, equal speeds, or a share that is not between 0 and 1.
+    Returns:
+        The pushes, and one error for each file that is misnamed or cannot be used.
+
+    Raises:
+        LogError: If the folder is missing, if it has no file of that object on that surface, or if fewer than ten
+            pushes at `speed` are usable.
+        ValueError: If the outline of the shape is unknown, if the speeds are equal, or if `train_share` is not between
+            0 and 1.
     """
     about = mit_shape(shape)
     if not 0 < train_share < 1:
@@ -119,8 +155,16 @@ def load_mit_folder(
 
 
 class _Push(NamedTuple):
-    """What is known from the first to the last sample at which all of it is. index: among the files. time: (m,) s.
-    tip: (m, 2) m. pose: (m, 3) m, rad. force: (m, 2) N, on the object. All in the world."""
+    """A push from the first to the last sample at which tip, object and force are known, in the world frame.
+
+    Attributes:
+        index: Position of the file in `find_mit_pushes`.
+        name: Parameters of the push.
+        time: (m,) times, in s.
+        tip: (m, 2) centers of the tip, in m.
+        pose: (m, 3) poses of the object, in m and rad.
+        force: (m, 2) forces on the object, in N.
+    """
 
     index: int
     name: PushName
@@ -130,18 +174,18 @@ class _Push(NamedTuple):
     force: Floats
 
     def when(self, shares: Sequence[float] | Floats) -> Floats:
-        """(k,) s, after those shares of the time (k,)."""
+        """Return the times (k,), in s, at these fractions (k,) of the duration."""
         begin, end = self.time[0], self.time[-1]
-        return np.clip(begin + np.asarray(shares) * (end - begin), begin, end)  # rounding might exceed the end
+        return np.clip(begin + np.asarray(shares) * (end - begin), begin, end)  # roundoff might exceed the end
 
     def at(self, shares: Sequence[float] | Floats) -> tuple[Floats, Floats]:
-        """(k, 3) poses and (k, 2) places of the tip after those shares of the time (k,)."""
+        """Return the poses (k, 3) and the centers of the tip (k, 2) at these fractions (k,) of the duration."""
         when = self.when(shares)
         return interpolated(when, self.time, self.pose), interpolated(when, self.time, self.tip)
 
 
 def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName, Path]], list[LogError]]:
-    """As `find_mit_pushes`, and an error for each file whose name begins as if it were one of these, but is wrong."""
+    """Return what `find_mit_pushes` returns, and an error for each misnamed file of the same surface and object."""
     if not folder.is_dir():
         raise LogError(folder, "expected a folder of the MIT pushing data set, found none")
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (*SUFFIXES, ".zip"))
@@ -167,11 +211,13 @@ def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName,
 
 
 def _order(named: tuple[PushName, Path]) -> tuple[float, ...]:
+    """Return the key by which pushes are sorted."""
     _, _, *numbers, repetition = named[0]
     return (*numbers, -1 if repetition is None else repetition)
 
 
 def _nothing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
+    """Describe what was found in place of the wanted files."""
     wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
     if there:
         counts = (f"{len(stems)} of {other} on {on}" for (on, other), stems in sorted(there.items()))
@@ -184,6 +230,7 @@ def _nothing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], z
 def _too_few(
     folder: Path, what: str, count: int, steady: list[tuple[int, PushName, Path]], problems: list[LogError]
 ) -> LogError:
+    """Make the error for a folder with too few usable pushes."""
     speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in steady})) or "none"
     message = f"expected at least {LEAST} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
     if problems:
@@ -192,9 +239,13 @@ def _too_few(
 
 
 def _read(index: int, name: PushName, path: Path) -> _Push:
-    """Raises LogError for a file that is damaged, or whose tracker lost the object."""
+    """Read the push of a file.
+
+    Raises:
+        LogError: If the file is damaged, or if the tracker lost the object.
+    """
     (push,) = (load_mit_json if path.suffix.lower() == ".json" else load_mit_hdf5)(path).pushes
-    assert push.force is not None  # which these files have, as they have the time
+    assert push.force is not None  # these files always have force and time
     assert push.time is not None
     rows = _known(path, push.time, push.seen & np.isfinite(push.force[:, 0]))
     time, tip, pose = push.time[rows], push.hand[rows], push.pose[rows]
@@ -203,8 +254,11 @@ def _read(index: int, name: PushName, path: Path) -> _Push:
 
 
 def _known(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
-    """From the first to the last sample (m,) that is `known`. Raises LogError if one between is not: the object's, as
-    the force has no gaps."""
+    """Return the range from the first to the last sample (m,) that is known.
+
+    Raises:
+        LogError: If a sample in between is unknown. The object was not seen there, because the force has no gaps.
+    """
     rows = np.flatnonzero(known)
     if len(rows) < 2 or time[rows[-1]] == time[rows[0]]:
         raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
@@ -216,8 +270,14 @@ def _known(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
 
 
 def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
-    """Raises LogError where the tracker jumps. Looks at stretches of the path, because a jump is spread over several
-    samples where the tracker was slower than the tip's stamps."""
+    """Check that the tracker does not jump.
+
+    The test compares all samples of a stretch of the path, not only neighbors. The poses are interpolated at the time
+    stamps of the tip. Where the tracker has fewer samples than the tip, a jump is spread over several samples.
+
+    Raises:
+        LogError: If it jumps.
+    """
     travel = float(np.linalg.norm(tip[-1] - tip[0]))
     window = len(time) if travel <= JUMP_PATH else max(2, round(len(time) * JUMP_PATH / travel))
     ranges = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
@@ -233,17 +293,24 @@ def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
 
 
 def _straight(pushes: Sequence[_Push], shares: tuple[float, float], about: MitShape) -> StraightPushes:
+    """Make a group of pushes from the states at two fractions of the duration."""
     ends = [push.at(shares) for push in pushes]
     pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
     tip = np.array([tip for _, tip in ends]).reshape(-1, 2, 2)
     start, end = pose[:, 0], pose[:, 1]
-    end[:, 2] = start[:, 2] + nearest_turn(end[:, 2] - start[:, 2])
+    end[:, 2] = start[:, 2] + wrap_to_pi(end[:, 2] - start[:, 2])
     index = np.array([push.index for push in pushes], np.int64)
     return StraightPushes(index, start, end, tip[:, 0], tip[:, 1], _believable(pose, tip, about), toolbox={})
 
 
 def _believable(pose: Floats, tip: Floats, about: MitShape) -> NDArray[np.bool_]:
-    """(k,) of the poses (k, 2, 3) and places of the tip (k, 2, 2), m, before and after each push."""
+    """Return whether the tracker can be trusted in each of k pushes.
+
+    Args:
+        pose: (k, 2, 3) poses of the object before and after each push, in m and rad.
+        tip: (k, 2, 2) centers of the tip before and after each push, in m.
+        about: The object.
+    """
     if not len(pose):
         return np.zeros(0, bool)
     before, after = (
@@ -257,13 +324,17 @@ def _believable(pose: Floats, tip: Floats, about: MitShape) -> NDArray[np.bool_]
 
 
 def _in_body(pose: Floats, vectors: Floats) -> Floats:
-    """(k, 2): world vectors (k, 2) in the body frames of k poses (k, 3)."""
+    """Rotate world vectors (k, 2) into the body frames of k poses (k, 3)."""
     return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
 
 
 def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
-    """Wrench (3,) N, N m and displacement (3,) m, rad, of the parts in which the finger pushes: both about the body
-    origin, in the body frame at the part's middle."""
+    """Iterate over the wrenches and displacements of the parts in which the finger pushes.
+
+    Yields:
+        The wrench (3,), in N and N m, and the displacement (3,), in m and rad, both about the body origin and in the
+            body frame at the middle of the part.
+    """
     tip, force = _in_body(push.pose, push.tip - push.pose[:, :2]), _in_body(push.pose, push.force)
     distance, contact = nearest_on_outline(about.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
@@ -287,10 +358,12 @@ def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
+    """Return the cross products (n,) of vectors (n, 2) in the plane."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _repeats(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]:
+    """Return the rows (r, 2) in `fast` and `whole` of the same nominal push with the nearest repetition."""
     rows: dict[tuple[float, ...], list[int]] = {}
     for row, push in enumerate(whole):
         rows.setdefault(_action(push), []).append(row)
@@ -303,8 +376,10 @@ def _repeats(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]
 
 
 def _action(push: _Push) -> tuple[float, ...]:
+    """Return side, fraction and angle, which are equal in repetitions of a push."""
     return push.name.side, push.name.fraction, push.name.angle
 
 
 def _repetition(push: _Push) -> int:
+    """Return the number of the repetition; 0 if the push has none."""
     return push.name.repetition or 0

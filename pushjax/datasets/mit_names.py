@@ -1,7 +1,15 @@
-"""What the files of the MIT pushing data set are called: what was pushed, where, how fast, and at which angle.
+"""Parse the file names of the MIT pushing data set: what was pushed, where, how fast, and at which angle.
 
-As in `motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349_rep=0003.h5`, where `rep` is there only for
-pushes that were repeated. Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016.
+An example is `motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349_rep=0003.h5`.
+
+The fields are:
+
+- `surface` and `shape`: names of the surface and of the object.
+- `a` and `v`: acceleration in mm/s^2 and speed in mm/s.
+- `i`, `s` and `t`: side, fraction and angle in rad; see `PushName`.
+- `rep`: number of the repetition, present only for repeated pushes.
+
+Reference: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016.
 """
 
 import math
@@ -12,18 +20,27 @@ from typing import NamedTuple
 
 from pushjax.datasets.pushes import LogError
 
-SUFFIXES = (".json", ".h5", ".hdf5")  # the first is preferred, as it needs no other package
+SUFFIXES = (".json", ".h5", ".hdf5")  # the first is preferred, because it needs no other package
 PREFIX = "motion_surface="
 _WORDS = ("surface", "shape")
 _NUMBERS = ("a", "v", "i", "s", "t")
+# A value ends at the next "_key=" or at the end of the name, so it may contain underscores.
 _FIELD = re.compile(r"_([a-z]+)=(.*?)(?=_[a-z]+=|$)")
 
 
 class PushName(NamedTuple):
-    """surface, shape: as the data set calls them. acceleration: m/s^2, of the tip; 0 where its speed is constant.
-    speed: m/s, of the tip; below 0, which is none, where it accelerates. side: of the outline, from 0, which is all of
-    a round one. fraction: in [0, 1], along that side, where the tip aims. angle: rad, of the push against the side's
-    normal. repetition: from 0; None where the push has no number."""
+    """The parameters of a push, as given in its file name.
+
+    Attributes:
+        surface: Name of the surface in the data set.
+        shape: Name of the object in the data set.
+        acceleration: Acceleration of the tip, in m/s^2; 0 if its speed is constant.
+        speed: Speed of the tip, in m/s. Negative if the tip accelerates, because it then has no constant speed.
+        side: Side of the outline that is pushed, from 0. A round outline has only side 0.
+        fraction: Position along that side at which the tip aims, in [0, 1].
+        angle: Angle of the push from the normal of the side, in rad.
+        repetition: Number of the repetition, from 0; None if the push has no such number.
+    """
 
     surface: str
     shape: str
@@ -36,9 +53,18 @@ class PushName(NamedTuple):
 
 
 def parse_push_name(path: str | PathLike[str]) -> PushName:
-    """Reads the name of a file, whatever its folder and with or without its suffix; it need not exist.
+    """Parse the name of a file, which need not exist.
 
-    Fields may come in any order, and others are passed over. Raises LogError for one that lacks or is no number.
+    Fields may be in any order. Unknown fields are ignored.
+
+    Args:
+        path: The file, in any folder, with or without its suffix.
+
+    Returns:
+        The parameters of the push, in SI units.
+
+    Raises:
+        LogError: If a field is missing, or if one of `a`, `v`, `i`, `s`, `t` and `rep` is not a valid number.
     """
     name = Path(path).name
     stem = Path(name).stem if Path(name).suffix.lower() in SUFFIXES else name
@@ -53,14 +79,19 @@ def parse_push_name(path: str | PathLike[str]) -> PushName:
         shape=fields["shape"],
         acceleration=acceleration / 1e3,
         speed=speed / 1e3,
-        side=_whole(path, "i", side),
+        side=_nonnegative_int(path, "i", side),
         fraction=fraction,
         angle=angle,
-        repetition=_whole(path, "rep", _number(path, fields, "rep")) if "rep" in fields else None,
+        repetition=_nonnegative_int(path, "rep", _number(path, fields, "rep")) if "rep" in fields else None,
     )
 
 
 def _number(path: str | PathLike[str], fields: dict[str, str], key: str) -> float:
+    """Return a field as a number.
+
+    Raises:
+        LogError: If it is no finite number.
+    """
     try:
         value = float(fields[key])
     except ValueError:
@@ -70,7 +101,12 @@ def _number(path: str | PathLike[str], fields: dict[str, str], key: str) -> floa
     return value
 
 
-def _whole(path: str | PathLike[str], key: str, value: float) -> int:
+def _nonnegative_int(path: str | PathLike[str], key: str, value: float) -> int:
+    """Return a value as an integer.
+
+    Raises:
+        LogError: If it is negative or not an integer.
+    """
     if value != int(value) or value < 0:
         raise LogError(path, f"expected a number from 0 without a fraction for {key} in the name, found {value:g}")
     return int(value)

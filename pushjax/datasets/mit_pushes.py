@@ -1,12 +1,14 @@
-"""Thousands of straight pushes of one object on one surface, from the MIT pushing data set, with what another program
-made of them.
+"""Thousands of straight pushes of one object on one surface, from the MIT data set, with the toolbox's predictions.
 
-The tip goes along a straight line at constant speed. `whole` are pushes of 50 mm at 10 mm/s from before the touch to
-the end; `middle` those of them that the original authors tested with, from 10 to 90 % of their time; `fast` are the
-same nominal pushes at 20 mm/s, where recorded. Pushes that are not in `middle` were trained with.
+The tip of the pusher moves along a straight line at constant speed. There are three groups of pushes:
 
-Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016, as evaluated by the toolbox of
-Zhou, Bagnell, Mason, RSS 2017.
+- `whole`: pushes of 50 mm at 10 mm/s, from before the contact to the end.
+- `middle`: the test pushes of `whole`, from 10 to 90 % of their duration. All other pushes of `whole` are training
+  pushes. In the curated archives, the toolbox's authors chose the test pushes.
+- `fast`: the same nominal pushes (side, contact position and angle) at 20 mm/s, where recorded.
+
+Reference: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016, as evaluated by the toolbox
+of Zhou, Bagnell, Mason, RSS 2017.
 """
 
 from dataclasses import dataclass
@@ -21,20 +23,29 @@ from pushjax.datasets._archive import Arrays, archive_names, check_shapes, float
 from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.records import LARGEST_NUMBER
 
-GROUPS = {"whole": "full", "middle": "eval", "fast": "v20"}
+GROUP_PREFIXES = {"whole": "full", "middle": "eval", "fast": "v20"}
 _POSES = ("object_pose_start", "object_pose_end")
 _TIPS = ("tip_start", "tip_end")
-_ABOUT = ("train_wrench", "train_twist", "train_valid", "eval_to_full", "full_in_eval")
-_SHAPE = ("vertices_body", "rho", "tip_radius", "surface", "shape")
-TOOLBOX = {"quartic": "poly4", "ellipsoid": "quadratic"}
+_TRAINING_ARRAYS = ("train_wrench", "train_twist", "train_valid", "eval_to_full", "full_in_eval")
+_OBJECT_ARRAYS = ("vertices_body", "rho", "tip_radius", "surface", "shape")
+TOOLBOX_SUFFIXES = {"quartic": "poly4", "ellipsoid": "quadratic"}
 
 
 @dataclass(frozen=True, eq=False)
 class StraightPushes:
-    """k pushes. index: (k,) the push's row in the original file. start, end: (k, 3) m, rad, world, the object's poses;
-    the end angle is the one nearest to that of the start. tip_start, tip_end: (k, 2) m, world, the tip's centre.
-    valid: (k,) whether the tracker can be believed. toolbox: (k, 3) the end as the original toolbox predicted it, by
-    the name of the limit surface's kind; empty where it is not known."""
+    """A group of k straight pushes. For `middle`, start and end are at 10 and 90 % of the duration.
+
+    Attributes:
+        index: (k,) number of the push. In a curated archive, it is the row in the original file. In the published data
+            set, it is the position in the list from `find_mit_pushes`.
+        start: (k, 3) pose of the object at the start, in m and rad, world frame.
+        end: (k, 3) pose of the object at the end. Its angle is the one nearest to that of the start.
+        tip_start: (k, 2) center of the tip at the start, in m, world frame.
+        tip_end: (k, 2) center of the tip at the end.
+        valid: (k,) whether the tracker can be trusted.
+        toolbox: End poses (k, 3) as predicted by the original toolbox, by the kind of the limit surface ("quartic",
+            "ellipsoid"); empty if unknown.
+    """
 
     index: NDArray[np.int64]
     start: Floats
@@ -49,13 +60,24 @@ class StraightPushes:
 
 
 class MitPushes(NamedTuple):
-    """Of one object on one surface.
+    """The straight pushes of one object on one surface; the module docstring describes the three groups.
 
-    whole, middle, fast: see above; fast has no push where none was recorded. learned: (whole,) the pushes of `whole`
-    that the toolbox trained with. middle_of: (middle,) the row in `whole` of the same push. repeats: (r, 2) rows in
-    `fast` and in `whole` of the same nominal push. wrench, twist: (m, 3) on the object in its body frame about the body
-    origin, of any scale: pairs that the toolbox trained with. vertices: (v, 2) m, body. length: m, which weighs
-    rotation against translation. tip_radius: m. surface, shape: names. source: the file or folder.
+    Attributes:
+        whole: Complete pushes.
+        middle: The test pushes, from 10 to 90 % of their duration.
+        fast: The same pushes at higher speed; no pushes if none was recorded.
+        learned: (whole,) whether a push of `whole` is used for training.
+        middle_of: (middle,) row in `whole` of the same push.
+        repeats: (r, 2) row in `fast`, and row in `whole` of the same nominal push.
+        wrench: (m, 3) wrenches on the object, in the body frame about the body origin, of any scale. Each row, with the
+            same row of `twist`, is a training pair.
+        twist: (m, 3) twists of the object, in the body frame about the body origin, of any scale.
+        vertices: (v, 2) vertices of the outline, in m, body frame.
+        length: Characteristic length, in m, which weighs rotation against translation.
+        tip_radius: Radius of the tip, in m.
+        surface: Name of the surface.
+        shape: Name of the object.
+        source: The file or folder that was read.
     """
 
     whole: StraightPushes
@@ -75,18 +97,27 @@ class MitPushes(NamedTuple):
 
 
 def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
-    """Reads a file of the `mit_push` folder.
+    """Read a curated archive from the folder `mit_push`.
 
-    Raises LogError if the file is missing, is no such archive, lacks an array, or holds one of the wrong shape or with
-    numbers that are not finite.
+    The toolbox trained with the same pushes, and with the same pairs of wrench and twist.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The pushes in the file.
+
+    Raises:
+        LogError: If the file is missing or is not an archive, if an array is missing or has the wrong shape, if a
+            number is not finite or is too large, or if a push of `middle` is not in `whole`.
     """
     file = Path(path)
-    names = [*_ABOUT, *_SHAPE]
+    names = [*_TRAINING_ARRAYS, *_OBJECT_ARRAYS]
     with_fast = "v20_index" in archive_names(file, "straight pushes")
-    groups = {name: prefix for name, prefix in GROUPS.items() if name != "fast" or with_fast}
+    groups = {name: prefix for name, prefix in GROUP_PREFIXES.items() if name != "fast" or with_fast}
     for prefix in groups.values():
         names += [f"{prefix}_{part}" for part in ("index", *_POSES, *_TIPS, "valid")]
-        names += [f"{prefix}_sim_pose_end_{kind}" for kind in TOOLBOX.values()]
+        names += [f"{prefix}_sim_pose_end_{kind}" for kind in TOOLBOX_SUFFIXES.values()]
     if with_fast:
         names.append("v20_to_full_action")
     data = read_archive(file, names, "straight pushes")
@@ -129,27 +160,37 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
 
 
 def _group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
+    """Read the group of pushes whose arrays have this prefix.
+
+    Raises:
+        LogError: If an array has the wrong shape, or if a number is not finite or is too large.
+    """
     count = len(data[f"{prefix}_index"]) if data[f"{prefix}_index"].ndim else -1
     shapes: dict[str, tuple[int, ...]] = {f"{prefix}_{name}": (count, 3) for name in _POSES}
-    shapes |= {f"{prefix}_sim_pose_end_{kind}": (count, 3) for kind in TOOLBOX.values()}
+    shapes |= {f"{prefix}_sim_pose_end_{kind}": (count, 3) for kind in TOOLBOX_SUFFIXES.values()}
     shapes |= {f"{prefix}_{name}": (count, 2) for name in _TIPS}
     check_shapes(path, data, shapes | {f"{prefix}_index": (count,), f"{prefix}_valid": (count,)})
     _finite(path, data, tuple(shapes))
     start, end = (floats(data[f"{prefix}_{name}"]) for name in _POSES)
     tip_start, tip_end = (floats(data[f"{prefix}_{name}"]) for name in _TIPS)
-    toolbox = {name: floats(data[f"{prefix}_sim_pose_end_{kind}"]) for name, kind in TOOLBOX.items()}
+    toolbox = {name: floats(data[f"{prefix}_sim_pose_end_{kind}"]) for name, kind in TOOLBOX_SUFFIXES.items()}
     for pose in (end, *toolbox.values()):
-        pose[:, 2] = start[:, 2] + nearest_turn(pose[:, 2] - start[:, 2])
+        pose[:, 2] = start[:, 2] + wrap_to_pi(pose[:, 2] - start[:, 2])
     index, valid = data[f"{prefix}_index"].astype(np.int64), data[f"{prefix}_valid"].astype(bool)
     return StraightPushes(index, start, end, tip_start, tip_end, valid, toolbox)
 
 
 def _finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
+    """Check that all numbers of the arrays are finite, with magnitudes below LARGEST_NUMBER.
+
+    Raises:
+        LogError: For the first array that fails.
+    """
     for name in names:
         if not np.issubdtype(data[name].dtype, np.number) or not (np.abs(data[name]) < LARGEST_NUMBER).all():
             raise LogError(path, f"expected finite numbers below {LARGEST_NUMBER:g}, found others in {name}")
 
 
-def nearest_turn(angle: Floats) -> Floats:
-    """The same angles within half a turn, rad."""
+def wrap_to_pi(angle: Floats) -> Floats:
+    """Wrap angles, in rad, to [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

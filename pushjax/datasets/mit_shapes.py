@@ -1,8 +1,9 @@
-"""Outlines of the eleven objects of the MIT pushing data set, in the frames their tracker reports.
+"""Outlines of the eleven objects of the MIT pushing data set, in the frames that their tracker reports.
 
-Source: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016; the numbers are those that the
-toolbox of Zhou, Bagnell, Mason, RSS 2017, takes. The origin is the centre of all but the triangles, where it is 45 mm
-from each leg.
+The origin is the center of the object. For triangles, it is the point 45 mm from each leg.
+
+Reference: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016. The numbers are those of
+the toolbox of Zhou, Bagnell, Mason, RSS 2017.
 """
 
 from typing import NamedTuple
@@ -11,29 +12,39 @@ import numpy as np
 
 from pushjax.datasets.pushes import Floats
 
-TIP_RADIUS = 0.00475  # m
+TIP_RADIUS = 0.00475  # radius of the pusher's tip, m
+# Dimensions in m: half sides of rectangles, legs of triangles, distance of the origin from each leg.
 _RECTANGLES = {"rect1": (0.045, 0.045), "rect2": (0.044955, 0.05629), "rect3": (0.067505, 0.04497)}
 _LEGS = {"tri1": (0.1259, 0.12587), "tri2": (0.151, 0.12587), "tri3": (0.1765, 0.12561)}
 _RIGHT_ANGLE = 0.045
 _SEMI_AXES = {"ellip1": (0.0525, 0.0525), "ellip2": (0.0525, 0.065445), "ellip3": (0.0525, 0.0785)}
 _ELLIPSE_CORNERS = 99
-_HEXAGON = 0.0605
+_HEXAGON = 0.0605  # distance of the vertices from the center, m
 MIT_SHAPES = (*_RECTANGLES, *_LEGS, *_SEMI_AXES, "hex", "butter")
 
-# The butterfly, from the tip of one wing: a cubic spline with one knot on each side, at u steps of about 5 mm. x is odd
-# in u, y even. In m per power of u; the last of each is of the cube beyond the knot.
+# The lower wing of the butterfly is a cubic spline x(u), y(u). The tip of the wing is at u = 0, with one knot on each
+# side of it, at |u| = _KNOT. One unit of u is a step of about 5 mm. x is odd in u, y is even. Coefficients are in m per
+# power of u. The last coefficient of each belongs to (|u| - _KNOT)^3, which counts only beyond the knots.
 _KNOT = 10.8359
 _X = (6.77379e-3, -2.016559e-5, 6.916228e-5)  # u, u^3
 _Y = (-0.0780175, 4.187392e-4, -1.220402e-5, 1.140326e-5)  # 1, u^2, |u|^3
-_STEPS = 19  # to each side; the next one is the waist
-_WAIST = 0.0274593
-_POINTS = 8  # of a step, as published; there x runs one of them ahead of y, and to the right by
+_STEPS = 19  # steps of the spline to each side of u = 0; one step more leads to the waist
+_WAIST = 0.0274593  # half width of the waist, where y = 0, m
+# The published outline has 8 points per step. In it, each x belongs to the y of the next point, and x is shifted right
+# by _SHIFT (m).
+_POINTS = 8
 _SHIFT = 8.03e-5
 
 
 class MitShape(NamedTuple):
-    """vertices: (v, 2) m, body, counter-clockwise. length: m, which weighs rotation against translation: the vertices'
-    mean distance from their mean. tip_radius: m."""
+    """The outline of an object, and the tip that pushes it.
+
+    Attributes:
+        vertices: (v, 2) vertices in m, body frame, counter-clockwise.
+        length: Characteristic length, in m, which weighs rotation against translation: the mean distance of the
+            vertices from their mean.
+        tip_radius: Radius of the tip, in m.
+    """
 
     vertices: Floats
     length: float
@@ -41,7 +52,19 @@ class MitShape(NamedTuple):
 
 
 def mit_shape(name: str) -> MitShape:
-    """One of MIT_SHAPES. Ellipses have 99 vertices, the butterfly 636. Raises ValueError for another name."""
+    """Return one of the shapes in MIT_SHAPES.
+
+    Ellipses have 99 vertices, the butterfly has 636.
+
+    Args:
+        name: Name of the shape in the data set.
+
+    Returns:
+        The outline, its characteristic length and the tip's radius.
+
+    Raises:
+        ValueError: If the name is not in MIT_SHAPES.
+    """
     if name not in MIT_SHAPES:
         raise ValueError(f"shape must be one of {', '.join(MIT_SHAPES)}; got {name!r}")
     vertices = _vertices(name)
@@ -49,15 +72,24 @@ def mit_shape(name: str) -> MitShape:
 
 
 def nearest_on_outline(vertices: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """(n,) signed distances in m, negative inside, and (n, 2) the nearest places of an outline (v, 2) of straight edges
-    to n points (n, 2)."""
+    """Find the points on a polygon that are nearest to the given points.
+
+    Args:
+        vertices: (v, 2) vertices of the outline, in m.
+        points: (n, 2) points, in m.
+
+    Returns:
+        The signed distances (n,) of the points from the outline, in m, negative inside, and the nearest points (n, 2)
+            on it.
+    """
     edge = np.roll(vertices, -1, axis=0) - vertices
     to = points[:, None] - vertices
     share = np.clip(np.sum(to * edge, axis=2) / np.sum(edge**2, axis=1), 0, 1)
     apart = np.linalg.norm(to - share[..., None] * edge, axis=2)
     each, nearest = np.arange(len(points)), np.argmin(apart, axis=1)
     place = vertices[nearest] + share[each, nearest][:, None] * edge[nearest]
-    # inside, the edges that cross the point's height to its right wind once around it
+    # Winding number of the outline about each point. It counts the edges that cross the ray from the point along +x.
+    # Rising edges add one, falling edges subtract one. It is not zero for a point inside.
     above = to[..., 1] < 0
     left = edge[:, 0] * to[..., 1] > edge[:, 1] * to[..., 0]
     rising, falling = ~above & np.roll(above, -1, axis=1), above & ~np.roll(above, -1, axis=1)
@@ -66,6 +98,7 @@ def nearest_on_outline(vertices: Floats, points: Floats) -> tuple[Floats, Floats
 
 
 def _vertices(name: str) -> Floats:
+    """Return the vertices (v, 2) of a shape in MIT_SHAPES, in m."""
     if name in _RECTANGLES:
         return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.array(_RECTANGLES[name])
     if name in _LEGS:
@@ -77,12 +110,16 @@ def _vertices(name: str) -> Floats:
 
 
 def _around(corners: int, first: int) -> Floats:
+    """Return points (corners, 2) at equal angles on the unit circle, the first at `first` steps from the x axis."""
     angle = 2 * np.pi * (np.arange(corners) + first) / corners
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def _butterfly() -> Floats:
-    """From the waist on the left around the lower wing; the upper one is that, turned by half."""
+    """Return the butterfly's vertices, from the waist on the left around the lower wing and then the upper one.
+
+    The upper wing is the lower one, turned by half a turn.
+    """
     u = np.arange(-_STEPS, _STEPS + 1.0)
     beyond = np.clip(np.abs(u) - _KNOT, 0, None) ** 3
     x = _X[0] * u + _X[1] * u**3 + _X[2] * np.sign(u) * beyond + _SHIFT

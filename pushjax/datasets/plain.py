@@ -1,6 +1,6 @@
-"""Pushes in plain files of one's own: a `.csv` table, or an `.npz` archive of pushes with equally many samples.
+"""Read pushes from plain files: a `.csv` table, or an `.npz` archive of pushes with equally many samples.
 
-Units are SI, the frame is the world's; names and shapes are those at the head of this file.
+Units are SI, and the frame is the world frame. The constants at the top of this file list names and shapes.
 """
 
 import csv
@@ -17,15 +17,15 @@ from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, checked, gathered
 from pushjax.datasets.records import Fault, quoted
 
-# Columns of a table: these, and each of the further groups either whole or not at all.
+# Columns of a table: all of _REQUIRED, and each group of _FURTHER either as a whole or not at all.
 _PUSH = "push"
 _REQUIRED = (_PUSH, *HAND[:2], *OBJECT)
 _FURTHER = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)
 COLUMNS = (_PUSH, *HAND, *OBJECT, "time", *FORCE)
-# A row may lack all numbers of one of these groups: the object was not seen there, no force was measured.
+# A row may lack all numbers of the object's pose, if the object was not seen, or of the force, if none was measured.
 _MAY_LACK = (*OBJECT, *FORCE)
 
-# Arrays of an archive, with n pushes of k samples: `path` with `start` and `end`, or with `pose`.
+# Arrays of an archive with n pushes of k samples: `path`, and either `start` and `end` or `pose`.
 _BOTH_ENDS, _ALL_ALONG = ("start", "end"), ("pose",)
 _OPTIONAL = ("force", "time")
 ARRAYS = ("path", *_BOTH_ENDS, *_ALL_ALONG, *_OPTIONAL)
@@ -33,15 +33,31 @@ LAYOUT = "path (n, k, dof) with start and end (n, 3) or pose (n, k, 3), if known
 
 
 class _Row(NamedTuple):
+    """One row of a table.
+
+    Attributes:
+        line: Line of the file on which the row ends, from 1.
+        cells: The text of each cell.
+    """
+
     line: int
     cells: list[str]
 
 
 def load_csv(path: Path) -> Recordings:
-    """Reads a table with a header; columns in any order, rows of one push one after another.
+    """Read a table with a header.
 
-    A push with a bad cell, or that does not see the object in its first and last row, becomes a problem. Raises
-    LogError if the file is no such table, its columns are others, or no push is usable.
+    Columns may be in any order. The rows of one push follow each other. A push becomes a problem if one of its cells is
+    bad, or if the object is not seen in its first or last row.
+
+    Args:
+        path: The table, in UTF-8 text.
+
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If the file is no such table, if it has other columns, or if no push is usable.
     """
     rows = _rows(path)
     header = next(rows, None)
@@ -49,13 +65,13 @@ def load_csv(path: Path) -> Recordings:
         raise LogError(path, f"expected a header of columns ({', '.join(COLUMNS)}), found an empty file")
     names = _header(path, header)
     label = names.index(_PUSH)
-    # A row too short to say which push it is of belongs to one of its own.
+    # Rows that are too short to have a label form a push of their own, which becomes a problem.
     pushes = groupby(rows, key=lambda row: row.cells[label].strip() if label < len(row.cells) else "")
     return gathered(path, (_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
 
 
 def _rows(path: Path) -> Iterator[_Row]:
-    """The rows that are not blank, each with the line it ends on."""
+    """Iterate over the rows that are not blank."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.reader(file)
@@ -71,7 +87,11 @@ def _rows(path: Path) -> Iterator[_Row]:
 
 
 def _header(path: Path, header: _Row) -> list[str]:
-    """The names of the columns. Raises LogError unless they are allowed, enough, and each there once."""
+    """Return the names of the columns.
+
+    Raises:
+        LogError: If a column is unknown, required but missing, or present twice.
+    """
     names = [cell.strip() for cell in header.cells]
     missing = [name for name in _REQUIRED if name not in names]
     for group in _FURTHER:
@@ -88,6 +108,7 @@ def _header(path: Path, header: _Row) -> list[str]:
 
 
 def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recording | LogError:
+    """Read the rows of one push, or return the error that describes its first fault."""
     try:
         numbers = [_numbers(names, row) for row in rows]
     except Fault as fault:
@@ -108,7 +129,11 @@ def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recordi
 
 
 def _numbers(names: list[str], row: _Row) -> Mapping[str, float]:
-    """The numbers of a row by column, NaN for a blank where there may be one. Raises Fault."""
+    """Read the numbers of a row, by column; a blank cell gives NaN where blanks are allowed.
+
+    Raises:
+        Fault: If a cell is bad, or if the row has too many or too few.
+    """
     if len(row.cells) != len(names):
         raise Fault(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
     cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
@@ -118,6 +143,11 @@ def _numbers(names: list[str], row: _Row) -> Mapping[str, float]:
 
 
 def _number(name: str, cell: str, line: int) -> float:
+    """Read the number in a cell; a blank cell gives NaN where blanks are allowed.
+
+    Raises:
+        Fault: If the cell has no number or, where it must, no finite one.
+    """
     if not cell and name in _MAY_LACK:
         return math.nan
     try:
@@ -131,10 +161,20 @@ def _number(name: str, cell: str, line: int) -> float:
 
 
 def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
-    """Reads an archive that holds the arrays `names`, `path` one of them.
+    """Read an `.npz` archive of pushes with equally many samples.
 
-    A push with numbers that are not finite becomes a problem (NaN in `pose` and `force` means not seen, not measured).
-    Raises LogError for other arrays or shapes, or if no push is usable.
+    A push becomes a problem if it has numbers that are not finite. In `pose` and `force`, NaN is allowed: the object
+    was not seen, or no force was measured.
+
+    Args:
+        path: The archive.
+        names: Names of the arrays in it; `path` must be one of them.
+
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If the archive has other arrays or other shapes, or if no push is usable.
     """
     wanted = _wanted(path, names)
     data = read_archive(path, wanted, "pushes")
@@ -159,18 +199,27 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
 
 
 def _wanted(path: Path, names: frozenset[str]) -> list[str]:
-    """The arrays to read: all. Raises LogError for unknown ones, and unless one way of giving the poses is used."""
+    """Return the names of the arrays to read, which are all that the archive should have.
+
+    Raises:
+        LogError: If an array is unknown, or if poses are given both as `pose` and as `start` and `end`.
+    """
     unknown = sorted(names - set(ARRAYS))
     if unknown:
         raise LogError(path, f"expected {LAYOUT}; found unknown arrays {', '.join(unknown)}")
     if set(_ALL_ALONG) & names and set(_BOTH_ENDS) & names:
         raise LogError(path, "expected either start and end or pose, found both")
     poses = _ALL_ALONG if set(_ALL_ALONG) & names else _BOTH_ENDS
-    # Those that are not there as well: reading says that they are missing.
+    # Required arrays are listed even if they are absent, because `read_archive` reports them as missing.
     return ["path", *poses, *(name for name in _OPTIONAL if name in names)]
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
+    """Check types and shapes.
+
+    Raises:
+        LogError: If an array has no numbers, or a shape that does not fit that of `path`.
+    """
     for name, array in data.items():
         if array.dtype.kind not in "fiu":
             raise LogError(path, f"expected numbers in {name}, found {array.dtype}")

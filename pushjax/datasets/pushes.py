@@ -1,13 +1,14 @@
-"""What a log of single-finger pushes holds, and the wrench-displacement pairs the paper takes from it.
+"""The contents of a log of single-finger pushes, and the wrench-displacement pairs that the paper takes from it.
 
-Frames: *world* is the robot's base; *body* is fixed to the object, its origin at the centre of mass; a body
-point p lies at (x, y) + R(theta) p in the world. Forces and wrenches are those the finger applies *to the
+Frames: *world* is the base frame of the robot. *body* is fixed to the object, with its origin at the center of mass. A
+body point p lies at (x, y) + R(theta) p in the world. Forces and wrenches are those that the finger applies *to the
 object*.
 
-Source of the processing: Zhou, Bagnell, Mason, "A fast stochastic contact model for planar pushing and
-grasping", RSS 2017, and its published toolbox. One deviation: the toolbox interpolates the object's angle
-without looking for wraps and so turns some pushes the long way round; here the angle always goes the short
-way.
+There is one deviation from the reference's processing. The toolbox interpolates the object's angle without unwrapping
+it, and so turns some pushes the long way round. Here the angle always takes the short way.
+
+Reference: Zhou, Bagnell, Mason, "A fast stochastic contact model for planar pushing and grasping", RSS 2017, and its
+published toolbox.
 """
 
 from collections.abc import Sequence
@@ -19,21 +20,25 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-# Filter of the toolbox: the first 30 % of the samples (approach, contact building up) are dropped.
+# The toolbox's filter drops the first 30 % of the samples: the finger approaches, and contact builds up.
 SKIPPED_FRACTION = 0.3
-# Onset of contact: above the sensor's noise, and above a fraction of the typical force of the push, which is
-# taken from the second half of the samples because the finger is surely in contact there.
+# Contact begins when the force exceeds the sensor's noise (N) and a fraction of the typical force of the push. The
+# typical force is taken from the second half of the samples, where the finger is surely in contact.
 ONSET_FORCE = 0.3
 ONSET_FRACTION = 0.3
-# The robot was told to go 15 mm beyond an approach gap of 2.5 mm. The log misses the last millimetre or so of
-# it (the finger is still moving at the last logged sample), while the measured end pose does not.
+# The robot was commanded to go 15 mm beyond an approach gap of 2.5 mm; in m. The log misses about the last millimeter
+# of this motion (the finger is still moving at the last logged sample), but the measured end pose includes it.
 COMMANDED_TRAVEL = 0.0175
 
 
 class LogError(ValueError):
     """A log, or one push of it, that cannot be used.
 
-    `path` is the file as given; `push`, its push's number (from 0), and `line` (from 1) are None if unknown.
+    Attributes:
+        path: The file, as given by the caller.
+        message: What was expected, and what was found.
+        push: Number of the push in the file, from 0; None if unknown.
+        line: Line in the file, from 1; None if unknown.
     """
 
     def __init__(
@@ -54,16 +59,25 @@ class LogError(ValueError):
         return f"{', '.join(place)}: {self.message}"
 
     def __reduce__(self) -> tuple[object, ...]:
-        # The default rebuilds from the message alone, which would break errors that cross a process boundary.
+        # By default, pickle rebuilds an exception from its message alone. That would fail between processes.
         return _rebuild_error, (self.path, self.message, self.push, self.line)
 
 
 def _rebuild_error(path: str, message: str, push: int | None, line: int | None) -> LogError:
+    """Rebuild an unpickled error."""
     return LogError(path, message, push=push, line=line)
 
 
 def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> LogError:
-    """Of a file without a usable push: the first problem, and how many more there are."""
+    """Build the error for a file without a usable push: the first problem, and the number of further ones.
+
+    Args:
+        path: The file.
+        problems: The errors of its pushes.
+
+    Returns:
+        The error, to be raised by the caller.
+    """
     if not problems:
         return LogError(path, "expected at least one push, found none")
     first = problems[0]
@@ -73,9 +87,11 @@ def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> L
 
 @dataclass(frozen=True, eq=False)
 class Onset:
-    """First touch, as the force shows it.
+    """First contact, as detected from the force.
 
-    time: s, clock of the push. tip: (2,) m, world, the finger's centre then, interpolated in the logged path.
+    Attributes:
+        time: Time in s, on the clock of the push.
+        tip: (2,) center of the finger at that time, in m, world frame, interpolated in the logged path.
     """
 
     time: float
@@ -84,16 +100,21 @@ class Onset:
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """One push. M finger samples and K force samples on one clock, which starts at the first force sample.
+    """One push, with M finger samples and K force samples on one clock that starts at the first force sample.
 
-    index: number of the push in its log, from 0.
-    pose_start, pose_end: (3,) x, y (m), theta (rad) of the body frame in the world, measured at rest before
-        and after the push. theta starts in (-pi, pi]; the end angle is the one nearest to it and may lie
-        outside.
-    tip_time: (M,) s; tip: (M, 2) m, world, the finger's centre; tip_yaw: (M,) rad, world, the finger's
-        orientation about the vertical: first one in (-pi, pi], continuous after.
-    force_time: (K,) s; force: (K, 2) N, world, on the object; the reading of the first sample is subtracted.
-    onset: first touch, or None where the force never rises enough.
+    Attributes:
+        index: Number of the push in its log, from 0.
+        pose_start: (3,) pose of the body frame in the world before the push, measured at rest: x, y (m), theta (rad).
+            Theta is in (-pi, pi].
+        pose_end: (3,) pose after the push, measured at rest. Its angle is the one nearest to the start angle and may
+            lie outside (-pi, pi].
+        tip_time: (M,) times of the finger samples, in s.
+        tip: (M, 2) centers of the finger, in m, world frame.
+        tip_yaw: (M,) orientations of the finger about the vertical, in rad, world frame. The first is in (-pi, pi], the
+            others continue from it without jumps.
+        force_time: (K,) times of the force samples, in s.
+        force: (K, 2) forces on the object, in N, world frame. The reading of the first sample is subtracted.
+        onset: First contact; None if the force never rises enough.
     """
 
     index: int
@@ -109,17 +130,21 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class PushLog:
-    """The usable pushes of one log and what is wrong with the others.
+    """The usable pushes of one log, and the problems of the others.
 
-    pushes: in the order of the log.
-    problems: one error per unusable push, and one for what concerns the file as a whole (header, cut end).
-    vertices: (3, 2) m, body; the right-angle corner first, then clockwise.
-    length: m, the characteristic length rho by which the paper weighs rotation: corner to centre of mass.
-    tip_radius: m, radius of the finger.
-    support_points: (p, 2) m, body; (0, 2) where the whole face touches the surface.
-    support_force: (p,) N, normal force at each support point.
-    surface, arrangement: names of the material and of the support arrangement; "unknown" where nothing tells.
-    source: the file read.
+    Attributes:
+        pushes: The usable pushes, in the order of the log.
+        problems: One error for each unusable push, and one for each problem of the file as a whole (header, truncated
+            end).
+        vertices: (3, 2) vertices of the triangle, in m, body frame: the right-angle corner first, then clockwise.
+        length: Characteristic length rho, in m, by which the paper weighs rotation: distance of the right-angle corner
+            from the center of mass.
+        tip_radius: Radius of the finger, in m.
+        support_points: (p, 2) support points, in m, body frame; (0, 2) if the whole face touches the surface.
+        support_force: (p,) normal force at each support point, in N.
+        surface: Name of the surface material; "unknown" if neither the caller nor the file names it.
+        arrangement: Name of the support arrangement; "unknown" if neither the caller nor the file names it.
+        source: The file that was read.
     """
 
     pushes: tuple[Push, ...]
@@ -134,24 +159,34 @@ class PushLog:
     source: str
 
     def wrench_twist_pairs(self) -> tuple[Floats, Floats]:
-        """One pair per push: the wrench that moved the object, and the displacement that followed.
+        """Return one pair for each push: the wrench that moved the object, and the displacement that followed.
 
-        Returns wrench (n, 3): fx, fy (N), tau (N m), about the body origin in the moving body frame, averaged
-        over the samples `force_filter` keeps; and displacement (n, 3): dx, dy (m), dtheta (rad) from start to
-        end in the starting body frame. Neither is normalised; the direction of the displacement stands for
-        the twist's.
+        Neither is normalized. The direction of the displacement stands for that of the twist.
 
-        Source: the toolbox of Zhou et al. 2017, but with the angle interpolated the short way.
+        Returns:
+            Two arrays (n, 3). The first has the wrenches fx, fy (N), tau (N m) about the body origin, in the moving
+                body frame, averaged over the samples that `force_filter` keeps. The second has the displacements dx, dy
+                (m), dtheta (rad) from start to end, in the body frame at the start.
+
+        Reference: The toolbox of Zhou et al. 2017, except that the angle is interpolated the short way.
         """
         wrench = np.array([_mean_wrench(push) for push in self.pushes]).reshape(-1, 3)
         displacement = np.array([_displacement(push) for push in self.pushes]).reshape(-1, 3)
         return wrench, displacement
 
     def commanded_tip_end(self, push: Push) -> Floats:
-        """(2,) m, world: where the finger was told to stop. Inferred: the logged start plus 17.5 mm along the
-        push.
+        """Return where the finger was commanded to stop.
 
-        Raises ValueError if the logged finger does not move, because the push then has no direction.
+        This is inferred: the logged start plus 17.5 mm along the push.
+
+        Args:
+            push: A push of this log.
+
+        Returns:
+            (2,) center of the finger, in m, world frame.
+
+        Raises:
+            ValueError: If the logged finger does not move, because the push then has no direction.
         """
         travel = push.tip[-1] - push.tip[0]
         distance = np.linalg.norm(travel)
@@ -161,10 +196,15 @@ class PushLog:
 
 
 def force_filter(force: Floats) -> NDArray[np.bool_]:
-    """(K,) which of the force samples (K, 2) count: not in the first 30 %, and at least as strong as the mean
-    force.
+    """Select the force samples after the first 30 % that are at least as strong as the mean force.
 
-    Same rule as the toolbox, including its counting from 1; nothing is smoothed.
+    This is the rule of the toolbox, including its counting from 1. Nothing is smoothed.
+
+    Args:
+        force: (K, 2) forces, in N.
+
+    Returns:
+        (K,) mask of the samples to keep.
     """
     count = len(force)
     late = np.arange(1, count + 1) >= np.ceil(SKIPPED_FRACTION * count)
@@ -172,9 +212,16 @@ def force_filter(force: Floats) -> NDArray[np.bool_]:
 
 
 def contact_onset(force_time: Floats, force: Floats, tip_time: Floats, tip: Floats) -> Onset | None:
-    """First sample with |force| > max(0.3 N, 0.3 median |force| of the second half), or None.
+    """Find the first sample with |force| > max(0.3 N, 0.3 median |force| of the second half).
 
-    Shapes, units and frames as in `Push`.
+    Args:
+        force_time: (K,) times of the force samples, in s.
+        force: (K, 2) forces, in N.
+        tip_time: (M,) times of the finger samples, in s.
+        tip: (M, 2) centers of the finger, in m, world frame.
+
+    Returns:
+        Time and center of the finger at that sample; None if there is no such sample.
     """
     strength = np.hypot(force[:, 0], force[:, 1])
     threshold = max(ONSET_FORCE, ONSET_FRACTION * float(np.median(strength[len(strength) // 2 :])))
@@ -186,31 +233,33 @@ def contact_onset(force_time: Floats, force: Floats, tip_time: Floats, tip: Floa
 
 
 def rotation(theta: Floats | float) -> Floats:
-    """(..., 2, 2) rotation matrices of angles (...) in rad."""
+    """Return the rotation matrices (..., 2, 2) of angles (...) in rad."""
     cos, sin = np.cos(theta), np.sin(theta)
     return np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
 
 
 def wrap_angle(angle: Floats) -> Floats:
-    """The same angle in (-pi, pi], rad."""
+    """Return the same angle in (-pi, pi], in rad."""
     return np.pi - np.mod(np.pi - angle, 2 * np.pi)
 
 
 def continuous_angle(angle: Floats) -> Floats:
-    """(m,) rad: without jumps of 2 pi, and with the first one in (-pi, pi]."""
+    """Unwrap angles (m,) in rad so that they have no jumps of 2 pi and the first is in (-pi, pi]."""
     smooth = np.unwrap(angle)
     return smooth - smooth[0] + wrap_angle(smooth[0])
 
 
 def _displacement(push: Push) -> Floats:
+    """Return the displacement dx, dy (m), dtheta (rad) of a push in the body frame at its start."""
     moved = push.pose_end - push.pose_start
     return np.append(rotation(push.pose_start[2]).T @ moved[:2], wrap_angle(moved[2]))
 
 
 def _mean_wrench(push: Push) -> Floats:
+    """Return the wrench (3,) of a push about the body origin, averaged over the samples of `force_filter`."""
     keep = force_filter(push.force)
-    # The object is only seen before and after the push. Its way between is spread evenly over the kept
-    # samples, by their number and not by their time: that is how the paper's pairs were made.
+    # The object is seen only before and after the push. Its displacement is spread evenly over the kept samples, by
+    # sample number and not by time, because the paper's pairs were made in this way.
     share = np.linspace(0.0, 1.0, int(keep.sum()))[:, None]
     moved = push.pose_end - push.pose_start
     moved[2] = wrap_angle(moved[2])
@@ -224,4 +273,5 @@ def _mean_wrench(push: Push) -> Floats:
 
 
 def _path_at(time: Floats, path_time: Floats, path: Floats) -> Floats:
+    """Interpolate a path (m, 2), known at the times (m,), at other times (k,)."""
     return np.stack([np.interp(time, path_time, path[:, axis]) for axis in range(2)], axis=1)

@@ -1,6 +1,6 @@
-"""Recorded pushes of any hand and object: one structure, whatever the kind of file they come from.
+"""Recorded pushes of any hand and object: one structure for all kinds of files.
 
-World, body frame and the sign of the force are those of `pushes`.
+World frame, body frame and the sign of the force are those of `pushes`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -13,29 +13,32 @@ from numpy.typing import NDArray
 from pushjax.datasets.pushes import Floats, LogError, Push, PushLog, nothing_usable
 from pushjax.datasets.records import LARGEST_NUMBER
 
-# What the columns are called, in files and in what is said about them.
+# Names of the columns, in files and in error messages.
 HAND = ("hand_x", "hand_y", "hand_theta", "hand_distance")
 OBJECT = ("object_x", "object_y", "object_theta")
 FORCE = ("force_x", "force_y")
-TURNS = 2  # from zero, that an angle in rad is at most: unwrapped, degrees would look like any angle
+# Largest object angle, in turns from zero; a larger one is taken to be in degrees. This is tested before unwrapping,
+# because unwrapped degrees look like any other angle.
+TURNS = 2
 
 
 class InDegrees(LogError):
-    """Of a push whose angles cannot be in rad."""
+    """The error for a push whose angles cannot be in rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One push, as m samples of the hand and what was known of the object at each.
+    """One push: m samples of the hand, and what is known of the object at each of them.
 
-    index: number of the push in its file, from 0.
-    hand: (m, dof) m and rad, world: configurations as `pushjax.Hand` takes them. Two numbers are the centre (x, y) of a
-        finger; more are x, y, theta (continuous), opening.
-    pose: (m, 3) x, y (m), theta (rad) of the body frame in the world; theta goes the short way from one seen sample to
-        the next. NaN where the object was not seen.
-    seen: (m,) where it was; the first and the last are.
-    force: (m, 2) N, world, on the object, NaN where there is none; None where none was recorded.
-    time: (m,) s, never going back, from an arbitrary origin; None where none was recorded.
+    Attributes:
+        index: Number of the push in its file, from 0.
+        hand: (m, dof) configurations of the hand as `pushjax.Hand` takes them, in m and rad, world frame. With dof = 2
+            they are the center (x, y) of a finger. With more they are x, y, theta (continuous), opening.
+        pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one seen
+            sample to the next. NaN where the object was not seen.
+        seen: (m,) whether the object was seen. True for the first and the last sample.
+        force: (m, 2) forces on the object, in N, world frame, NaN where there is none; None if no force was recorded.
+        time: (m,) times, in s, non-decreasing, from an arbitrary origin; None if no time was recorded.
     """
 
     index: int
@@ -48,13 +51,19 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """The usable pushes of one file, what is wrong with the others, and what the file knows of the object.
+    """The usable pushes of one file, the problems of the others, and what the file says about the object.
 
-    pushes: in the order of the file, all with the same dof.
-    problems: one error per unusable push, and one for what concerns the file as a whole (a cut end, say).
-    source: the file read.
-    vertices: (k, 2) m, body. length: m, which weighs rotation against translation. tip_radius: m, of the finger.
-    support_points: (p, 2) m, body; (0, 2) where the whole face touches the surface. None for what is unknown.
+    Optional attributes are None if they are unknown.
+
+    Attributes:
+        pushes: The usable pushes, in the order of the file, all with the same dof.
+        problems: One error for each unusable push, and one for each problem of the file as a whole (a truncated end,
+            say).
+        source: The file that was read.
+        vertices: (k, 2) vertices of the object, in m, body frame.
+        length: Characteristic length, in m, which weighs rotation against translation.
+        tip_radius: Radius of the finger, in m.
+        support_points: (p, 2) support points, in m, body frame; (0, 2) if the whole face touches the surface.
     """
 
     pushes: tuple[Recording, ...]
@@ -67,10 +76,16 @@ class Recordings:
 
     @staticmethod
     def of_log(log: PushLog) -> "Recordings":
-        """The pushes of a triangle log: the object seen at the first and the last sample of the finger only.
+        """Convert a triangle log, in which the object is seen only at the first and the last sample of the finger.
 
-        The force is interpolated at the finger's samples. The finger's path is the logged one, which ends a millimetre
-        or so before the object comes to rest (see `PushLog.commanded_tip_end`).
+        The force is interpolated at the finger's samples. The finger's path is the logged one, which ends about a
+        millimeter before the object comes to rest (see `PushLog.commanded_tip_end`).
+
+        Args:
+            log: The log, from `load_triangle_log` or `load_push_npz`.
+
+        Returns:
+            The same pushes and problems.
         """
         return Recordings(
             pushes=tuple(_of_push(push) for push in log.pushes),
@@ -84,6 +99,7 @@ class Recordings:
 
 
 def _of_push(push: Push) -> Recording:
+    """Convert a push of a triangle log."""
     count = len(push.tip)
     pose = np.full((count, 3), np.nan)
     pose[0], pose[-1] = push.pose_start, push.pose_end
@@ -98,16 +114,38 @@ def _of_push(push: Push) -> Recording:
 
 
 def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """(m, c): the columns of `known` (k, c) at the times (m,), linearly between those (k,); NaN outside of them."""
+    """Interpolate columns linearly at other times.
+
+    Args:
+        time: (m,) times to interpolate at, in s.
+        known_time: (k,) times of the known values, in s, non-decreasing.
+        known: (k, c) known values.
+
+    Returns:
+        (m, c) interpolated values; NaN outside the known times.
+    """
     columns = [np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in known.T]
     return np.stack(columns, axis=1)
 
 
 def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
-    """Recordings of what was made of each push of a file. Raises LogError where nothing is usable."""
+    """Collect the results of all pushes of a file.
+
+    If more than a quarter of the results are `InDegrees`, all other pushes become such errors too.
+
+    Args:
+        path: The file.
+        found: The recording of each push, or its error.
+
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If no push is usable.
+    """
     each = list(found)
     if 4 * sum(isinstance(one, InDegrees) for one in each) > len(each):
-        # the angles of the others are just small
+        # The others only seem to be in rad, because their angles in degrees are small.
         message = "the angles of many other pushes of the file cannot be in rad: are all in degrees?"
         each = [InDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
     problems = tuple(one for one in each if isinstance(one, LogError))
@@ -127,9 +165,19 @@ def checked(
     time: Floats | None = None,
     lines: Sequence[int] | None = None,
 ) -> Recording | LogError:
-    """A Recording of these arrays (as there; pose NaN where not seen), or what is wrong with them.
+    """Check the arrays of one push.
 
-    lines: (m,) of the file, from 1, one per sample, where it has lines.
+    Args:
+        path: The file, for error messages.
+        index: Number of the push in the file, from 0.
+        hand: (m, dof) configurations of the hand, as in `Recording`.
+        pose: (m, 3) poses of the object, NaN where it was not seen. Angles need not be continuous.
+        force: (m, 2) forces on the object, NaN where there is none; None if not recorded.
+        time: (m,) times in s; None if not recorded.
+        lines: (m,) line of each sample in the file, from 1; None if the file has no lines.
+
+    Returns:
+        The recording, with unwrapped angles, or the error that describes the first fault.
     """
 
     def wrong(message: str, row: int) -> LogError:
@@ -159,6 +207,7 @@ def checked(
 def _first_problem(
     hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, wrong: Callable[[str, int], LogError]
 ) -> LogError | None:
+    """Find the first fault in the arrays of `checked`; `wrong` makes an error of a message and a row of the push."""
     columns = [(hand_names(hand.shape[1]), hand, False), (OBJECT, pose, True)]
     if force is not None:
         columns.append((FORCE, force, True))
@@ -180,12 +229,21 @@ def _first_problem(
 
 
 def hand_names(dof: int) -> tuple[str, ...]:
-    """(dof,) what the columns of a hand's configuration are called."""
+    """Return the names (dof,) of the columns of a hand's configuration."""
     return (*HAND[:dof], *(f"hand_{column}" for column in range(len(HAND), dof)))
 
 
 def bad_number(names: Sequence[str], values: Floats, may_lack: bool) -> tuple[str, int] | None:
-    """What is wrong with the first bad row, and which it is. A row `may_lack` all its numbers: NaN then."""
+    """Find the first row with a number that is not finite or too large.
+
+    Args:
+        names: (c,) names of the columns, for the message.
+        values: (m, c) numbers.
+        may_lack: Whether all numbers of a row may be missing. They are NaN then.
+
+    Returns:
+        A message and the row; None if all rows are good.
+    """
     bad = ~(np.abs(values) < LARGEST_NUMBER)
     if may_lack:
         bad[np.isnan(values).all(axis=1)] = False

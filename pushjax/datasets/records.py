@@ -1,13 +1,13 @@
-"""The text of a triangle log, taken apart into records; knows the layout, not what the numbers mean.
+"""Split the text of a triangle log into records. This module knows the layout, not the meaning of the numbers.
 
-Layout, one item per line: the number of pushes; then for each push its object pose before and after (7
-numbers each), the number of force samples and those samples (3 numbers each), the number of robot samples and
-those (8 each).
+The layout has one item per line. The first line is the number of pushes. Each push then has its object pose before and
+after (7 numbers each), the number of force samples, those samples (3 numbers each), the number of robot samples, and
+those samples (8 numbers each).
 
-A damaged record must not cost the ones after it. If its counts still fit, the next record starts where they
-say; if not, at the next place that looks like a start: poses and a count are the only lines of 7, 7 and 1
-numbers in a row. Two neighbouring records whose starts are both beyond recognition count as one, and those
-after are numbered one less.
+A damaged record must not cost the records after it. If its sample counts are still consistent, the next record starts
+where they say. Otherwise the next record starts at the next place that looks like a start: poses and a count are the
+only consecutive lines of 7, 7 and 1 numbers. Two neighboring records whose starts are both unrecognizable count as one,
+and the numbers of the records after them are too low by one.
 """
 
 import gzip
@@ -21,16 +21,24 @@ import numpy as np
 from pushjax.datasets.pushes import Floats, LogError
 
 POSE_COLUMNS, COUNT_COLUMNS, FORCE_COLUMNS, ROBOT_COLUMNS = 7, 1, 3, 8
-# A push takes about 670 force and 220 robot samples; the longest imaginable one stays far below this.
+# A push has about 670 force samples and 220 robot samples. Even a very long push stays far below this.
 MOST_SAMPLES = 1_000_000
-# Nothing logged (s, mm, N) comes near; beyond it, squares might overflow later.
+# No logged quantity (s, mm, N) comes near this value. Squares of larger numbers might overflow later.
 LARGEST_NUMBER = 1e12
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One push as logged: `poses` (2, 7), `force` (K, 3), `robot` (M, 8); its first pose is on `line`."""
+    """One push as logged.
+
+    Attributes:
+        index: Number of the push in its log, from 0.
+        line: Line of the first pose in the file, from 1.
+        poses: (2, 7) object poses before and after the push, one logged line each.
+        force: (K, 3) force samples.
+        robot: (M, 8) robot samples.
+    """
 
     index: int
     line: int
@@ -40,15 +48,22 @@ class Record:
 
     @property
     def force_line(self) -> int:
+        """Line of the first force sample, from 1."""
         return self.line + 3
 
     @property
     def robot_line(self) -> int:
+        """Line of the first robot sample, from 1."""
         return self.force_line + len(self.force) + 1
 
 
 class Fault(Exception):
-    """What is wrong with a record, before it is known which file and push it belongs to."""
+    """A fault in a record, raised before the file and the push that it belongs to are known.
+
+    Attributes:
+        line: Line of the fault, from 1.
+        at_end: Whether the fault is that the log ends too early.
+    """
 
     def __init__(self, message: str, line: int, *, at_end: bool = False) -> None:
         super().__init__(message)
@@ -57,9 +72,17 @@ class Fault(Exception):
 
 
 def read_records(path: Path) -> Iterator[Record | LogError]:
-    """The records of a log in order, each whole one as a Record and each damaged one as a LogError.
+    """Iterate over the records of a log in order.
 
-    A damaged header or end gives one further LogError. Raises LogError if the file is unreadable or empty.
+    Args:
+        path: The log, plain or gzip-compressed.
+
+    Yields:
+        A `Record` for each intact record and a `LogError` for each damaged one. A damaged header or a damaged end of
+            the file gives one further `LogError`.
+
+    Raises:
+        LogError: If the file is unreadable or empty.
     """
     lines, damage = _read_lines(path)
     promised, fault = _header(lines)
@@ -90,7 +113,10 @@ def read_records(path: Path) -> Iterator[Record | LogError]:
 
 
 def _read_lines(path: Path) -> tuple[list[str], str]:
-    """The lines, and how the gzip stream is damaged ("" if it is not); what precedes the damage is good."""
+    """Read the lines of a log, and describe the damage of its gzip stream ("" if there is none).
+
+    The lines before the damage are intact.
+    """
     damage = ""
     try:
         text = path.read_bytes()
@@ -103,7 +129,7 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             damage = f"; the gzip stream is damaged: {error}"
             text = _undamaged(text)
-            # The cut may fall inside a number that still looks like one.
+            # The stream may be cut inside a number, and the rest still looks like a number: drop the last line.
             text = text[: text.rfind(b"\n") + 1]
     lines = text.decode("ascii", errors="replace").rstrip().splitlines()
     if not lines:
@@ -112,7 +138,10 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
 
 
 def _undamaged(zipped: bytes) -> bytes:
-    """What a gzip stream holds before its damage. Byte by byte: a call that fails gives nothing at all."""
+    """Return what a gzip stream holds before its damage.
+
+    The stream is decompressed byte by byte, because a call that fails returns nothing.
+    """
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     text = bytearray()
     try:
@@ -124,6 +153,7 @@ def _undamaged(zipped: bytes) -> bytes:
 
 
 def _header(lines: list[str]) -> tuple[int | None, Fault | None]:
+    """Read the promised number of pushes from the first line: the number, or None and the fault."""
     try:
         promised = _count(lines, 0, "pushes")
     except Fault as fault:
@@ -134,11 +164,16 @@ def _header(lines: list[str]) -> tuple[int | None, Fault | None]:
 
 
 def _promise(promised: int | None) -> str:
+    """Describe the number of pushes that the header promises, if it is known."""
     return "" if promised is None else f" (the header promises {promised} pushes)"
 
 
 def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
-    """The record that starts at line index `at`, and where the next one starts. Raises Fault."""
+    """Read the record that starts at line index `at`, and return it with the line index after its end.
+
+    Raises:
+        Fault: If the record is damaged.
+    """
     first = _table(lines, at, 1, POSE_COLUMNS, "object pose before the push")
     last = _table(lines, at + 1, 1, POSE_COLUMNS, "object pose after the push")
     force_count = _count(lines, at + 2, "force samples")
@@ -153,6 +188,11 @@ def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
 
 
 def _count(lines: list[str], at: int, what: str) -> int:
+    """Read the number of samples or pushes at line index `at`.
+
+    Raises:
+        Fault: If the line is missing, is no integer, or is not between 0 and MOST_SAMPLES.
+    """
     if at >= len(lines):
         raise Fault(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
     try:
@@ -165,7 +205,11 @@ def _count(lines: list[str], at: int, what: str) -> int:
 
 
 def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Floats:
-    """(count, columns) numbers from as many lines."""
+    """Read a table of shape (count, columns) from `count` lines, starting at line index `at`.
+
+    Raises:
+        Fault: If a line is missing or has other numbers than expected.
+    """
     rows = [line.split() for line in lines[at : at + count]]
     try:
         table = np.array(rows, dtype=np.float64).reshape(-1, columns) if rows else np.empty((0, columns))
@@ -178,12 +222,12 @@ def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Fl
 
 
 def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str) -> Fault:
-    """The first thing wrong with the lines of a table that is known to be bad."""
+    """Find the first fault in the lines of a table that is known to be bad."""
     for row, line in enumerate(lines[at : at + count]):
         where = what if count == 1 else f"{what} {row + 1} of {count}"
         tokens = line.split()
         if len(tokens) != columns:
-            # The last line of the file with too little on it was cut off while it was written.
+            # If the last line of the file has too few numbers, it was cut off while it was written.
             cut = at + row == len(lines) - 1 and len(tokens) < columns
             found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {quoted(line)}"
             return Fault(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
@@ -201,21 +245,35 @@ def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str)
 
 
 def quoted(text: str) -> str:
+    """Quote text for a message, shortened to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def _columns(lines: list[str], at: int) -> int:
+    """Count the numbers on the line at index `at`; -1 after the end of the file."""
     return len(lines[at].split()) if at < len(lines) else -1
 
 
 def _start_score(lines: list[str], at: int) -> int:
-    """How many of the three lines from `at` have the columns of a record's start: 3; 2 if one is damaged."""
+    """Count the lines, of the three from index `at`, whose number of columns fits the start of a record.
+
+    An intact start scores 3. A start with one damaged line scores 2.
+    """
     shape = (POSE_COLUMNS, POSE_COLUMNS, COUNT_COLUMNS)
     return sum(_columns(lines, at + row) == columns for row, columns in enumerate(shape))
 
 
 def _resume(lines: list[str], at: int, fault_at: int) -> int:
-    """Where to go on after the record that starts at `at`, damaged at `fault_at`; the end if nowhere."""
+    """Find the line index at which to continue after a damaged record.
+
+    Args:
+        lines: Lines of the log.
+        at: Line index at which the damaged record starts.
+        fault_at: Line index of the fault.
+
+    Returns:
+        Line index of the next record's start; the number of lines if there is no further start.
+    """
     try:
         robot_at = at + 3 + _count(lines, at + 2, "")
         end = robot_at + 1 + _count(lines, robot_at, "")
@@ -223,9 +281,9 @@ def _resume(lines: list[str], at: int, fault_at: int) -> int:
             return end
     except Fault:
         pass
-    # What comes before the fault has been recognised as part of this record.
+    # The lines before the fault have been recognized as part of this record, so the search starts at the fault.
     for start in range(max(fault_at, at + 1), len(lines)):
         if _start_score(lines, start) >= 2:
-            # A damaged line just before a start of three good lines looks like a start of two.
+            # A damaged line just before an intact start (score 3) also scores 2: skip it.
             return start + 1 if _start_score(lines, start + 1) == 3 else start
     return len(lines)

@@ -1,4 +1,7 @@
-"""The curated arrays of the same pushes: one `.npz` per log, in SI units and in the frames of `pushes`."""
+"""Read curated arrays of one-finger pushes of the triangle: one `.npz` per log, in SI units.
+
+The frames are those of `pushes`.
+"""
 
 from os import PathLike
 from pathlib import Path
@@ -31,12 +34,21 @@ _STREAMS = {"tip_offsets": ("tip_t", "tip_xy", "tip_yaw"), "ft_offsets": ("ft_t"
 
 
 def load_push_npz(path: str | PathLike[str]) -> PushLog:
-    """Reads a file of the `three_point_push` folder, rows in order; `Push.index` is its `push_index`.
+    """Read a file of the `three_point_push` folder.
 
-    Rows marked invalid, or holding numbers that are not finite, become problems. Raises LogError if the file
-    is missing, is no such archive, lacks an array or has one of the wrong size, or if no row is usable.
+    The order of the rows is kept, and `Push.index` is the `push_index` of the row. A row becomes a problem if it is
+    marked invalid or has numbers that are not finite. The constants at the top of this file list the arrays that are
+    read, and their shapes.
 
-    The arrays it reads, and their shapes, are named at the head of this file.
+    Args:
+        path: The file.
+
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If the file is missing or no such archive, if an array is missing or has the wrong size, or if no row
+            is usable.
     """
     file = Path(path)
     wanted = [*_PER_PUSH, *_PER_FILE, *_STREAMS, *(name for names in _STREAMS.values() for name in names)]
@@ -68,6 +80,11 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
 
 
 def _check_sizes(path: Path, data: Arrays) -> None:
+    """Check the numbers of rows, and that the offsets of the streams rise from 0.
+
+    Raises:
+        LogError: For the first array that fails.
+    """
     count = row_count(path, data, _PER_PUSH)
     for offsets_name, names in _STREAMS.items():
         offsets = data[offsets_name]
@@ -79,6 +96,7 @@ def _check_sizes(path: Path, data: Arrays) -> None:
 
 
 def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
+    """Read the push of a row, or return the error that describes its first fault."""
     index = int(floats(data["push_index"])[row])
     if not data["valid"][row]:
         return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)

@@ -1,8 +1,10 @@
-"""Original text logs of the aluminium triangle pushed by one finger (Zhou et al. 2017, Table 2).
+"""Read original text logs of the aluminum triangle that one finger pushes.
 
-What a record must satisfy to count as a push is in `_check`; what it means is in `_push`. Both follow the
-published toolbox, except that quaternions are normalised here (they have three to six digits) and angles
-never turn the long way.
+`_check` has the conditions under which a record counts as a push. `_push` interprets its numbers. Both follow the
+published toolbox, with two exceptions: quaternions are normalized here, because they have three to six digits, and
+angles never turn the long way.
+
+Reference: Zhou et al. 2017, Table 2.
 """
 
 from os import PathLike
@@ -26,14 +28,15 @@ from pushjax.datasets.pushes import (
 )
 from pushjax.datasets.records import Fault, Record, read_records
 
-# Logged quaternions are off unit norm by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
+# The norms of logged quaternions deviate from one by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
 QUATERNION_TOLERANCE = 0.01
-# Broken trials hold one to three samples per push, whole ones some 670 and 220.
+# Broken trials have one to three samples per push. Complete ones have some 670 force and 220 robot samples.
 FEWEST_SAMPLES = 4
-# A finger that moves less has no direction; the path is logged with 0.1 mm resolution.
+# A finger that moves less than this (m) has no clear direction, because its path is logged with a resolution of 0.1 mm.
 SHORTEST_TRAVEL = 0.001
-# The motion capture has jumped if the object went further than the finger can have pushed it (deviation
-# |dx| + length |dtheta|), or if it ends where the finger is not: off the line of the edge it pushes on.
+# The motion capture has jumped in two cases. (1) The object moved more than MOST_MOTION (m, as |dx| + length |dtheta|),
+# which is more than the finger can push it. (2) At the end, the finger is more than MOST_GAP (m) away from the line of
+# the edge that it pushes on.
 MOST_MOTION = 0.060
 MOST_GAP = 0.003
 
@@ -46,18 +49,26 @@ def load_triangle_log(
     support_points: ArrayLike | None = None,
     strict: bool = False,
 ) -> PushLog:
-    """Reads an original log, plain or gzip-compressed (told from its content, not from its name).
+    """Read an original log, plain or gzip-compressed, which is recognized by content and not by name.
 
-    surface: material the triangle slides on; by default what the file's and folder's names tell.
-    arrangement: "3pts1" ... "3pts4" or "patch", which sets the support points; by default from the names.
-    support_points: (3, 2) or (0, 2) m, body; overrides those of the arrangement.
-    strict: raise the first problem instead of collecting it.
+    Damaged pushes become entries of `problems`. The others stay usable, as far as the layout can be followed.
 
-    Damaged pushes become entries of `problems` and the others stay usable, as far as the layout can be
-    followed. Raises LogError if no push is usable, or the file is missing, empty or no such log; ValueError
-    for an unknown `arrangement` or support points that cannot carry the object.
+    Args:
+        path: The log.
+        surface: Material that the triangle slides on; by default taken from the names of the file and its folder.
+        arrangement: "3pts1" ... "3pts4" or "patch", which determines the support points; by default taken from the
+            names.
+        support_points: (3, 2) or (0, 2) support points, in m, body frame; they override those of the arrangement.
+        strict: Whether to raise the first problem instead of collecting it.
 
-    Source: layout and processing as in the toolbox of Zhou et al. 2017; the rule for jumps is our own.
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If no push is usable, or if the file is missing, empty or no such log.
+        ValueError: If `arrangement` is unknown, or if the support points cannot carry the object.
+
+    Reference: Layout and processing are as in the toolbox of Zhou et al. 2017. The rule for jumps is our own.
     """
     file = Path(path)
     name, points = _support(file, arrangement, support_points)
@@ -92,6 +103,7 @@ def load_triangle_log(
 
 
 def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
+    """Return the name of the arrangement and its support points (p, 2), from the arguments or else the names."""
     name, known = setup.name_support(path) or (setup.UNKNOWN, np.empty((0, 2)))
     if arrangement is not None:
         name, known = arrangement, setup.support_points(arrangement)
@@ -102,7 +114,11 @@ def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> t
 
 
 def _usable_push(record: Record) -> Push:
-    """The push of a record. Raises Fault if it cannot be trusted."""
+    """Convert a record to a push.
+
+    Raises:
+        Fault: If the record cannot be trusted.
+    """
     _check(record)
     push = _push(record)
     _check_motion(push, record.line + 1)
@@ -115,6 +131,11 @@ def _usable_push(record: Record) -> Push:
 
 
 def _check(record: Record) -> None:
+    """Check that a record has enough samples, unit quaternions, and clocks that do not go back and overlap in time.
+
+    Raises:
+        Fault: If a condition is violated.
+    """
     robot_count_line = record.robot_line - 1
     for what, table, line in (
         ("force", record.force, record.line + 2),
@@ -131,6 +152,11 @@ def _check(record: Record) -> None:
 
 
 def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
+    """Check that the quaternions, the first of which is on `line`, have unit norm.
+
+    Raises:
+        Fault: For the first that has not.
+    """
     norm = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
     if len(bad):
@@ -138,6 +164,11 @@ def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
 
 
 def _check_clock(time: Floats, line: int, what: str) -> None:
+    """Check that the times, the first of which is on `line`, do not decrease.
+
+    Raises:
+        Fault: For the first that does.
+    """
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         step = time[back[0] + 1] - time[back[0]]
@@ -146,7 +177,13 @@ def _check_clock(time: Floats, line: int, what: str) -> None:
 
 
 def _check_motion(push: Push, line: int) -> None:
-    """`line` is that of the pose after the push, which is where a jump shows."""
+    """Check that the finger moves and that the motion capture does not jump.
+
+    `line` is the line of the pose after the push, which is where a jump shows.
+
+    Raises:
+        Fault: If a condition is violated.
+    """
     travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
     if not travel >= SHORTEST_TRAVEL:
         raise Fault(
@@ -156,7 +193,7 @@ def _check_motion(push: Push, line: int) -> None:
     moved = push.pose_end - push.pose_start
     deviation = float(np.hypot(moved[0], moved[1]) + setup.LENGTH * abs(moved[2]))
     gap = _end_gap(push)
-    # Written so that a NaN from absurdly large numbers fails as well.
+    # The condition is negated so that it also fails for NaN, which very large numbers can give.
     if not (deviation <= MOST_MOTION and abs(gap) <= MOST_GAP):
         expected = f"less than {MOST_MOTION * 1e3:g} mm and to end within {MOST_GAP * 1e3:g} mm of the finger"
         found = f"{deviation * 1e3:.4g} mm and {gap * 1e3:.4g} mm"
@@ -164,29 +201,30 @@ def _check_motion(push: Push, line: int) -> None:
 
 
 def _end_gap(push: Push) -> float:
-    """Distance (m, > 0 outside) of the last finger centre from the line of the edge facing the first one."""
+    """Return the distance of the last finger center from the line of the edge facing the first one (m, > 0 outside)."""
     start = _edge_distances(push.pose_start, push.tip[0])
     return float(_edge_distances(push.pose_end, push.tip[-1])[np.argmax(start)])
 
 
 def _edge_distances(pose: Floats, point: Floats) -> Floats:
-    """(3,) signed distances of a world point from the lines of the edges, positive outside."""
+    """Return the signed distances (3,) of a world point from the lines of the edges, positive outside."""
     edge = np.roll(setup.VERTICES, -1, axis=0) - setup.VERTICES
-    # The vertices run clockwise, so the outside is to the left of an edge.
+    # The vertices are in clockwise order, so the outside is to the left of an edge.
     outward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     in_body = rotation(pose[2]).T @ (point - pose[:2])
     return np.sum((in_body - setup.VERTICES) * outward, axis=1)
 
 
 def _push(record: Record) -> Push:
+    """Convert a checked record to a push."""
     start, end = (_body_pose(row) for row in record.poses)
     end[2] = start[2] + wrap_angle(end[2] - start[2])
-    # Unix seconds use up most of a float64's digits; the clock of the push starts at its first force sample.
+    # Unix times in s use most digits of a float64, so the clock of the push starts at its first force sample.
     force_time = record.force[:, 0] - record.force[0, 0]
     tip_time = record.robot[:, 0] - record.force[0, 0]
     tip = record.robot[:, 1:3] / 1000
     yaw = continuous_angle(_yaw(record.robot[:, 4:]))
-    # The finger's frame, in which the sensor reads, turns a little during the push.
+    # The sensor measures in the finger's frame, which turns a little during the push.
     in_tool = setup.FORCE_SIGN * record.force[:, 1:] @ setup.R_TOOL.T
     force = np.einsum("kij,kj->ki", rotation(np.interp(force_time, tip_time, yaw)), in_tool - in_tool[0])
     return Push(
@@ -203,19 +241,19 @@ def _push(record: Record) -> Push:
 
 
 def _body_pose(row: Floats) -> Floats:
-    """(3,) x, y (m), theta (rad) of the body frame in the world, from a logged pose (7,) of the corner."""
+    """Convert a logged pose (7,) of the corner to the world pose (3,) of the body frame: x, y (m), theta (rad)."""
     w, x, y, z = row[3:] / np.linalg.norm(row[3:])
-    # First two rows of the rotation matrix; the plate's small tilt shortens the way to its centre.
+    # First two rows of the rotation matrix. The plate's small tilt shortens the distance to its center in the plane.
     matrix = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         ]
     )
-    position = row[:2] / 1000 + matrix @ setup.CENTRE_OF_MASS
+    position = row[:2] / 1000 + matrix @ setup.CENTER_OF_MASS
     return np.append(position, wrap_angle(_yaw(row[None, 3:]))[0])
 
 
 def _yaw(quaternions: Floats) -> Floats:
-    """(m,) rad: rotation about the vertical of quaternions (m, 4), in the order w, x, y, z, of small tilt."""
+    """Return the rotations (m,) about the vertical, in rad, of quaternions (m, 4) of small tilt, ordered w, x, y, z."""
     return 2 * np.arctan2(quaternions[:, 3], quaternions[:, 0])

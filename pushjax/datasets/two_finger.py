@@ -1,8 +1,8 @@
-"""Pushes of the aluminium triangle with two fingers, as tidy arrays.
+"""Read pushes of the aluminum triangle with two fingers from curated arrays.
 
-The hand's frame: origin midway between the fingers, which sit at (0, +-spacing / 2); x is the direction it first
-approaches in. World, body frame and triangle are those of `pushes`. The hand's path is the *commanded* one: it turns
-rigidly about a fixed point of the world, or goes straight.
+The origin of the hand's frame is midway between the fingers, which are at (0, +-spacing / 2). Its x axis is the
+direction in which the hand first approaches. World frame, body frame and triangle are those of `pushes`. The hand's
+path is the *commanded* one: a rigid rotation about a fixed point of the world, or a straight line.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pushjax.datasets._archive import Arrays, check_shapes, read_archive, row_count
 from pushjax.datasets.pushes import Floats, LogError, rotation, wrap_angle
 
-# Shapes of what the archive holds; n counts its pushes, p its support points.
+# Arrays of the archive. Those of _PER_PUSH have one row of this shape per push, those of _PER_FILE have this shape.
 _PER_PUSH = {
     "push_index": (),
     "valid": (),
@@ -37,19 +37,32 @@ _SUPPORT = ("support_points_body", "support_normal_force", "surface", "arrangeme
 
 @dataclass(frozen=True, eq=False)
 class TwoFingerLog:
-    """The usable pushes of one archive, row by row, and what is wrong with the others.
+    """The usable pushes of one archive, one row each, and the problems of the others.
 
-    index: (n,) the push's number in the log. group: (n,) equal where the same nominal action was repeated. time: (n,)
-    s since 1970, when it began.
-    pose_start, pose_end: (n, 3) m, rad, the object's, world, measured at rest; the end angle is the one nearest to the
-        start's.
-    hand_start, hand_end: (n, 3) m, rad, the hand's, world, commanded. turn: (n,) rad, by how much it turns between.
-    center: (n, 2) m, world, what it turns about; NaN where it does not turn.
-    gap_start, gap_end: (n, 2) m, from the fingers' centres to the outline, as told at the start, measured at the end.
-    stick_deviation: (n,) m, as `stick_deviation` gives it.
-    vertices: (3, 2) m, body. length: m, the metric's. spacing: m, between the fingers' centres.
-    support_points: (p, 2) m, body, and support_force: (p,) N; empty where the whole face touches the surface.
-    problems: one error per unusable push. surface, arrangement, source: names of material, support and file.
+    Attributes:
+        index: (n,) number of the push in its log.
+        group: (n,) equal for repetitions of the same nominal action.
+        time: (n,) time at which the push began, in s since 1970.
+        pose_start: (n, 3) pose of the object before the push, in m and rad, world frame, measured at rest.
+        pose_end: (n, 3) pose of the object after the push, measured at rest. Its angle is the one nearest to the start
+            angle.
+        hand_start: (n, 3) pose of the hand before the push, in m and rad, world frame, commanded.
+        hand_end: (n, 3) pose of the hand after the push, commanded.
+        turn: (n,) angle by which the hand turns in between, in rad.
+        center: (n, 2) point about which the hand turns, in m, world frame; NaN if it does not turn.
+        gap_start: (n, 2) distances of the fingers' centers from the outline at the start, as commanded, in m.
+        gap_end: (n, 2) the same distances at the end, as measured, in m.
+        stick_deviation: (n,) motion of the object relative to the hand, in m, as defined by the function
+            `stick_deviation`.
+        vertices: (3, 2) vertices of the triangle, in m, body frame.
+        length: Characteristic length of the metric, in m.
+        spacing: Distance between the fingers' centers, in m.
+        support_points: (p, 2) support points, in m, body frame; empty if the whole face touches the surface.
+        support_force: (p,) normal force at each support point, in N; empty if the whole face touches the surface.
+        problems: One error for each unusable push.
+        surface: Name of the surface material.
+        arrangement: Name of the support arrangement.
+        source: The file that was read.
     """
 
     index: NDArray[np.int64]
@@ -78,9 +91,16 @@ class TwoFingerLog:
         return len(self.index)
 
     def paths(self, steps: int) -> Floats:
-        """(n, steps + 1, 4): the hand's configurations (x, y, theta, spacing) along each push, in equal steps.
+        """Return the hand's configurations along each push, in equal steps.
 
-        Raises ValueError for fewer than one step.
+        Args:
+            steps: Number of steps.
+
+        Returns:
+            (n, steps + 1, 4) configurations x, y (m), theta (rad), spacing (m), world frame.
+
+        Raises:
+            ValueError: If `steps` is less than one.
         """
         if steps < 1:
             raise ValueError(f"steps must be at least 1; got {steps}")
@@ -98,8 +118,20 @@ class TwoFingerLog:
 def stick_deviation(
     hand_start: ArrayLike, hand_end: ArrayLike, pose_start: ArrayLike, pose_end: ArrayLike, length: float
 ) -> Floats:
-    """(...,) m: |dx| + length |dtheta| of the object as the hand sees it, from start to end; zero where they moved as
-    one body. A gap that closed first counts as well. All poses (..., 3), world."""
+    """Return the motion of the object relative to the hand from start to end, |dx| + length |dtheta|.
+
+    It is zero if both moved as one body. Closing an initial gap between hand and object counts as relative motion too.
+
+    Args:
+        hand_start: (..., 3) poses of the hand before the push, in m and rad, world frame.
+        hand_end: (..., 3) poses of the hand after the push.
+        pose_start: (..., 3) poses of the object before the push.
+        pose_end: (..., 3) poses of the object after the push.
+        length: Characteristic length, in m, which weighs rotation against translation.
+
+    Returns:
+        (...,) deviations, in m.
+    """
     before, after = (
         _seen(np.asarray(hand), np.asarray(pose)) for hand, pose in ((hand_start, pose_start), (hand_end, pose_end))
     )
@@ -108,15 +140,25 @@ def stick_deviation(
 
 
 def _seen(hand: NDArray, pose: NDArray) -> Floats:
+    """Return the poses of the object in the frame of the hand."""
     away = np.einsum("...ji,...j->...i", rotation(hand[..., 2]), pose[..., :2] - hand[..., :2])
     return np.concatenate([away, (pose[..., 2] - hand[..., 2])[..., None]], axis=-1)
 
 
 def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
-    """Reads a file of the `two_finger_push` folder.
+    """Read a file of the `two_finger_push` folder.
 
-    Rows marked invalid, or holding numbers that are not finite, become problems. Raises LogError if the file is
-    missing, is no such archive, lacks an array or has one of the wrong size, or if no row is usable.
+    A row becomes a problem if it is marked invalid or has numbers that are not finite.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The usable pushes, and the problems of the others.
+
+    Raises:
+        LogError: If the file is missing or no such archive, if an array is missing or has the wrong size, or if no row
+            is usable.
     """
     file = Path(path)
     data = read_archive(file, [*_PER_PUSH, *_PER_FILE, *_SUPPORT], "two-finger pushes")
@@ -157,6 +199,11 @@ def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
 
 
 def _checked_count(path: Path, data: Arrays) -> int:
+    """Return the number of pushes, after checking shapes and types.
+
+    Raises:
+        LogError: For the first array that fails.
+    """
     count = row_count(path, data, _PER_PUSH)
     check_shapes(path, data, _PER_FILE)
     points, force = data["support_points_body"], data["support_normal_force"]
@@ -169,6 +216,7 @@ def _checked_count(path: Path, data: Arrays) -> int:
 
 
 def _problem(path: Path, numbers: dict[str, Floats], row: int) -> LogError | None:
+    """Describe why a row is unusable; None if it is usable."""
     index = int(numbers["push_index"][row])
     if not numbers["valid"][row]:
         return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)

@@ -1,1 +1,1 @@
-"""One module per experiment."""
+"""The experiments, one module or package each."""

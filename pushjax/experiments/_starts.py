@@ -1,9 +1,18 @@
-"""Where random experiments begin."""
+"""Random start positions for experiments."""
 
 import numpy as np
 
 
 def in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
-    """(n, 2), uniform in a circle of `radius` m about the origin."""
+    """Sample points uniformly in a circle about the origin.
+
+    Args:
+        rng: Random generator.
+        radius: Radius of the circle, m.
+        n: Number of points.
+
+    Returns:
+        The points (n, 2), m.
+    """
     away, angle = radius * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     return np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)

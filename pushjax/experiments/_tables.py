@@ -1,4 +1,4 @@
-"""What tables of predicted against measured pushes share."""
+"""Functions that the tables of predicted against measured pushes share."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,17 @@ BOOTSTRAPS = 2000
 
 @jax.jit
 def final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: jax.Array):
-    """Of every push at every friction, (frictions, pushes, 3), and how many of its steps failed."""
+    """Simulate every push with every coefficient of friction.
+
+    Args:
+        slider: The pushed object.
+        hand: The hand that pushes it.
+        pushes: Start poses and paths of one condition.
+        frictions: (frictions,), coefficients of friction.
+
+    Returns:
+        The final poses (frictions, pushes, 3), world, m and rad, and the number of failed steps (frictions, pushes).
+    """
 
     def one(path, start, friction):
         push = pj.rollout(slider, hand, path, pose=start, friction=friction)
@@ -22,6 +32,11 @@ def final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: 
 
 
 def bootstrapped_ci95(values: np.ndarray, rng: np.random.Generator) -> float:
-    """Half the width of the 95 % interval of a mean."""
+    """Return half the width of the 95 % confidence interval of a mean, by bootstrap.
+
+    Args:
+        values: (n,), the values whose mean is taken.
+        rng: Random generator of the bootstrap.
+    """
     resampled = rng.choice(values, (BOOTSTRAPS, len(values))).mean(axis=1)
     return float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2)

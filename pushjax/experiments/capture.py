@@ -1,14 +1,17 @@
-"""Two fingers push a disc: from where do they end up with it between them, and what does noise change?
+"""Two fingers push a disk: which starts end with the disk between the fingers, and how does noise change that?
 
-A disc of 52.5 mm under uniform pressure, two point fingers 100 mm apart that go 262.5 mm straight, 500 start centres
-uniform in a circle of 78.8 mm ahead of them. A push converges where the disc ends with its centre within 1 mm of where
-it rests on both fingers. Left open by the paper and chosen here: where the circle lies, how far the fingers go into it,
-their radius, the friction, and what counts as converged. The same starts are pushed with every noise and friction.
+A disk of radius 52.5 mm lies under uniform pressure. Two point fingers, 100 mm apart, move 262.5 mm straight ahead. The
+500 start centers are uniform in a circle of radius 78.8 mm ahead of the fingers. A push converges if the center of the
+disk ends within 1 mm of the place where the disk rests on both fingers. The same starts are pushed with every noise and
+every friction.
 
-Source: Zhou et al. 2017, section VI.B, figure on two point fingers pushing a circle.
+The paper leaves the following open, and it is chosen here: where the circle lies, how far the fingers go into it, the
+radius of the fingers, the friction, and the criterion of convergence.
+
+Reference: Zhou et al. 2017, section VI.B, figure on two point fingers pushing a circle.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +21,14 @@ import numpy as np
 import scipy.stats
 
 import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.experiments._starts import in_circle
-from pushjax.report import envelope
 
-DISC, FINGER, APART, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
-CIRCLE, AHEAD = 0.0788, 0.135  # m: radius of the circle of start centres, and its middle
+DISK, FINGER, APART, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
+CIRCLE, AHEAD = 0.0788, 0.135  # m: radius of the circle of start centers, and its distance ahead of the fingers
 N, STEPS, DRAWN = 500, 525, 100
-DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the first friction is the one compared and drawn
+DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the picture and the record's own figures are of the first friction
 NEAR = 1e-3  # m
 CELLS, PAIRS, GRID = 150, 400, 80
 
@@ -36,16 +40,33 @@ def run(
     steps: int = STEPS,
     dof: Sequence[float] = DOFS,
     friction: Sequence[float] = FRICTIONS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """Convergent shares by noise and friction; pictures into `out`. dof: two, less noise first."""
+    """Find the share of convergent pushes for every noise and friction.
+
+    Args:
+        seed: Seed of the wrench-twist pairs, the start centers and the pushes.
+        out: Folder for the pictures. None: no pictures.
+        n: Number of start centers.
+        steps: Steps of each push.
+        dof: Two values of the degrees of freedom of the sampled limit surfaces, the one with less noise first.
+        friction: Coefficients of friction of the fingers. The first one is drawn, and gives the record's own figures.
+        progress: Called with the number of cells done and their total.
+
+    Returns:
+        The record. It has one row per friction and `dof`: the share of convergent pushes, the share of verdicts that
+        another sample changes, and the difference between the two `dof`.
+
+    Raises:
+        ValueError: If `dof` is not two different numbers, or `friction` is empty or holds a number twice.
+    """
     if len(dof) != 2 or dof[0] == dof[1]:
         raise ValueError(f"dof must be two different ones, to compare; got {', '.join(f'{d:g}' for d in dof)}")
     if not friction or len(set(friction)) != len(friction):
         raise ValueError(f"friction must be one or more, each once; got {', '.join(f'{mu:g}' for mu in friction)}")
-    disc = pj.Disk(DISC)
-    pairs = pj.Support.uniform(disc, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
-    slider = pj.Slider(disc, pj.fit_limit_surface(*pairs, degree=2))
+    disk = pj.Disk(DISK)
+    pairs = pj.Support.uniform(disk, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    slider = pj.Slider(disk, pj.fit_limit_surface(*pairs, degree=2))
     hand = pj.Hand.two_fingers(FINGER)
     path = pj.line((0, 0, np.pi / 2, APART), (0, TRAVEL, np.pi / 2, APART), steps)
     starts = start_poses(n, seed)
@@ -53,7 +74,7 @@ def run(
     for mu in friction:
         for degrees in dof:
             model = pj.FrictionModel(dof=degrees, friction=mu)
-            # twice, with other draws: what verdicts the draw alone changes
+            # run twice with different samples, to find how many verdicts the sampling alone changes
             for again in (False, True):
                 key = jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + again)
                 pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True)
@@ -69,9 +90,9 @@ def run(
             row["changed_by_noise_percent"] = 100 * float(np.mean(less != more))
     drawn = {degrees: shown[friction[0], degrees, False] for degrees in dof}
     pictures = [] if out is None else _draw(out, slider, hand, path, drawn)
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "disc_m": DISC, "finger_m": FINGER}
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "disk_m": DISK, "finger_m": FINGER}
     settings |= {"apart_m": APART, "travel_m": TRAVEL, "circle_m": CIRCLE, "ahead_m": AHEAD, "near_m": NEAR}
-    return envelope(
+    return result_record(
         "capture",
         settings,
         n=n,
@@ -84,18 +105,27 @@ def run(
 
 
 def start_poses(n: int, seed: int) -> np.ndarray:
-    """(n, 3), centres uniform in the circle."""
+    """Sample start poses of the disk with centers uniform in the circle.
+
+    Args:
+        n: Number of poses.
+        seed: Seed of the centers.
+
+    Returns:
+        The poses (n, 3), world, m and rad; all angles are zero.
+    """
     centers = in_circle(np.random.default_rng(seed), CIRCLE, n) + np.array([0, AHEAD])
     return np.column_stack([centers, np.zeros(n)]).astype(jnp.result_type(float))
 
 
 def converged(pushes: pj.MonteCarlo) -> np.ndarray:
-    """Which discs end between both fingers."""
-    rests = TRAVEL + np.sqrt((DISC + FINGER) ** 2 - (APART / 2) ** 2)
+    """Return which disks end between both fingers, (n,)."""
+    rests = TRAVEL + np.sqrt((DISK + FINGER) ** 2 - (APART / 2) ** 2)
     return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - rests) < NEAR
 
 
 def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: dict[float, tuple]) -> list[str]:
+    """Draw the first friction into the folder `out` and return the path of the picture."""
     from pushjax import plot
 
     runs = {
@@ -110,7 +140,7 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: d
 
 
 def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray] | None:
-    """Of start centres (n, 2), 1/mm^2, over a grid; None of too few to tell."""
+    """Estimate the density of start centers (n, 2) over a grid, 1/mm^2; None if there are too few (two or less)."""
     if len(centers) <= 2:
         return None
     x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
@@ -119,8 +149,8 @@ def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.nda
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
-    lines = [f"Two fingers push a disc {1e3 * TRAVEL:.1f} mm, {record['n']} start centres:"]
+    """Return the text that the command prints for a record of `run`."""
+    lines = [f"Two fingers push a disk {1e3 * TRAVEL:.1f} mm, {record['n']} start centers:"]
     for row in record["rows"]:
         failed = row["outcomes"]["failed"]
         lines.append(

@@ -1,4 +1,4 @@
-"""A first push: fit an ellipsoid and a quartic to a square, push it with both, and draw what happened."""
+"""A first push: fit an ellipsoid and a quartic to a square, push it with both, and draw the results."""
 
 from pathlib import Path
 from typing import Any
@@ -8,14 +8,24 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.report import envelope
+from pushjax._internal.record import result_record
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
 START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100
 
 
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
-    """Fit both surfaces to 64 support points under the square, push 50 mm off centre; pictures into `out`."""
+    """Fit both surfaces to 64 support points under the square, and push it off center over 50 mm with each.
+
+    Args:
+        seed: Seed of the wrench-twist pairs.
+        out: Folder for the pictures. None: no pictures.
+
+    Returns:
+        The record. It has one row per surface: the angle error of the fit (degrees), whether the fit converged, the
+        final pose (m, rad), the number of steps in each contact mode, and the first failed step or -1. `apart_mm` is
+        the deviation between the two final poses.
+    """
     key = jax.random.key(seed)
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=64)
@@ -31,7 +41,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
             {
                 "model": name,
                 "fit_angle_deg": float(np.degrees(fit.angle)),
-                "fit_status": pj.Status(int(fit.status)).name,
+                "fit_converged": bool(fit.converged),
                 "pose": push.pose[-1],
                 "modes": _counts(push),
                 "first_failure": int(push.first_failure),
@@ -40,22 +50,31 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     apart = pj.deviation(pushes["ellipsoid"][0].pose[-1], pushes["quartic"][0].pose[-1], pairs.length)
     pictures = [] if out is None else _draw(out, key, block, support, pairs, surfaces, pushes)
     settings = {"seed": seed, "side_m": SIDE, "radius_m": RADIUS, "friction": FRICTION, "steps": STEPS, "pairs": 400}
-    return envelope("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
+    return result_record("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
 
 
 def _counts(push: pj.Trajectory) -> dict[str, int]:
+    """Count the steps in each contact mode."""
     values, counts = np.unique(np.asarray(push.mode), return_counts=True)
     return {pj.ContactMode(int(v)).name: int(c) for v, c in zip(values, counts, strict=True)}
 
 
 def motion_cone_setup(key: jax.Array):
-    """The paper's figure 2: 100 grid points, a quartic from 200 pairs, a push to the right of the motion cone."""
+    """Set up the paper's figure 2: 100 grid points, a quartic from 200 pairs, a push to the right of the motion cone.
+
+    Args:
+        key: PRNG key of the wrench-twist pairs.
+
+    Returns:
+        The square, its support, the limit surface, the contact and its solution: the arguments of
+        `plot.motion_cone_figure`.
+    """
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=100)
     surface = pj.fit_limit_surface(*support.wrench_twist_pairs(key, 200), degree=4)
     point, normal = jnp.array([[-0.02, -SIDE / 2]]), jnp.array([[0.0, 1.0]])
     right = pj.motion_cone(surface, point[0], normal[0], FRICTION)[1]
-    turn = -np.radians(15)  # clockwise of the cone's right edge
+    turn = -np.radians(15)  # the push lies clockwise of the cone's right edge
     push = jnp.stack(
         [np.cos(turn) * right[0] - np.sin(turn) * right[1], np.sin(turn) * right[0] + np.cos(turn) * right[1]]
     )
@@ -64,6 +83,7 @@ def motion_cone_setup(key: jax.Array):
 
 
 def _draw(out: Path, key, block, support, pairs, surfaces, pushes) -> list[str]:
+    """Draw the three pictures into the folder `out` and return their paths."""
     from pushjax import plot
 
     drawn = {
@@ -75,8 +95,8 @@ def _draw(out: Path, key, block, support, pairs, surfaces, pushes) -> list[str]:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
-    lines = ["A 90 mm square, 64 support points, pushed 18 mm off centre over 50 mm (mu = 0.25):"]
+    """Return the text that the command prints for a record of `run`."""
+    lines = ["A 90 mm square, 64 support points, pushed 18 mm off center over 50 mm (mu = 0.25):"]
     for row in record["rows"]:
         x, y, theta = np.asarray(row["pose"], float)
         modes = ", ".join(f"{count} {name.lower()}" for name, count in row["modes"].items())

@@ -1,13 +1,14 @@
-"""Two fingers that close on a slider and jam: the verdict, its threshold, and the picture that proves it.
+"""Two fingers close on a slider and jam: the status, its friction threshold, and a picture that proves it.
 
-Contacts A and C lie on opposite faces, a distance 2 a apart along their normals and 2 h across (the paper's moment
-labelling example). To let the fingers close, the slider must turn about a centre in the band between the two normals,
-counter-clockwise. The faces then slip, friction acts along one edge of each cone, and the moment of those edges about
-the middle is proportional to h - mu a. So beyond mu = h / a the fingers' forces cannot turn it that way: no twist
-satisfies both contacts. At the same friction the line AC enters both friction cones, and the fingers can press against
-each other along it, which is the squeeze certificate. Neither depends on the limit surface.
+Contacts A and C lie on opposite faces, a distance 2 a apart along their normals and 2 h apart across them (the paper's
+moment labeling example). To let the fingers close, the slider must turn counterclockwise about a center in the band
+between the two normals. The contacts then slide, and friction acts along one edge of each cone. The moment of those
+edges about the middle is proportional to h - mu a. So beyond mu = h / a the forces of the fingers cannot turn the
+slider that way, and no twist satisfies both contacts. At the same friction the line AC enters both friction cones. The
+fingers can then press against each other along this line, which is the squeeze certificate. Neither argument depends on
+the limit surface.
 
-Source: Zhou et al. 2017, section IV.B, figure on jamming; Mason 2001 for moment labelling.
+Reference: Zhou et al. 2017, section IV.B, figure on jamming; Mason 2001 for moment labeling.
 """
 
 from pathlib import Path
@@ -18,38 +19,64 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.report import envelope
+from pushjax._internal.record import result_record
 
-HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h, m
-CLOSING = 0.001  # of each finger, m
-BELOW, ABOVE = 0.25, 0.55  # frictions drawn
-NEAR = 1e-3  # of the threshold: the nearest frictions on both sides of it
+HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
+CLOSING = 0.001  # displacement of each finger, m
+BELOW, ABOVE = 0.25, 0.55  # frictions that are drawn
+NEAR = 1e-3  # relative distance from the threshold to the nearest friction on either side of it
 
 
 def contacts(friction) -> pj.Contacts:
-    """A on the left, low; C on the right, high: closing turns the slider counter-clockwise."""
+    """Return the two contacts: A on the left, low, and C on the right, high.
+
+    The closing fingers turn the slider counterclockwise.
+
+    Args:
+        friction: Coefficient of friction of both contacts.
+
+    Returns:
+        The contacts in the body frame, with the displacements of the two fingers (m).
+    """
     point = jnp.array([[-HALF_WIDTH, -HALF_OFFSET], [HALF_WIDTH, HALF_OFFSET]])
     normal = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
     return pj.Contacts(point, normal, CLOSING * normal, friction)
 
 
 def threshold() -> float:
-    """The friction at which it jams, by statics alone."""
+    """Return the coefficient of friction h / a from which the fingers jam, by statics alone."""
     return HALF_OFFSET / HALF_WIDTH
 
 
 def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
+    """Fit an ellipsoid and a quartic to uniform pressure under a rectangle.
+
+    Args:
+        seed: Seed of the wrench-twist pairs.
+
+    Returns:
+        The rectangle, and the two limit surfaces by name.
+    """
     block = pj.Polygon.rectangle(2 * HALF_WIDTH, 0.05)
     pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(seed), 400)
     return block, {name: pj.fit_limit_surface(*pairs, degree=d) for name, d in (("ellipsoid", 2), ("quartic", 4))}
 
 
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
-    """The status over friction with both surfaces, the threshold found and expected; the picture into `out`."""
+    """Find the status over friction with both surfaces, and compare the threshold found with the expected one.
+
+    Args:
+        seed: Seed of the wrench-twist pairs that the surfaces are fitted to.
+        out: Folder for the pictures. None: no pictures.
+
+    Returns:
+        The record. It has one row per surface: the smallest friction that jams, the largest that moves, the threshold
+        by statics, and all statuses. `verdicts` holds the status at the two drawn frictions.
+    """
     block, both = surfaces(seed)
     close = threshold() * (1 + NEAR * jnp.array([-1.0, 1.0]))
     scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), close))
-    frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program for both
+    frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program solves all
     rows, motions = [], {}
     for name, surface in both.items():
         solved = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
@@ -69,10 +96,11 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     verdicts = {str(mu): pj.Status(int(m.status)).name for mu, m in zip((BELOW, ABOVE), drawn, strict=True)}
     pictures = [] if out is None else _draw(out, block, drawn)
     settings = {"seed": seed, "half_width_m": HALF_WIDTH, "half_offset_m": HALF_OFFSET, "closing_m": CLOSING}
-    return envelope("jam", settings, rows=rows, verdicts=verdicts, pictures=pictures)
+    return result_record("jam", settings, rows=rows, verdicts=verdicts, pictures=pictures)
 
 
 def _draw(out: Path, block: pj.Polygon, motions: list[pj.Motion]) -> list[str]:
+    """Draw the two frictions into the folder `out` and return the path of the picture."""
     from pushjax import plot
 
     panels = [(contacts(mu), motion) for mu, motion in zip((BELOW, ABOVE), motions, strict=True)]
@@ -80,7 +108,7 @@ def _draw(out: Path, block: pj.Polygon, motions: list[pj.Motion]) -> list[str]:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
+    """Return the text that the command prints for a record of `run`."""
     lines = [f"Two fingers close on opposite faces, offset: statics says they jam from mu = {threshold():.4f}."]
     for row in record["rows"]:
         jams = "never jams" if row["jams_from"] is None else f"jams from {row['jams_from']:.4f}"

@@ -1,10 +1,10 @@
-"""A parallel jaw closes on a rectangle: four start poses, four outcomes.
+"""A parallel jaw closes on a rectangle from four start poses, with four different outcomes.
 
-The paper's first figure: a jaw with 27 x 10 mm pads closing along y on a 50 x 35 mm rectangle. Depending on where the
-rectangle lies it ends grasped off centre, jammed, grasped off centre the other way, or slipped out.
+This is the first figure of the paper: a jaw with 27 x 10 mm pads closes along y on a 50 x 35 mm rectangle. The start
+pose decides whether the rectangle ends grasped off center, jammed, grasped off center the other way, or slipped out.
 
-Both a jam and a grasp end the motion. Called grasped here is what ends flat between the pads, each touching along an
-edge; jammed, what is wedged between them askew.
+Both a jam and a grasp end the motion. Here a rectangle counts as grasped if it ends flat between the pads and touches
+each of them along an edge. It counts as jammed if it is wedged askew between them.
 """
 
 from pathlib import Path
@@ -15,24 +15,34 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.report import envelope
+from pushjax._internal.record import result_record
 
 WIDTH, HEIGHT, FRICTION = 0.050, 0.035, 0.2
 PAD, THICKNESS = 0.027, 0.010
 OPENING, CLOSED = 0.075, 0.0005
-# Start poses: m, m, degrees
+# Start poses: x (m), y (m), angle (degrees)
 STARTS = {
     "grasped with offset": (0.010, 0.0, 32.0),
     "jammed": (0.0, 0.005, 60.0),
     "grasped with the other offset": (-0.014, -0.002, 28.0),
     "slipped out": (0.030, 0.0, 45.0),
 }
-HOLD = 5  # steps for which the closed jaw waits: what has slipped out is then free
-FLAT = np.radians(1.0)  # nearer than this to one of its edges a grasp is flat: the last step leaves a little
+HOLD = 5  # steps for which the closed jaw waits, so that a rectangle that has slipped out is free at the end
+FLAT = np.radians(1.0)  # largest tilt of a flat grasp: the last step leaves a little
 
 
 def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, Any]:
-    """All four, with a quartic fitted to 64 support points; the picture into `out`."""
+    """Simulate the four closings with a quartic fitted to 64 support points.
+
+    Args:
+        seed: Seed of the wrench-twist pairs that the quartic is fitted to.
+        out: Folder for the pictures. None: no pictures.
+        steps: Number of steps in which the jaw closes.
+
+    Returns:
+        The record, with one row per start pose: name, start (m, m, degrees), final pose (m, rad), and what `outcome`
+        gives.
+    """
     block = pj.Polygon.rectangle(WIDTH, HEIGHT)
     pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(seed), 400)
     slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
@@ -50,11 +60,19 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
     pictures = [] if out is None else _draw(out, block, hand, drawn)
     settings = {"seed": seed, "steps": steps, "friction": FRICTION, "slider_m": (WIDTH, HEIGHT)}
     settings |= {"pad_m": (PAD, THICKNESS), "opening_m": (OPENING, CLOSED)}
-    return envelope("squeeze", settings, rows=rows, pictures=pictures)
+    return result_record("squeeze", settings, rows=rows, pictures=pictures)
 
 
 def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
-    """What became of one closing: in words, the status, the opening at which the jaw stopped, failed steps."""
+    """Classify how one closing ended.
+
+    Args:
+        grasp: Trajectory of the rectangle.
+
+    Returns:
+        The outcome in words, the final status, the opening at which the jaw stopped (mm), the angle between the
+        rectangle and the nearest multiple of 90 degrees (degrees), and the number of failed steps.
+    """
     status = pj.Status(int(grasp.status[-1]))
     stopped = int(grasp.stopped)
     tilt = abs((float(grasp.pose[-1, 2]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
@@ -69,13 +87,14 @@ def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
 
 
 def _draw(out: Path, block: pj.Polygon, hand: pj.Hand, grasps: dict[str, pj.Trajectory]) -> list[str]:
+    """Draw the four closings into the folder `out` and return the path of the picture."""
     from pushjax import plot
 
     return [str(plot.save(plot.grasp_figure(block, hand, grasps), out / "squeeze.png"))]
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
+    """Return the text that the command prints for a record of `run`."""
     lines = [f"A jaw with {1e3 * PAD:.0f} mm pads closes on a 50 x 35 mm rectangle (mu = {FRICTION}):"]
     for row in record["rows"]:
         x, y, theta = np.asarray(row["pose"], float)

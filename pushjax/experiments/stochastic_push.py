@@ -1,14 +1,14 @@
-"""Many pushes of one square: where random friction leaves it.
+"""Distribution of the displacement of one square in many pushes under random friction.
 
-2000 pushes of the 90 mm square of the MIT data set by its round tip, all alike but for friction: the quartic's Gram
-matrix with 20 degrees of freedom, the contact's coefficient uniform in [0.15, 0.35]. Left open by the paper and chosen
-here: where the tip touches (70 % along the side) and in how many steps.
+The 90 mm square of the MIT data set is pushed 2000 times by the data set's round tip. The pushes differ only in
+friction. The limit surface is a quartic whose Gram matrix has a Wishart distribution with 20 degrees of freedom. The
+coefficient of friction at the contact is uniform in [0.15, 0.35]. Zhou et al. leave open where the tip touches and in
+how many steps it moves. Here it touches 70 % along the side and moves in `STEPS` steps.
 
-Source: Zhou et al. 2017, section VI.B, figures on pushing with stochasticity; the setting of Yu et al. 2016, figures 9
-and 10.
+Reference: Zhou et al. 2017, section VI.B, figures on pushing with stochasticity; the setting of Yu et al. 2016, figures
+9 and 10.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +18,34 @@ import numpy as np
 import scipy.stats
 
 import pushjax as pj
-from pushjax.monte_carlo.result import COORDINATES
-from pushjax.report import envelope
-from pushjax.verify.convexity import least_curvatures
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.simulation.monte_carlo_result import COORDINATES
+from pushjax.testing.convexity import least_curvatures
 
 SIDE, RADIUS = 0.09, 0.00475  # m
-ALONG, TRAVEL = 0.018, 0.05  # m: of the side's middle, and how far the tip goes
-CELLS, PAIRS = 64, 400
+ALONG, TRAVEL = 0.018, 0.05  # m: distance of the tip from the middle of the side, and its travel
+SUPPORT_POINTS, PAIRS = 64, 400
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
-BINS, MOST_DRAWN, FEWEST = 40, 2000, 20
-# Of the largest coefficient, the least curvature that is none: coefficients are rounded to float32
+BINS, MOST_PLOTTED, FEWEST = 40, 2000, 20
+# A surface counts as convex if its least curvature, relative to its largest coefficient, is at least this. It is not
+# zero because the coefficients are rounded to float32.
 CONVEX = -3e-7
 LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi, "Δθ / °")}
 
 
 def setting(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
+    """Build the slider, the hand and the path that all pushes share.
+
+    Args:
+        seed: Seed of the wrench-twist pairs that the quartic is fitted to.
+        steps: Number of steps of the path.
+
+    Returns:
+        The square with its quartic, the finger, and the path (steps + 1, 2) of the finger's center, in m.
+    """
     block = pj.Polygon.rectangle(SIDE, SIDE)
-    pairs = pj.Support.uniform(block, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    pairs = pj.Support.uniform(block, points=SUPPORT_POINTS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
     slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
     start = -SIDE / 2 - RADIUS
     return slider, pj.Hand.finger(RADIUS), pj.line((start, ALONG), (start + TRAVEL, ALONG), steps)
@@ -47,36 +58,59 @@ def run(
     steps: int = STEPS,
     dof: float = DOF,
     friction: tuple[float, float] = FRICTION,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """The distribution of how far the square moves; pictures into `out`."""
+    """Sample the pushes and describe the distribution of the square's displacement.
+
+    Args:
+        seed: Seed of the wrench-twist pairs; the pushes use `seed + 1`.
+        out: Folder for the pictures. None: no pictures.
+        n: Number of pushes, at least 20.
+        steps: Steps of each push.
+        dof: Degrees of freedom of the quartic's Gram matrix.
+        friction: Lowest and highest coefficient of friction at the contact.
+        progress: Called with the number of pushes done and their total.
+
+    Returns:
+        The record, which holds:
+
+            - for each coordinate of the displacement (m, rad): its moments, histogram and test of normality
+            - the correlations of the coordinates
+            - the number of sampled surfaces that are not convex
+            - the share of sampled surfaces that were repaired, and the mean shrinkage of these (see `SurfaceSample`)
+            - the outcomes
+            - the time of the run and that of compiling, in s
+
+    Raises:
+        ValueError: If there are too few pushes for a test of normality.
+    """
     if n < FEWEST:
         raise ValueError(f"n must be at least {FEWEST}, for a test of normality; got {n}")
     slider, hand, path = setting(seed, steps)
     model = pj.FrictionModel(dof=dof, friction=friction)
     key = jax.random.key(seed + 1)
     arguments = (key, n, slider, hand, path)
-    few = n <= MOST_DRAWN
+    few = n <= MOST_PLOTTED
     rest: dict[str, Any] = {"pose": jnp.zeros(3), "model": model, "trajectories": few}
-    first = pj.monte_carlo(*arguments, **rest, progress=progress)  # compiles
+    first = pj.monte_carlo(*arguments, **rest, progress=progress)  # includes compiling
     pushes = pj.monte_carlo(*arguments, **rest)
     delta = np.asarray(pushes.delta, np.float64)
     pictures = []
     if out is not None:
         rest["trajectories"] = True
-        drawn = pushes if few else pj.monte_carlo(key, MOST_DRAWN, slider, hand, path, **rest)  # the first of them
+        drawn = pushes if few else pj.monte_carlo(key, MOST_PLOTTED, slider, hand, path, **rest)  # the first pushes
         pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
-    settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": CELLS, "pairs": PAIRS}
-    return envelope(
+    settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
+    return result_record(
         "stochastic-push",
         settings,
         n=n,
         delta={name: _figures(delta[:, k]) for k, name in enumerate(COORDINATES)},
         correlation=np.corrcoef(delta.T),
         nonconvex=int(np.sum(~(_curvatures(key, model, slider.surface, n) >= CONVEX))),
-        repaired=float(np.mean(pushes.pull > 0)),
-        mean_pull=pushes.summary()["repaired"]["mean_pull"],
+        repaired=float(np.mean(pushes.shrinkage > 0)),
+        mean_shrinkage=pushes.summary()["repaired"]["mean_shrinkage"],
         outcomes=pushes.outcomes(),
         run_s=pushes.seconds,
         compile_s=first.seconds - pushes.seconds,
@@ -85,6 +119,7 @@ def run(
 
 
 def _figures(values: np.ndarray) -> dict[str, Any]:
+    """Return the moments, the histogram and a test of normality of one coordinate."""
     counts, edges = np.histogram(values, bins=BINS)
     figures: dict[str, Any] = {"mean": values.mean(), "std": values.std(ddof=1), "edges": edges, "counts": counts}
     test = scipy.stats.normaltest(values)
@@ -94,13 +129,16 @@ def _figures(values: np.ndarray) -> dict[str, Any]:
 
 
 def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -> np.ndarray:
-    """Of every surface that was drawn, drawn again."""
+    """Return the least curvature of every sampled surface.
+
+    The surfaces are sampled again, with the keys that `monte_carlo` used.
+    """
     around: Any = model.around(surface)
 
     def drawn(index):
         return around.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
 
-    some, program, found = min(n, MOST_DRAWN), jax.jit(jax.vmap(drawn)), []
+    some, program, found = min(n, MOST_PLOTTED), jax.jit(jax.vmap(drawn)), []
     for first in range(0, n, some):
         indices = np.minimum(np.arange(first, first + some), n - 1).astype(np.uint32)
         found.append(least_curvatures(np.asarray(program(indices)))[: n - first])
@@ -108,6 +146,7 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
 
 
 def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: pj.MonteCarlo, trajectory) -> list[str]:
+    """Draw the pushes and the histograms into the folder `out` and return the paths of the pictures."""
     import matplotlib.pyplot as plt
 
     from pushjax import plot
@@ -129,7 +168,7 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: 
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
+    """Return the text that the command prints for a record of `run`."""
     settings, delta = record["settings"], record["delta"]
     lines = [
         f"{record['n']} pushes of a 90 mm square over {1e3 * TRAVEL:.0f} mm, dof {settings['dof']:g}, friction "

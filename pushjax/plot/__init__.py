@@ -1,12 +1,11 @@
-"""Pictures and motion, in mm and degrees, in colours that the colour-blind can tell apart.
+"""Figures and animations, in mm and degrees, in colors that color-blind readers can tell apart.
 
-A function `..._figure` makes a whole figure, `animate` and `animate_cloud` a moving one, `save` a file of either; a
-`..._panel`, and what the pictures are made of (`outline`, `hand_at`, `traces`), draws into given axes.
+A function `..._figure` makes a whole figure. `animate` and `animate_cloud` make an animation. `save` writes either to a
+file. A function `..._panel` draws into given axes, and so do the parts of pictures: `outline`, `hand_at` and `traces`.
 """
 
 from pushjax.plot.animation import animate as animate
 from pushjax.plot.animation import animate_cloud as animate_cloud
-from pushjax.plot.causes import causes_figure as causes_figure
 from pushjax.plot.clouds import capture_figure as capture_figure
 from pushjax.plot.clouds import cloud_figure as cloud_figure
 from pushjax.plot.contacts import jam_figure as jam_figure
@@ -14,7 +13,6 @@ from pushjax.plot.contacts import motion_cone_figure as motion_cone_figure
 from pushjax.plot.distributions import density_panel as density_panel
 from pushjax.plot.distributions import histogram_panel as histogram_panel
 from pushjax.plot.distributions import pose_panel as pose_panel
-from pushjax.plot.distributions import spread_figure as spread_figure
 from pushjax.plot.distributions import traces as traces
 from pushjax.plot.files import save as save
 from pushjax.plot.forces import ContactForces as ContactForces
@@ -26,7 +24,6 @@ from pushjax.plot.pushes import RealPush as RealPush
 from pushjax.plot.pushes import grasp_figure as grasp_figure
 from pushjax.plot.pushes import push_figure as push_figure
 from pushjax.plot.pushes import real_figure as real_figure
-from pushjax.plot.speed import speed_figure as speed_figure
 from pushjax.plot.style import BETWEEN as BETWEEN
 from pushjax.plot.style import BLUE as BLUE
 from pushjax.plot.style import END as END

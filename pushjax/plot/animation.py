@@ -1,7 +1,8 @@
-"""Pushes and grasps in motion.
+"""Animations of pushes and grasps.
 
-The frames are equally spaced over a push's steps, whatever their number, so that a recording and its simulation run
-side by side from start to end. What happens after the last thing has moved is left out, and the last frame stays.
+The frames of each push are equally spaced over its steps, however many it has. So a recording and its simulation run
+side by side from start to end, even if one has more steps. The animation ends when nothing moves any more in any push,
+for example because the hand jammed, and the last frame stays on the screen for a moment.
 """
 
 from collections.abc import Mapping
@@ -13,18 +14,18 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from pushjax.hands import Hand
+from pushjax.geometry.shape import Shape
 from pushjax.plot.motion import Animation
 from pushjax.plot.parts import placed, vertices
 from pushjax.plot.style import BETWEEN, BLUE, END, GREEN, MM, ORANGE, START, STYLE, legend_below, row
 from pushjax.plot.tracks import Moved, Track, fingers_along, track_of
-from pushjax.shapes import Shape
+from pushjax.simulation.hand import Hand
 
-LONGEST = 0.4  # of the slider's size, the arrow of the largest force
-WEAKEST = 1e-3  # of the largest: a force that is not drawn
-WIDE, AROUND = 3.8, 1.2  # in, a panel, and what is above and below it
-NARROW = 0.2  # in: the legend below one panel alone has one more row
-RIM = 0.04  # of what is shown, the empty rim around it
+LONGEST = 0.4  # length of the arrow of the largest force, in units of the slider's size
+WEAKEST = 1e-3  # weaker forces are not drawn, in units of the largest
+PANEL_WIDTH, HEIGHT_AROUND = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
+LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
+RIM = 0.04  # width of the empty rim, in units of what is shown
 
 
 def animate(
@@ -37,17 +38,29 @@ def animate(
     frames: int = 60,
     seconds: float = 4.0,
 ) -> Animation:
-    """Pushes or grasps in motion, side by side: the slider (its start grey), the fingers, the trace of its centre, the
-    contacts with the forces on the slider as arrows, and the step's status and contact modes in words; from a step that
-    failed on, its status and number in red.
+    """Animate pushes or grasps side by side.
 
-    pushes: one, or several by name: trajectories of `rollout`, or recordings (`Recorded`, shown without forces), all of
-    that shape and hand. measured: poses (points, 3) by a push's name, world, m and rad, shown dashed over it. forces:
-    whether contacts and forces are shown; the legend says how large the longest arrow is, and arrows of all panels
-    have one scale. frames: how many, equally spaced over the steps. seconds: how long it plays.
+    Each panel shows the slider (its start in gray), the fingers, the trace of the slider's center, the contacts with
+    the forces on the slider as arrows, and the status and contact modes of the step in words. From a failed step on,
+    the words are its status and number, in red.
 
-    `save` writes it to a file. Raises ValueError for no push, fewer than two frames, a name in `measured` that no push
-    has, or a trajectory of a hand with another number of contacts.
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        pushes: One push, or several by name, all of that shape and hand: trajectories of `rollout`, or recordings
+            (`Recorded`), which are shown without forces.
+        measured: Poses (points, 3) by the name of a push, world, m and rad. They are drawn dashed over that push.
+        forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend says how
+            large the longest arrow is.
+        frames: Number of frames, equally spaced over the steps.
+        seconds: Time that the animation plays, s.
+
+    Returns:
+        The animation; `save` writes it to a file.
+
+    Raises:
+        ValueError: If there is no push, if there are fewer than two frames, if a name in `measured` is that of no push,
+            or if a trajectory is of a hand with another number of contacts.
     """
     by_name = dict(pushes) if isinstance(pushes, Mapping) else {"": pushes}
     over = dict(measured or {})
@@ -57,16 +70,16 @@ def animate(
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
     tracks = [track_of(shape, hand, push, over.get(name), forces) for name, push in by_name.items()]
-    moments = _moments(tracks, frames)
+    moments = _frame_fractions(tracks, frames)
     largest = max(track.largest for track in tracks)
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(tracks), WIDE, WIDE + AROUND, shared=True)
+        figure, all_axes = row(len(tracks), PANEL_WIDTH, PANEL_WIDTH + HEIGHT_AROUND, shared=True)
         panels = [_Panel(axes, track, largest) for axes, track in zip(all_axes, tracks, strict=True)]
         for axes, name in zip(all_axes, by_name, strict=True):
-            axes.set_title(name, pad=18)  # above the words
+            axes.set_title(name, pad=18)  # leaves room for the words below it
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
-        _whole(figure, all_axes, tracks)
+        _share_limits(figure, all_axes, tracks)
         _legend(figure, all_axes[0], bool(over), largest)
 
     def draw(frame: int) -> None:
@@ -87,12 +100,24 @@ def animate_cloud(
     frames: int = 60,
     seconds: float = 4.0,
 ) -> Animation:
-    """Many pushes by one path, at once: all their outlines, faint, the ways of their centres, the start and the hand.
+    """Animate many pushes along one path at once.
 
-    path: (steps + 1, dof), the hand's configurations. trajectory: (pushes, steps + 1, 3), poses as `monte_carlo(...,
-    trajectories=True)` keeps them; world, m and rad. frames, seconds: as in `animate`.
+    The picture shows the outlines of all pushes, faint, the paths of their centers, the start, and the hand.
 
-    `save` writes it to a file. Raises ValueError for fewer than two frames, or a path of another length.
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        path: (steps + 1, dof), configurations of the hand.
+        trajectory: (pushes, steps + 1, 3), poses as `monte_carlo(..., trajectories=True)` keeps them, world, m and rad.
+        title: Title of the picture.
+        frames: Number of frames, equally spaced over the steps.
+        seconds: Time that the animation plays, s.
+
+    Returns:
+        The animation; `save` writes it to a file.
+
+    Raises:
+        ValueError: If there are fewer than two frames, or the path is of another length than the trajectories.
     """
     poses, fingers = np.asarray(trajectory, float), fingers_along(hand, path)
     if poses.ndim != 3 or len(fingers[0]) != poses.shape[1]:
@@ -107,7 +132,7 @@ def animate_cloud(
         outlines, ways = (LineCollection([], colors=BLUE, linewidths=w, alpha=faint) for w in (0.8, 0.6))
         axes.add_collection(outlines)
         axes.add_collection(ways)
-        (centers,) = axes.plot([], [], ".", color=END, ms=3, alpha=0.5, label="centres")
+        (centers,) = axes.plot([], [], ".", color=END, ms=3, alpha=0.5, label="centers")
         axes.plot(*lines[0, 0].T, color=START, lw=1.4, label="start")
         axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
         tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
@@ -128,7 +153,13 @@ def animate_cloud(
 
 
 class _Panel:
-    """The artists of one push, and how they look at a share of it."""
+    """The artists of one push.
+
+    Args:
+        axes: Axes to draw into.
+        track: The push as it is drawn.
+        largest: Largest force of all panels, N, which sets the scale of the arrows.
+    """
 
     def __init__(self, axes: Axes, track: Track, largest: float):
         self.track = track
@@ -137,7 +168,7 @@ class _Panel:
         self.weakest = WEAKEST * largest
         axes.plot(*track.outline[0].T, color=BETWEEN, lw=1.0, label="start")
         (self.outline,) = axes.plot([], [], color=START, lw=1.5, label="slider")
-        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centre")
+        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its center")
         self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
         (self.measured,) = axes.plot([], [], "--", color=END, lw=1.3, label="measured")
         (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
@@ -149,7 +180,7 @@ class _Panel:
         self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above)
 
     def draw(self, share: float) -> None:
-        """share: of the push, from 0 to 1."""
+        """Show the push at a share of its steps, from 0 to 1."""
         track = self.track
         k = round(share * (len(track.outline) - 1))
         self.outline.set_data(*track.outline[k].T)
@@ -163,49 +194,54 @@ class _Panel:
         acts = np.linalg.norm(track.force[k], axis=1) > self.weakest
         self.contacts.set_data(*track.contact[k][acts].T)
         if self.arrows is not None:
-            # an arrow that is not there would leave a dot at its place
+            # an arrow of length zero would leave a dot
             at, force = (np.where(acts[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
             self.arrows.set_offsets(at)
             self.arrows.set_UVC(*(self.scale * force).T)
 
 
-def _moments(tracks: list[Track], frames: int) -> np.ndarray:
-    """The shares of the pushes to show: up to where the last thing moves in any."""
+def _frame_fractions(tracks: list[Track], frames: int) -> np.ndarray:
+    """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
     last = 0.0
     for track in tracks:
         steps = len(track.outline) - 1
         moving = [np.any(np.diff(each, axis=0) != 0, axis=(1, 2)) for each in (track.outline, *track.fingers)]
         moves = np.flatnonzero(np.any(moving, axis=0))
-        stop = steps if moves.size == 0 else min(moves[-1] + 2, steps)  # with the step that says why
+        # includes the step whose status says why nothing moves any more
+        stop = steps if moves.size == 0 else min(moves[-1] + 2, steps)
         last = max(last, stop / steps)
     return _equally(1.0, frames) * last
 
 
 def _equally(end: float, frames: int) -> np.ndarray:
-    """So many numbers from 0 to `end`."""
+    """Return equally spaced numbers from 0 to `end`, one per frame."""
     if frames < 2:
         raise ValueError(f"frames must be at least 2; got {frames}")
     return np.linspace(0, end, frames)
 
 
-def _whole(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:
-    """One range for all panels, with everything in it at all times, and a figure of its proportions."""
+def _share_limits(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:
+    """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
     parts = [part for track in tracks for part in (track.outline, *track.fingers)]
     parts += [track.measured for track in tracks if track.measured is not None]
     _range(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
     figure.set_layout_engine("compressed", h_pad=0.06)
-    around = AROUND + (NARROW if len(all_axes) == 1 else 0.0)
-    figure.set_size_inches(WIDE * len(all_axes) + 0.5, float(np.clip(WIDE * high / wide, 1.5, 5.5)) + around)
+    around = HEIGHT_AROUND + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
+    figure.set_size_inches(
+        PANEL_WIDTH * len(all_axes) + 0.5, float(np.clip(PANEL_WIDTH * high / wide, 1.5, 5.5)) + around
+    )
 
 
 def _range(axes: Axes, points: list[np.ndarray]) -> None:
+    """Set the range of the axes to hold all points (..., 2), mm, with an empty rim."""
     low, high = (find(np.concatenate(points), axis=0) for find in (np.nanmin, np.nanmax))
     rim = RIM * (high - low).max()
     axes.set(xlim=(low[0] - rim, high[0] + rim), ylim=(low[1] - rim, high[1] + rim))
 
 
 def _legend(figure: Figure, axes: Axes, measured: bool, largest: float) -> None:
+    """Draw one legend for all panels, without `measured` if nothing was measured."""
     if largest > 0:
         axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest:.2g} N")
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once

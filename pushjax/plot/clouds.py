@@ -1,4 +1,4 @@
-"""Pictures of many pushes at once: their ways and ends, and which starts end as wanted."""
+"""Pictures of many pushes at once: their paths and ends, and which starts end as wanted."""
 
 from collections.abc import Mapping
 
@@ -8,21 +8,28 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pushjax.hands import Hand
+from pushjax.geometry.shape import Shape
 from pushjax.plot.distributions import density_panel, traces
 from pushjax.plot.parts import hand_at, outline
 from pushjax.plot.style import BETWEEN, BLUE, END, MM, START, STYLE, legend_below
-from pushjax.shapes import Shape
+from pushjax.simulation.hand import Hand
 
 QUANTILES = (0.025, 0.5, 0.975)
 Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
 
 
 def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectory: np.ndarray, title: str = "") -> Figure:
-    """The ways of the centre in many pushes that begin alike; the start, and the ends with the median angle and those
-    that 2.5 and 97.5 % of the pushes fall short of; the hand at both ends of its path.
+    """Draw many pushes that begin alike: the paths of the center, the start, and three of the ends.
 
-    path: (steps + 1, dof), the hand's configurations. trajectory: (pushes, steps + 1, 3), poses; both world, m and rad.
+    The three ends are those at the 2.5 %, 50 % and 97.5 % quantiles of the final angle. The hand is drawn at both ends
+    of its path.
+
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        path: (steps + 1, dof), configurations of the hand.
+        trajectory: (pushes, steps + 1, 3), poses of the slider, world, m and rad.
+        title: Title of the picture.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
@@ -37,7 +44,7 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectory: np.ndar
         fingers = np.asarray(hand.poses(jnp.asarray(path)))
         hand_at(axes, hand, fingers[0], START, 1.0)
         hand_at(axes, hand, fingers[-1], END, 1.0)
-        axes.plot([], [], color=BLUE, lw=0.8, label="ways of the centre")
+        axes.plot([], [], color=BLUE, lw=0.8, label="ways of the center")
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=title)
         handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
         axes.legend(handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -52,12 +59,19 @@ def capture_figure(
     density: Density | None = None,
     ways: int = 100,
 ) -> Figure:
-    """Many starts, and which of them end as wanted (red, the others black): the ways of the centre, a panel a run; the
-    hand at its start grey, at its end blue with one slider that it caught.
+    """Draw many starts and which of them end as wanted (red, the others black), one panel per run.
 
-    path: (steps + 1, dof). runs: by name, the poses (pushes, steps + 1, 3) and which are wanted (pushes,). ways: how
-    many are drawn at most in each panel, the first. density: of the wanted starts of the last run, 1/mm², over a grid
-    ((n, n) of x, (n, n) of y, m), for one more panel with the start centres of that run. World, m and rad.
+    Each panel shows the paths of the center. The hand is gray at its start, and blue at its end with one slider that it
+    caught.
+
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        path: (steps + 1, dof), configurations of the hand.
+        runs: By name, the poses (pushes, steps + 1, 3), world, m and rad, and which pushes are wanted (pushes,).
+        density: Density of the wanted starts of the last run, for one more panel with the start centers of that run:
+            ((n, n) of x, (n, n) of y), m, and the density (n, n) there, 1/mm². None: no such panel.
+        ways: Largest number of paths in each panel; the first ones are drawn.
     """
     with plt.rc_context(STYLE):
         ratios = [1.0] * len(runs) + ([] if density is None else [1.45])
@@ -78,7 +92,7 @@ def capture_figure(
             name, (trajectory, wanted) = list(runs.items())[-1]
             starts = trajectory[:, 0, :2]
             density_panel(panels[0, -1], *density, starts[wanted], starts[~wanted])
-            panels[0, -1].set_title(f"start centres, {name}")
+            panels[0, -1].set_title(f"start centers, {name}")
         for color, label in ((END, "end as wanted"), (START, "do not")):
             panels[0, 0].plot([], [], color=color, label=label)
         legend_below(figure, panels[0, 0], columns=2)
@@ -86,11 +100,12 @@ def capture_figure(
 
 
 def _ways(axes: Axes, trajectory: np.ndarray, wanted: np.ndarray) -> None:
+    """Draw the paths and the start centers, the wanted ones in red."""
     for which, color in ((wanted, END), (~wanted, START)):
         traces(axes, trajectory[which], color, alpha=0.5)
         axes.plot(*(MM * trajectory[which, 0, :2].T), ".", color=color, ms=3)
 
 
 def _faint(lines: int) -> float:
-    """The opacity at which so many lines on top of each other still show where they are dense."""
+    """Return the opacity at which this many lines on top of each other still show where they are dense."""
     return float(np.clip(30 / max(lines, 1), 0.06, 0.6))

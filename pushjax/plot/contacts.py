@@ -1,25 +1,33 @@
-"""Pictures of a contact problem: one contact and its cones, two that close and may jam."""
+"""Pictures of a contact problem: one contact with its cones, or two contacts that close and may jam."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pushjax.limit_surface import LimitSurface
+from pushjax.contact.cones import friction_cone, motion_cone
+from pushjax.contact.problem import Contacts, Motion
+from pushjax.contact.status import Status
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.support import Support
+from pushjax.geometry.shape import Shape
 from pushjax.plot.parts import arrow, center_of_rotation, outline
 from pushjax.plot.style import BETWEEN, BLUE, GREEN, MM, ORANGE, PURPLE, START, STYLE, legend_below, row
-from pushjax.shapes import Shape
-from pushjax.solve import Contacts, Motion, friction_cone, motion_cone
-from pushjax.status import Status
-from pushjax.support import Support
 
 
 def motion_cone_figure(
     shape: Shape, support: Support, surface: LimitSurface, contacts: Contacts, motion: Motion
 ) -> Figure:
-    """One contact: support points, friction cone, motion cone, the push, and the centre of rotation with its sign.
+    """Draw one contact with its friction cone and motion cone.
 
-    Of `contacts` the first is drawn; all are in the body frame, m. motion: what `solve_contacts` gives for it.
+    The picture also shows the support points, the push, and the center of rotation with its sign.
+
+    Args:
+        shape: Outline of the slider.
+        support: Support of the slider.
+        surface: Limit surface of the slider.
+        contacts: The contacts in the body frame, m. The first one is drawn.
+        motion: What `solve_contacts` gives for them.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
@@ -49,11 +57,16 @@ def motion_cone_figure(
 
 
 def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
-    """Two closing contacts, labelled: where a centre of rotation keeps both fingers out, and what their forces can do.
+    """Draw two closing contacts, labeled: the centers of rotation that they allow, and what their forces can do.
 
-    Each panel: friction cones; the contact normals and the region between or beyond them where a counter-clockwise (+)
-    or clockwise (-) centre of rotation moves both contacts away from their fingers; the line through the contacts,
-    along which they press on each other if it lies in both cones; the verdict, with the centre of rotation.
+    Each panel shows the friction cones and the contact normals. It shows the region, between or beyond the normals, in
+    which a counterclockwise (+) or clockwise (-) center of rotation moves both contacts away from their fingers. It
+    shows the line through the contacts, along which the fingers press on each other if it lies in both cones. And it
+    shows the status, with the center of rotation.
+
+    Args:
+        shape: Outline of the slider.
+        panels: For each panel the two contacts, in the body frame, and their solution.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(panels), 5.0, 4.6)
@@ -80,21 +93,21 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
 
 
 def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tuple[np.ndarray, np.ndarray]) -> None:
-    """Where a centre of rotation of either sign moves all contacts away from their fingers."""
+    """Draw where a center of rotation of either sign moves all contacts away from their fingers."""
     grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(*box, strict=True))), axis=-1)
     arm = point[:, None, None] - grid[None]
-    # a counter-clockwise turn about c moves p along perp(p - c)
+    # a counterclockwise turn about c moves p along perp(p - c)
     away = -normal[:, None, None, 0] * arm[..., 1] + normal[:, None, None, 1] * arm[..., 0]
     for sign, color in ((1, ORANGE), (-1, PURPLE)):
         region = np.all(sign * away > 0, axis=0)
         if region.any():
             axes.contourf(grid[..., 0], grid[..., 1], region, levels=[0.5, 1.5], colors=[color], alpha=0.16)
-            label = "centre of rotation allowed, " + ("+" if sign > 0 else "\N{MINUS SIGN}")
+            label = "center of rotation allowed, " + ("+" if sign > 0 else "\N{MINUS SIGN}")
             axes.fill([], [], color=color, alpha=0.16, label=label)
 
 
 def _labelled_contact(axes: Axes, name: str, p: np.ndarray, n: np.ndarray, mu: float, reach: float) -> None:
-    """Normal, friction cone and closing finger of a contact at p (2,), mm."""
+    """Draw the normal, the friction cone and the closing finger of a contact at p (2,), mm."""
     axes.plot(*np.array([p - 2 * reach * n, p + 2 * reach * n]).T, "--", color=BLUE, lw=0.9)
     tangent = np.array([-n[1], n[0]])
     for side in (1, -1):

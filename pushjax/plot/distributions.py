@@ -1,4 +1,4 @@
-"""Pictures of where many pushes end. Panels are drawn into given axes, so that an experiment lays them out."""
+"""Pictures of where many pushes end, drawn into given axes so that an experiment can lay them out."""
 
 from typing import Any
 
@@ -6,21 +6,35 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 
-from pushjax.plot.style import BLUE, END, GREEN, MM, ORANGE, PURPLE, START, STYLE
+from pushjax.plot.style import BLUE, END, MM, ORANGE, START
 
-TICK = 1.6  # mm, half the length of a pose's tick
+TICK = 1.6  # mm, length of a pose's tick
 
 
 def traces(axes: Axes, trajectory: np.ndarray, color: str = BLUE, alpha: float = 0.06) -> None:
-    """The ways (n, steps + 1, 3) of the slider's origin, in mm."""
+    """Draw the paths of the slider's origin, in mm.
+
+    Args:
+        axes: Axes to draw into.
+        trajectory: (n, steps + 1, 3), poses, m and rad.
+        color: Color of the lines.
+        alpha: Opacity of the lines.
+    """
     axes.add_collection(LineCollection(list(MM * trajectory[..., :2]), colors=color, linewidths=0.6, alpha=alpha))
     axes.autoscale_view()
 
 
 def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = None, alpha: float = 0.6) -> None:
-    """Poses (n, 3): a dot at each position with a tick along its x axis, in mm."""
+    """Draw poses as dots with a tick along their x axis, in mm.
+
+    Args:
+        axes: Axes to draw into.
+        poses: (n, 3), m and rad.
+        color: Color of dots and ticks.
+        label: Label in the legend.
+        alpha: Opacity.
+    """
     at = MM * poses[:, :2]
     along = TICK * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     axes.add_collection(LineCollection(list(np.stack([at, at + along], axis=1)), colors=color, lw=0.5, alpha=alpha))
@@ -29,8 +43,14 @@ def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = No
 
 
 def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian: tuple[float, float] | None = None):
-    """Bars of a histogram with `edges` and `counts`, `label` on its axis; gaussian: mean and deviation of one to draw
-    over it."""
+    """Draw the bars of a histogram.
+
+    Args:
+        axes: Axes to draw into.
+        counted: The histogram, with `edges` (bins + 1,) and `counts` (bins,).
+        label: Label of the horizontal axis.
+        gaussian: Mean and standard deviation of a Gaussian to draw over the bars. None: no Gaussian.
+    """
     edges, counts = np.asarray(counted["edges"]), np.asarray(counted["counts"])
     axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75)
     if gaussian is not None and gaussian[1] > 0:
@@ -42,42 +62,20 @@ def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian
 
 
 def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside, outside) -> Any:
-    """A density over (x, y) in mm, with the points (n, 2) m that made it in red and the others in black."""
+    """Draw a density over x and y, in mm, with two kinds of points.
+
+    Args:
+        axes: Axes to draw into.
+        grid: (n, n) of x and (n, n) of y, m.
+        density: (n, n), 1/mm².
+        inside: (points, 2), m, the points that the density was made from, in red.
+        outside: (points, 2), m, the other points, in black.
+
+    Returns:
+        The color bar.
+    """
     drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
     axes.plot(*(MM * np.asarray(outside)).T, ".", color=START, ms=2.5)
     axes.plot(*(MM * np.asarray(inside)).T, ".", color=END, ms=2.5)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
     return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)
-
-
-def spread_figure(pooled: dict[str, dict[str, dict[str, Any]]], curve: list[dict[str, Any]]) -> Figure:
-    """Left: how often regions of predicted distributions hold what happened, against how often they should. Right: the
-    mean deviation by how many pushes were learned from. pooled: by kind of push and method, with the shares `inside_50`
-    and `inside_90`; curve: rows of `count`, `physics_mm`, `process_mm`."""
-    with plt.rc_context(STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(8.4, 3.8), layout="constrained")
-        methods = {"noise": ("identified noise", BLUE), "normal": ("normal errors", ORANGE)}
-        methods |= {"process": ("Gaussian process", GREEN), "calibrated": ("calibrated levels", PURPLE)}
-        left.plot([0, 100], [0, 100], color="0.7", lw=0.9, label="as it should be")
-        for group, dash in (("middle", "-"), ("whole", "--")):
-            for (name, (label, color)), marker in zip(methods.items(), "os^D", strict=True):
-                row = pooled.get(group, {}).get(name)
-                if row is not None:
-                    shares = [0, 100 * row["inside_50"], 100 * row["inside_90"], 100]
-                    look = {"color": color, "ls": dash, "marker": marker, "ms": 4, "lw": 1.1}
-                    left.plot([0, 50, 90, 100], shares, label=f"{label}, {group}", **look)
-        left.set(xlabel="predicted share / %", ylabel="share of the pushes / %", title="Pushes inside a region")
-        left.legend(loc="lower right", fontsize=7.5)
-        counts = [row["count"] for row in curve]
-        for name, label, color, style in (
-            ("physics", "physics", BLUE, "o-"),
-            ("process", "Gaussian process", GREEN, "^--"),
-        ):
-            right.plot(counts, [row[f"{name}_mm"] for row in curve], style, color=color, ms=4, label=label)
-        right.set(xlabel="pushes learned from", ylabel="mean deviation / mm", ylim=(0, None))
-        right.set_title("Few pushes, and many")
-        if counts:
-            right.set_xscale("log", base=2)
-            right.set_xticks(counts, [str(count) for count in counts])
-        right.legend(loc="upper right")
-        return figure

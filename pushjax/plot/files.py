@@ -1,4 +1,4 @@
-"""From a picture, still or moving, to a file."""
+"""Write figures and animations to files."""
 
 from pathlib import Path
 
@@ -10,12 +10,22 @@ from pushjax.plot.style import STYLE
 
 
 def save(picture: Figure | Animation, path: Path | str) -> Path:
-    """Write a picture in the format of the path's suffix, make its folder, and close the figure.
+    """Write a figure or an animation in the format of the path's suffix, and close the figure.
 
-    A figure: .png, .pdf, .svg and whatever else matplotlib knows. Motion: .gif; .html, a page with a player that needs
-    nothing else, also offline; .mp4, which needs the program `ffmpeg`.
+    The folder of the file is made if needed. A figure can be written as .png, .pdf, .svg and everything else that
+    matplotlib knows. An animation can be written as .gif; as .html, a page with a player that needs nothing else, also
+    offline; or as .mp4, which needs the program `ffmpeg`.
 
-    Raises ValueError for a suffix that is none of these, RuntimeError for .mp4 where there is no `ffmpeg`.
+    Args:
+        picture: The figure or animation.
+        path: Path of the file.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: If the suffix is none of these.
+        RuntimeError: If there is no `ffmpeg` for an .mp4.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -23,7 +33,7 @@ def save(picture: Figure | Animation, path: Path | str) -> Path:
         picture.write(path)
         plt.close(picture.figure)
         return path
-    with plt.rc_context(STYLE):  # ticks, and the resolution, are made only now
+    with plt.rc_context(STYLE):  # ticks and resolution are set only now
         picture.savefig(path, bbox_inches="tight")
     plt.close(picture)
     return path

@@ -1,4 +1,4 @@
-"""A moving picture, and its files: GIF, a page with a player, a film."""
+"""An animation, and its files: a GIF, a page with a player, or a film."""
 
 import base64
 import html
@@ -16,18 +16,24 @@ from PIL import Image
 from pushjax.plot.style import STYLE
 
 DPI = 100
-REST = 1.2  # s, for which the last frame stays
-COLORS = 64  # of all frames together: what keeps the files small
-REFINE = 3  # of the colours: without it thin grey lines come out tinted
-SAMPLES = 6  # frames that the colours are taken from
+REST = 1.2  # s, time that the last frame stays
+COLORS = 64  # number of colors of all frames together, small so that the files are small
+REFINE = 3  # rounds of refining the palette: without them thin gray lines come out tinted
+SAMPLES = 6  # frames that the palette is taken from
 SUFFIXES = (".gif", ".html", ".mp4")
 
 
 @dataclass(frozen=True)
 class Animation:
-    """A figure that moves: `draw(k)` makes it show frame k of `frames`, which play in `seconds`, over and over.
+    """A figure that is drawn anew for each frame and plays in a loop.
 
-    `save` writes it to a file; a notebook shows it with its player.
+    `save` writes it to a file. A notebook shows it with its player.
+
+    Attributes:
+        figure: The figure.
+        draw: `draw(k)` makes the figure show frame k.
+        frames: Number of frames.
+        seconds: Time that the frames play, s.
     """
 
     figure: Figure
@@ -36,7 +42,7 @@ class Animation:
     seconds: float
 
     def pictures(self) -> list[Image.Image]:
-        """Every frame, all with one palette."""
+        """Return every frame as an image, all with one palette."""
         with plt.rc_context(STYLE):
             self._lay_out()
             drawn = [self._picture(k) for k in range(self.frames)]
@@ -49,19 +55,20 @@ class Animation:
         return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in drawn]
 
     def _lay_out(self) -> None:
-        """Once: nothing but the contents shall move."""
-        for _ in range(4):  # how a panel of fixed aspect fits, the layout learns from the drawing before
+        """Fix the layout, so that only the contents move."""
+        for _ in range(4):  # the layout learns from the drawing before how a panel of fixed aspect fits
             self.figure.canvas.draw()
         self.figure.set_layout_engine("none")
 
     def _picture(self, k: int) -> Image.Image:
+        """Return frame k as an image."""
         self.draw(k)
         buffer = io.BytesIO()
         self.figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": 1})
         return Image.open(buffer).convert("RGB")
 
     def player(self) -> str:
-        """A fragment of a page that plays it, with everything in it."""
+        """Return a fragment of an HTML page that plays the animation, with everything in it."""
         encoded = []
         for picture in self.pictures():
             buffer = io.BytesIO()
@@ -71,12 +78,18 @@ class Animation:
         return PLAYER.substitute(frames=",\n".join(encoded), last=self.frames - 1, interval=interval, rest=1e3 * REST)
 
     def _repr_html_(self) -> str:
+        """Show the player in a notebook."""
         return self.player()
 
     def write(self, path: Path) -> None:
-        """As `save` does it, into a folder that exists.
+        """Write the animation as `save` does, into a folder that exists.
 
-        Raises ValueError for another suffix, RuntimeError for .mp4 where there is no `ffmpeg`.
+        Args:
+            path: Path of the file, with the suffix .gif, .html or .mp4.
+
+        Raises:
+            ValueError: If the suffix is another one.
+            RuntimeError: If there is no `ffmpeg` for an .mp4.
         """
         suffix = path.suffix.lower()
         if suffix == ".gif":
@@ -92,10 +105,11 @@ class Animation:
             raise ValueError(f"{path.name}: motion is written as {', '.join(SUFFIXES)}; got {path.suffix or 'none'}")
 
     def _film(self, path: Path) -> None:
+        """Write an .mp4 with `ffmpeg`."""
         if not FFMpegWriter.isAvailable():
             raise RuntimeError(f"{path.name}: .mp4 needs the program ffmpeg; .gif and .html need nothing")
         rate = max(1, round(self.frames / self.seconds))
-        writer = FFMpegWriter(fps=rate, extra_args=["-pix_fmt", "yuv420p"])  # what every player shows
+        writer = FFMpegWriter(fps=rate, extra_args=["-pix_fmt", "yuv420p"])  # a pixel format that every player shows
         with plt.rc_context(STYLE), writer.saving(self.figure, str(path), dpi=DPI):
             self._lay_out()
             for k in [*range(self.frames), *[self.frames - 1] * round(REST * rate)]:

@@ -1,4 +1,4 @@
-"""What pictures are made of: outlines, fingers, arrows, centres of rotation. All take SI units and draw in mm."""
+"""The parts of pictures: outlines, fingers, arrows, centers of rotation. Most take SI units and draw in mm."""
 
 from typing import Any
 
@@ -6,21 +6,32 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from pushjax.hands import Finger, Hand, Pad
+from pushjax.geometry.shape import Shape
 from pushjax.plot.style import MM, PURPLE
-from pushjax.shapes import Shape
+from pushjax.simulation.hand import Finger, Hand, Pad
 
-FINE = 200  # points of a smooth outline
+FINE = 200  # points along a smooth outline
 
 
 def vertices(shape: Shape) -> np.ndarray:
-    """The outline as a polygon's vertices (vertices, 2), body frame, m: a polygon's own, else points along it."""
+    """Return an outline as the vertices of a polygon, (vertices, 2), body frame, m.
+
+    They are the vertices of the shape if it is a polygon, else `FINE` points along its boundary.
+    """
     points = getattr(shape, "vertices", None)
     return np.asarray(shape.boundary(FINE) if points is None else points)
 
 
 def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Points (points, 2) m of a body at the poses (..., 3), closed and in mm: (..., points + 1, 2)."""
+    """Return the closed outline of a body at each of several poses, in mm.
+
+    Args:
+        points: (points, 2), body frame, m.
+        poses: (..., 3), m and rad.
+
+    Returns:
+        (..., points + 1, 2), mm.
+    """
     x, y, theta = np.moveaxis(np.asarray(pose)[..., None], -2, 0)
     c, s = np.cos(theta), np.sin(theta)
     px, py = np.vstack([points, points[:1]]).T
@@ -28,17 +39,35 @@ def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float, **line: Any) -> None:
-    """The shape at a pose (3,), in mm. line: anything else of `Axes.plot`."""
+    """Draw a shape at a pose, in mm.
+
+    Args:
+        axes: Axes to draw into.
+        shape: The shape.
+        pose: (3,), m and rad.
+        color: Color of the line.
+        width: Width of the line, in points.
+        line: Other arguments of `Axes.plot`.
+    """
     axes.plot(*placed(vertices(shape), np.asarray(pose)).T, color=color, lw=width, **line)
 
 
 def hand_at(axes: Axes, hand: Hand, poses: np.ndarray, color: str, width: float) -> None:
-    """The fingers at their poses (fingers, width), in mm."""
+    """Draw the fingers of a hand, in mm.
+
+    Args:
+        axes: Axes to draw into.
+        hand: The hand.
+        poses: (fingers, 2) or (fingers, 3), centers or poses of the fingers as `hand.poses` gives them, m and rad.
+        color: Color of the lines.
+        width: Width of the lines, in points.
+    """
     for finger, where in zip(hand.fingers, np.asarray(poses), strict=True):
         _finger(axes, finger, where, color, width)
 
 
 def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
+    """Draw one finger: a pad as its outline, a round finger as a circle."""
     if isinstance(finger, Pad):
         outline(axes, finger.shape, pose, color, width)
     else:
@@ -46,7 +75,7 @@ def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: flo
 
 
 def arrow(axes: Axes, tail: np.ndarray, tip: np.ndarray, color: str, width: float) -> None:
-    """From one point (2,) to another, mm; both count for the range that the axes show."""
+    """Draw an arrow from one point (2,) to another, in mm. Both points extend the range that the axes show."""
     shape = {"arrowstyle": "-|>", "color": color, "lw": width, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (tip[0], tip[1]), (tail[0], tail[1]), arrowprops=shape)
     axes.update_datalim([tail, tip])
@@ -54,11 +83,16 @@ def arrow(axes: Axes, tail: np.ndarray, tip: np.ndarray, color: str, width: floa
 
 
 def center_of_rotation(axes: Axes, twist: np.ndarray) -> None:
-    """About which a twist (3,), body frame, turns the slider, with the sign of the turn; nothing of a translation."""
+    """Draw the center about which a twist turns the slider, with the sign of the turn.
+
+    Args:
+        axes: Axes to draw into.
+        twist: (3,), body frame. Nothing is drawn for a translation.
+    """
     vx, vy, omega = twist
     if omega == 0:
         return
     center = MM * np.array([-vy, vx]) / omega
     axes.plot(*center, "o", mfc="white", mec=PURPLE, ms=13, mew=1.6)
     axes.annotate("+" if omega > 0 else "\N{MINUS SIGN}", center, ha="center", va="center", color=PURPLE, fontsize=12)
-    axes.plot([], [], "o", mfc="white", mec=PURPLE, label="centre of rotation")
+    axes.plot([], [], "o", mfc="white", mec=PURPLE, label="center of rotation")

@@ -1,4 +1,4 @@
-"""Pictures of single pushes and grasps, side by side; simulated, and real beside predicted."""
+"""Pictures of single pushes and grasps, side by side: simulated ones, and real ones beside predictions."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -11,22 +11,27 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from pushjax.hands import Hand
+from pushjax.contact.status import Status
+from pushjax.geometry.shape import Shape
 from pushjax.plot.parts import hand_at, outline, placed, vertices
 from pushjax.plot.style import BETWEEN, BLUE, END, MM, ORANGE, START, STYLE, legend_below, legend_of_moments, row
-from pushjax.rollout import Trajectory
-from pushjax.shapes import Shape
-from pushjax.status import Status
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import Trajectory
 
 
 def push_figure(
     shape: Shape, pushes: Mapping[str, tuple[Trajectory, np.ndarray]], radius: float, frames: int = 5
 ) -> Figure:
-    """Pushes by one round finger, side by side: outline and finger at the start black, at the end red, between grey;
-    the centre's trace.
+    """Draw pushes by one round finger, side by side.
 
-    pushes: by name, a trajectory and the path (steps + 1, 2) of the finger's centre, m. radius: m, the finger's.
-    frames: how many moments between start and end. A push with a step that failed says so in its title.
+    Outline and finger are black at the start, red at the end, and gray between. The trace of the slider's center is
+    drawn too. The title of a push with a failed step says so.
+
+    Args:
+        shape: Outline of the slider.
+        pushes: By name, a trajectory and the path (steps + 1, 2) of the finger's center, m.
+        radius: Radius of the finger, m.
+        frames: Number of moments between start and end.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(pushes), 4.0, 4.2, shared=True)
@@ -37,24 +42,30 @@ def push_figure(
                 color = START if k == 0 else END if k == shown[-1] else BETWEEN
                 outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
-            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="centre of the slider")
+            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="center of the slider")
             axes.set(title=_titled(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
         return figure
 
 
 def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], frames: int = 4) -> Figure:
-    """Grasps side by side: slider and fingers at the start black, at the end red, between grey; the centre's trace.
+    """Draw grasps side by side.
 
-    Pushes by any hand can be drawn so, too. frames: how many moments between start and end, of those in which the
-    slider moves. A grasp with a step that failed says so in its title.
+    Slider and fingers are black at the start, red at the end, and gray between. The trace of the slider's center is
+    drawn too. The title of a grasp with a failed step says so. Pushes by any hand can also be drawn with it.
+
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        grasps: Trajectories by name.
+        frames: Number of moments between start and end, among those in which the slider moves.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(grasps), 3.1, 3.9, shared=True)
         for axes, (name, grasp) in zip(all_axes, grasps.items(), strict=True):
             pose = np.asarray(grasp.pose)
             fingers = np.asarray(hand.poses(grasp.configuration))
-            # only where the slider moves is there something to see
+            # there is something to see only where the slider moves
             moves = np.flatnonzero(np.any(np.diff(pose, axis=0) != 0, axis=1))
             last = len(pose) - 1 if moves.size == 0 else min(moves[-1] + 1, len(pose) - 1)
             first = 0 if moves.size == 0 else moves[0]
@@ -63,7 +74,7 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
                 width = 0.8 if color == BETWEEN else 1.4
                 outline(axes, shape, pose[k], color, width)
                 hand_at(axes, hand, fingers[k], color, width)
-            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="centre of the slider", zorder=4)
+            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="center of the slider", zorder=4)
             axes.set(title=_titled(name.replace(": ", ":\n"), grasp), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         legend_of_moments(figure, all_axes[0])
@@ -71,16 +82,19 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
 
 
 def _titled(name: str, push: Trajectory) -> str:
-    """The title of a push; if a step failed, with its status, since what is drawn after it is no answer."""
+    """Return the title of a push, with the status if a step failed: what is drawn after it is no answer."""
     first = int(push.first_failure)
     return name if first < 0 else f"{name}\n{Status(int(push.status[first])).name} from step {first}"
 
 
 class RealPush(NamedTuple):
-    """A push that was measured, and what was predicted of it; world, m and rad.
+    """A push that was measured, and its prediction; world, m and rad.
 
-    start, end: (3,), the slider's measured poses. predicted: its end (3,), or draws of it (draws, 3). path: the hand's
-    configurations (points, dof), or None.
+    Attributes:
+        start: (3,), measured pose of the slider at the start.
+        end: (3,), measured pose at the end.
+        predicted: (3,), predicted pose at the end, or samples of it (draws, 3).
+        path: (points, dof), configurations of the hand, or None.
     """
 
     start: np.ndarray
@@ -90,8 +104,16 @@ class RealPush(NamedTuple):
 
 
 def real_figure(shape: Shape, pushes: Mapping[str, RealPush], hand: Hand | None = None) -> Figure:
-    """Real pushes side by side: the measured start (grey) and end (black), the predicted end or ends (blue, dashed),
-    and the fingers' paths with the fingers at their end, where a hand is given."""
+    """Draw real pushes side by side.
+
+    The measured start is gray, the measured end is black. The predicted end is blue and dashed; several predicted ends
+    are blue and faint. With a hand, the paths of the fingers are drawn, and the fingers at the end of their paths.
+
+    Args:
+        shape: Outline of the slider.
+        pushes: Pushes by name.
+        hand: The hand. None: it is not drawn.
+    """
     with plt.rc_context(STYLE):
         figure, all_axes = row(len(pushes), 3.6, 3.8)
         for axes, (name, push) in zip(all_axes, pushes.items(), strict=True):
@@ -111,6 +133,7 @@ def real_figure(shape: Shape, pushes: Mapping[str, RealPush], hand: Hand | None 
 
 
 def _predicted(axes: Axes, shape: Shape, poses: np.ndarray) -> None:
+    """Draw one predicted pose (3,) dashed, or several (draws, 3) faint."""
     if poses.ndim == 1:
         outline(axes, shape, poses, BLUE, 1.5, linestyle="--", label="predicted end")
         return

@@ -1,4 +1,4 @@
-"""One look for all pictures: colours, weights, units, and how a picture becomes a file."""
+"""One look for all pictures: colors, line styles, units, panels and legends."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,11 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 MM, DEGREES = 1e3, 180 / np.pi  # lengths are drawn in mm, angles in degrees
-# Okabe & Ito's, which the colour-blind can tell apart
+# The colors of Okabe & Ito, which color-blind readers can tell apart
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
-# The moments of a push: of three lightnesses, so that a greyscale print keeps them apart
+# The moments of a push have three lightnesses, so that a grayscale print keeps them apart
 START, BETWEEN, END = "black", "0.72", "#C1121F"
-# Curves beside each other: colour, dash, marker. The colours are of nearly one lightness: in greyscale the rest tells.
+# Color, dash and marker of curves beside each other. The colors have nearly one lightness, so in grayscale dash and
+# marker tell the curves apart.
 SERIES = (
     (BLUE, "-", "o"),
     (ORANGE, "--", "s"),
@@ -23,9 +24,9 @@ SERIES = (
     ("#56B4E9", (0, (5, 1, 1, 1, 1, 1)), "v"),
     ("black", (0, (1, 3)), "x"),
 )
-MODELS = {"quartic": 0, "ellipsoid": 1}  # in every picture the same
+MODELS = {"quartic": 0, "ellipsoid": 1}  # row of `SERIES`, the same in every picture
 LOOK = ("color", "linestyle", "marker")
-HATCH = "////"  # of the second of two kinds of bars
+HATCH = "////"  # hatch of the second of two kinds of bars
 
 STYLE: Any = {
     "font.size": 9,
@@ -38,13 +39,20 @@ STYLE: Any = {
     "hatch.linewidth": 0.6,
     "legend.frameon": False,
     "savefig.dpi": 160,
-    "pdf.fonttype": 42,  # text that stays text
+    "pdf.fonttype": 42,  # keeps text as text
     "svg.fonttype": "none",
 }
 
 
 def row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
-    """Panels side by side, each of that size in inches. shared: they show the same range."""
+    """Make a figure with panels side by side.
+
+    Args:
+        panels: Number of panels.
+        width: Width of each panel, in.
+        height: Height of each panel, in.
+        shared: Whether the panels show the same range.
+    """
     figure, axes = plt.subplots(
         1, panels, figsize=(width * panels, height), sharex=shared, sharey=shared, layout="constrained", squeeze=False
     )
@@ -52,9 +60,13 @@ def row(panels: int, width: float, height: float, shared: bool = False) -> tuple
 
 
 def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Each curve with its name, and its colour, dash and marker as arguments of `Axes.plot`.
+    """Return for each curve its name, the curve, and its color, dash and marker as arguments of `Axes.plot`.
 
-    Raises ValueError for more curves than one can tell apart.
+    Args:
+        curves: Curves by name. The quartic and the ellipsoid look the same in every picture.
+
+    Raises:
+        ValueError: If there are more curves than one can tell apart.
     """
     if len(curves) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
@@ -64,19 +76,19 @@ def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
 
 
 def bars(color: str, hatched: bool = False) -> dict[str, Any]:
-    """How bars of a kind look, as arguments of `Axes.bar`; the error bars too."""
+    """Return how bars of a kind look, with their error bars, as arguments of `Axes.bar`."""
     hatch = HATCH if hatched else None
     return {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    """One legend for all panels, of what `axes` shows."""
+    """Draw one legend for all panels below them, with the labels of `axes` in `columns` columns."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 def legend_of_moments(figure: Figure, axes: Axes) -> None:
-    """The legend of pictures that show a push at its start, between, and at its end."""
+    """Draw the legend of pictures that show a push at its start, between, and at its end."""
     for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
         axes.plot([], [], color=color, label=label)
     legend_below(figure, axes, columns=4)

@@ -8,24 +8,30 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pushjax.limit_surface import LimitSurface
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.support import WrenchTwistPairs
 from pushjax.plot.style import STYLE, looks
-from pushjax.support import WrenchTwistPairs
 
 FORCE_X, FORCE_Y, TORQUE = "$f_x$ / load", "$f_y$ / load", r"$\tau$ / (length · load)"
-NEARBY = 0.06  # of the load: pairs so near to a cut are drawn with it
-LONG = 0.5  # of an arrow, in the same unit
-TOWARDS = np.radians(30), np.radians(-60)  # where the viewer is: elevation and azimuth
+NEARBY = 0.06  # in units of the load: pairs this near to a cut are drawn with it
+LONG = 0.5  # length of an arrow, in the same unit
+TOWARDS = np.radians(30), np.radians(-60)  # elevation and azimuth of the viewer
 
 
 def limit_surfaces(
     surfaces: Mapping[str, LimitSurface], pairs: WrenchTwistPairs, load: float, *, arrows: int = 12
 ) -> Figure:
-    """Level sets H = 1 in 3-D, over load and length, and cuts through them, with the wrenches they were fitted to.
+    """Draw level sets H = 1 in 3-D and cuts through them, with the wrenches that they were fitted to.
 
-    surfaces: by name. pairs: what they were fitted to. load: N, what wrenches are drawn in units of. arrows: so many
-    of the pairs, spread over the side that is seen, with an arrow at the wrench along the twist; where the surface
-    fits, it is the surface's normal, since the twist is the gradient of H (in `(vx, vy, length omega)`).
+    Forces are drawn in units of the load, torques in units of length times load. At some of the wrenches an arrow shows
+    the twist, as `(vx, vy, length omega)`. A twist is parallel to the gradient of H. So where the surface fits, the
+    arrow is normal to the surface.
+
+    Args:
+        surfaces: Limit surfaces by name.
+        pairs: The pairs that the surfaces were fitted to.
+        load: Total friction limit of the support, N.
+        arrows: Number of pairs with an arrow, spread over the side that is seen.
     """
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(3.6 * len(surfaces) + 4.0, 3.9), layout="constrained")
@@ -49,11 +55,12 @@ def limit_surfaces(
 
 
 def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> None:
+    """Draw the level set H = 1 of a surface in 3-D."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
     ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
     x, y, z = np.moveaxis(_on_level_set(surface, ball) / load, -1, 0)
     axes.plot_surface(x, y, z, color=color, alpha=0.35, linewidth=0.2, edgecolor=color)  # type: ignore[attr-defined]
-    # few ticks: in between, the labels of the axes run into them
+    # few ticks, because the labels of more ticks would run into the labels of the axes
     axes.set(xlabel=FORCE_X, ylabel=FORCE_Y, xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     axes.set_zlabel(TORQUE)  # type: ignore[attr-defined]
     elevation, azimuth = np.degrees(TOWARDS)
@@ -62,7 +69,10 @@ def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> No
 
 
 def _cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, other: int) -> None:
-    """The level sets where one component vanishes: f_x against the component number `other`."""
+    """Draw the cut of the level sets with a plane: component `other` (1 is f_y, 2 the torque) over f_x.
+
+    The remaining component, number 3 - other, is zero in this plane.
+    """
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))
     circle[:, 0], circle[:, other] = np.cos(angle), np.sin(angle)
@@ -75,7 +85,7 @@ def _cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, l
 
 
 def _spread(wrench: np.ndarray, count: int) -> np.ndarray:
-    """Indices of up to `count` wrenches on the viewer's side, each as far as can be from those before it."""
+    """Return indices of up to `count` wrenches on the viewer's side, each as far as possible from those before it."""
     elevation, azimuth = TOWARDS
     viewer = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     seen = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
@@ -90,7 +100,7 @@ def _spread(wrench: np.ndarray, count: int) -> np.ndarray:
 
 
 def _on_level_set(surface: LimitSurface, normalized: np.ndarray) -> np.ndarray:
-    """Normalised wrenches scaled along their rays to H = 1."""
+    """Scale wrenches `(fx, fy, tau / length)` along their rays to H = 1; the result has the same form, in N."""
     flat = normalized.reshape(-1, 3) * np.array([1, 1, float(surface.length)])
     level = np.array(jax.vmap(surface.on_level_set)(flat.astype(surface.length.dtype)))
     level[:, 2] /= float(surface.length)

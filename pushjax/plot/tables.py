@@ -8,10 +8,13 @@ from pushjax.plot.style import BLUE, ORANGE, STYLE, bars
 
 
 def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
-    """Mean deviation by condition: ours with its interval, and the paper's, one group of bars a condition.
+    """Draw mean deviations by condition, with their intervals and the paper's, one group of bars per condition.
 
-    cells: each with `surface`, `object`, `model` ("quartic" or "ellipsoid"), `mean_mm`, `ci95_bootstrap_mm` and
-    `paper_mm` (or None). width: in.
+    Args:
+        cells: Each with `surface`, `object`, `model` ("quartic" or "ellipsoid"), `mean_mm`, `ci95_bootstrap_mm` and
+            `paper_mm` (or None).
+        title: Title of the picture.
+        width: Width of the figure, in.
     """
     with plt.rc_context(STYLE):
         conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))

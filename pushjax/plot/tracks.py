@@ -1,29 +1,33 @@
-"""What a push looks like at each of its points: outlines in mm, contacts, forces, words."""
+"""A push as it is drawn at each of its points: outlines in mm, contacts, forces, words."""
 
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax.hands import Hand, Pad
+from pushjax.contact.status import ContactMode, Status
+from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import contact_forces
 from pushjax.plot.parts import FINE, placed, vertices
 from pushjax.plot.style import MM
-from pushjax.rollout import Trajectory
-from pushjax.shapes import Shape
-from pushjax.status import ContactMode, Status
+from pushjax.simulation.hand import Hand, Pad
+from pushjax.simulation.rollout import Trajectory
 
 
 class Recorded(NamedTuple):
-    """A push that was measured: pose (points, 3) of the slider and configuration (points, dof) of the hand, at the same
-    times; world, m and rad."""
+    """A push that was measured, with slider and hand at the same times; world, m and rad.
+
+    Attributes:
+        pose: (points, 3), poses of the slider.
+        configuration: (points, dof), configurations of the hand.
+    """
 
     pose: np.ndarray
     configuration: np.ndarray
 
 
 class Moved(Protocol):
-    """What can be shown in motion: a `Trajectory` or a `Recorded`."""
+    """What can be animated: a `Trajectory` or a `Recorded`."""
 
     @property
     def pose(self) -> Any: ...
@@ -33,9 +37,18 @@ class Moved(Protocol):
 
 
 class Track(NamedTuple):
-    """A push as it is drawn, mm: outlines (points, vertices, 2), of each finger (points, vertices, 2), centres (points,
-    2); over it measured outlines; of each point the contacts and forces of the step that led there, N, and words.
-    failed: the first step that did, or -1."""
+    """A push as it is drawn, in mm and N.
+
+    Attributes:
+        outline: (points, vertices, 2), outlines of the slider.
+        fingers: For each finger its outlines, (points, vertices, 2).
+        center: (points, 2), centers of the slider.
+        measured: Measured outlines to draw over it, or None.
+        contact: (points, contacts, 2), contacts of the step that led to each point.
+        force: (points, contacts, 2), forces of that step, N.
+        words: For each point a description of that step.
+        failed: The first failed step, or -1.
+    """
 
     outline: np.ndarray
     fingers: list[np.ndarray]
@@ -48,10 +61,23 @@ class Track(NamedTuple):
 
     @property
     def largest(self) -> float:
+        """The largest force, N."""
         return float(np.max(np.linalg.norm(self.force, axis=-1), initial=0.0))
 
 
 def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None, forces: bool) -> Track:
+    """Convert a push to what is drawn.
+
+    Args:
+        shape: Outline of the slider.
+        hand: The hand.
+        push: The push.
+        measured: (points, 3), poses to draw over it, world, m and rad; or None.
+        forces: Whether to find contacts and forces.
+
+    Raises:
+        ValueError: If the push has another number of configurations than of poses.
+    """
     pose, body = np.asarray(push.pose, float), vertices(shape)
     fingers = fingers_along(hand, push.configuration)
     if len(fingers[0]) != len(pose):
@@ -71,7 +97,7 @@ def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None,
 
 
 def _in_world(pose: np.ndarray, point: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each pose the contacts, mm, and forces of the step that led there; of the first, nothing."""
+    """Return for each pose the contacts, mm, and forces of the step that led there; zero for the first pose."""
     c, s = np.cos(pose[1:, None, 2]), np.sin(pose[1:, None, 2])
 
     def turned(v):
@@ -83,7 +109,7 @@ def _in_world(pose: np.ndarray, point: np.ndarray, force: np.ndarray) -> tuple[n
 
 
 def _words(status: int, modes: np.ndarray) -> str:
-    """A step in words: its status, and how many contacts stick and slide."""
+    """Describe a step in words: its status, and how many contacts stick and slide."""
     kinds, counts = np.unique(modes[modes != ContactMode.SEPARATED], return_counts=True)
     each = [f"{n} {_plain(ContactMode(int(kind)))}" for kind, n in zip(kinds, counts, strict=True)]
     one = len(modes) == 1
@@ -91,11 +117,12 @@ def _words(status: int, modes: np.ndarray) -> str:
 
 
 def _plain(name: ContactMode | Status) -> str:
+    """Return the name of a mode or status in lower case, with spaces."""
     return name.name.lower().replace("_", " ")
 
 
 def fingers_along(hand: Hand, configurations: Any) -> list[np.ndarray]:
-    """Of each finger its outline along the configurations (points, dof): (points, vertices, 2), mm."""
+    """Return for each finger its outlines along the configurations (points, dof): (points, vertices, 2), mm."""
     poses = np.asarray(hand.poses(jnp.asarray(configurations)), float)
     angle = np.linspace(0, 2 * np.pi, FINE // 4, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])

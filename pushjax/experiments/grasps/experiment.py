@@ -1,14 +1,15 @@
-"""Grasping under uncertainty: where a parallel jaw leaves a rectangle, or a butterfly, that lay anywhere in it.
+"""Grasping under uncertainty: where a parallel jaw leaves a rectangle or a butterfly that lay anywhere in it.
 
-The jaw's pads are 27 x 10 mm; it closes from 85 mm until it is stopped, or shut. The limit surface is an ellipsoid with
-250 degrees of freedom around the one that the pressure gives (along the rim; of the rectangle also six points), the
-friction of the pads uniform in [0.015, 0.02]. Left open by the paper and chosen here: how far the jaw is open at first,
-and that start poses which the open jaw would overlap are drawn again.
+The pads of the jaw are 27 x 10 mm. The jaw closes from 85 mm until it is stopped or shut. The limit surface is an
+ellipsoid, sampled with 250 degrees of freedom around the one that the pressure gives. The pressure acts along the rim;
+the rectangle is also simulated on six points. The friction of the pads is uniform in [0.015, 0.02].
 
-Source: Zhou et al. 2017, section VI.C, figures on grasping under uncertainty.
+The paper leaves two things open, which are chosen here. One is how far the jaw is open at first. The other is that
+start poses that overlap the open jaw are sampled again.
+
+Reference: Zhou et al. 2017, section VI.C, figures on grasping under uncertainty.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.experiments.grasps.outcomes import classify, spikes, start_poses
 from pushjax.experiments.grasps.sliders import SLIDERS
-from pushjax.report import envelope
 
 PAD, THICKNESS = 0.027, 0.010  # m
 STEPS, DOF, FRICTION, PAIRS, HOLD = 840, 250.0, (0.015, 0.02), 400, 5
@@ -35,9 +37,26 @@ def run(
     steps: int = STEPS,
     dof: float = DOF,
     friction: tuple[float, float] = FRICTION,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """slider: "rectangle" or "butterfly". One cell for each pressure; pictures into `out`."""
+    """Simulate the grasps of one slider and compute one cell for each pressure.
+
+    Args:
+        slider: "rectangle" or "butterfly".
+        seed: Seed of the wrench-twist pairs and the start poses; the grasps use `seed + 1`.
+        out: Folder for the pictures. None: no pictures.
+        n: Number of grasps. None: that of the slider's setting.
+        steps: Steps in which the jaw closes.
+        dof: Degrees of freedom of the sampled ellipsoids.
+        friction: Lowest and highest coefficient of friction of the pads.
+        progress: Called with the number of grasps done and their total.
+
+    Returns:
+        The record, with the cells, the start poses, and how many of them were sampled again.
+
+    Raises:
+        ValueError: If the slider is unknown.
+    """
     if slider not in SLIDERS:
         raise ValueError(f"slider must be one of {', '.join(SLIDERS)}; got {slider!r}")
     setting = SLIDERS[slider]()
@@ -70,7 +89,7 @@ def run(
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "pad_m": (PAD, THICKNESS)}
     settings |= {"opening_m": setting.opening, "circle_m": setting.circle, "pairs": PAIRS}
     first = cells[0]
-    return envelope(
+    return result_record(
         f"grasp-{slider}",
         settings,
         n=count,
@@ -83,6 +102,7 @@ def run(
 
 
 def _figures(grasps: pj.MonteCarlo, became: np.ndarray, symmetry: float) -> dict[str, Any]:
+    """Compute the outcomes, the spikes of the angle, and the histograms of the grasps that hold."""
     held = grasps.stopped >= 0
     pose = np.asarray(grasps.pose, np.float64)
     histograms = {
@@ -101,7 +121,7 @@ def _figures(grasps: pj.MonteCarlo, became: np.ndarray, symmetry: float) -> dict
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints."""
+    """Return the text that the command prints for a record of `run`."""
     name = record["experiment"].removeprefix("grasp-")
     lines = [f"A jaw closes on a {name} from {record['n']} poses ({record['redrawn']} drawn again, being in its way):"]
     for cell in record["cells"]:

@@ -1,8 +1,8 @@
-"""What became of each grasp.
+"""Outcome of each grasp.
 
-Every slider whose hand stopped is held between both pads. Here, other than in `MonteCarlo.outcomes`, called grasped is
-what is stable there: turned a little either way it would need the jaw wider. Jammed is what friction alone keeps, where
-a turn would let the jaw close.
+Every slider whose hand stopped is held between both pads. Unlike `MonteCarlo.outcomes`, this module counts a grasp as
+grasped if it is stable: the jaw would have to be wider if the slider turned a little either way. It counts a grasp as
+jammed if friction alone keeps it: a turn would let the jaw close.
 """
 
 from typing import Any
@@ -15,12 +15,21 @@ from pushjax.experiments._starts import in_circle
 
 TURN = np.radians(1.0)
 POINTS = 500
-SPIKE = np.radians(1.0)  # the width of a bin of angles in which to look for spikes
-FEWEST = 0.02  # of all, that make one
+SPIKE = np.radians(1.0)  # width of a bin of angles in which spikes are looked for
+FEWEST = 0.02  # smallest share of all angles that makes a spike
 
 
 def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
-    """How far apart pads of width `pad`, centred at the origin, must be at least for the slider at each pose."""
+    """Compute the least distance between the pads that leaves room for the slider at each pose.
+
+    Args:
+        shape: Outline of the slider.
+        poses: (n, 3), m and rad, in the frame of the jaw.
+        pad: Width of the pads, which are centered at the origin, m.
+
+    Returns:
+        (n,), m; zero where the slider is not between the pads.
+    """
     outline = np.asarray(shape.boundary(POINTS), np.float64)
     if isinstance(shape, pj.Polygon):
         corners = np.asarray(shape.vertices, np.float64)
@@ -31,7 +40,7 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
     top, bottom = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
     after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    for side in (-pad / 2, pad / 2):  # where the outline passes the pads' corners
+    for side in (-pad / 2, pad / 2):  # where the outline crosses the lines through the pads' corners
         across = (x - side) * (after_x - side) < 0
         share = np.where(across, (side - x) / np.where(across, after_x - x, 1.0), 0.0)
         height = y + share * (after_y - y)
@@ -44,7 +53,16 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
 
 
 def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
-    """(n,) of "grasped", "jammed", "free", "failed"."""
+    """Classify every grasp.
+
+    Args:
+        grasps: The n grasps.
+        shape: Outline of the slider.
+        pad: Width of the pads, m.
+
+    Returns:
+        (n,), each "grasped", "jammed", "free" or "failed".
+    """
     pose = np.asarray(grasps.pose, np.float64)
     held, failed = grasps.stopped >= 0, grasps.failed > 0
     here = openings(shape, pose, pad)
@@ -56,9 +74,23 @@ def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
 def start_poses(
     slider: pj.Slider, hand: pj.Hand, configuration: Any, circle: float, n: int, seed: int
 ) -> tuple[np.ndarray, int]:
-    """(n, 3): centres uniform in a circle, angles within 90 degrees; and how many were drawn again because the open
-    jaw would already have overlapped them."""
-    from pushjax.rollout import overlaps
+    """Sample start poses that do not overlap the open jaw.
+
+    Centers are uniform in a circle, and angles are uniform within 90 degrees of zero. Poses that overlap the jaw are
+    sampled again.
+
+    Args:
+        slider: The slider.
+        hand: The jaw.
+        configuration: Configuration of the open jaw.
+        circle: Radius of the circle, m.
+        n: Number of poses.
+        seed: Seed of the poses.
+
+    Returns:
+        The poses (n, 3), and how many were sampled again.
+    """
+    from pushjax.simulation.rollout import overlaps
 
     rng = np.random.default_rng(seed)
     kept, again = np.zeros((0, 3)), 0
@@ -75,10 +107,18 @@ def start_poses(
 
 
 def spikes(angles: np.ndarray, symmetry: float) -> list[dict[str, float]]:
-    """Where at least `FEWEST` of the angles, taken modulo the symmetry, lie within one bin, largest first."""
+    """Find spikes in a distribution of angles: bins that hold at least the share `FEWEST` of all angles.
+
+    Args:
+        angles: Angles, rad.
+        symmetry: Angle after which the outline is the same, rad. The angles are taken modulo it.
+
+    Returns:
+        The angle (degrees) and the share of each spike, largest share first.
+    """
     wrapped = np.mod(np.asarray(angles, np.float64) + symmetry / 2, symmetry) - symmetry / 2
     bins = round(symmetry / SPIKE)
-    # bins about multiples of a degree, so that a spike at a right angle is in one
+    # bins are centered at multiples of a degree, so that a spike at a right angle is in one bin
     number = np.mod(np.round(wrapped / SPIKE).astype(int), bins)
     counts = np.bincount(number, minlength=bins)
     found = np.flatnonzero(counts >= FEWEST * len(angles))

@@ -1,4 +1,4 @@
-"""The pictures: where it lay, where it is left, and histograms of both."""
+"""The pictures of the grasps: where the slider lay, where it is left, and histograms of both."""
 
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,20 @@ BINS = 60
 def draw(
     out: Path, name: str, setting: Setting, hand: pj.Hand, path: Any, starts: np.ndarray, shown: dict[str, tuple]
 ) -> list[str]:
+    """Draw start poses and final poses, with histograms, for every pressure.
+
+    Args:
+        out: Folder for the picture.
+        name: Name of the file, without its suffix.
+        setting: The slider.
+        hand: The jaw.
+        path: (steps + 1, dof), configurations of the jaw.
+        starts: (n, 3), start poses, m and rad.
+        shown: By pressure, the grasps and the outcome of each.
+
+    Returns:
+        The path of the picture, in a list.
+    """
     with plt.rc_context(plot.STYLE):
         rows = len(shown) + 1
         figure, axes = plt.subplots(rows, 4, figsize=(14.0, 3.4 * rows), layout="constrained")
@@ -37,7 +51,7 @@ def draw(
             row[0].set(title=f"where they end, pressure: {pressure}", aspect="equal")
             row[0].legend(loc="upper right", markerscale=3, fontsize=7)
             held = np.array(grasps.pose[grasps.stopped >= 0], np.float64)
-            # a spike at a right angle is one, not two halves
+            # shifted so that a spike at a right angle is not cut into two halves
             held[:, 2] = np.mod(held[:, 2] + setting.symmetry / 4, setting.symmetry) - setting.symmetry / 4
             _histograms(row[1:], held)
             row[2].set_title("of those held (θ modulo its symmetry)")
@@ -45,6 +59,7 @@ def draw(
 
 
 def _histograms(panels, poses: np.ndarray) -> None:
+    """Draw histograms of x, y (mm) and theta (degrees) of poses (n, 3)."""
     for k, (axes, (scale, label)) in enumerate(zip(panels, NUMBERS, strict=True)):
         values = scale * np.asarray(poses[:, k], np.float64)
         if len(values):

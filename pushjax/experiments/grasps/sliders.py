@@ -1,8 +1,8 @@
-"""What is grasped: outlines, what carries them, and from where.
+"""The sliders that are grasped: their outlines, supports and start poses.
 
-The rectangle is the paper's. Of the butterfly the paper gives two diameters, 39 mm across its convex ends and 28.6 mm
-across its concave waist; the outline here is r(angle) = a + b cos(2 angle) + c cos(4 angle) with these two, and a c of
--1 mm, which makes the waist a hollow of 17 mm radius.
+The rectangle is the paper's. For the butterfly the paper gives two diameters: 39 mm across its convex ends and 28.6 mm
+across its concave waist. The outline here is r(angle) = a + b cos(2 angle) + c cos(4 angle) with these two diameters
+and c = -1 mm, which makes the waist a hollow of 17 mm radius.
 """
 
 from typing import Any, NamedTuple
@@ -12,14 +12,22 @@ import numpy as np
 
 import pushjax as pj
 
-LONG, WAIST = 0.039, 0.0286  # m, the butterfly's diameters
-HOLLOW = -0.001  # m, c
+LONG, WAIST = 0.039, 0.0286  # m, diameters of the butterfly
+HOLLOW = -0.001  # c, m
 CONTROLS = 24
 
 
 class Setting(NamedTuple):
-    """One experiment. circle: m, the radius in which start centres lie. symmetry: the angle after which the outline is
-    the same."""
+    """One experiment.
+
+    Attributes:
+        shape: Outline of the slider.
+        supports: Supports by the name of their pressure.
+        n: Number of grasps.
+        circle: Radius of the circle that start centers lie in, m.
+        symmetry: Angle after which the outline is the same, rad.
+        opening: First and last opening of the jaw, m.
+    """
 
     shape: pj.Shape
     supports: dict[str, pj.Support]
@@ -30,6 +38,7 @@ class Setting(NamedTuple):
 
 
 def rectangle() -> Setting:
+    """Return the setting of the rectangle, on its rim or on six points."""
     block = pj.Polygon.rectangle(0.050, 0.035)
     x, y = 0.025, 0.0175
     six = np.array([(-x, -y), (0, -y), (x, -y), (x, y), (0, y), (-x, y)])
@@ -38,6 +47,7 @@ def rectangle() -> Setting:
 
 
 def butterfly() -> Setting:
+    """Return the setting of the butterfly, on its rim."""
     angle = 2 * np.pi * np.arange(CONTROLS) / CONTROLS
     b = (LONG - WAIST) / 4
     r = LONG / 2 - b - HOLLOW + b * np.cos(2 * angle) + HOLLOW * np.cos(4 * angle)

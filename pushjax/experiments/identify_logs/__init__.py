@@ -1,4 +1,4 @@
-"""A user's own logs: `experiment` from `setting`, `findings` and `picture`."""
+"""Identification from a user's own logs: `experiment` builds on `setting`, `findings` and `picture`."""
 
 from pushjax.experiments.identify_logs.experiment import run as run
 from pushjax.experiments.identify_logs.experiment import summary as summary

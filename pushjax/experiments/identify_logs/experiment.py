@@ -1,7 +1,8 @@
-"""From logs of pushes to friction, limit surface and calibration, with intervals, and a report.
+"""Identify friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
 
-What cannot be learned from is left out, counted and named. Several logs are pushes of one object under one friction,
-unless they are `separate`: then each has its own, and they share how the set-up is off.
+Pushes and logs that cannot be learned from are left out, counted and named. Several logs are pushes of one object under
+one friction, unless they are `separate`. Then each log has its own friction and surface, and all logs share the
+calibration of the setup.
 """
 
 from collections.abc import Callable
@@ -14,19 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.experiments.identify_logs import setting
 from pushjax.experiments.identify_logs.findings import Findings, parameters, predictions
 from pushjax.experiments.identify_logs.setting import Options
-from pushjax.identify.noise import Noise, identify_noise
-from pushjax.identify.recorded import paired, recorded, seen_after
-from pushjax.identify.screening import screened
-from pushjax.identify.uncertainty import Profile, profile, scalars
-from pushjax.report import envelope
+from pushjax.identification.noise import Noise, identify_noise
+from pushjax.identification.pushes import Pushes
+from pushjax.identification.recordings import has_wrenches, observed_often_enough, screen
+from pushjax.identification.uncertainty import Profile, profile, scalars
 
-FEWEST = 3  # pushes: fewer tell nothing about how far off they are
+FEWEST = 3  # pushes; from fewer the size of their errors cannot be told
 LEVEL = 0.9
-# Of how far the objects moved, and of what was expected before, that deviations may be before one is warned.
+# The mean deviation must be below the share POOR of the mean motion; or below the mean motion and the share NO_BETTER
+# of the mean deviation expected before the fit. Otherwise there is a warning.
 POOR, NO_BETTER = 0.4, 0.9
 
 
@@ -35,12 +38,27 @@ def run(
     options: Options,
     seed: int = 0,
     out: Path | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
     say: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
-    """say: told what is done next.
+    """Identify from logs, and draw and save the result.
 
-    Raises LogError for a log that cannot be used, ValueError for options that do not fit."""
+    Args:
+        logs: Files of recorded pushes.
+        options: What is known, and what is to be found.
+        seed: Seed of the wrench-twist pairs of the expected surfaces, and of the noise.
+        out: Folder for the pictures and `identified.json`. None: neither.
+        progress: Called with the number of parts done and their total.
+        say: Called with a description of what is done next.
+
+    Returns:
+        The record: one row per number that is no part of the surface, how well the pushes are predicted, the noise if
+        asked for, a warning or None, and the problems of what was left out.
+
+    Raises:
+        LogError: If no log, or no push of any log, can be used.
+        ValueError: If the options do not fit together or to the logs, or there are too few pushes.
+    """
     findings = find(logs, options, seed, progress, say)
     found = findings.found
     pictures, saved = [], None
@@ -54,13 +72,13 @@ def run(
     own = {name: value for name, value in chosen.items() if value is not None}
     noise = None if findings.noise is None else _noise(findings.noise)
     predicted = predictions(findings)
-    return envelope(
+    return result_record(
         "identify",
         {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | own,
         rows=parameters(findings, LEVEL),
         sigma_mm=1e3 * float(found.sigma),
         direction=float(found.direction),
-        converged=int(found.status) == pj.Status.MOVING,
+        converged=bool(found.converged),
         steps=int(found.steps),
         poses=len(findings.pushes.rows),
         wrenches=int(np.sum(np.asarray(findings.pushes.paired))),
@@ -77,9 +95,24 @@ def find(
     logs: list[Path],
     options: Options,
     seed: int,
-    progress: Callable[[int, int], None],
+    progress: ProgressCallback,
     say: Callable[[str], None],
 ) -> Findings:
+    """Identify from logs, with intervals, predictions and noise.
+
+    Logs that cannot be used become problems, as long as one log can be used.
+
+    Args:
+        logs: Files of recorded pushes.
+        options: What is known, and what is to be found.
+        seed: Seed of the wrench-twist pairs of the expected surfaces, and of the noise.
+        progress: Called with the number of parts done and their total.
+        say: Called with a description of what is done next.
+
+    Raises:
+        LogError: If no log, or no push of any log, can be used.
+        ValueError: If the options do not fit together or to the logs, or there are too few pushes.
+    """
     if not logs:
         raise ValueError("PATH: expected at least one file of recorded pushes; got none")
     recordings, useless = _each(logs, load_recordings)
@@ -90,7 +123,7 @@ def find(
         if columns != hand.dof:
             raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
     _check_forces(recordings, options)
-    recordings, no_better = _each(recordings, lambda one: screened(one, shape, hand))
+    recordings, no_better = _each(recordings, lambda one: screen(one, shape, hand))
     problems = (*useless, *no_better, *(problem for one in recordings for problem in one.problems))
     count = sum(len(one.pushes) for one in recordings)
     if count < FEWEST:
@@ -121,7 +154,8 @@ def find(
     noise = None
     if options.noise:
         say("fitting how much friction scatters")
-        # of pushes that were learned from too little is left over: every second about what the others tell
+        # Residuals of pushes that were learned from are too small. So the noise is fitted to every second push, about
+        # what is identified from the others.
         odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
         others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns, touching=touching)
         second = pushes.weighted(pushes.weight * odd)
@@ -134,18 +168,19 @@ def find(
 
 
 def _check_forces(recordings: list[Recordings], options: Options) -> None:
+    """Raise ValueError if forces are asked for that the options or the logs do not allow."""
     if not options.forces:
         return
     if options.parts < 2:
         needs = "the parts of a push, each of which gives a wrench, to be 2 at least"
         raise ValueError(f"--forces needs --parts, {needs}; got {options.parts}")
     for one in recordings:
-        if not paired(one):
+        if not has_wrenches(one):
             raise ValueError(f"--forces: {one.source} does not have the forces of a single finger for every push")
 
 
 def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
-    """What is made of every item, and the errors of those of which nothing is: raised only if it is so of all."""
+    """Apply `of` to the items; return its results and the errors of the others. Raise the first error if all fail."""
     good, bad = [], []
     for item in items:
         try:
@@ -158,25 +193,47 @@ def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings
 
 
 def conditions(recordings: list[Recordings], shape, options: Options, seed: int) -> tuple[pj.Pushes, pj.Slider]:
-    """Every log a condition, or all logs one."""
-    degree = {"quartic": 4, "ellipsoid": 2}[options.surface]
-    # the same of every log, for they become one array
-    parts = options.parts if all(seen_after(one, options.parts) for one in recordings) else 1
-    forces = options.forces and all(paired(one) for one in recordings)
-    each = [recorded(one, options.steps, parts, shape if forces else None) for one in recordings]
+    """Convert the logs to one condition each, or to a single condition for all of them.
 
-    def expected(one: Recordings) -> pj.LimitSurface:
-        return setting.expected_surface(setting.support_of(options.support, shape, one), degree, seed)
+    Poses during the push are used if every log has enough of them, and forces if every log has them. Logs of a
+    single condition must have the same expected surface.
+
+    Args:
+        recordings: The logs.
+        shape: Outline of the object.
+        options: What is known, and what is to be found. `separate` gives each log its own condition.
+        seed: Seed of the wrench-twist pairs of the expected surfaces.
+
+    Returns:
+        The pushes, and the slider with the expected surface or, for several conditions, the stacked surfaces.
+    """
+    degree = {"quartic": 4, "ellipsoid": 2}[options.surface]
+    # the same for every log, because they become one array
+    parts = options.parts if all(observed_often_enough(one, options.parts) for one in recordings) else 1
+    forces = options.forces and all(has_wrenches(one) for one in recordings)
+    each = [Pushes.of(one, options.steps, parts=parts, shape=shape if forces else None) for one in recordings]
+
+    supports = [setting.support_of(options.support, shape, one) for one in recordings]
+
+    def expected(support: pj.Support) -> pj.LimitSurface:
+        return setting.expected_surface(support, degree, seed)
 
     if options.separate and len(each) > 1:
-        several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(expected(one) for one in recordings))
+        several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(expected, supports))
         return pj.Pushes.conditions(each), pj.Slider(shape, several)
+    first, *others = map(jax.tree.leaves, supports)
+    for one, leaves in zip(recordings[1:], others, strict=True):
+        if not all(map(np.array_equal, first, leaves)):
+            raise ValueError(
+                f"{recordings[0].source} and {one.source} have different supports, so different limit surfaces are "
+                "expected: give --separate, or --support for all"
+            )
     whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *each)
-    return whole, pj.Slider(shape, expected(recordings[0]))
+    return whole, pj.Slider(shape, expected(supports[0]))
 
 
 def _warning(predicted: dict[str, Any]) -> str | None:
-    """Of a fit that explains next to nothing: whatever it says of friction is worth as little."""
+    """Return a warning if the fit explains next to nothing, since its friction is worth as little; else None."""
     mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
     if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
         return None
@@ -187,6 +244,7 @@ def _warning(predicted: dict[str, Any]) -> str | None:
 
 
 def _noise(noise: Noise) -> dict[str, Any]:
+    """Return the noise as numbers for the record, lengths in mm."""
     return {
         "dof": float(noise.dof),
         "friction": np.asarray(noise.friction),
@@ -199,7 +257,7 @@ def _noise(noise: Noise) -> dict[str, Any]:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints: a line for each number found."""
+    """Return the text that the command prints: one line per number found."""
     problems, level = record["problems"], record["settings"]["level"]
     counted = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
     lines = [f"{record['pushes']} pushes used, {counted}."]

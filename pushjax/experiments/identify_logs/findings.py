@@ -1,4 +1,4 @@
-"""What was found of logs, as figures."""
+"""What was found from logs, as numbers for the report."""
 
 from typing import Any, NamedTuple
 
@@ -8,15 +8,27 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.datasets import LogError
-from pushjax.identify.noise import Noise
-from pushjax.identify.uncertainty import Profile, normal_interval, profile_interval
+from pushjax.identification.noise import Noise
+from pushjax.identification.uncertainty import Profile, normal_interval, profile_interval
 
-METRES = ("center", "inset", "end", "lag", "offset", "marker")
+METERS = ("center", "inset", "end", "lag", "offset", "marker")
 ANGLE = "marker.2"
 
 
 class Findings(NamedTuple):
-    """Everything, before it is printed and drawn. slider: as expected. length: m, of the deviations."""
+    """Everything that was found, before it is printed and drawn.
+
+    Attributes:
+        problems: Errors of the logs and pushes that were left out.
+        slider: The slider as expected before the fit.
+        hand: The hand.
+        pushes: The pushes that were learned from.
+        found: The result of the identification.
+        predicted: The same pushes, predicted with that result.
+        profiles: Profile of each number that is no part of the surface.
+        noise: How much friction scatters, if asked for.
+        length: Length that weighs rotation in the deviations, m.
+    """
 
     problems: tuple[LogError, ...]
     slider: pj.Slider
@@ -30,28 +42,40 @@ class Findings(NamedTuple):
 
     @property
     def final(self) -> np.ndarray:
-        """Predicted final poses, (pushes, 3), of all conditions in a row."""
+        """Predicted final poses (pushes, 3), with the pushes of all conditions in a row."""
         return self.rows(self.predicted.pose[..., -1, :])
 
     def rows(self, value: Any) -> np.ndarray:
-        """(..., pushes, ...) of all conditions in a row, without what only fills them up."""
+        """Put the pushes of all conditions in a row, without the padding.
+
+        Args:
+            value: (..., pushes, ...), with the axes of conditions and pushes first.
+        """
         there = np.asarray(self.pushes.weight) > 0
         return np.asarray(value, float)[there]
 
     def deviation_mm(self, poses: np.ndarray) -> np.ndarray:
-        """(pushes,), from the measured final poses."""
+        """Return the deviation of final poses (pushes, 3) from the measured ones, (pushes,), mm."""
         return 1e3 * np.asarray(pj.deviation(poses, self.rows(self.pushes.end), self.length), float)
 
 
 def unit(label: str) -> tuple[str, float]:
-    """In which a number is shown, and how many of those there are in one of SI."""
+    """Return the unit that a number is shown in, and how many of it make one SI unit."""
     if label == ANGLE:
         return "°", 180 / np.pi
-    return ("mm", 1e3) if label.startswith(METRES) else ("", 1.0)
+    return ("mm", 1e3) if label.startswith(METERS) else ("", 1.0)
 
 
 def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
-    """One row for each number found that is no part of the surface."""
+    """Describe each number found that is no part of the surface.
+
+    Args:
+        findings: What was found.
+        level: Level of the intervals, such as 0.9.
+
+    Returns:
+        One row per number: estimate, normal and profile interval, how far it is determined, and its profile.
+    """
     found, rows = findings.found, []
     deviation = np.sqrt(np.diagonal(np.asarray(found.covariance, float)))
     for each in findings.profiles:
@@ -64,7 +88,7 @@ def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
                 "estimate": scale * float(each.value[each.normal == 0][0]),
                 "interval": [scale * end for end in normal_interval(found, each.label, level)],
                 "profile": [scale * end for end in profile_interval(each, level)],
-                "determined": found.determined[each.label],
+                "determined": found.variance_reduction[each.label],
                 "z": float(found.z[index]),
                 "z_deviation": float(deviation[index]),
                 "profile_value": scale * each.value,
@@ -75,10 +99,13 @@ def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
 
 
 def predictions(findings: Findings) -> dict[str, Any]:
-    """How far off the final poses are, in mm: as found, as was expected before, and had nothing moved."""
+    """Describe how well the pushes are predicted.
+
+    Deviations of the final poses are in mm: with what was found, as expected before the fit, and if nothing had moved.
+    """
     found = findings.found
     off = findings.deviation_mm(findings.final)
-    determined = [value for label, value in found.determined.items() if label.startswith("surface")]
+    determined = [value for label, value in found.variance_reduction.items() if label.startswith("surface")]
     before = findings.rows(_expected(findings))
     return {
         "pushes": len(off),
@@ -92,12 +119,12 @@ def predictions(findings: Findings) -> dict[str, Any]:
         "surface_determined": float(sum(determined)),
         "surface": np.asarray(found.physical.surface),
         "length_m": np.asarray(found.prior.mean.length),
-        "told_by": {name: findings.rows(found.told_by(name)) for name in found.prior.layout.names},
+        "information_share": {name: findings.rows(found.information_share(name)) for name in found.prior.layout.names},
     }
 
 
 def _expected(findings: Findings) -> jax.Array:
-    """Final poses as predicted before any push was seen, at the middle of the friction's range."""
+    """Predict final poses with the prior's mean, without any push, at the middle of the friction's range."""
     found = findings.found
     before = eqx.tree_at(lambda one: one.z, found, found.prior.start)
     return before.predict(findings.pushes, findings.slider, findings.hand).pose[..., -1, :]

@@ -1,4 +1,4 @@
-"""The report's pictures: predicted over measured pushes, what is left over, and the profiles."""
+"""The report's pictures: predicted over measured pushes, residuals, and profiles."""
 
 from pathlib import Path
 
@@ -10,16 +10,18 @@ from scipy.interpolate import PchipInterpolator
 from pushjax import plot
 from pushjax.experiments.identify_logs.findings import Findings, unit
 
-RISE_OF_90 = 1.3528  # half the square of the normal distribution's 95 % quantile
+RISE_OF_90 = 1.3528  # half the square of the 95 % quantile of the normal distribution
 SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
 
 
 def draw(findings: Findings, out: Path) -> list[str]:
+    """Draw the three pictures into the folder `out` and return their paths."""
     with plt.rc_context(plot.STYLE):
         return [str(picture(findings, out)) for picture in (_pushes, _residuals, _profiles)]
 
 
 def _pushes(findings: Findings, out: Path) -> Path:
+    """Draw the best, the median, the 90th percentile and the worst push, predicted over measured."""
     final = findings.final
     off = findings.deviation_mm(final)
     order = np.argsort(off)
@@ -46,6 +48,7 @@ def _pushes(findings: Findings, out: Path) -> Path:
 
 
 def _residuals(findings: Findings, out: Path) -> Path:
+    """Draw the residuals with rings of one and two sigma, and the distribution of deviations."""
     residual = 1e3 * findings.rows(findings.found.residual)
     sigma = 1e3 * float(findings.found.sigma)
     figure, axes = plt.subplots(1, 3, figsize=(12.0, 3.8), layout="constrained")
@@ -74,6 +77,7 @@ def _residuals(findings: Findings, out: Path) -> Path:
 
 
 def _profiles(findings: Findings, out: Path) -> Path:
+    """Draw the profile of each number beside its normal approximation."""
     profiles = findings.profiles
     columns = min(len(profiles), 4)
     rows = -(-len(profiles) // columns)

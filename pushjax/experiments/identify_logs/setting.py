@@ -1,4 +1,4 @@
-"""What was pushed, by what, on what: as a command line says it, or the logs themselves."""
+"""What was pushed, by what and on what, read from command-line options or from the logs themselves."""
 
 import csv
 from collections.abc import Callable
@@ -10,31 +10,31 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from pushjax._options import option
+from pushjax._internal.options import cli_option
 from pushjax.datasets.recordings import Recordings
 
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
 HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width and thickness of a pad)"
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
 PAIRS = 400
-CELLS = 100  # under a slider whose pressure is known everywhere
+CELLS = 100  # support points under a slider whose pressure is known everywhere
 
 
-Metres = Annotated[float | None, option("M")]
+Meters = Annotated[float | None, cli_option("M")]
 
 
 @dataclass
 class Options:
-    """What is known and what is to be found, as a command line has it."""
+    """What is known and what is to be found, as options of the command line."""
 
-    shape: Annotated[str | None, option("SHAPE")] = None
+    shape: Annotated[str | None, cli_option("SHAPE")] = None
     """The object: rectangle:0.1x0.05, disk:0.05 (radius), ellipse:0.06x0.04 (semi-axes), regular:6x0.05 (corners,
     distance of each), all in m, or a CSV file of vertices. Default: what the logs tell."""
     hand: str = "finger"
     """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
-    radius: Metres = None
+    radius: Meters = None
     """Of the fingers, m. Default: what the logs tell."""
-    support: Annotated[str | None, option("SUPPORT")] = None
+    support: Annotated[str | None, cli_option("SUPPORT")] = None
     """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
     Default: what the logs tell, else uniform."""
     surface: Literal["quartic", "ellipsoid"] = "quartic"
@@ -43,17 +43,17 @@ class Options:
     """How well it is known beforehand: degrees of freedom; fewer, less well."""
     friction: tuple[float, float] = (0.0, 1.0)
     """Lowest and highest that the fingers' friction may be."""
-    center: Metres = None
-    """Find the centre of pressure too; by how much it may be off, m (standard deviation; and so the next five)."""
-    inset: Metres = None
+    center: Meters = None
+    """Find the center of pressure too; by how much it may be off, m (standard deviation; and so the next five)."""
+    inset: Meters = None
     """Find by how much the outline is smaller."""
-    end: Metres = None
+    end: Meters = None
     """Find how far the hand went on after its path ends."""
-    lag: Metres = None
+    lag: Meters = None
     """Find how far the hand was behind where its path says."""
-    offset: Metres = None
+    offset: Meters = None
     """Find how far the hand's coordinates are off those of the object."""
-    marker: Metres = None
+    marker: Meters = None
     """Find how far the object's frame is off the one that was tracked; its angle, times the radius of gyration."""
     touching: bool = False
     """At the end of most pushes the finger touches the object: learn from the gap that was seen there."""
@@ -70,7 +70,15 @@ class Options:
 
 
 def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.Disk | pj.Ellipse:
-    """m; of the logs where `text` does not tell."""
+    """Return the outline of the object.
+
+    Args:
+        text: The outline as an option, m. None: that of the logs.
+        recordings: The logs.
+
+    Raises:
+        ValueError: If the text is no outline, or the logs have none or different ones.
+    """
     if text is None:
         known = [one.vertices for one in recordings if one.vertices is not None]
         if len(known) < len(recordings):
@@ -95,6 +103,16 @@ def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.
 
 
 def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj.Hand:
+    """Return the hand.
+
+    Args:
+        text: The kind of hand as an option.
+        radius: Radius of the fingers, m. None: that of the logs.
+        recordings: The logs.
+
+    Raises:
+        ValueError: If the text is no hand, or the logs do not have one radius.
+    """
     kind, _, rest = text.partition(":")
     if kind == "parallel_jaw":
         return pj.Hand.parallel_jaw(*_numbers("--hand", text, rest, "x", 2, HANDS))
@@ -114,7 +132,16 @@ def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj
 
 
 def support_of(text: str | None, shape, recordings: Recordings) -> pj.Support:
-    """Of one log, of unit load."""
+    """Return the support of the object in one log, with unit load.
+
+    Args:
+        text: The support as an option. None: the support points of the log, or uniform pressure if it has none.
+        shape: Outline of the object.
+        recordings: The log.
+
+    Raises:
+        ValueError: If the text is no support.
+    """
     if text is None and recordings.support_points is not None and len(recordings.support_points):
         return pj.Support.tripod(recordings.support_points)
     if text in (None, "uniform"):
@@ -129,12 +156,19 @@ def support_of(text: str | None, shape, recordings: Recordings) -> pj.Support:
 
 
 def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSurface:
+    """Fit the limit surface that a support leads to expect.
+
+    Args:
+        support: The support.
+        degree: 4 for a quartic, else an ellipsoid.
+        seed: Seed of the wrench-twist pairs.
+    """
     pairs = support.wrench_twist_pairs(jax.random.key(seed), PAIRS)
     return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
 
 
 def _vertices(path: Path) -> np.ndarray:
-    """A file of x, y (m), a vertex a line; a heading is allowed."""
+    """Read a file with one vertex x, y (m) per line; a heading is allowed."""
     try:
         rows = [row for row in csv.reader(path.read_text().splitlines()) if row]
     except (OSError, UnicodeDecodeError) as error:
@@ -152,6 +186,7 @@ def _vertices(path: Path) -> np.ndarray:
 
 
 def _numbers(option: str, given: str, text: str, apart: str, count: int, allowed: str) -> list[float]:
+    """Read `count` numbers that are separated by `apart`; raise ValueError with the option's name otherwise."""
     try:
         found = [float(part) for part in text.split(apart)]
     except ValueError:

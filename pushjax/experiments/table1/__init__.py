@@ -1,5 +1,4 @@
-"""Straight pushes of the MIT data set: `experiment` from `conditions`, `methods` and `repeats`; what its error comes
-from in `causes`, predicted distributions in `spread`."""
+"""Table 1, straight pushes of the MIT data set: `experiment` builds on `conditions`, `methods` and `repeats`."""
 
 from pushjax.experiments.table1.experiment import run as run
 from pushjax.experiments.table1.experiment import summary as summary

@@ -1,6 +1,6 @@
-"""The objects and surfaces, the paper's figures for them, and the pushes as arrays.
+"""The objects and surfaces of table 1, the paper's figures for them, and the pushes as arrays.
 
-The curated archives hold two surfaces; the published folders a third, delrin.
+The curated archives hold two surfaces. The published folders also hold a third, delrin.
 """
 
 import warnings
@@ -19,18 +19,18 @@ from pushjax.datasets.pushes import Floats, rotation
 ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")
 OBJECTS = ("rect1", "rect2", "rect3", "tri1", "tri3", "ellip1", "ellip2", "ellip3", "hex", "butter", "tri2")
-ALL_SURFACES = ("delrin", *SURFACES)  # the first is not in the archives
-APART = ("tri2",)  # not in the paper, whose tracker lost it: in no mean
+ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the archives
+APART = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
 MODELS = {"quartic": 4, "ellipsoid": 2}
-# Corners that all polygons are filled up to, where their edges go straight on: one compiled program does for all.
+# Polygons with fewer vertices get this many, by splitting edges, so that one compiled program serves all polygons.
 CORNERS = 6
-BUTTERFLY = 64  # corners; 0.3 mm at most from its 636 vertices. As a spline it takes three times as long to compile
-SIDES = 6  # at most; of outlines without corners, quadrants
+BUTTERFLY = 64  # vertices, at most 0.3 mm from its 636 original ones; a spline takes three times as long to compile
+SIDES = 6  # at most; an outline with more vertices is divided into quadrants
 
-LEARNED_SHARE = 0.2  # the paper's, of pushes that come without a split
+LEARNED_SHARE = 0.2  # training share of the paper, used for pushes that come without a split
 
-# Mean deviation in mm, Zhou et al. 2017, table 1; and the mean over conditions of deviation over no-motion, percent,
-# delrin included.
+# Zhou et al. 2017, table 1: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
+# of the ratio of the two in percent, delrin included.
 PAPER_MM = {
     ("delrin", "quartic"): (8.28, 5.37, 6.10, 9.71, 7.54, 7.68, 8.90, 7.35, 6.38, 4.83),
     ("delrin", "ellipsoid"): (8.60, 5.92, 8.20, 9.90, 8.18, 6.85, 6.29, 8.08, 6.42, 5.97),
@@ -48,7 +48,17 @@ PAPER_PERCENT = {"quartic": 20.05, "ellipsoid": 21.39}
 
 
 def chosen(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
-    """The surfaces. Raises ValueError for surfaces or objects that there are not."""
+    """Check the names of surfaces and objects, and return the surfaces.
+
+    Args:
+        folder: Folder of the data.
+        surface: Names of surfaces. None: those of the curated archives.
+        object: Names of objects.
+
+    Raises:
+        ValueError: If a name is unknown, if none is given, or if delrin is asked for where the folder holds the curated
+            archives.
+    """
     surface = SURFACES if surface is None else surface
     for name, given, allowed in (("surface", surface, ALL_SURFACES), ("object", object, OBJECTS)):
         unknown = [one for one in given if one not in allowed]
@@ -60,8 +70,17 @@ def chosen(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -
 
 
 def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
-    """From the curated archives in `mit_push`, if it is there; else from the files of the published data set. seed: of
-    which pushes are learned from, where the data do not say. Warns of files that are left out."""
+    """Load the pushes of one object on one surface, and warn of files that are left out.
+
+    The curated archives are read from the subfolder `mit_push` if there is one, else the files of the published data
+    set.
+
+    Args:
+        folder: Folder of the data.
+        surface: Name of the surface.
+        name: Name of the object.
+        seed: Seed of the choice of training pushes, where the data do not have one.
+    """
     if (folder / ARCHIVES).is_dir():
         return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
     log, problems = load_mit_folder(folder, surface, name, train_share=LEARNED_SHARE, seed=seed)
@@ -72,11 +91,16 @@ def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
 
 
 def paper_mm(surface: str, name: str, model: str) -> float | None:
+    """Return the paper's mean deviation in mm, or None for an object that is not in the paper."""
     return None if name in APART else PAPER_MM[surface, model][OBJECTS.index(name)]
 
 
 def outline(log: MitPushes) -> pj.Shape:
-    """The ellipses and the butterfly are given by many vertices."""
+    """Return the outline of the object.
+
+    The data give ellipses and the butterfly by many vertices. An ellipse is fitted to its vertices, and `BUTTERFLY` of
+    the butterfly's vertices are kept. Other polygons get at least `CORNERS` vertices.
+    """
     if log.shape.startswith("ellip"):
         inverse_squares = np.linalg.lstsq(log.vertices**2, np.ones(len(log.vertices)), rcond=None)[0]
         return pj.Ellipse(*(1 / np.sqrt(inverse_squares)))
@@ -86,7 +110,7 @@ def outline(log: MitPushes) -> pj.Shape:
 
 
 def _filled(vertices: Floats) -> Floats:
-    """With the longest edges halved until there are `CORNERS` vertices."""
+    """Halve the longest edges until there are at least `CORNERS` vertices."""
     while len(vertices) < CORNERS:
         after = np.roll(vertices, -1, axis=0)
         longest = int(np.argmax(np.linalg.norm(after - vertices, axis=1)))
@@ -95,7 +119,16 @@ def _filled(vertices: Floats) -> Floats:
 
 
 def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
-    """(pushes,): which edge the tip is nearest to at the start; of outlines with many, which quadrant."""
+    """Find the side of the object that the tip is nearest to at the start of each push.
+
+    Args:
+        log: The object, with its outline.
+        pushes: Pushes of that object.
+
+    Returns:
+        (pushes,), the index of the nearest edge. For an outline of more than `SIDES` vertices it is the quadrant of the
+        body frame in which the tip is.
+    """
     tip = np.einsum("nji,nj->ni", rotation(pushes.start[:, 2]), pushes.tip_start - pushes.start[:, :2])
     vertices = log.vertices
     if len(vertices) > SIDES:
@@ -105,8 +138,21 @@ def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
 
 
 def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
-    """Those of some rows, with their sides and how late they come in the file, filled up to a `batch` with pushes of no
-    weight, so that one compiled program does for all objects of a kind."""
+    """Convert some of the pushes to `Pushes`, padded to a fixed number.
+
+    The padding has no weight. With it, one compiled program serves all objects of a kind. Each push carries the side
+    that it pushes (`sides`), and as its age how late it comes in the file.
+
+    Args:
+        log: The object and all its pushes.
+        pushes: The group of pushes in `log` to choose from.
+        rows: Indices of the chosen pushes.
+        steps: Steps of each path.
+        batch: Number of pushes after padding.
+
+    Raises:
+        ValueError: If `batch` is smaller than the number of chosen pushes.
+    """
     path = lines(pushes, rows, steps)
     age = pushes.index / max(int(log.whole.index.max()), 1)
     parts = pushes.start[rows], path, pushes.end[rows], age[rows], sides(log, pushes)[rows]
@@ -121,6 +167,6 @@ def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: in
 
 
 def lines(pushes: StraightPushes, rows: np.ndarray, steps: int) -> Floats:
-    """(rows, steps + 1, 2): the tips' paths."""
+    """Return the straight paths of the tip in the chosen pushes, (rows, steps + 1, 2), m, world."""
     begin, stop = pushes.tip_start[rows], pushes.tip_end[rows]
     return begin[:, None] + np.linspace(0, 1, steps + 1)[None, :, None] * (stop - begin)[:, None]

@@ -1,27 +1,28 @@
-"""Table 1 of the paper: eleven objects pushed along straight lines on two surfaces; predicted against measured.
+"""Table 1 of the paper: eleven objects pushed along straight lines on two surfaces, predicted against measured.
 
-Surface and friction are learned from about eighty whole pushes of each object; the other pushes, from 10 to 90 % of
-their time, are predicted: the mean deviation of the final poses (Zhou et al. 2017, section VI.B, table 1).
+Surface and friction are learned from about eighty whole pushes of each object. The other pushes are predicted, from 10
+to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al. 2017, section VI.B, table 1).
 
-Deviations from the paper: one split, where the paper has ten; pushes are tested that the tracker lost, as there. The
-curated archives have no pushes on delrin, the paper's third surface; the published folders do.
+Deviations from the paper: there is one split, where the paper has ten. Pushes that the tracker lost are tested too, as
+in the paper. The curated archives have no pushes on delrin, the paper's third surface; the published folders do.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.cell_cache import CellCache
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments._kept import Kept
 from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table1.conditions import APART, MODELS, OBJECTS, PAPER_PERCENT, chosen, load, paper_mm
 from pushjax.experiments.table1.methods import METHODS, Predicted, Setting
 from pushjax.experiments.table1.repeats import noise_floor_mm
-from pushjax.report import envelope
 
 
 def run(
@@ -32,13 +33,28 @@ def run(
     method: Sequence[str] = tuple(METHODS),
     surface: Sequence[str] | None = None,
     object: Sequence[str] = OBJECTS,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """A cell for each surface, object, method and model. folder: the data's, with `mit_push/`, or that of the published
-    data set. method: one or more of "wrench_twist" and "identified". surface: by default those of the archives.
+    """Compute one cell for each surface, object, method and model.
 
-    With `out`, every cell is kept there as soon as it is known, and taken from there if the run was interrupted.
-    Raises LogError for data that lack or are damaged, ValueError for an unknown method, surface or object.
+    With `out`, every cell is saved there as soon as it is known. An interrupted run continues with the saved cells.
+
+    Args:
+        folder: Folder of the data: the one that contains `mit_push/`, or that of the published data set.
+        seed: Seed of the bootstrap, and of the choice of training pushes where the data do not have one.
+        out: Folder for the pictures and the saved cells. None: neither.
+        steps: Steps of each push.
+        method: One or both of "wrench_twist" and "identified".
+        surface: Names of surfaces. None: those of the curated archives.
+        object: Names of objects.
+        progress: Called with the number of cells done and their total.
+
+    Returns:
+        The record, with the cells, and the means by method and model.
+
+    Raises:
+        LogError: If data are missing or damaged.
+        ValueError: If a method, surface or object is unknown.
     """
     surface = chosen(folder, surface, object)
     unknown = [one for one in method if one not in METHODS]
@@ -46,12 +62,12 @@ def run(
         raise ValueError(f"method must be one or more of {', '.join(METHODS)}; got {unknown or 'none'}")
     logs = [load(folder, on, target, seed) for on in surface for target in object]
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
-    kept = Kept(None if out is None else out / "table1-cells.json", settings)
+    kept = CellCache("table1", out, settings)
     cells, total = [], len(logs) * len(MODELS) * len(method)
     for log in logs:
         floor = noise_floor_mm(log)
         for model in MODELS:
-            setting = None  # for all methods, but made only if a cell lacks
+            setting = None  # shared by all methods, and made only if a cell is missing
             for name in method:
                 labels = {"surface": log.surface, "object": log.shape, "model": model, "method": name}
                 cell = kept.find(labels)
@@ -65,12 +81,12 @@ def run(
                 progress(len(cells), total)
     means = {name: {model: _means(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
-    kept.forget()
     settings |= {"method": list(method), "surfaces": list(surface), "objects": list(object)}
-    return envelope("table1", settings, cells=cells, means=means, pictures=pictures)
+    return result_record("table1", settings, cells=cells, means=means, pictures=pictures)
 
 
 def _cell(log: MitPushes, model: str, predicted: Predicted, seed: int) -> dict[str, Any]:
+    """Compute the figures of one cell, apart from its labels, noise floor and run time."""
     off = deviation_mm(log, predicted.final)
     toolbox = log.middle.toolbox.get(model)
     return {
@@ -91,7 +107,7 @@ def _cell(log: MitPushes, model: str, predicted: Predicted, seed: int) -> dict[s
 
 
 def _calibration(predicted: Predicted) -> dict[str, Any]:
-    """What else was found, mm."""
+    """Return what else was identified: lengths in mm, the angle of the marker in degrees."""
     if predicted.found is None:
         return {}
     own = predicted.found.physical
@@ -102,12 +118,17 @@ def _calibration(predicted: Predicted) -> dict[str, Any]:
 
 
 def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:
-    """(pushes,), of those that are tested."""
+    """Return the deviations of the test pushes, (pushes,), mm.
+
+    Args:
+        log: The pushes.
+        final: (pushes, 3), final poses predicted for `log.middle`.
+    """
     return 1e3 * np.asarray(pj.deviation(final, log.middle.end, log.length), np.float64)
 
 
 def _means(cells: list[dict], method: str, model: str) -> dict[str, Any]:
-    """Over the paper's ten objects, and of each surface alone."""
+    """Return the means over the paper's ten objects, over all surfaces and for each surface alone."""
     mine = [c for c in cells if (c["method"], c["model"]) == (method, model) and c["object"] not in APART]
     if not mine:
         return {}
@@ -116,6 +137,7 @@ def _means(cells: list[dict], method: str, model: str) -> dict[str, Any]:
 
 
 def _mean(cells: list[dict], model: str) -> dict[str, float | None]:
+    """Average cells of one method and model."""
     toolbox = [cell["toolbox_mm"] for cell in cells]
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in cells])),
@@ -127,6 +149,7 @@ def _mean(cells: list[dict], model: str) -> dict[str, float | None]:
 
 
 def _draw(cells: list[dict], out: Path) -> list[str]:
+    """Draw one picture per method into the folder `out` and return their paths."""
     from pushjax import plot
 
     title, drawn = "Straight pushes: final pose, predicted against measured", []
@@ -138,7 +161,7 @@ def _draw(cells: list[dict], out: Path) -> list[str]:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints: the paper's table with ours beside it."""
+    """Return the text that the command prints: the paper's table with the computed one beside it."""
     objects, surfaces = record["settings"]["objects"], record["settings"]["surfaces"]
     lines = ["Mean deviation in mm, test pushes; the paper's in brackets."]
     for name, means in record["means"].items():
@@ -176,5 +199,6 @@ def summary(record: dict[str, Any]) -> str:
 
 
 def _entry(cell: dict[str, Any]) -> str:
+    """Format a cell: the computed mean, and the paper's in brackets."""
     paper = "" if cell["paper_mm"] is None else f" ({cell['paper_mm']:.2f})"
     return f"{cell['mean_mm']:.2f}{paper}"

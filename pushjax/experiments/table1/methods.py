@@ -1,9 +1,13 @@
-"""Two ways to predict the pushes that were not learned from: each gives final poses, (pushes, 3), the friction it found
-and how many steps failed.
+"""Two ways to predict the test pushes, which are not used for training.
 
-wrench_twist  the surface fitted to measured forces and motions, the friction by a grid: the paper's.
-identified    friction, surface, centre of pressure, and where tip and object really were, from final poses, in which
-              the two touch, starting from that surface. What overlap is left at the start is taken to be none.
+Each gives the final poses (pushes, 3), the friction that it found, and the number of failed steps.
+
+wrench_twist  The method of the paper. The surface is fitted to measured forces and motions. The friction is found on a
+              grid.
+identified    Friction, surface, center of pressure, and the true positions of tip and object are identified from the
+              final poses of the training pushes. Tip and object are assumed to touch in most of these poses. The search
+              starts from the surface of `wrench_twist`. If the corrected positions still overlap at the start of a
+              push, the overlap is assumed to be a measurement error.
 """
 
 from typing import Any, NamedTuple
@@ -18,14 +22,15 @@ from pushjax.experiments._tables import final_poses
 from pushjax.experiments.table1.conditions import MODELS, outline, straight
 
 FRICTIONS = np.linspace(0.0, 0.6, 31)
-IDENTIFY_STEPS = 25  # at most: derivatives are for the fit, whose answer does not change with more
-# Pushes to learn from, and to test with: at most so many, filled up to so many.
+# Largest number of steps per push in the identification, which takes derivatives. More steps give the same answer.
+IDENTIFY_STEPS = 25
+# Largest numbers of pushes to learn from and to test with; arrays are padded to them.
 LEARNED, TESTED = 128, 304
-# How far what is not known may be from what it is taken for: the surface (degrees of freedom), the centre of pressure,
-# the outline, the tip against the world in which the tracker sees the object, and the object against what is tracked,
-# m. Chosen on abs.
+# Priors, as in `pj.Unknowns`. DOF is the degrees of freedom of the surface. The others are standard deviations, in m:
+# CENTER of the center of pressure, INSET of how much smaller the outline is, OFFSET of the tip in the world frame of
+# the tracker, and MARKER of the object in the frame that is tracked. All values were chosen on the surface abs.
 DOF, CENTER, INSET, OFFSET, MARKER = 10.0, 0.015, 0.001, 0.002, 0.001
-NO_ROOM = 1e-6  # for what is not to be found
+NO_ROOM = 1e-6  # prior standard deviation of what must not be fitted
 UNKNOWNS: dict[str, Any] = {
     "dof": DOF,
     "center": CENTER,
@@ -37,6 +42,15 @@ UNKNOWNS: dict[str, Any] = {
 
 
 class Predicted(NamedTuple):
+    """Predictions of the test pushes.
+
+    Attributes:
+        final: (pushes, 3), final poses, world, m and rad.
+        friction: The coefficient of friction that was found.
+        failed: Number of failed steps.
+        found: The result of the identification; None if there was none.
+    """
+
     final: np.ndarray
     friction: float
     failed: int
@@ -44,7 +58,17 @@ class Predicted(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """learned, tested: as arrays, filled up; coarse: what was learned from, in few steps. surface: from forces."""
+    """What both methods need of one object, with pushes as padded arrays.
+
+    Attributes:
+        learned: Pushes to learn from.
+        coarse: The same pushes in at most `IDENTIFY_STEPS` steps.
+        tested: Pushes to predict.
+        shape: Outline of the object.
+        hand: The round finger.
+        surface: Limit surface fitted to measured forces and motions.
+        length: Length that weighs rotation against translation, m.
+    """
 
     learned: pj.Pushes
     coarse: pj.Pushes
@@ -56,6 +80,13 @@ class Setting(NamedTuple):
 
     @staticmethod
     def of(log: MitPushes, model: str, steps: int) -> "Setting":
+        """Build the setting of one object.
+
+        Args:
+            log: The pushes of the object.
+            model: "quartic" or "ellipsoid".
+            steps: Steps of each push.
+        """
         rows = np.flatnonzero(log.learned & log.whole.valid)
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
@@ -71,10 +102,12 @@ class Setting(NamedTuple):
 
     @property
     def slider(self) -> pj.Slider:
+        """The object with the fitted surface."""
         return pj.Slider(self.shape, self.surface)
 
 
 def wrench_twist(setting: Setting) -> Predicted:
+    """Predict with the fitted surface and the friction that is best for the training pushes, on a grid."""
     learned, tested = setting.learned, setting.tested
     on_grid, _ = final_poses(setting.slider, setting.hand, learned, jnp.asarray(FRICTIONS, learned.path.dtype))
     errors = pj.deviation(on_grid, learned.end[None], setting.length)
@@ -84,6 +117,7 @@ def wrench_twist(setting: Setting) -> Predicted:
 
 
 def identified(setting: Setting) -> Predicted:
+    """Predict with everything that is identified from the final poses of the training pushes."""
     found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
     predicted = found.predict(setting.tested, setting.slider, setting.hand)
     failed = own(predicted.failed, setting.tested)
@@ -91,8 +125,21 @@ def identified(setting: Setting) -> Predicted:
 
 
 def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: float = 0.0) -> pj.Identified:
-    """What the pushes tell, if the finger touches at the end of most. overlap: the share of it, at the start, that
-    pushes. Pushes to learn from are whole, from the touch on, and tell nothing of it: it is said, not found."""
+    """Identify the unknowns, assuming that the finger touches the object at the end of most pushes.
+
+    Tip and object may overlap at the start of a push. One fraction of the overlap is real and pushes the object. The
+    rest is a measurement error. The fraction is imposed, not fitted. The training pushes are whole, from the touch on,
+    so they carry no information about it.
+
+    Args:
+        pushes: Pushes to learn from.
+        setting: The object, its hand and its length.
+        unknowns: What to find, with its priors. `overlap` must be one of the unknowns.
+        overlap: Fraction of the overlap at the start that pushes the object. The unknown `overlap` is one minus this.
+
+    Returns:
+        The result, with the unknown `overlap` imposed and the standard deviation of its prior set to 1.
+    """
     found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
     places = jnp.asarray([label.startswith("overlap") for label in found.labels])
     none = jnp.where(places, 1 - overlap, found.z).astype(found.z.dtype)
@@ -103,5 +150,5 @@ METHODS = {"wrench_twist": wrench_twist, "identified": identified}
 
 
 def own(values, pushes: pj.Pushes) -> np.ndarray:
-    """Without what only fills up."""
+    """Return the values without those of the padding, as float64."""
     return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]

@@ -1,18 +1,24 @@
-"""How well a push predicts its own repetition: what no model without noise can be better than."""
+"""How well a push predicts its own repetition: no model without noise can do better."""
 
 import numpy as np
 
 import pushjax as pj
 from pushjax.datasets.mit_pushes import MitPushes, StraightPushes
-from pushjax.se2 import compose, inverse
+from pushjax.geometry.se2 import compose, inverse
 
 
 def noise_floor_mm(log: MitPushes) -> float | None:
-    """Mean deviation of a push from the mean of all its repetitions, as told by pairs of them: two pushes differ by
-    sqrt(2) of that. None without repetitions.
+    """Estimate the mean deviation of a push from the mean of all its repetitions, in mm.
 
-    The two of a pair start a millimetre or less apart, and one was twice as fast. Both are whole; of the pushes that
-    are tested, which are shorter, the floor is taken to be lower in proportion to how far the object moves.
+    The estimate comes from pairs of repetitions: two pushes differ by sqrt(2) times that deviation. The two pushes of a
+    pair start a millimeter or less apart, and one was twice as fast. Both are whole. The pushes that are tested are
+    shorter, so their floor is assumed to be lower in proportion to how far the object moves.
+
+    Args:
+        log: The pushes of one object on one surface.
+
+    Returns:
+        The floor of the tested pushes, or None if there are no repetitions.
     """
     rows = log.repeats[log.fast.valid[log.repeats[:, 0]] & log.whole.valid[log.repeats[:, 1]]]
     if not len(rows):
@@ -24,9 +30,10 @@ def noise_floor_mm(log: MitPushes) -> float | None:
 
 
 def _motion(pushes: StraightPushes) -> np.ndarray:
-    """(n, 3): the end poses in the frames of the starts, where repetitions are the same push."""
+    """Return the end poses in the frames of the starts, (n, 3), in which repetitions are the same push."""
     return np.asarray(compose(inverse(pushes.start), pushes.end), float)
 
 
 def _moved(pushes: StraightPushes, length: float) -> float:
+    """Return the mean deviation of the end poses from the start poses, m."""
     return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, length), float)))

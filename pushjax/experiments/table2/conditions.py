@@ -1,4 +1,4 @@
-"""The eight conditions, the paper's figures for them, and where the robot's finger really was."""
+"""The eight conditions of table 2, the paper's figures for them, and where the robot's finger really was."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,8 @@ CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
 MODELS = {"quartic": 4, "ellipsoid": 2}
 PAIRS, SPLITS = 400, 10
 
-# Mean deviation in mm, Zhou et al. 2017, table 2; and the mean over conditions of deviation over no-motion, percent.
+# Zhou et al. 2017, table 2: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
+# of the ratio of the two in percent.
 PAPER_MM = {
     ("hardboard", "quartic"): (3.52, 2.75, 2.92, 2.80),
     ("hardboard", "ellipsoid"): (3.82, 3.63, 3.35, 3.96),
@@ -27,21 +28,37 @@ PAPER_PERCENT = {"quartic": 20.48, "ellipsoid": 24.97}
 
 
 class Geometry(NamedTuple):
-    """Where the robot's finger really was: its radius, by how much the outline is smaller than nominal (m), and
-    whether the path goes on to where the robot was told to stop, past the last logged sample."""
+    """Where the robot's finger really was.
+
+    Attributes:
+        radius: Radius of the finger, m.
+        inset: Distance by which the outline is smaller than nominal, m.
+        commanded_end: Whether the path continues past the last logged sample, to where the robot was told to stop.
+    """
 
     radius: float
     inset: float
     commanded_end: bool
 
 
-# nominal: the paper's set-up. measured: contact began, by the force sensor, with the finger's centre 0.7 mm inside the
-# nominal outline, and the log misses the last millimetre of the motion.
+# nominal: the paper's setup. measured: according to the force sensor, contact began with the center of the finger 0.7
+# mm inside the nominal outline; and the log misses the last millimeter of the motion.
 GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 0.0007, True)}
 
 
 def load(folder: Path, surface: str, name: str) -> PushLog:
-    """A condition's pushes: its tidy archive, or else an original log whose name begins with the condition."""
+    """Load the pushes of a condition from its curated archive, or else from an original log.
+
+    The name of an original log begins with the condition. If there are several, the first is read.
+
+    Args:
+        folder: Folder of the files.
+        surface: Name of the surface.
+        name: Name of the object, which stands for the arrangement of its supports.
+
+    Raises:
+        ValueError: If there is neither an archive nor a log.
+    """
     archive = folder / f"{surface}_{name}.npz"
     originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
     if archive.exists():
@@ -55,29 +72,53 @@ def load(folder: Path, surface: str, name: str) -> PushLog:
 
 
 def ideal_surface(log: PushLog, model: str, key: jax.Array) -> pj.LimitSurface:
-    """Fitted to pairs of the known support points under the loads that statics gives them."""
+    """Fit a limit surface to pairs of the known support points, under the loads that statics gives them.
+
+    Args:
+        log: The pushes of a condition, with the support points and their loads.
+        model: "quartic" or "ellipsoid".
+        key: PRNG key of the wrench-twist pairs.
+    """
     support = pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
     return pj.fit_limit_surface(*support.wrench_twist_pairs(key, PAIRS), degree=MODELS[model])
 
 
 def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
+    """Return the outline of the triangle, smaller by the inset of the geometry."""
     polygon = pj.Polygon(log.vertices)
     return polygon.inset(geometry.inset) if geometry.inset else polygon
 
 
 def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
+    """Convert a log to `Pushes`.
+
+    Args:
+        log: The pushes of a condition.
+        geometry: Says whether the paths continue to where the robot was told to stop.
+        steps: Steps of each path.
+    """
     if geometry.commanded_end:
         log = replace(log, pushes=tuple(_ended(log, push) for push in log.pushes))
     return pj.Pushes.of(log, steps)
 
 
 def _ended(log: PushLog, push: Push) -> Push:
+    """Append to the path the point where the robot was told to stop."""
     tip = np.vstack([push.tip, log.commanded_tip_end(push)])
     return replace(push, tip=tip, tip_time=np.append(push.tip_time, push.tip_time[-1]))
 
 
 def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:
-    """(splits, pushes): True for the random part that each split learns from."""
+    """Choose the random part of the pushes that each split learns from.
+
+    Args:
+        log: The pushes of a condition.
+        share: Fraction of the pushes to learn from.
+        rng: Random generator.
+
+    Returns:
+        (splits, pushes), True for the pushes to learn from.
+    """
     chosen = np.zeros((SPLITS, len(log.pushes)), bool)
     for row in chosen:
         row[rng.permutation(len(row))[: round(share * len(row))]] = True

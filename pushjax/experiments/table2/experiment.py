@@ -1,18 +1,18 @@
-"""Table 2 of the paper: a triangle on three known support points, pushed by a robot; predicted against measured.
+"""Table 2 of the paper: a robot pushes a triangle on three known support points, predicted against measured.
 
-Each condition's limit surface is that of its ideal pressure (the support points are known, statics gives their loads),
-or fitted to measured forces, or identified from where the triangle ended up (`methods`); part of the pushes is learned
-from and the others are predicted: the mean deviation of the final poses, over ten random splits (Zhou et al. 2017,
-section VI.A).
+The limit surface of each condition comes from one of three `methods`. It is that of the ideal pressure (the support
+points are known, and statics gives their loads), or it is fitted to measured forces, or it is identified from where the
+triangle ended up. One part of the pushes is learned from, and the others are predicted. The result is the mean
+deviation of the final poses, over ten random splits (Zhou et al. 2017, section VI.A).
 
-Deviations from the paper: the surface is normalised with the support's own radius of gyration, not with the length of
-the error metric; for the narrow support (3pts1) that is four times shorter, and the paper's choice squeezes the part of
-the surface that matters there into a thin disc (quartic: 3.0 against 5.2 mm). One set of pairs serves all splits. A
-surface is fitted to the forces of half of the pushes, not 40 percent: of what we have, that is the first share with as
-many pairs as a quartic has coefficients.
+There are three deviations from the paper. First, the surface is normalized with the support's own radius of gyration,
+not with the length of the error metric. For the narrow support (3pts1) that radius is four times shorter, and the
+paper's choice squeezes the part of the surface that matters there into a thin disk (quartic: 3.0 against 5.2 mm).
+Second, one set of pairs serves all splits. Third, a surface is fitted to the forces of half of the pushes, not of 40
+percent: with the data at hand, half is the first share that has as many pairs as a quartic has coefficients.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
@@ -39,7 +41,6 @@ from pushjax.experiments.table2.conditions import (
     training,
 )
 from pushjax.experiments.table2.methods import FRICTIONS, Predicted
-from pushjax.report import envelope
 
 
 def run(
@@ -49,10 +50,25 @@ def run(
     geometry: str = "nominal",
     steps: int = 100,
     method: Sequence[str] = tuple(methods.TRAIN_SHARE),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """Sixteen cells a method. folder: the data's, with `three_point_push/`. geometry: "nominal" or "measured". method:
-    one or more of "ideal", "wrench_twist" and "identified"."""
+    """Compute sixteen cells for each method: every condition with both models.
+
+    Args:
+        folder: Folder of the data, which contains `three_point_push/`.
+        seed: Seed of the wrench-twist pairs, the splits and the bootstrap.
+        out: Folder for the pictures. None: no pictures.
+        geometry: "nominal" or "measured".
+        steps: Steps of each push.
+        method: One or more of "ideal", "wrench_twist" and "identified".
+        progress: Called with the number of parts done and their total.
+
+    Returns:
+        The record, with the cells, and the means by method and model.
+
+    Raises:
+        ValueError: If the geometry or a method is unknown, or the data of a condition are missing.
+    """
     if geometry not in GEOMETRIES:
         raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}; got {geometry!r}")
     unknown = [name for name in method if name not in methods.TRAIN_SHARE]
@@ -70,7 +86,7 @@ def run(
 
     cells = []
     for model in MODELS:
-        # keys and generators are each condition's own, so that a cell does not depend on which others there are
+        # each condition has its own keys and generators, so that a cell does not depend on which others there are
         surfaces = [ideal_surface(log, model, jax.random.key(seed + k)) for k, log in enumerate(logs)]
         for name in method:
             rngs = [np.random.default_rng(seed + k) for k in range(len(logs))]
@@ -84,10 +100,11 @@ def run(
     pictures = [] if out is None else _draw(cells, out)
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
     settings |= where._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
-    return envelope("table2", settings, cells=cells, means=means, pictures=pictures)
+    return result_record("table2", settings, cells=cells, means=means, pictures=pictures)
 
 
 def _predicted(name, model, logs, pushes, surfaces, train, where, done) -> list[Predicted]:
+    """Predict all conditions with one method, and call `done` after each part."""
     if name == "identified":
         return methods.identified(logs, pushes, surfaces, train, where, done)
     found = []
@@ -103,7 +120,7 @@ def _predicted(name, model, logs, pushes, surfaces, train, where, done) -> list[
 def _cell(
     pushes: pj.Pushes, length: float, found: Predicted, train: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """What the pushes that were not learned from say, over all splits."""
+    """Compute the figures of the pushes that were not learned from, over all splits."""
     still = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)
     test = ~train
     means = [error[mine].mean() for error, mine in zip(found.errors, test, strict=True)]
@@ -123,6 +140,7 @@ def _cell(
 
 
 def _mean(cells: list[dict], method: str, model: str) -> dict[str, float]:
+    """Average the cells of one method and model."""
     mine = [cell for cell in cells if (cell["method"], cell["model"]) == (method, model)]
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in mine])),
@@ -133,6 +151,7 @@ def _mean(cells: list[dict], method: str, model: str) -> dict[str, float]:
 
 
 def _draw(cells: list[dict], out: Path) -> list[str]:
+    """Draw one picture per method into the folder `out` and return their paths."""
     from pushjax import plot
 
     title, drawn = "Triangle on three points: final pose, predicted against measured", []
@@ -144,7 +163,7 @@ def _draw(cells: list[dict], out: Path) -> list[str]:
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints: the paper's table with ours beside it."""
+    """Return the text that the command prints: the paper's table with the computed one beside it."""
     lines = [f"Mean deviation in mm, test pushes, {SPLITS} splits; the paper's in brackets."]
     for name, means in record["means"].items():
         cells = [cell for cell in record["cells"] if cell["method"] == name]

@@ -1,9 +1,13 @@
-"""Three ways to predict the pushes that were not learned from. Each gives the deviation of every push, in mm, under
-every split: (splits, pushes); what friction it found, (splits,); and how many steps failed.
+"""Three ways to predict the pushes that were not learned from.
 
-ideal         the surface of the known support, the friction by a grid (the paper's).
-wrench_twist  the surface fitted to the forces measured on the way, the friction by a grid (the paper's other way).
-identified    friction, surface and how far the hand really went from the final poses alone: `pushjax.identify`.
+Each gives the deviation of every push under every split in mm, (splits, pushes); the friction that it found, (splits,);
+and the number of failed steps.
+
+ideal         The surface of the known support, with the friction found on a grid: the paper's.
+wrench_twist  The surface fitted to the forces measured during the pushes, with the friction found on a grid: the other
+              way of the paper.
+identified    Friction, surface, and how far the hand really went, identified from the final poses alone:
+              `pushjax.identification`.
 """
 
 from collections.abc import Callable
@@ -19,14 +23,22 @@ from pushjax.experiments._tables import final_poses
 from pushjax.experiments.table2.conditions import MODELS, Geometry, outline, recorded
 
 FRICTIONS = np.linspace(0.0, 0.8, 41)
-# Of the pushes, to learn from. A quartic has fifteen coefficients, a push gives one pair.
+# Share of the pushes to learn from. A quartic has fifteen coefficients, and a push gives one pair.
 TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
-IDENTIFY_STEPS = 40  # at most: derivatives are for the fit, whose answer does not change with more
-# The supports are known to a millimetre or so, the robot's set-up less well.
+IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same answer with more
+# Priors: the supports are known to about a millimeter, the robot's setup less well.
 DOF, INSET, END = 200.0, 0.002, 0.001
 
 
 class Predicted(NamedTuple):
+    """Predictions of one condition.
+
+    Attributes:
+        errors: (splits, pushes), deviation of every push, mm.
+        friction: (splits,), the coefficient of friction that was found.
+        failed: Number of failed steps.
+    """
+
     errors: np.ndarray
     friction: np.ndarray
     failed: int
@@ -35,6 +47,15 @@ class Predicted(NamedTuple):
 def ideal(
     log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, train: np.ndarray, geometry: Geometry
 ) -> Predicted:
+    """Predict one condition with a given surface and the friction that is best for the training pushes, on a grid.
+
+    Args:
+        log: The pushes as logged.
+        pushes: The same pushes as arrays.
+        surface: Limit surface of the known support.
+        train: (splits, pushes), True for the pushes to learn from.
+        geometry: Where the finger really was.
+    """
     errors, failed = _on_grid(log, pushes, surface, geometry)
     return _best(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
 
@@ -42,7 +63,16 @@ def ideal(
 def wrench_twist(
     log: PushLog, pushes: pj.Pushes, length: jax.Array, model: str, train: np.ndarray, geometry: Geometry
 ) -> Predicted:
-    """length: of the surfaces, m."""
+    """Predict one condition with a surface fitted to measured forces, and the best friction on a grid.
+
+    Args:
+        log: The pushes as logged, with their forces.
+        pushes: The same pushes as arrays.
+        length: Characteristic length of the fitted surfaces, m.
+        model: "quartic" or "ellipsoid".
+        train: (splits, pushes), True for the pushes to learn from.
+        geometry: Where the finger really was.
+    """
     wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in log.wrench_twist_pairs())
     errors, failed = [], 0
     for mine in train:
@@ -61,8 +91,21 @@ def identified(
     geometry: Geometry,
     done: Callable[[], None],
 ) -> list[Predicted]:
-    """All conditions at once: they share the robot, whose geometry is not taken as given. `done` is called after each
-    split."""
+    """Predict all conditions with what is identified from the final poses of all of them at once.
+
+    The conditions share the robot, whose geometry is not taken as given.
+
+    Args:
+        logs: The pushes of each condition as logged.
+        recordings: The same pushes as arrays, with the steps of the prediction.
+        surfaces: Limit surface of the known support of each condition: the mean of its prior.
+        train: For each condition (splits, pushes), True for the pushes to learn from.
+        geometry: Where the finger is assumed to have been, as the mean of the prior.
+        done: Called after each split.
+
+    Returns:
+        One prediction per condition.
+    """
     fine = pj.Pushes.conditions(recordings)
     steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
     pushes = pj.Pushes.conditions([recorded(log, geometry, steps) for log in logs])
@@ -89,7 +132,7 @@ def identified(
 def _on_grid(
     log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Deviation in mm of every push at every friction, (frictions, pushes), and how many steps failed of each."""
+    """Return every push's deviation in mm and number of failed steps at every friction, (frictions, pushes)."""
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
     final, failed = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
@@ -97,7 +140,7 @@ def _on_grid(
 
 
 def _best(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
-    """Of each split's errors (frictions, pushes) those at the friction that is best on what it learns from."""
+    """Choose for each split's errors (frictions, pushes) the friction that is best for its training pushes."""
     best = [int(np.argmin(e[:, mine].mean(axis=1))) for e, mine in zip(errors, train, strict=True)]
     chosen = np.stack([e[b] for e, b in zip(errors, best, strict=True)])
     return Predicted(chosen, FRICTIONS[best], int(failed.sum()))

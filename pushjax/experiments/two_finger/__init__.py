@@ -1,4 +1,4 @@
-"""Two fingers turn a real triangle: `experiment` from `predictions`, `scores` and `picture`."""
+"""Two fingers turn a real triangle: `experiment` builds on `predictions`, `scores` and `picture`."""
 
 from pushjax.experiments.two_finger.experiment import run as run
 from pushjax.experiments.two_finger.experiment import summary as summary

@@ -1,33 +1,34 @@
-"""Two fingers turn a real triangle: final poses, and whether the object stuck to the hand, predicted against measured.
+"""Two fingers turn a real triangle: final poses, and whether it stuck to the hand, predicted against measured.
 
 The limit surface comes from the support: three points whose loads statics gives, or uniform pressure under the whole
-face. Fingers follow the commanded motion of the hand. The friction at the fingers and their effective radius are chosen
-by a grid on 40 % of the actions and the other 60 % are predicted, over ten random splits; all repeats of an action are
-on one side of a split. An effective radius takes up what the logs leave open: how far the outline is from where the
-tracker says.
+face. The fingers follow the commanded motion of the hand. The friction at the fingers and their effective radius are
+chosen on a grid, with 40 % of the actions. The other 60 % are predicted. This is repeated over ten random splits, and
+all repeats of an action are on one side of a split. The effective radius compensates for what the logs leave open: how
+far the outline is from where the tracker says.
 
-How good a prediction can be is told by the actions that were repeated: the same hand motion from the same place on the
-object does not end the same way twice. A push is called stuck if the object, seen from the hand, moved less than 3 mm
-in the metric of the deviation, closing the first gap of up to 1 mm included; prediction and measurement alike.
+The actions that were repeated show how good a prediction can be: the same hand motion from the same place on the object
+does not end the same way twice. A push counts as stuck if the object moved less than 3 mm relative to the hand, in the
+metric of the deviation. That motion includes closing the first gap, which is up to 1 mm. The same criterion holds for
+prediction and measurement.
 
-What the model leaves is not the tracker's error: starts shifted by 0.5 mm and 0.3 degrees move the predictions by about
-1 mm. It is the pushes that slip past a finger at another moment than predicted, above all under the face that touches
-everywhere, where the pressure is not known. One that grows towards the rim would do a little better there (6.3
-against 6.9 mm, everything chosen on all pushes), but nothing measured speaks for it.
+The error that the model leaves is not the tracker's: starts shifted by 0.5 mm and 0.3 degrees move the predictions by
+about 1 mm. The error comes from the pushes that slip past a finger at another moment than predicted. This happens
+above all under the face that touches everywhere, where the pressure is not known. A pressure that grows towards the rim
+would fit slightly better there (6.3 against 6.9 mm, everything chosen on all pushes), but no measurement supports it.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 from pushjax.datasets.two_finger import load_two_finger_npz
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
 from pushjax.experiments.two_finger.scores import STUCK, days, figures
-from pushjax.report import envelope
 
 OBJECTS = ("3pts1", "3pts3", "patch")
 
@@ -37,12 +38,25 @@ def run(
     seed: int = 0,
     out: Path | None = None,
     steps: int = 60,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressCallback = no_progress,
     model: str = "quartic",
 ) -> dict[str, Any]:
-    """One cell for each object. folder: the data's, with `two_finger_push/`. model: "quartic" or "ellipsoid".
+    """Compute one cell for each object.
 
-    Raises LogError where the data are not there or damaged, ValueError for another model or fewer than one step.
+    Args:
+        folder: Folder of the data, which contains `two_finger_push/`.
+        seed: Seed of the wrench-twist pairs, the splits and the bootstrap.
+        out: Folder for the pictures. None: no pictures.
+        steps: Steps of each push.
+        progress: Called with the number of objects done and their total.
+        model: "quartic" or "ellipsoid".
+
+    Returns:
+        The record, with the cells, and the friction and radius that suit each day best.
+
+    Raises:
+        LogError: If the data are missing or damaged.
+        ValueError: If the model is unknown, or there is less than one step.
     """
     if model not in MODELS:
         raise ValueError(f"model must be one of {', '.join(MODELS)}; got {model!r}")
@@ -69,11 +83,11 @@ def run(
         "splits": SPLITS,
         "train_share": TRAIN_SHARE,
     }
-    return envelope("two-finger", settings, cells=cells, days=by_day, pictures=pictures)
+    return result_record("two-finger", settings, cells=cells, days=by_day, pictures=pictures)
 
 
 def summary(record: dict[str, Any]) -> str:
-    """What the command prints: a line for each object."""
+    """Return the text that the command prints: one line per object."""
     lines = [f"Two-finger pushes, {record['settings']['model']}; test pushes, {SPLITS} splits by action.", ""]
     lines.append(
         f"{'object':8}{'pushes':>7}{'mean / mm':>14}{'no motion':>11}{'ratio':>8}{'median':>8}"

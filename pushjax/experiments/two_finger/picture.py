@@ -1,4 +1,4 @@
-"""The picture: for each object the distribution of deviations, and three test pushes."""
+"""The picture of the two-finger pushes: for each object the distribution of deviations, and three test pushes."""
 
 from pathlib import Path
 
@@ -12,7 +12,18 @@ from pushjax.experiments.two_finger.predictions import deviation_mm, per_push
 
 
 def draw(shown: list[tuple], out: Path) -> str:
-    """For each object the distribution of deviations, and three test pushes of the first split."""
+    """Draw for each object the distribution of deviations, and three test pushes of the first random split.
+
+    The three pushes are those with the median, the 90th percentile and the largest deviation of the final pose.
+
+    Args:
+        shown: One tuple per object: its name, its log, the predicted final poses (radii, frictions, n, 3), their
+            deviations from the measured ones in mm (radii, frictions, n), and what the splits gave (`Tested`).
+        out: Folder for the picture.
+
+    Returns:
+        The path of the picture.
+    """
     with plt.rc_context(plot.STYLE):
         figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
         for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
@@ -31,6 +42,14 @@ def draw(shown: list[tuple], out: Path) -> str:
 
 
 def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> None:
+    """Draw the cumulative distributions of two sets of deviations.
+
+    Args:
+        axes: The panel.
+        name: Name of the object.
+        predicted: Deviations of the predicted final poses, mm.
+        still: Deviations if nothing moved, that is, of the start poses, mm.
+    """
     for values, color, dash, label in (
         (predicted, plot.BLUE, "-", "predicted"),
         (still, plot.BETWEEN, "--", "no motion"),
@@ -43,6 +62,7 @@ def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> 
 
 
 def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
+    """Draw the start, the measured end and the predicted end of one push, with the fingers."""
     shape = pj.Polygon(log.vertices)
     drawn = (
         (log.pose_start[push], plot.BETWEEN, "-", "start"),

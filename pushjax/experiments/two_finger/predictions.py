@@ -1,4 +1,4 @@
-"""The pushes simulated on a grid of frictions and finger radii, and what random splits choose from it."""
+"""The two-finger pushes, simulated on a grid of frictions and finger radii, and what random splits choose from it."""
 
 from typing import NamedTuple
 
@@ -17,8 +17,13 @@ RADII = (0.0, 0.0005, 0.001, 0.0015)
 
 
 class Prediction(NamedTuple):
-    """Of every push with every radius and friction. final: (radii, frictions, n, 3), world, m and rad. failed, jammed:
-    (radii, frictions, n), steps that failed, and whether the hand jammed or grasped on the way."""
+    """Predictions of every push with every radius and friction.
+
+    Attributes:
+        final: (radii, frictions, n, 3), final poses, world, m and rad.
+        failed: (radii, frictions, n), number of failed steps.
+        jammed: (radii, frictions, n), whether the hand jammed or grasped on the way.
+    """
 
     final: np.ndarray
     failed: np.ndarray
@@ -26,22 +31,35 @@ class Prediction(NamedTuple):
 
 
 class Tested(NamedTuple):
-    """What the splits gave. chosen: the (radius, friction) indices of each split. test: which pushes each tested."""
+    """What the splits gave.
+
+    Attributes:
+        chosen: Indices (radius, friction) that each split chose.
+        test: Indices of the pushes that each split tested.
+    """
 
     chosen: list[tuple[int, int]]
     test: list[np.ndarray]
 
 
 def support(log: TwoFingerLog) -> pj.Support:
-    """What carries the object, of unit load."""
+    """Return the support of the object, with unit load: its points, or uniform pressure if it has none."""
     if len(log.support_points) == 0:
         return pj.Support.uniform(pj.Polygon(log.vertices), CELLS)
     return pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
 
 
 def predict(log: TwoFingerLog, model: str, key: jax.Array, steps: int, batch: int | None = None) -> Prediction:
-    """Every push, with every radius and friction. batch: pad the pushes to so many, so that logs of different lengths
-    share one compiled program."""
+    """Simulate every push with every radius and friction.
+
+    Args:
+        log: The pushes of one object.
+        model: "quartic" or "ellipsoid".
+        key: PRNG key of the wrench-twist pairs.
+        steps: Steps of each push.
+        batch: Number to which the pushes are padded, so that logs of different lengths share one compiled program.
+            None: no padding.
+    """
     pairs = support(log).wrench_twist_pairs(key, PAIRS)
     slider = pj.Slider(pj.Polygon(log.vertices), pj.fit_limit_surface(*pairs, degree=MODELS[model]))
     rows = np.arange(max(len(log), batch or 0)) % len(log)
@@ -53,6 +71,7 @@ def predict(log: TwoFingerLog, model: str, key: jax.Array, steps: int, batch: in
 
 @jax.jit
 def _final_poses(slider: pj.Slider, radius, paths, starts, frictions):
+    """Return the final poses, the number of failed steps, and whether the hand stopped, by friction and push."""
     hand = pj.Hand.two_fingers(radius)
 
     def one(path, start, friction):
@@ -64,12 +83,26 @@ def _final_poses(slider: pj.Slider, radius, paths, starts, frictions):
 
 
 def deviation_mm(log: TwoFingerLog, final: np.ndarray) -> np.ndarray:
-    """(..., n) mm, from predicted final poses (..., n, 3) to the measured ones."""
+    """Return the deviation of predicted from measured final poses, (..., n), mm.
+
+    Args:
+        log: The n pushes.
+        final: (..., n, 3), predicted final poses, world, m and rad.
+    """
     return 1e3 * np.asarray(pj.deviation(final, log.pose_end, log.length), np.float64)
 
 
 def splits(log: TwoFingerLog, errors: np.ndarray, rng: np.random.Generator) -> Tested:
-    """Friction and radius chosen on part of the actions, the others held back."""
+    """Choose friction and radius on part of the actions, for each of several random splits.
+
+    Args:
+        log: The n pushes.
+        errors: (radii, frictions, n), deviations.
+        rng: Random generator of the splits.
+
+    Returns:
+        The choice of each split, and the pushes of the actions that it did not use.
+    """
     actions = np.unique(log.group)
     chosen, test = [], []
     for _ in range(SPLITS):
@@ -83,7 +116,15 @@ def splits(log: TwoFingerLog, errors: np.ndarray, rng: np.random.Generator) -> T
 
 
 def per_push(values: np.ndarray, tested: Tested) -> np.ndarray:
-    """(n,): the mean of values (radii, frictions, n) over the splits that tested a push; NaN where none did."""
+    """Average the values of each push over the splits that tested it.
+
+    Args:
+        values: (radii, frictions, n).
+        tested: What the splits gave.
+
+    Returns:
+        (n,), NaN where no split tested the push.
+    """
     count, total = np.zeros(values.shape[-1]), np.zeros(values.shape[-1])
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
         total[pushes] += values[at][pushes]

@@ -1,4 +1,8 @@
-"""How good the predictions are: deviations, stuck or not, beside what repeats of one action differ by."""
+"""How good the predictions of the two-finger pushes are.
+
+Deviations, and agreement on whether the object stuck to the hand, are set beside the differences between repeats of one
+action.
+"""
 
 from typing import Any
 
@@ -8,7 +12,7 @@ import pushjax as pj
 from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import SPLITS, Prediction, Tested, deviation_mm, per_push
-from pushjax.se2 import compose, inverse
+from pushjax.geometry.se2 import compose, inverse
 
 BOOTSTRAPS = 2000
 STUCK = 0.003  # m
@@ -17,7 +21,15 @@ DAY = 86400.0  # s
 
 
 def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int) -> dict[str, Any]:
-    """Every figure of one object."""
+    """Compute every figure of one object.
+
+    Args:
+        log: The n pushes of the object.
+        prediction: Predictions on the grid.
+        errors: (radii, frictions, n), their deviations, mm.
+        tested: What the splits gave.
+        seed: Seed of the bootstrap.
+    """
     still = deviation_mm(log, log.pose_start)
     pairs = list(zip(tested.chosen, tested.test, strict=True))
     means = [errors[at][pushes].mean() for at, pushes in pairs]
@@ -48,7 +60,7 @@ def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, teste
 
 
 def _interval(per_push: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
-    """Half a 95 % interval of the mean, by bootstrap over actions: repeats are not independent."""
+    """Return half the 95 % interval of the mean, by bootstrap over actions, because repeats are not independent."""
     actions, of = np.unique(group, return_inverse=True)
     total, count = np.bincount(of, per_push), np.bincount(of)
     drawn = rng.integers(len(actions), size=(BOOTSTRAPS, len(actions)))
@@ -57,7 +69,11 @@ def _interval(per_push: np.ndarray, group: np.ndarray, rng: np.random.Generator)
 
 
 def _stick(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
-    """How often prediction and measurement agree on stuck or not, and the shares of the four cases, over the tests."""
+    """Compare prediction and measurement on whether the object stuck to the hand.
+
+    Returns:
+        How often the two agree, the agreement by chance, and the shares of the four cases, over all tests.
+    """
     really = log.stick_deviation < STUCK
     table = np.zeros((2, 2))
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
@@ -72,18 +88,18 @@ def _stick(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, An
     }
     return {
         "stick_agreement": float(table[0, 0] + table[1, 1]),
-        # what always giving the commoner answer would reach
+        # the agreement reached by always giving the more frequent answer
         "stick_by_chance": float(max(table.sum(axis=1))),
         "stuck": {name: float(share) for name, share in shares.items()},
     }
 
 
 def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
-    """How well the repeats of an action agree, and the model's deviation on the same pushes.
+    """Compare the repeats of each action with each other, and with the model on the same pushes.
 
-    floor_mm: mean deviation of a push from what its action does on average, as the mean of the others tells it: of k
-    repeats that is too large by sqrt(k / (k - 1)), which is taken out. floor_agreement: how often two repeats agree on
-    stuck or not.
+    `floor_mm` is the mean deviation of a push from what its action does on average. It is estimated from the mean of
+    the other repeats. For k repeats that estimate is too large by sqrt(k / (k - 1)), which is divided out.
+    `floor_agreement` is how often two repeats agree on whether the object stuck.
     """
     moved, stuck = _object_motion(log), log.stick_deviation < STUCK
     floor, model, agree = [], [], []
@@ -111,12 +127,22 @@ def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
 
 
 def _object_motion(log: TwoFingerLog) -> np.ndarray:
-    """(n, 3): the end poses in the frames of the starts, where repeats of an action are the same push."""
+    """Return the end poses in the frames of the starts, (n, 3), in which repeats of an action are the same push."""
     return np.asarray(compose(inverse(log.pose_start), log.pose_end), float)
 
 
 def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
-    """The friction and radius that suit each day's pushes (UTC) best, nothing held back: was the set-up the same?"""
+    """Find the friction and radius that suit each day's pushes (UTC) best, to see whether the setup stayed the same.
+
+    All pushes of a day are used; none are held back. Days with fewer than `FEWEST_OF_A_DAY` pushes are left out.
+
+    Args:
+        log: The n pushes of one object.
+        errors: (radii, frictions, n), deviations, mm.
+
+    Returns:
+        One row per day: date, number of pushes, friction, radius and mean deviation.
+    """
     rows, day = [], np.floor(log.time / DAY).astype(int)
     for number in np.unique(day):
         mine = day == number

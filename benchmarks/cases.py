@@ -1,0 +1,218 @@
+"""The programs to time: each case makes one for a dtype and a batch, with the number of steps to divide its time by."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import pushjax as pj
+from benchmarks import grasps, tasks
+from benchmarks.timing import on_cpu
+from pushjax.testing.problems import random_contacts_problem
+
+TILE = 4000  # pushes of a larger batch that are computed together, so that their data stay in the cache
+PAIRS = 400  # wrench-twist pairs of a fit
+
+
+class Work(NamedTuple):
+    """One program to time.
+
+    Attributes:
+        case: Name of the row.
+        dtype: Floating type, "float32" or "float64".
+        batch: Number of pushes, grasps, problems, surfaces or fits.
+        steps: Mean number of steps in contact of each of the batch; one where there are no steps.
+        function: Function of `args`.
+        args: Its arguments.
+        error_mm: Largest error of the final poses of the fan at this number of steps, mm, or None.
+        host: Whether `function` is called as it is, instead of being compiled.
+    """
+
+    case: str
+    dtype: str
+    batch: int
+    steps: float
+    function: Callable
+    args: tuple
+    error_mm: float | None = None
+    host: bool = False
+
+
+def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = None) -> Work:
+    """Make a program for the final poses of random pushes in the range of the fan.
+
+    Each push has its own surface and friction.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of pushes.
+        model: "quartic" or "ellipsoid".
+        steps: Number of steps. Default: as few as keep the error within `tasks.ALLOWED_MM`.
+    """
+    by_steps = tasks.errors(model, dtype)
+    steps = tasks.fewest_steps(by_steps) if steps is None else steps
+    one, args = each_push(model, dtype, batch, steps)
+
+    def final(*args):
+        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
+
+    modes = jax.vmap(lambda *each: one(*each).mode)(*jax.tree.map(lambda leaf: leaf[: min(batch, 500)], args))
+    contact = float(np.mean(np.asarray(modes) != pj.ContactMode.SEPARATED))
+    return Work(f"push_{model}", dtype, batch, steps * contact, final, args, by_steps.get(steps))
+
+
+def gradient(dtype: str, batch: int) -> Work:
+    """Make a program for the gradient of x + y + theta by surface, path and friction, of the same pushes."""
+    plain = push(dtype, batch)
+    derivative = jax.grad(lambda args: jnp.sum(plain.function(*args)))
+    return plain._replace(case="gradient", function=lambda *args: derivative(args))
+
+
+def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False) -> Work:
+    """Make a program for the final poses of random grasps: two fingers close on the askew square and turn it.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of grasps.
+        steps: Number of steps. Default: as few as keep the error within `tasks.ALLOWED_MM`.
+        varied: Whether each grasp has its own surface.
+    """
+    by_steps = grasps.errors(dtype) if steps is None else {}
+    steps = tasks.fewest_steps(by_steps) if steps is None else steps
+    one, args = each_grasp(grasps.hand(dtype), dtype, batch, steps)
+
+    def final(*args):
+        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
+
+    name = "grasp_two_fingers"
+    if varied:
+        surface = tasks.task("quartic", dtype).slider.surface
+        name, args = "grasp_surfaces", (*args, _surfaces(surface, jax.random.key(0), batch))
+    return Work(name, dtype, batch, steps, final, args, by_steps.get(steps))
+
+
+def solve(dtype: str, batch: int, contacts: int) -> Work:
+    """Make a program for the twists of random contact problems with `contacts` contacts."""
+    draw = jax.vmap(lambda key: random_contacts_problem(key, contacts=contacts))
+    problem = tasks.cast(draw(jax.random.split(jax.random.key(contacts), batch)), dtype)
+
+    def motion(*args):
+        return in_tiles(lambda s, c: pj.solve_contacts(s, c).twist, args, batch)
+
+    return Work(f"solve_{contacts}", dtype, batch, 1.0, motion, (problem.surface, problem.contacts))
+
+
+def sampling(dtype: str, batch: int) -> Work:
+    """Make a program for random quartics, certified convex, from the sampler of the paper."""
+    surface = tasks.task("quartic", dtype).slider.surface
+    random = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype).around(surface)
+    keys = jax.random.split(jax.random.key(0), batch)
+
+    def surfaces(keys):
+        return in_tiles(lambda key: random.sample(key)[0], (keys,), batch)
+
+    return Work("sampling", dtype, batch, 1.0, surfaces, (keys,))
+
+
+def fit(dtype: str, batch: int, degree: int) -> Work:
+    """Make a program that fits surfaces to `PAIRS` wrench-twist pairs each, as a user does: with checks and a report.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of fits.
+        degree: Degree of the surfaces, 2 or 4.
+    """
+
+    def surfaces(*args):
+        return jax.vmap(lambda *each: pj.fit_limit_surface(*each, degree=degree, report=True))(*args)
+
+    name = {2: "ellipsoid", 4: "quartic"}[degree]
+    return Work(f"fit_{name}", dtype, batch, 1.0, surfaces, pairs(dtype, batch))
+
+
+def pairs(dtype: str, batch: int) -> tuple:
+    """Return wrenches and twists, (batch, PAIRS, 3), and lengths, (batch,), of the square on its 64 points."""
+    support = tasks.cast(pj.Support.uniform(pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)), "float64")
+    keys = jax.random.split(jax.random.key(0), batch)
+    return tasks.cast(jax.jit(jax.vmap(lambda key: support.wrench_twist_pairs(key, PAIRS)))(keys), dtype)
+
+
+def monte_carlo(dtype: str, batch: int) -> Work:
+    """Make a program for pushes under random friction from end to end: from a key to NumPy arrays and their summary."""
+    steps = 8  # within 0.1 mm, as in `push`; the tip touches in all of them
+    here = tasks.task("quartic", dtype)
+    path = tasks.paths(jnp.array([0.01], dtype), jnp.array([0.2], dtype), steps)[0]
+    model = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype)
+
+    def summary(key):
+        pushes = pj.monte_carlo(key, batch, here.slider, here.hand, path, pose=here.pose, model=model)
+        return pushes.summary()
+
+    return Work("monte_carlo", dtype, batch, steps, summary, (jax.random.key(1),), host=True)
+
+
+def in_tiles(function: Callable, args: tuple, batch: int) -> Any:
+    """Apply `vmap` to at most TILE of the batch at once on a CPU, and to the whole batch on an accelerator.
+
+    Args:
+        function: Function of one of the batch.
+        args: Arguments with a leading axis of the batch.
+        batch: Size of the batch.
+    """
+    if batch <= TILE or not on_cpu():
+        return jax.vmap(function)(*args)
+    return jax.lax.map(lambda each: function(*each), args, batch_size=TILE)
+
+
+def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
+    """Return the function of one push, and the surface, path and friction of each push.
+
+    All of these differ between pushes, so that no work can be shared.
+    """
+    here = tasks.task(model, dtype)
+    keys = jax.random.split(jax.random.key(0), 4)
+
+    def uniform(key, low, high):
+        return jax.random.uniform(key, (batch,), dtype, low, high)
+
+    def one(surface: Any, path: Any, friction: Any) -> pj.Trajectory:
+        return here._replace(slider=pj.Slider(here.slider.shape, surface)).push(path, friction)
+
+    surface = _surfaces(here.slider.surface, keys[0], batch)
+    path = tasks.paths(
+        uniform(keys[1], -tasks.REACH, tasks.REACH), uniform(keys[2], -tasks.STEEPEST, tasks.STEEPEST), steps
+    )
+    return one, (surface, path, uniform(keys[3], 0.15, 0.35))
+
+
+def each_grasp(hand: pj.Hand, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
+    """Return the function of one grasp, and the pose and path of each grasp.
+
+    The function uses the same surface for all grasps, unless its third argument gives another.
+
+    Args:
+        hand: A hand whose last coordinate is the opening.
+        dtype: Floating type.
+        batch: Number of grasps.
+        steps: Number of steps.
+    """
+    slider, friction = tasks.task("quartic", dtype).slider, jnp.asarray(grasps.FRICTION, dtype)
+
+    def one(pose: Any, path: Any, surface: Any = slider.surface) -> pj.Trajectory:
+        return pj.rollout(pj.Slider(slider.shape, surface), hand, path, pose=pose, friction=friction)
+
+    poses = grasps.random_poses(jax.random.key(1), batch, dtype)
+    return one, (poses, grasps.paths(poses, steps))
+
+
+def _surfaces(surface: pj.LimitSurface, key: Array, batch: int) -> pj.LimitSurface:
+    """Return `batch` copies of `surface`, each scaled by another factor; their lengths are the same."""
+    scale = 1 + 0.01 * jax.random.normal(key, (batch,), surface.length.dtype)
+
+    def each(leaf):
+        return scale.reshape(-1, *(1,) * leaf.ndim) * leaf[None] if leaf.ndim else jnp.broadcast_to(leaf, (batch,))
+
+    return jax.tree.map(each, surface)

@@ -1,0 +1,177 @@
+"""Limit surfaces fitted to the same pairs by a convex program: cvxpy with the solver Clarabel.
+
+The program is as small as it can be made. If the scales s_i of `pushjax.friction.fit` are free, their optimal values
+follow from the coefficients. The loss is then a quadratic function of the coefficients alone, so that 400 pairs reduce
+to a program in 15 or 6 numbers. A scale must not be negative; this is checked afterwards. With the scales as variables
+the program takes about 15 times as long.
+
+The quartic is sos-convex: z' hess H(F) z = y' Q y with y = z (x) F, where Q is a positive semidefinite 9 x 9 matrix.
+For the ellipsoid, its own matrix is positive semidefinite. The program is built once, with the data as parameters, and
+then solved for each set of pairs.
+"""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pushjax.friction.fit import QUADRATIC_MONOMIALS, RIDGE, VALUE_WEIGHT
+from pushjax.friction.quartic import MONOMIALS
+
+
+class Fitted(NamedTuple):
+    """Results of the fits.
+
+    Attributes:
+        loss: Loss of each set of pairs, (sets,), as in `pushjax.friction.fit.FitReport`.
+        clipped: Number of pairs, over all sets, whose scale came out negative. If there are any, the program is not the
+            one that `pushjax.friction.fit` solves.
+        processor: CPU time of all fits together, s, without building the program.
+    """
+
+    loss: np.ndarray
+    clipped: int
+    processor: float
+
+
+def fit(wrench: np.ndarray, twist: np.ndarray, length: np.ndarray, degree: int) -> Fitted:
+    """Fit a limit surface to each set of pairs.
+
+    Args:
+        wrench: Wrenches, (sets, pairs, 3), in SI units.
+        twist: Twists, (sets, pairs, 3), in SI units.
+        length: Characteristic lengths, (sets,), m.
+        degree: 2 for ellipsoids, 4 for quartics.
+
+    Returns:
+        The losses, the number of negative scales, and the CPU time.
+
+    Raises:
+        ValueError: If cvxpy is not installed.
+    """
+    program = Program(degree)
+    program.solve(*quadratic(wrench[0], twist[0], float(length[0]), degree)[:2])  # compiles at the first solve
+    losses, clipped = [], 0
+    busy = time.process_time()
+    for each in zip(wrench, twist, length, strict=True):
+        factor, slope, along = quadratic(*each, degree)
+        loss, a = program.solve(factor, slope)
+        clipped += int(np.sum(along @ a < 0))
+        losses.append(loss + VALUE_WEIGHT)
+    return Fitted(np.array(losses), clipped, time.process_time() - busy)
+
+
+def cvxpy() -> Any:
+    """Import and return the package cvxpy.
+
+    Raises:
+        ValueError: If it is not installed.
+    """
+    try:
+        import cvxpy
+    except ImportError as missing:
+        raise ValueError("--peers of fit needs cvxpy: pip install '.[bench]'") from missing
+    return cvxpy
+
+
+class Program:
+    """The convex program: minimize |factor a|^2 - 2 slope . a over the coefficients `a` of convex surfaces.
+
+    Args:
+        degree: 2 for ellipsoids, 4 for quartics.
+    """
+
+    def __init__(self, degree: int):
+        cp = cvxpy()
+        n = len(monomials(degree))
+        self.a, self.factor, self.slope = cp.Variable(n), cp.Parameter((n, n)), cp.Parameter(n)
+        matrix = cp.Variable((3, 3) if degree == 2 else (9, 9), PSD=True)
+        basis = np.stack([gram(unit, degree) for unit in np.eye(n)], axis=-1)
+        matching = []
+        for places, coefficients in _classes(basis, degree):
+            matching.append(sum(matrix[place] for place in places) == coefficients @ self.a)
+        loss = cp.sum_squares(self.factor @ self.a) - 2 * self.slope @ self.a
+        self.problem, self.solver = cp.Problem(cp.Minimize(loss), matching), cp.CLARABEL
+
+    def solve(self, factor: np.ndarray, slope: np.ndarray) -> tuple[float, np.ndarray]:
+        """Solve the program for these parameters, (n, n) and (n,); return the minimum and the coefficients, (n,)."""
+        self.factor.value, self.slope.value = factor, slope
+        loss: Any = self.problem.solve(solver=self.solver)
+        return float(loss), np.asarray(self.a.value)
+
+
+def monomials(degree: int) -> np.ndarray:
+    """Return the exponents of the monomials of H, (n, 3): 6 for degree 2, 15 for degree 4."""
+    return QUADRATIC_MONOMIALS if degree == 2 else MONOMIALS
+
+
+def quadratic(wrench, twist, length: float, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the loss of `pushjax.friction.fit` at the optimal scales s_i, as a quadratic function of the coefficients.
+
+    The loss is |factor a|^2 - 2 slope . a + constant, where a is the vector of the n coefficients.
+
+    Args:
+        wrench: Wrenches, (pairs, 3), in SI units.
+        twist: Twists, (pairs, 3), in SI units.
+        length: Characteristic length, m.
+        degree: 2 for ellipsoids, 4 for quartics.
+
+    Returns:
+        `factor`, (n, n); `slope`, (n,); and a matrix, (pairs, n), whose product with a gives the scales
+        s_i = grad H(F_i) . V_i.
+    """
+    powers = monomials(degree)
+    f, v = wrench / [1, 1, length], twist * [1, 1, length]
+    f, v = f / np.mean(np.linalg.norm(f, axis=1)), v / np.linalg.norm(v, axis=1, keepdims=True)
+    values = np.prod(f[:, None] ** powers, axis=2)
+    gradients = []
+    for k in range(3):
+        lowered = np.maximum(powers - np.eye(3, dtype=int)[k], 0)
+        gradients.append(powers[:, k] * np.prod(f[:, None] ** lowered, axis=2))
+    along = np.sum([g * v[:, k : k + 1] for k, g in enumerate(gradients)], axis=0)
+    misfit = np.sum([g.T @ g for g in gradients], axis=0) - along.T @ along
+    hessian = (misfit + VALUE_WEIGHT * values.T @ values) / len(f) + RIDGE * np.eye(len(powers))
+    return np.linalg.cholesky(hessian).T, VALUE_WEIGHT * values.mean(axis=0), along
+
+
+def gram(a: np.ndarray, degree: int) -> np.ndarray:
+    """Return the Hessian of H as a symmetric tensor, a form in y = z (x) F.
+
+    Its first two indices are those of the second derivative. The rest are those of the products of F that remain.
+
+    Args:
+        a: Coefficients of H, (n,).
+        degree: 2 for ellipsoids, 4 for quartics.
+
+    Returns:
+        The tensor, (3, 3) for degree 2, (3, 3, 3, 3) for degree 4.
+    """
+    tensor = np.zeros((3,) * degree)
+    for index in np.ndindex(*tensor.shape):
+        counts = np.bincount(index, minlength=3)
+        row = int(np.flatnonzero((monomials(degree) == counts).all(axis=1))[0])
+        orders = 1.0
+        left = degree
+        for count in counts:
+            for k in range(count):
+                orders *= left / (k + 1)
+                left -= 1
+        tensor[index] = a[row] / orders
+    return tensor * (2.0 if degree == 2 else 12.0)
+
+
+def _classes(basis: np.ndarray, degree: int):
+    """Return the linear conditions that tie the positive semidefinite matrix to the coefficients `a`.
+
+    Each condition is a pair: entries of the matrix, and a row. The sum of the entries is the coefficient of one
+    monomial of the form, z_i z_j or z_i z_j F_k F_l. The product of the row with `a` is the same coefficient.
+    """
+    if degree == 2:
+        return [([(i, j)], basis[i, j]) for i in range(3) for j in range(i, 3)]
+    found = []
+    for i, j, k, m in np.ndindex(3, 3, 3, 3):
+        if i <= j and k <= m:
+            places = {(i, j, k, m), (j, i, k, m), (i, j, m, k), (j, i, m, k)}
+            total = sum(basis[p] for p in places)
+            found.append(([(3 * p[0] + p[2], 3 * p[1] + p[3]) for p in places], total))
+    return found

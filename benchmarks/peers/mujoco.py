@@ -1,0 +1,350 @@
+"""Pushes by MuJoCo (C): final poses, creep of a sticking tip, the timestep that they need, and their computing time.
+
+One call of `mj_step` with the number of steps computes a whole push in C, without Python between the steps. Each thread
+has its own copy of the model and computes a part of the pushes. `mujoco.rollout` does the same work, and also records
+every state, in the same time.
+
+The slider starts at rest on the table, after it has settled; settling is not timed. The final pose is read when the tip
+arrives at its end, before anything coasts.
+
+The largest sufficient timestep is searched on a grid and then by bisection, so that the grid is no disadvantage for
+MuJoCo: the search finds 15.4 ms where the grid alone has 14.1 on four supports, and 12.2 where it has 10 on three.
+"""
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.peers.scene import Scene, Settings, build, engine
+from benchmarks.tasks import error_mm
+
+SETTLE = 400  # time until the slider lies still, in time constants of normal contact
+AWAY = 10.0  # m; where the slider settles, out of the tip's reach
+# Offset (m) along the side and angle (rad) from its normal. The first four stick on most supports; the others slide.
+PUSHES = (
+    (0.0, 0.0),
+    (0.004, 0.0),
+    (0.01, 0.0),
+    (0.02, 0.0),
+    (0.03, 0.0),
+    (-0.015, 0.175),
+    (0.02, -0.44),
+    (-0.03, 0.61),
+)
+REFINEMENTS = 3.5  # halvings of the time constant down to the timestep that counts as converged
+COARSEST = 8  # largest timestep of the grid, in time constants: contact is certainly lost
+BISECTIONS = 4  # between the largest good timestep and the first bad one: a factor of √2 becomes 1.02
+
+
+class Pushed(NamedTuple):
+    """Results of the pushes.
+
+    Attributes:
+        pose: Final poses of the slider, (n, 3), m and rad, in the frame of its start pose.
+        slip: Distance that the tip's contact has slid along the slider's side, (n,), m. Positive to the left of the
+            inward normal.
+        seconds: Wall time of the pushes, s, without building and settling.
+        processor: CPU time of the pushes, summed over threads, s.
+    """
+
+    pose: np.ndarray
+    slip: np.ndarray
+    seconds: float
+    processor: float
+
+
+class StepError(NamedTuple):
+    """Error and cost at one timestep.
+
+    Attributes:
+        timestep: Timestep, s.
+        error_mm: Largest deviation of a final pose from that of the smallest timestep, mm.
+        us_per_push: CPU time per push, µs.
+    """
+
+    timestep: float
+    error_mm: float
+    us_per_push: float
+
+
+class Frame(NamedTuple):
+    """The world frame in which MuJoCo computes a push, and the timestep.
+
+    Attributes:
+        rotation: Rotation from the slider's start frame to the world frame, (2, 2).
+        angle: Angle of the same rotation, rad.
+        steps: Number of steps.
+        timestep: Timestep, s.
+    """
+
+    rotation: np.ndarray
+    angle: float
+    steps: int
+    timestep: float
+
+
+def fan(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return the paths of `PUSHES`: on the square's left side, just touching it at the start.
+
+    Args:
+        scene: The square, the tip and the length of the pushes.
+
+    Returns:
+        Start and end positions of the tip's center, both (n, 2), m, in the slider's start frame.
+    """
+    offset, angle = np.array(PUSHES).T
+    starts = np.stack([np.full(len(PUSHES), -scene.side / 2 - scene.tip_radius), offset], axis=1)
+    return starts, starts + scene.travel * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def push(
+    scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray, threads: int = 1
+) -> Pushed:
+    """Push a slider that starts at pose zero, by a tip that moves in a straight line.
+
+    Args:
+        scene: What is pushed.
+        settings: How MuJoCo computes.
+        timestep: Upper limit of the timestep, s. It is reduced so that each push takes a whole number of steps.
+        starts: Start positions of the tip's center, (n, 2), m.
+        ends: End positions of the tip's center, (n, 2), m.
+        threads: Number of threads that share the pushes.
+
+    Returns:
+        The final poses, the slips and the times.
+    """
+    starts, ends = np.asarray(starts, float).reshape(-1, 2), np.asarray(ends, float).reshape(-1, 2)
+    model = build(scene, settings, timestep)
+    settled = settle(model, settings)
+    frames = [frame(scene, timestep, *each) for each in zip(starts, ends, strict=True)]
+    qpos = np.array([initial(model, settled, *each) for each in zip(frames, starts, strict=True)])
+    shares = [range(k, len(starts), threads) for k in range(threads)]
+    workers = [(copy.copy(model), engine().MjData(model)) for _ in shares]
+    begin, busy = time.perf_counter(), time.process_time()
+    if threads == 1:
+        _run(*workers[0], scene, frames, qpos, shares[0])
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            tasks = [
+                pool.submit(_run, *mine, scene, frames, qpos, share)
+                for mine, share in zip(workers, shares, strict=True)
+            ]
+            for task in tasks:
+                task.result()
+    seconds, processor = time.perf_counter() - begin, time.process_time() - busy
+    pose = np.array([final_pose(*each) for each in zip(frames, qpos, ends, strict=True)]).reshape(-1, 3)
+    return Pushed(pose, slip(scene, pose, starts, ends), seconds, processor)
+
+
+def settle(model: Any, settings: Settings) -> np.ndarray:
+    """Return the slider at rest on the table: position and orientation of its free joint, (7,), m and quaternion.
+
+    Args:
+        model: The MjModel.
+        settings: Its settings, for the time that settling takes.
+    """
+    mujoco = engine()
+    data, moving = mujoco.MjData(model), model.geom_surfacevel.copy()
+    data.qpos[0] = AWAY
+    model.geom_surfacevel[:] = 0
+    mujoco.mj_step(model, data, nstep=round(SETTLE * settings.normal / model.opt.timestep))
+    model.geom_surfacevel[:] = moving
+    return data.qpos[:7].copy()
+
+
+def frame(scene: Scene, timestep: float, start: np.ndarray, end: np.ndarray) -> Frame:
+    """Return the world frame in which the push is along x, with its number of steps.
+
+    Args:
+        scene: What is pushed.
+        timestep: Upper limit of the timestep, s.
+        start: Start position of the tip's center, (2,), m.
+        end: End position of the tip's center, (2,), m.
+    """
+    along = end - start
+    distance = np.hypot(*along)
+    steps = max(1, int(np.ceil(distance / (scene.speed * timestep) - 1e-9)))
+    cos, sin = along / distance
+    return Frame(np.array([[cos, sin], [-sin, cos]]), -np.arctan2(sin, cos), steps, distance / (scene.speed * steps))
+
+
+def initial(model: Any, settled: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
+    """Return the initial qpos, (nq,): the tip's center is at the world's origin, and at `start` in the slider's frame.
+
+    Args:
+        model: The MjModel.
+        settled: The slider at rest, (7,), from `settle`.
+        frame: The world frame of the push.
+        start: Start position of the tip's center, (2,), m.
+    """
+    qpos = np.zeros(model.nq)
+    qpos[:2] = -frame.rotation @ start
+    qpos[2] = settled[2]
+    turn = np.array([np.cos(frame.angle / 2), 0.0, 0.0, np.sin(frame.angle / 2)])
+    engine().mju_mulQuat(qpos[3:7], turn, settled[3:7])
+    return qpos
+
+
+def _run(model, data, scene: Scene, frames: list[Frame], qpos: np.ndarray, share: range) -> None:
+    """Simulate the pushes `share`, and overwrite their rows of `qpos` with the final positions."""
+    mujoco = engine()
+    for k in share:
+        mujoco.mj_resetData(model, data)
+        model.opt.timestep = frames[k].timestep
+        data.qpos[:] = qpos[k]
+        data.qvel[0] = -scene.speed  # the slider moves with the conveyor
+        mujoco.mj_step(model, data, nstep=frames[k].steps)
+        qpos[k] = data.qpos
+
+
+def final_pose(frame: Frame, qpos: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return the slider's final pose, (3,), m and rad, in the frame of its start pose.
+
+    Args:
+        frame: The world frame of the push.
+        qpos: Final positions in MuJoCo's world.
+        origin: Final position of the world's origin in the frame of the start pose, (2,), m. With a conveyor, the world
+            moves with the tip.
+    """
+    w, x, y, z = qpos[3:7]
+    theta = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - frame.angle
+    return np.append(frame.rotation.T @ qpos[:2] + origin, (theta + np.pi) % (2 * np.pi) - np.pi)
+
+
+def slip(scene: Scene, pose: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return how far the tips slip, (n,), m, along the edge that faces their start.
+
+    A tip that sticks rolls on the edge: its center moves by the radius times the angle. That is not counted as slip.
+
+    Args:
+        scene: The slider and the tip.
+        pose: Final poses, (n, 3), m and rad, in the frame of the start pose.
+        starts: Start positions of the tip's center, (n, 2), m.
+        ends: End positions of the tip's center, (n, 2), m.
+    """
+    corner = scene.vertices
+    edge = np.roll(corner, -1, axis=0) - corner
+    edge /= np.linalg.norm(edge, axis=1, keepdims=True)
+    inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1)
+    if np.sum(inward * (corner.mean(axis=0) - corner)) < 0:  # the outline runs clockwise
+        inward = -inward
+    outside = np.sum(inward[None] * (corner[None] - starts[:, None]), axis=-1)
+    normal = inward[np.argmax(outside, axis=1)]
+    left = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
+    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
+    away = ends - pose[:, :2]
+    seen = np.stack([cos * away[:, 0] + sin * away[:, 1], cos * away[:, 1] - sin * away[:, 0]], axis=1)
+    return np.sum((seen - starts) * left, axis=1) - scene.tip_radius * pose[:, 2]
+
+
+def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) -> list[StepError]:
+    """Return `by_timestep` for the pushes of `fan`.
+
+    Args:
+        scene: What is pushed.
+        settings: How MuJoCo computes.
+        timesteps: Timesteps to try, s. By default they go from `COARSEST` down to 2^-`REFINEMENTS` time constants of
+            normal contact, by factors of √2.
+
+    Returns:
+        The error and the cost at each timestep, from the largest to the smallest.
+    """
+    exponents = np.arange(np.log2(COARSEST), -REFINEMENTS - 0.5, -0.5)
+    chosen = [float(each) for each in (timesteps or settings.normal * 2.0**exponents)]
+    starts, ends = fan(scene)
+
+    def run(timestep: float) -> tuple[np.ndarray, float]:
+        found = push(scene, settings, timestep, starts, ends)
+        return found.pose, found.processor
+
+    return by_timestep(run, chosen)[0]
+
+
+def by_timestep(
+    run: Callable[[float], tuple[np.ndarray, float]], timesteps: Sequence[float], allowed: float = 1e-4
+) -> tuple[list[StepError], np.ndarray]:
+    """Compare the final poses at each timestep with those at the smallest, and refine the list by `refined`.
+
+    Args:
+        run: Function from a timestep (s) to final poses, (n, 3), and the CPU time of all pushes, s.
+        timesteps: Timesteps to try, s. The smallest one gives the converged answer.
+        allowed: Allowed error, m, for `refined`.
+
+    Returns:
+        The error and the cost at each timestep but the smallest, from the largest down; and the final poses, (n, 3), at
+        the smallest.
+
+    Raises:
+        ValueError: As `largest` does.
+    """
+    *coarse, finest = sorted(timesteps, reverse=True)
+    exact, _ = run(finest)
+
+    def at(timestep: float) -> StepError:
+        pose, processor = run(timestep)
+        return StepError(timestep, float(error_mm(pose, exact).max()), 1e6 * processor / len(pose))
+
+    return refined([at(each) for each in coarse], at, allowed), exact
+
+
+def refined(rows: Sequence[StepError], at: Callable[[float], StepError], allowed: float = 1e-4) -> list[StepError]:
+    """Insert rows by bisection, so that the result of `largest` does not depend on the grid.
+
+    Args:
+        rows: Rows with falling timesteps.
+        at: Function that makes the row of a timestep (s).
+        allowed: Allowed error, m.
+
+    Returns:
+        The old and the new rows, with falling timesteps.
+
+    Raises:
+        ValueError: As `largest` does.
+    """
+    found = list(rows)
+    for _ in range(BISECTIONS):
+        good = found.index(largest(found, allowed))
+        if good == 0:
+            break
+        found.insert(good, at(float(np.sqrt(found[good - 1].timestep * found[good].timestep))))
+    return found
+
+
+def largest(rows: Sequence[StepError], allowed: float = 1e-4) -> StepError:
+    """Return the row of the largest timestep up to which all final poses are within `allowed` of the converged ones.
+
+    Args:
+        rows: Rows with falling timesteps.
+        allowed: Allowed error, m.
+
+    Raises:
+        ValueError: If the error of the smallest timestep is already larger.
+    """
+    good = None
+    for row in reversed(rows):
+        if not row.error_mm <= 1e3 * allowed:
+            break
+        good = row
+    if good is None:
+        raise ValueError(f"MuJoCo comes within {1e3 * allowed:g} mm at no timestep")
+    return good
+
+
+def timed(scene: Scene, settings: Settings, timestep: float, n: int = 40) -> Pushed:
+    """Compute `n` pushes, the pushes of `fan` repeated, to time them.
+
+    Args:
+        scene: What is pushed.
+        settings: How MuJoCo computes.
+        timestep: Upper limit of the timestep, s.
+        n: Number of pushes.
+
+    Returns:
+        The final poses, the slips and the times.
+    """
+    starts, ends = (np.resize(each, (n, 2)) for each in fan(scene))
+    return push(scene, settings, timestep, starts, ends)

@@ -1,0 +1,353 @@
+"""Benchmark rows of other programs: pushes and grasps by MuJoCo and MJX, fits by cvxpy, contact problems by scipy.
+
+MuJoCo and MJX each run at their largest timestep that stays within 0.1 mm of their own converged answer.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import pushjax as pj
+from benchmarks import cases, grasps, tasks
+from benchmarks.peers import contacts, coulomb, fits, grasp, mjx, mujoco
+from benchmarks.peers.scene import Scene, Settings, engine
+
+HALF = tasks.SIDE / 2
+SUPPORTS = {
+    "three": ((-0.03, -0.02), (0.03, -0.02), (0.0, 0.03)),
+    "four": ((-HALF, -HALF), (HALF, -HALF), (HALF, HALF), (-HALF, HALF)),
+}
+STICKS = (0.004, 0.01)  # offsets from the middle of the side at which the tip sticks, m
+TIMED, BATCH = 40, 64
+FITS, PROBLEMS, MOST_CONTACTS = 20, 100, 4
+REPEATS = 3  # number of times that each is timed
+NAMES = {"mujoco": "MuJoCo", "mjx": "MJX"}
+ALIKE = {"grasp_surfaces": "grasp_two_fingers"}  # cases that are the same problem for the other programs
+
+
+def check(case: Sequence[str]) -> None:
+    """Check that the cases can be compared with other programs.
+
+    Args:
+        case: Names of the cases.
+
+    Raises:
+        ValueError: If none of the cases has a peer, or if a program that is needed is not installed.
+    """
+    if not set(case) & set(PEERS):
+        raise ValueError(f"--peers is for {', '.join(PEERS)}; got it with {' '.join(case)}")
+    if {"push", "grasp"} & set(case):
+        engine()
+    if "fit" in case:
+        fits.cvxpy()
+
+
+def rows(case: Sequence[str]) -> list[dict[str, Any]]:
+    """Run the other programs on the cases, and return one row for each program.
+
+    Each row has `of`, the name of the rows that it is compared with, and the CPU time of one problem in s: the median
+    of `REPEATS` runs (`processor_s_each`) and their range (`processor_s_range`).
+
+    Args:
+        case: Names of the cases. Those without a peer are skipped.
+
+    Returns:
+        The rows.
+    """
+    return [found for name in case if name in PEERS for found in PEERS[name]()]
+
+
+def _pushes() -> list[dict[str, Any]]:
+    """Return rows of MuJoCo on three and on four supports, and of MJX on four, with the slip of a sticking finger."""
+    found = [_mujoco(name) for name in SUPPORTS]
+    return [*found, _mjx("four")]
+
+
+def _grasps() -> list[dict[str, Any]]:
+    """Return the row of MuJoCo on four supports, with its error against rigid contact.
+
+    In rigid contact, geometry alone determines the final angle.
+    """
+    scene = Scene(SUPPORTS["four"], friction_tip=grasps.FRICTION)
+    table, pose = grasp.accuracy(scene, grasp.SUPPORTED, grasp.Fingers())
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    poses = np.resize(grasps.fan(), (TIMED, 3))
+    _, each = _repeated(lambda: grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses), TIMED)
+    both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])
+    return [
+        {
+            "of": "grasp_two_fingers",
+            "peer": "mujoco",
+            "supports": "four",
+            "timestep_s": at.timestep,
+            "error_mm": at.error_mm,
+            "rigid_error_mm": float(1e3 * tasks.LENGTH * np.abs(both).max()),
+            "by_timestep": [row._asdict() for row in table],
+        }
+        | each
+    ]
+
+
+def _fits() -> list[dict[str, Any]]:
+    """Return the rows of cvxpy, with the worst ratio of pushjax's loss to that of cvxpy."""
+    found = []
+    for degree, name in ((4, "fit_quartic"), (2, "fit_ellipsoid")):
+        wrench, twist, length = (np.asarray(part) for part in cases.pairs("float64", FITS))
+        theirs, each = _repeated(lambda these=(wrench, twist, length, degree): fits.fit(*these), FITS)
+        ratio = {}
+        for dtype in ("float32", "float64"):
+            work = cases.fit(dtype, FITS, degree)
+            loss = np.asarray(jax.jit(work.function)(*work.args)[1].loss, float)
+            ratio[dtype] = float((loss / theirs.loss).max())
+        each |= {"of": name, "peer": "cvxpy", "clipped": theirs.clipped, "loss_over_theirs": ratio}
+        found.append(each)
+    return found
+
+
+def _problems() -> list[dict[str, Any]]:
+    """Return the rows of scipy on problems that have a motion, with the fraction for which scipy finds one."""
+    found = []
+    for m in range(1, MOST_CONTACTS + 1):
+        work = cases.solve("float64", 4 * PROBLEMS, m)
+        surface, problem = work.args
+        moving = np.flatnonzero(np.any(np.asarray(jax.jit(work.function)(*work.args)) != 0, axis=1))[:PROBLEMS]
+        kept = jax.tree.map(lambda leaf, k=moving: leaf[k], problem)
+        these = surface.coefficients[moving], surface.length[moving], kept
+        theirs, each = _repeated(lambda these=these: contacts.solve(*these), len(moving))
+        found.append(each | {"of": f"solve_{m}", "peer": "scipy", "found": float(theirs.found.mean())})
+    return found
+
+
+def _repeated(run: Callable[[], Any], count: int) -> tuple[Any, dict[str, Any]]:
+    """Run a function `REPEATS` times and measure its CPU time per item.
+
+    Args:
+        run: Function that returns a result with the attribute `processor`, its CPU time in s.
+        count: Number of items that one run computes.
+
+    Returns:
+        The result of the first run, and the CPU time per item: median and range.
+    """
+    found = [run() for _ in range(REPEATS)]
+    each = [one.processor / count for one in found]
+    return found[0], {"processor_s_each": float(np.median(each)), "processor_s_range": [min(each), max(each)]}
+
+
+PEERS: dict[str, Callable[[], list[dict[str, Any]]]] = {
+    "push": _pushes,
+    "grasp": _grasps,
+    "fit": _fits,
+    "solve": _problems,
+}
+
+
+def _mujoco(name: str) -> dict[str, Any]:
+    scene, settings = Scene(SUPPORTS[name]), Settings()
+    table = mujoco.accuracy(scene, settings)
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    found, each = _repeated(lambda: mujoco.timed(scene, settings, at.timestep, TIMED), TIMED)
+    return each | {
+        "of": "push_quartic",
+        "peer": "mujoco",
+        "supports": name,
+        "timestep_s": at.timestep,
+        "error_mm": at.error_mm,
+        "exact_error_mm": _exact_error_mm(name, found.pose),
+        "slip_um": _um(mujoco.push(scene, settings, at.timestep, *_straight(scene, STICKS)).slip),
+        "by_timestep": [row._asdict() for row in table],
+    }
+
+
+def _mjx(name: str) -> dict[str, Any]:
+    scene = Scene(SUPPORTS[name])
+    starts, ends = (np.resize(part, (BATCH, 2)) for part in mujoco.fan(scene))
+    batch = mjx.Batch(scene, mjx.SETTINGS, mjx.CONVERGED, starts, ends)
+    table = mjx.accuracy(batch)
+    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    found, each = _repeated(lambda: batch.pushed(at.timestep, mjx.softened(at.timestep)), BATCH)
+    return each | {
+        "of": "push_quartic",
+        "peer": "mjx",
+        "supports": name,
+        "timestep_s": at.timestep,
+        "error_mm": at.error_mm,
+        "exact_error_mm": _exact_error_mm(name, found.pose),
+        "compile_s": batch.compile_seconds,
+        "batch": BATCH,
+        "dtype": "float64",
+        "slip_um": _um(found.slip[[mujoco.PUSHES.index((offset, 0.0)) for offset in STICKS]]),
+        "by_timestep": [row._asdict() for row in table],
+    }
+
+
+def _exact_error_mm(name: str, pose: np.ndarray) -> float:
+    """Return the largest error (mm) of the final poses of `mujoco.fan`, (n, 3), against exact Coulomb friction.
+
+    Only the first poses are used, one for each push of the fan.
+    """
+    exact = _exact(name)
+    return float(tasks.error_mm(pose[: len(exact)], exact).max())
+
+
+@cache
+def _exact(name: str) -> np.ndarray:
+    scene = Scene(SUPPORTS[name])
+    points = np.array(scene.supports)
+    return np.array([coulomb.push(points, *each)[0] for each in zip(*mujoco.fan(scene), strict=True)])
+
+
+@cache
+def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) -> list[float]:
+    """Return the slip along the side (µm) of the tip in straight pushes by pushjax, without the distance it rolls.
+
+    Args:
+        dtype: "float32" or "float64".
+        offsets: Offsets of the tip from the middle of the side, m.
+        steps: Number of steps of each push.
+
+    Returns:
+        The slip at each offset, µm.
+
+    Raises:
+        ValueError: If the contact does not stick at one of the offsets.
+    """
+    here = tasks.task("quartic", dtype)
+    offset = jnp.asarray(offsets, dtype)
+    push = jax.jit(jax.vmap(here.push))(tasks.paths(offset, jnp.zeros_like(offset), steps))
+    for off, mode in zip(offsets, np.asarray(push.mode), strict=True):
+        if not np.all(mode == pj.ContactMode.STICKING):
+            raise ValueError(f"a push {1e3 * off:g} mm off the middle does not stick")
+    scene = Scene(SUPPORTS["four"])
+    return _um(mujoco.slip(scene, np.asarray(push.pose[:, -1], float), *_straight(scene, offsets)))
+
+
+@cache
+def same_fan_error_mm(dtype: str, steps: int) -> float:
+    """Return pushjax's largest error (mm) over the same pushes as MuJoCo's, on the same four supports.
+
+    The error is the difference from pushjax's converged answer.
+
+    Args:
+        dtype: "float32" or "float64".
+        steps: Number of steps of each push.
+    """
+    return float(tasks.error_mm(_same_fan(dtype, steps), _same_fan("float64", tasks.REFERENCE_STEPS)).max())
+
+
+def _same_fan(dtype: str, steps: int) -> np.ndarray:
+    """Return the final poses of MuJoCo's pushes by pushjax, (pushes, 3), m and rad."""
+    here = tasks.task("quartic", dtype)._replace(slider=tasks.cast(_on_four(), dtype))
+    offset, angle = (jnp.asarray(part, dtype) for part in np.array(mujoco.PUSHES).T)
+    return np.asarray(jax.jit(jax.vmap(here.push))(tasks.paths(offset, angle, steps)).pose[:, -1], float)
+
+
+@cache
+def _on_four() -> pj.Slider:
+    """Return the square on the four supports, with the quartic fitted to their limit surface."""
+    pairs = pj.Support.points(np.array(SUPPORTS["four"])).wrench_twist_pairs(jax.random.key(0), 400)
+    return pj.Slider(tasks.square("quartic").shape, pj.fit_limit_surface(*pairs, degree=4))
+
+
+def _straight(scene: Scene, offsets: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return start and end positions of the tip's center, both (n, 2), m, of pushes along the normal of the side."""
+    starts = np.array([[-scene.side / 2 - scene.tip_radius, y] for y in offsets])
+    return starts, starts + np.array([scene.travel, 0.0])
+
+
+def _um(slip: np.ndarray) -> list[float]:
+    return (1e6 * np.abs(slip)).tolist()
+
+
+def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
+    """Write the comparison with the fastest other program into the rows of pushjax.
+
+    Each row that has a peer gets `peer`, its name, and `peer_ratio`, how many times as many problems pushjax solves in
+    the same CPU time. Rows of pushes also get `slip_um`, the slip of a sticking finger in the same number of steps, and
+    `same_fan_error_mm`, the error over the same pushes as MuJoCo's.
+
+    Args:
+        rows: Rows of pushjax; changed in place.
+        peers: Rows of the other programs.
+    """
+    for row in rows:
+        same = [peer for peer in peers if peer["of"] == ALIKE.get(row["case"], row["case"])]
+        if same:
+            best = min(same, key=lambda peer: peer["processor_s_each"])
+            row["peer"] = best["peer"]
+            row["peer_ratio"] = best["processor_s_each"] * row["batch"] / row["processor_s"]
+            if row["case"] == "push_quartic":
+                steps = round(row["steps"])
+                row["slip_um"] = slip_um(row["dtype"], steps=steps)
+                row["same_fan_error_mm"] = same_fan_error_mm(row["dtype"], steps)
+
+
+def draw(record: dict[str, Any], out: Path) -> str:
+    """Draw computing time against error for pushes with different numbers of steps.
+
+    Args:
+        record: Record of the benchmark, with `by_steps` and `peers`.
+        out: Folder for the picture.
+
+    Returns:
+        Path of the picture.
+    """
+    from benchmarks.peers.figure import speed_figure
+    from pushjax import plot
+
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for row in record["by_steps"]:
+        point = row["processor_s"] / row["batch"], row["pose_error_mm"]
+        curves.setdefault(f"pushjax, {row['dtype']}", []).append(point)
+    for peer in (peer for peer in record["peers"] if peer["of"] == "push_quartic"):
+        # a row with error zero is the reference that the others are compared with
+        points = [(1e-6 * row["us_per_push"], row["error_mm"]) for row in peer["by_timestep"] if row["error_mm"] > 0]
+        if points:
+            curves[f"{NAMES[peer['peer']]}, {peer['supports']} supports"] = points
+    return str(plot.save(speed_figure(curves, tasks.ALLOWED_MM), out / "bench.png"))
+
+
+def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
+    """Return the lines that the command prints.
+
+    Args:
+        peers: Rows of the other programs.
+        rows: Rows of pushjax, after `compare`.
+    """
+    lines = ["", f"the same by others; simulators within {tasks.ALLOWED_MM} mm of their own converged answer:"]
+    for peer in peers:
+        each = f"{1e3 * peer['processor_s_each']:.2f} ms of a processor"
+        lines.append(f"  {peer['of']}, {peer['peer']}: {each}{_more(peer)}")
+    for row in rows:
+        if row["peer_ratio"] is not None:
+            each = 1e6 * row["processor_s"] / row["batch"]
+            more = "" if row["pose_error_mm"] is None else f" ({row['steps']:.3g} steps, {row['pose_error_mm']:.3f} mm)"
+            slip = f"; slip {' and '.join(f'{x:.1g}' for x in row['slip_um'])} um" if "slip_um" in row else ""
+            if "same_fan_error_mm" in row:
+                slip += f"; {row['same_fan_error_mm']:.3f} mm over the pushes of MuJoCo's"
+            lines.append(
+                f"  {row['case']}, pushjax, {row['dtype']}, batch {row['batch']}: {each:.2f} us of a processor{more}, "
+                f"1/{row['peer_ratio']:.0f} of {row['peer']}'s{slip}"
+            )
+    return lines
+
+
+def _more(peer: dict[str, Any]) -> str:
+    said = ""
+    if "timestep_s" in peer:
+        said += f", {peer['supports']} supports, {1e3 * peer['timestep_s']:.3g} ms steps ({peer['error_mm']:.3f} mm)"
+    if "exact_error_mm" in peer:
+        said += f", {peer['exact_error_mm']:.2f} mm from exact friction"
+    if "rigid_error_mm" in peer:
+        said += f", {peer['rigid_error_mm']:.2f} mm from rigid contact"
+    if peer.get("slip_um"):
+        said += f", slip {' and '.join(f'{x:.1f}' for x in peer['slip_um'])} um"
+    if "loss_over_theirs" in peer:
+        said += "; our loss over theirs: " + ", ".join(f"{x:.6f} ({d})" for d, x in peer["loss_over_theirs"].items())
+    if "found" in peer:
+        said += f", finds {100 * peer['found']:.0f} % of the motions"
+    return said

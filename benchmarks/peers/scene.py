@@ -1,0 +1,238 @@
+"""The push in MuJoCo: what is simulated (`Scene`), with which settings (`Settings`), and the model built from both.
+
+The push is planar. To keep it so, the tip touches the slider at the height of the table: a push above the table would
+shift load from one support to another. Contacts are given as pairs (the tip and the slider, each support and the
+table). Nothing else collides, and each pair has its own friction instead of the larger one of two geoms.
+
+The settings were chosen on eight pushes that stick and slide, on three supports and on four, by comparison with the
+exact Coulomb answer (`coulomb`).
+
+- cone "elliptic". A pyramid has 1.4 times more friction along its diagonals than along its axes. It causes an error of
+  3.7 mm at any timestep.
+- A sliding contact of MuJoCo dilates. Its normal force is D (μ b s − b v_n − k r), where s is the sliding speed,
+  b = 2 / (d t) is the damping for the time constant t, and D = d / ((1 − d) A) for the impedance d and the inverse
+  inertia A. If μ b s alone carries more than the load, the support lifts off the table, lands, and hops on. With
+  MuJoCo's default (elliptic, one time constant of 0.02 s) the error is 2.8 mm at 20 mm/s, and more with smaller time
+  constants or timesteps. Therefore sliding has its own time constant (`solreffriction`), several times as long as the
+  normal one, and the speed is low.
+- A sticking contact creeps with R f / b, so long time constants increase the creep. `impratio` reduces R at no cost.
+  The tip's time constant of sliding is shorter than that of the supports, because the tip sticks or slides slowly.
+- The normal time constant determines the penetration depth of the tip. It is as short as the timestep allows.
+  Impedances from 0.65 to 0.93 do about equally well; near 1 the supports are stiff enough to hop. The impedance is
+  constant, so that the stiffness does not depend on the depth.
+- integrator "discrete" (3.13 and later) treats contacts implicitly. The time constant may be one timestep; the other
+  integrators need at least two. "discrete" is best at large timesteps; at small ones "implicitfast" does as well.
+- solver "CG", tolerance 1e-6. It is as exact as "Newton" and 10 to 25 % faster (5.5 to 6 µs a step). "PGS" takes twice
+  as long. Looser tolerances add 0.05 mm and more, and with "implicitfast" they fail (1e-4: errors of millimeters).
+- noslip iterations reduce the creep little at small timesteps (from 9 to 4 µm) and disturb the answer at large ones
+  (0.17 mm).
+- The table is a conveyor (`surfacevel`, 3.11 and later) and the tip stands still, so that there are six degrees of
+  freedom.
+
+The speed is a compromise: a slower tip reduces inertia and dilation, but gives more time to creep. At a tenth of the
+speed the final poses differ by 0.19 mm at most. Time constants are in seconds and do not change with the timestep, so
+that smaller timesteps converge. Length, time and gravity scale: a push at half the speed, under a quarter of gravity
+and with twice the timestep, is the same computation.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+FOOT = 0.01  # m; radius of a support's sphere, which slides, so that its size does not matter
+HALF_HEIGHT = 0.01
+GRAVITY = 9.81
+# Mass of a tip that has a joint, kg. Three newtons slow it by 0.2 % within 5 ms, and its speed is reset after each step
+# (`mjx`). A tip of a million tons would keep its speed without that, but the solver's tolerance is relative to the
+# total inertia.
+TIP_MASS = 1e3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A slider on point supports, and the round tip that pushes it. SI units, the slider's body frame.
+
+    Attributes:
+        supports: Positions of the supports, m. The loads follow from statics for three supports, and from equal
+            stiffness for more.
+        side: Side of the square, m.
+        outline: Vertices of a convex polygon about the center of mass, m; a square of `side` unless given.
+        tip_radius: Radius of the tip, m.
+        friction_tip: Coefficient of friction between tip and slider.
+        friction_table: Coefficient of friction between supports and table.
+        mass: Mass of the slider, kg.
+        speed: Speed of the tip, m/s.
+        travel: Length of the pushes of `mujoco.fan`, m.
+
+    Raises:
+        ValueError: If there are fewer than three supports, or if one of `side`, `tip_radius`, `friction_table`, `mass`,
+            `speed` and `travel` is not positive.
+    """
+
+    supports: tuple[tuple[float, float], ...]
+    side: float = 0.09
+    outline: tuple[tuple[float, float], ...] = ()
+    tip_radius: float = 0.00475
+    friction_tip: float = 0.25
+    friction_table: float = 0.3
+    mass: float = 1.0
+    speed: float = 0.007
+    travel: float = 0.05
+
+    def __post_init__(self):
+        if len(self.supports) < 3:
+            raise ValueError(f"supports must be at least three points; got {len(self.supports)}")
+        for name in ("side", "tip_radius", "friction_table", "mass", "speed", "travel"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive; got {getattr(self, name)}")
+
+    @property
+    def vertices(self) -> np.ndarray:
+        """Vertices of the outline, (vertices, 2), m, body frame."""
+        half = self.side / 2
+        return np.array(self.outline or ((-half, -half), (half, -half), (half, half), (-half, half)), float)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of MuJoCo; the module header gives the reasons for the defaults.
+
+    Attributes:
+        cone: Type of friction cone.
+        solver: Constraint solver.
+        integrator: Time integrator.
+        impratio: Ratio of frictional to normal impedance.
+        normal: Time constant of normal contact, s.
+        sliding: Time constant of the supports' friction, s; 0 uses `normal`.
+        tip_sliding: Time constant of the tip's friction, s; 0 uses `normal`.
+        impedance: Least and greatest impedance (solimp).
+        iterations: Largest number of solver iterations.
+        line_search: Largest number of line search iterations.
+        tolerance: Tolerance of the solver.
+        noslip: Number of noslip iterations.
+    """
+
+    cone: str = "elliptic"
+    solver: str = "CG"
+    integrator: str = "discrete"
+    impratio: float = 170.0
+    normal: float = 0.010
+    sliding: float = 0.050
+    tip_sliding: float = 0.013
+    impedance: tuple[float, float] = (0.86, 0.86)
+    iterations: int = 100
+    line_search: int = 50
+    tolerance: float = 1e-6
+    noslip: int = 0
+
+
+def engine() -> Any:
+    """Import and return the package mujoco.
+
+    Raises:
+        ValueError: If it is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as missing:
+        raise ValueError("--peers needs the extra: pip install '.[bench]'") from missing
+    return mujoco
+
+
+def build(scene: Scene, settings: Settings, timestep: float, conveyor: bool = True) -> Any:
+    """Build the MjModel of a push.
+
+    In its world frame x is along the push, and the tip's center is at the origin when the push begins. Its qpos holds
+    the slider's free joint (7 numbers), then the position of the tip along x if the tip has a joint.
+
+    Args:
+        scene: What is pushed.
+        settings: How MuJoCo computes.
+        timestep: Timestep, s.
+        conveyor: Whether the table moves under a tip that stands still. Otherwise the tip has a joint.
+
+    Returns:
+        The MjModel.
+    """
+    mujoco = engine()
+    table = f'surfacevel="{-scene.speed:.9g} 0 0"' if conveyor else ""
+    joint = '<joint type="slide" axis="1 0 0"/>' if not conveyor else ""
+    body, mesh = slider_body(scene)
+    tip = pair("tip", "slider", scene.friction_tip, settings.normal, settings.tip_sliding, settings.impedance)
+    text = f"""<mujoco>
+      {options(settings, timestep)}
+      <asset>{mesh}</asset>
+      <default><geom contype="0" conaffinity="0" mass="0"/></default>
+      <worldbody>
+        <geom name="table" type="plane" size="1 1 .1" {table}/>
+        {body}
+        <body name="tip">{joint}<inertial mass="{TIP_MASS}" pos="0 0 0" diaginertia="1 1 1"/>
+          <geom name="tip" type="sphere" size="{scene.tip_radius}"/>
+        </body>
+      </worldbody>
+      <contact>{supported(scene, settings)}{tip}</contact>
+    </mujoco>"""
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def _slider(scene: Scene) -> tuple[str, str]:
+    """Return the slider's geom and the mesh that it needs. A box is faster than a mesh, and exact in MJX."""
+    if not scene.outline:
+        return f'type="box" size="{scene.side / 2} {scene.side / 2} {HALF_HEIGHT}"', ""
+    corners = " ".join(f"{x} {y} {z}" for x, y in scene.vertices for z in (-HALF_HEIGHT, HALF_HEIGHT))
+    return 'type="mesh" mesh="slider"', f'<mesh name="slider" vertex="{corners}"/>'
+
+
+def feet(scene: Scene) -> str:
+    """Return the XML of spheres under the slider, one for each support."""
+    each = enumerate(scene.supports)
+    return "".join(f'<geom name="foot{k}" type="sphere" size="{FOOT}" pos="{x} {y} {FOOT}"/>' for k, (x, y) in each)
+
+
+def pair(one: str, other: str, friction: float, normal: float, sliding: float, impedance: tuple[float, float]) -> str:
+    """Return the XML of a contact between two geoms.
+
+    Args:
+        one: Name of the first geom.
+        other: Name of the second geom.
+        friction: Coefficient of friction.
+        normal: Time constant of the normal contact, s.
+        sliding: Time constant of the friction, s; 0 uses `normal`.
+        impedance: Least and greatest impedance.
+
+    Returns:
+        The XML.
+    """
+    rest = f'solreffriction="{sliding} 1"' if sliding else ""
+    return (
+        f'<pair geom1="{one}" geom2="{other}" condim="3" friction="{friction} {friction} 0 0 0" '
+        f'solref="{normal} 1" solimp="{impedance[0]} {impedance[1]} 0.001 0.5 2" {rest}/>'
+    )
+
+
+def supported(scene: Scene, settings: Settings) -> str:
+    """Return the XML of the contacts between table and supports."""
+    of = scene.friction_table, settings.normal, settings.sliding, settings.impedance
+    return "".join(pair("table", f"foot{k}", *of) for k in range(len(scene.supports)))
+
+
+def options(settings: Settings, timestep: float) -> str:
+    """Return the XML of MuJoCo's options; `timestep` in s."""
+    return (
+        f'<option timestep="{timestep:.12g}" integrator="{settings.integrator}" cone="{settings.cone}" '
+        f'jacobian="dense" solver="{settings.solver}" iterations="{settings.iterations}" '
+        f'tolerance="{settings.tolerance}" ls_iterations="{settings.line_search}" '
+        f'noslip_iterations="{settings.noslip}" impratio="{settings.impratio}" gravity="0 0 {-GRAVITY}"/>'
+    )
+
+
+def slider_body(scene: Scene) -> tuple[str, str]:
+    """Return the XML of the slider, a free body on its supports, and of the mesh that it needs."""
+    inertia = scene.mass * np.mean(np.sum(scene.vertices**2, axis=1)) / 3
+    shape, mesh = _slider(scene)
+    body = f"""<body name="slider"><freejoint/>
+          <inertial mass="{scene.mass}" pos="0 0 0" diaginertia="{inertia / 2} {inertia / 2} {inertia}"/>
+          <geom name="slider" {shape}/>{feet(scene)}
+        </body>"""
+    return body, mesh

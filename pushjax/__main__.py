@@ -1,0 +1,5 @@
+"""Entry point of `python -m pushjax`."""
+
+from pushjax.cli.main import main
+
+main()

@@ -1,0 +1,39 @@
+"""A function call that automatic differentiation treats as a constant, and the matching rematerialization policy."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+
+FOUND = "found"
+
+
+def without_derivatives(search: Callable, *args) -> Any:
+    """Return `search(*args)` as a constant with respect to every derivative.
+
+    `stop_gradient` on the arguments gives the same numbers. But JAX then still traces every loop of the search several
+    times, which took most of the time of tracing a gradient.
+
+    Args:
+        search: Function of `args`. It must not close over anything that is differentiated.
+        *args: Its arguments, pytrees of arrays.
+    """
+
+    @eqx.filter_custom_jvp
+    def opaque(args):
+        return search(*args)
+
+    @opaque.def_jvp
+    def _(primals, tangents):
+        out = opaque(*primals)
+        zeros = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, out)
+        return out, zeros
+
+    return checkpoint_name(jax.lax.stop_gradient(opaque(args)), FOUND)
+
+
+# Reverse mode saves the results of the searches of a step, so that the backward pass does not search again.
+keep_found = jax.checkpoint_policies.save_only_these_names(FOUND)

@@ -1,0 +1,56 @@
+"""Cells of a long run, kept in a file until its results are written, so that an interrupted run can continue."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pushjax._internal.record import write_json
+
+
+class CellCache:
+    """Cells of a run, saved in a file until `delete` is called.
+
+    Args:
+        experiment: Name of the experiment.
+        folder: Folder of the file. If the file exists, its cells are loaded. None: the cells are not saved.
+        settings: Settings of the run.
+
+    Raises:
+        ValueError: If the file holds the cells of a run with other settings.
+
+    Attributes:
+        cells: All cells known so far.
+    """
+
+    def __init__(self, experiment: str, folder: Path | None, settings: dict[str, Any]):
+        self.path = None if folder is None else _file(experiment, folder)
+        self.settings = settings
+        self.cells: list[dict[str, Any]] = []
+        if self.path is not None and self.path.exists():
+            record = json.loads(self.path.read_text())
+            if record["settings"] != settings:
+                other = record["settings"]
+                raise ValueError(f"{self.path} is of a run with other settings, {other}: remove it, or use those")
+            self.cells = record["cells"]
+
+    def find(self, labels: dict[str, str]) -> dict[str, Any] | None:
+        """Return the first cell with these labels, or None."""
+        return next((cell for cell in self.cells if labels.items() <= cell.items()), None)
+
+    def add(self, cell: dict[str, Any]) -> dict[str, Any]:
+        """Append a cell, save all cells, and return the cell."""
+        self.cells.append(cell)
+        if self.path is not None:
+            aside = self.path.with_suffix(".part")
+            write_json({"settings": self.settings, "cells": self.cells}, aside)
+            aside.replace(self.path)  # atomic, so that an interruption cannot leave a half-written file
+        return cell
+
+    @staticmethod
+    def delete(experiment: str, folder: Path) -> None:
+        """Delete the file of an experiment, if there is one: to be called when the results are on the disk."""
+        _file(experiment, folder).unlink(missing_ok=True)
+
+
+def _file(experiment: str, folder: Path) -> Path:
+    return folder / f"{experiment}-cells.json"

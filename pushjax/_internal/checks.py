@@ -1,0 +1,156 @@
+"""Checks of arguments, and their conversion to arrays.
+
+A value is checked if it is known. Inside `jit`, `vmap` or `grad` it may be a tracer: its shape is still checked, its
+values are not, and an invalid value is reported as a status. Every message names the argument, the value that was given
+and the values that are allowed.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import ArrayLike as OneArrayLike
+
+from pushjax._internal.jit import outermost
+
+ArrayLike = OneArrayLike | Sequence[Any]  # accepted in place of an array: also lists and tuples of numbers
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """Return `value` as a NumPy array, or None if it is a tracer."""
+    if isinstance(value, Tracer):
+        return None
+    return np.asarray(value)
+
+
+def as_float(value: Any, dtype: Any = None) -> jax.Array:
+    """Return `value` as a floating array.
+
+    Args:
+        value: Array, number, or nested sequence of numbers.
+        dtype: Dtype of the result. Default: the value's own dtype if that is floating, else the default floating dtype
+            (float32 unless x64 is enabled).
+    """
+    array = value
+    if not isinstance(value, jax.Array):
+        held = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+        array = jnp.asarray(value) if held else np.asarray(value)
+    if dtype is None:
+        own = jnp.issubdtype(array.dtype, jnp.floating)
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype) if own else jnp.result_type(float)
+    if isinstance(array, np.ndarray):
+        return on_device(array.astype(dtype))
+    return array.astype(dtype)
+
+
+def on_device(array: np.ndarray) -> jax.Array:
+    """Return `array` as a JAX array without compiling anything.
+
+    Outside of a trace `jnp.asarray` would compile a program for every shape.
+    """
+    return jax.device_put(array) if outermost() else jnp.asarray(array)
+
+
+def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Evaluate `function` with NumPy if all its arrays are known, and with `jax.numpy` otherwise.
+
+    Evaluation with NumPy compiles nothing.
+
+    Args:
+        function: Called as `function(np, *arrays)` or `function(jnp, *arrays)`. Keyword arguments are passed on
+            unchanged.
+
+    Returns:
+        The function of the arrays and the keyword arguments.
+    """
+
+    @functools.wraps(function)
+    def call(*arrays: jax.Array, **static: Any) -> Any:
+        known = [concrete(array) for array in arrays]
+        if any(array is None for array in known):
+            return function(jnp, *arrays, **static)
+        dtype = jnp.result_type(*arrays)
+        return jax.tree.map(lambda found: on_device(np.asarray(found, dtype)), function(np, *known, **static))
+
+    return call
+
+
+def common_dtype(*values: Any) -> Any:
+    """Return the floating dtype of a computation over `values`; Python numbers do not affect it."""
+    # a NumPy float64 counts as the widest float that is enabled: float32, unless x64 is enabled
+    dtypes = [jax.dtypes.canonicalize_dtype(v.dtype) for v in jax.tree.leaves(values) if hasattr(v, "dtype")]
+    floats = [dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
+    return jnp.result_type(*floats) if floats else jnp.result_type(float)
+
+
+def check_shape(name: str, value: jax.Array, shape: tuple[int | str, ...]) -> None:
+    """Raise ValueError unless `value.shape` matches `shape`, in which a string stands for any length."""
+    ok = value.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, value.shape, strict=False)
+    )
+    if not ok:
+        wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+        raise ValueError(f"{name} has shape {value.shape}; expected {wanted}")
+
+
+def check_type(name: str, value: Any, *kinds: type) -> None:
+    """Raise TypeError unless `value` is an instance of one of `kinds`."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise TypeError(f"{name}: expected a {wanted}; got a {type(value).__name__}")
+
+
+def check_finite(name: str, value: Any) -> None:
+    """Raise ValueError if `value` is known and has an entry that is NaN or infinite."""
+    known = concrete(value)
+    if known is not None and not np.all(np.isfinite(known)):
+        bad = np.argwhere(~np.isfinite(np.atleast_1d(known)))
+        raise ValueError(
+            f"{name} must be finite; found {len(bad)} NaN or infinite value(s), "
+            f"the first at index {tuple(bad[0].tolist())}"
+        )
+
+
+def check_positive(name: str, value: Any) -> None:
+    """Raise ValueError if `value` is known and has an entry that is not positive."""
+    known = concrete(value)
+    if known is not None and not np.all(known > 0):
+        raise ValueError(f"{name} must be positive; got {_brief(known)}")
+
+
+def check_non_negative(name: str, value: Any) -> None:
+    """Raise ValueError if `value` is known and has an entry that is negative or NaN."""
+    known = concrete(value)
+    if known is not None and not np.all(known >= 0):
+        raise ValueError(f"{name} must not be negative; got {_brief(known)}")
+
+
+def normalized_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
+    """Return the argument `weights` as an array (count,) of non-negative numbers that are not all zero.
+
+    None stands for ones.
+
+    Raises:
+        ValueError: If the shape is different, a weight is negative or not finite, or all weights are zero.
+    """
+    value = as_float(np.ones(count) if weights is None else weights, dtype)
+    check_shape("weights", value, (count,))
+    check_finite("weights", value)
+    check_non_negative("weights", value)
+    known = concrete(value)
+    if known is not None and not known.any():
+        raise ValueError("weights must not all be zero")
+    return value
+
+
+def _brief(value: np.ndarray) -> str:
+    return f"{value.item():.6g}" if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
+
+
+def traced(tree: Any) -> bool:
+    """Return whether any leaf of `tree` is a tracer."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))

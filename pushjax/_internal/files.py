@@ -1,0 +1,62 @@
+"""JSON files of records whose numbers are read back bit for bit."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+T = TypeVar("T")
+
+
+def save_json(path: str | Path, form: str, version: int, dtype: Any, record: dict[str, Any]) -> None:
+    """Write a record to a JSON file, with the header that `load_json` checks.
+
+    Args:
+        path: The file.
+        form: Name of the format.
+        version: Version of the format.
+        dtype: Floating dtype of the record's numbers.
+        record: Content that `json` can write (see `to_list`).
+    """
+    whole = {"format": form, "version": version, "dtype": str(dtype)} | record
+    Path(path).write_text(json.dumps(whole, indent=1) + "\n")
+
+
+def to_list(value: Any) -> Any:
+    """Return an array as nested lists of float64 numbers; None stays None.
+
+    Writing them as text is lossless for float32 and float64.
+    """
+    return None if value is None else np.asarray(value, np.float64).tolist()
+
+
+def load_json(path: str | Path, what: str, form: str, version: int, build: Callable[[dict[str, Any], Any], T]) -> T:
+    """Read a record that `save_json` wrote, and build an object from it.
+
+    Args:
+        path: The file.
+        what: The file's expected content in words, for the error message.
+        form: Name of the format that the file must have.
+        version: Version of the format that the file must have.
+        build: Called as `build(record, dtype)`, where `dtype` is the floating dtype of the record's numbers.
+
+    Returns:
+        The result of `build`.
+
+    Raises:
+        ValueError: If the file does not hold such a record.
+    """
+    try:
+        record = json.loads(Path(path).read_text())
+        if record["format"] != form:
+            raise ValueError("its format is another")
+        if record["version"] != version:
+            raise ValueError(f"version {record['version']!r} of the format; this program reads {version}")
+        # float64 becomes float32 unless x64 is enabled
+        return build(record, jax.dtypes.canonicalize_dtype(record["dtype"]))
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        wrong = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} does not hold {what}: {wrong}") from error

@@ -1,0 +1,103 @@
+"""Compilation of the library's functions, without Python's garbage collector and with short compile times.
+
+A function that is called by itself can be compiled for a short compile time (`quick_jit`). A function that is
+part of a user's program is compiled for a short run time.
+"""
+
+import functools
+import gc
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # JAX up to 0.9
+    from jax.core import get_opaque_trace_state  # pyright: ignore[reportAttributeAccessIssue]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+MANY = 50_000  # a call that has created at least so many objects has traced something
+ASIDE = gc.get_freeze_count()  # objects that the interpreter itself has frozen
+
+
+# Later versions no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
+HAS_EMITTERS = jax.__version_info__ < (0, 11)
+# A program that is called by itself runs once or a few times, on one example, for milliseconds, so the user waits only
+# for its compilation. Level 0 is not an option: without fusion emitters, one solve in a hundred then does not converge.
+QUICK: dict[str, str | bool | int] = {"xla_backend_optimization_level": 1}
+if HAS_EMITTERS:
+    QUICK["xla_cpu_use_fusion_emitters"] = False
+OUTERMOST = get_opaque_trace_state()
+
+
+def outermost() -> bool:
+    """Return whether nothing is being traced: the caller is not inside `jit`, `grad` or `vmap`."""
+    return get_opaque_trace_state() == OUTERMOST
+
+
+def jit(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` with `equinox.filter_jit`, and trace it without the garbage collector (see `without_gc`).
+
+    Every argument that is not an array is a constant of the program.
+    """
+    return without_gc(eqx.filter_jit(function))
+
+
+def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
+    """Compile `function` as `jit` does, but with the compiler options `QUICK` when it is called by itself.
+
+    With these options compilation takes a third of the time (JAX up to 0.10), and the program takes up to twice as long
+    to run. Inside `jit` the function is part of the surrounding program and is compiled with that program's options.
+    Inside `grad` and `vmap` it is compiled with the default options, because batches may be large.
+    """
+    quick = eqx.filter_jit(function, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
+    thorough = eqx.filter_jit(function)
+
+    @functools.wraps(function, updated=())
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return (quick if outermost() else thorough)(*args, **kwargs)
+
+    return without_gc(call)
+
+
+def without_gc(function: Callable[P, R]) -> Callable[P, R]:
+    """Return `function` with Python's garbage collector disabled during its calls.
+
+    The first call of a program traces it, and traces it again for each surrounding `vmap` and `grad`. That creates
+    millions of objects, nearly all of which stay. The collector would scan them at every few hundred new objects and
+    find nothing; it took up to half of the time of tracing.
+
+    So the collector is disabled during the call, in all threads. After the call the new objects are promoted to the
+    oldest generation, where they would be had the collector run; otherwise it would scan all of them three more times.
+    A call that traces nothing leaves the generations as they are, so that garbage is found as soon as without this
+    wrapper.
+    """
+
+    @functools.wraps(function, updated=())
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not gc.isenabled():  # disabled by an outer call, or by the user
+            return function(*args, **kwargs)
+        try:  # all of it is inside `try`, because an interrupt may come between any two lines
+            gc.disable()
+            return function(*args, **kwargs)
+        finally:
+            try:
+                _age()
+            finally:
+                gc.enable()
+
+    return call
+
+
+def _age() -> None:
+    """Promote all objects to the oldest generation if there are many new ones."""
+    if gc.get_count()[0] < MANY or gc.get_freeze_count() > ASIDE:  # objects that the user has frozen must stay frozen
+        return
+    try:
+        gc.freeze()
+    finally:
+        gc.unfreeze()  # moves all frozen objects to the oldest generation

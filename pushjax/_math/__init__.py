@@ -1,0 +1,1 @@
+"""Vectors, small matrices and random matrices, shared by geometry, friction and contact."""

@@ -1,0 +1,41 @@
+"""Random Wishart matrices, sampled by Bartlett's decomposition."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PRNGKeyArray
+
+from pushjax._math.linalg import Lower, product, squared
+from pushjax._math.vec import Scalar, unstack
+
+
+def sample_wishart(key: PRNGKeyArray, factor: Lower, dof: Scalar) -> Lower:
+    """Sample a Wishart matrix W(L L', dof), divided by dof so that its mean is L L'.
+
+    Differentiable in `factor` and `dof`.
+
+    Args:
+        key: PRNG key.
+        factor: L, lower triangular with n rows.
+        dof: Degrees of freedom, above n - 1, which is not checked. Otherwise the result is meaningless, and can be
+            finite or NaN.
+
+    Returns:
+        The lower triangle of the symmetric matrix.
+    """
+    return squared(product(factor, bartlett(key, len(factor), dof)))
+
+
+def bartlett(key: PRNGKeyArray, size: int, dof: Scalar) -> Lower:
+    """Sample a lower triangular T with T T' ~ W(I, dof) / dof."""
+    below, diagonal = jax.random.split(key)
+    off = jax.random.normal(below, (size * (size - 1) // 2,), dof.dtype)
+    squares = 2 * jax.random.gamma(diagonal, (dof - jnp.arange(size, dtype=dof.dtype)) / 2, dtype=dof.dtype)
+    scale = jax.lax.rsqrt(dof)
+    normals, chis = iter(unstack(off * scale)), unstack(jnp.sqrt(squares) * scale)
+    return tuple((*(next(normals) for _ in range(i)), chis[i]) for i in range(size))
+
+
+def tril(matrix: Array) -> Lower:
+    """Return the lower triangle of an array (n, n)."""
+    size = matrix.shape[0]
+    return tuple(tuple(matrix[i, j] for j in range(i + 1)) for i in range(size))

@@ -1,1 +1,0 @@
-"""How fast, and how exact: what `pushjax bench` measures. Nothing else imports this."""

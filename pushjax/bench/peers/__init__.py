@@ -1,1 +1,0 @@
-"""Other programs that answer the same question, at their best settings."""

@@ -1,0 +1,1 @@
+"""Contact problems and their solvers: from contacts to the slider's motion."""

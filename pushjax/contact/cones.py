@@ -1,0 +1,84 @@
+"""Friction cones, and the motion cones to which a limit surface maps them."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_shape, common_dtype
+from pushjax.contact.contact_plane import Contact, LimitCurve
+from pushjax.contact.problem import Contacts, contacts_in_scalars
+from pushjax.friction.limit_surface import LimitSurface
+
+
+def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]:
+    """Compute the unit directions of the left and right edge of a friction cone.
+
+    The left edge is counterclockwise from the normal, the right edge clockwise.
+
+    Args:
+        normal: Unit normal into the slider, (2,), body frame.
+        friction: Coefficient of friction mu.
+
+    Returns:
+        Unit force directions, (2, 2), body frame: the left edge, then the right edge.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, the normal is not of unit length or the friction is
+            negative.
+    """
+    dtype = common_dtype(normal, friction)
+    contact = _checked_contact(jnp.zeros(2, dtype), normal, friction, dtype)
+    n, mu = contact.normal, contact.friction
+    edges = jnp.stack([(n + n.perp().scale(s)).array() for s in (mu, -mu)])
+    return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
+
+
+def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]:
+    """Compute the unit directions of the left and right edge of a motion cone.
+
+    A force along the left edge of the friction cone moves the contact point along the left edge of the motion cone. The
+    same holds for the right edges. A pusher that moves between the two edges sticks. An edge may be more than 90
+    degrees from the normal.
+
+    Args:
+        surface: The slider's limit surface.
+        point: Contact point, (2,), m, body frame.
+        normal: Unit normal into the slider, (2,), body frame.
+        friction: Coefficient of friction mu.
+
+    Returns:
+        Unit velocities of the contact point, (2, 2), body frame: the left edge, then the right edge.
+
+    Raises:
+        ValueError: If a shape is wrong, a number is not finite, the normal is not of unit length or the friction is
+            negative.
+
+    Examples:
+        >>> import numpy as np, pushjax as pj
+        >>> surface = pj.Ellipsoid(np.eye(3), length=0.03)
+        >>> print(np.asarray(motion_cone(surface, (0.02, -0.04), (0.0, 1.0), friction=0.25)).round(3))
+        [[0.157 0.988]
+         [0.689 0.725]]
+
+    Reference: Mason 1986; Zhou et al. 2017, section IV.A.
+    """
+    contact = _checked_contact(point, normal, friction, common_dtype(surface, point, normal))
+    curve = LimitCurve.of(surface.form(), contact)
+    edges = []
+    for s in (contact.friction, -contact.friction):
+        g = curve.motion(s)
+        g = g.scale(1 / jnp.maximum(jnp.abs(g.x), jnp.abs(g.y)))  # first, because the squares below may underflow
+        g = g.scale(1 / jnp.sqrt(g.dot(g)))
+        edges.append((contact.normal.scale(g.x) + contact.normal.perp().scale(g.y)).array())
+    return jnp.stack(edges)
+
+
+def _checked_contact(point: ArrayLike, normal: ArrayLike, friction: ArrayLike, dtype: Any) -> Contact:
+    """Check the arguments and make a contact with a pusher that does not move."""
+    p, n, mu = (as_float(value, dtype) for value in (point, normal, friction))
+    check_shape("point", p, (2,))
+    check_shape("normal", n, (2,))
+    check_shape("friction", mu, ())
+    contacts = Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu)
+    return contacts_in_scalars(contacts, contacts.friction)[0]

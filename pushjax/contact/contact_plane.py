@@ -1,0 +1,137 @@
+"""One contact in its contact plane, where the limit surface reduces to a curve.
+
+The wrenches that one contact can apply are F = J'(f_n n + f_t t), a plane. On it H becomes the binary form
+h(f_n, f_t) = H(J'(f_n n + f_t t)), convex and homogeneous of the same degree d. The contact point of the slider moves,
+in (n, t), along grad h. So a single contact is a limit curve h = 1 in the plane of contact forces, whatever the limit
+surface: a force f moves the contact point along the curve's normal at f.
+
+Along the friction cone let f = (1, s) and h(s) = h(1, s). Then the motion is (d h - s h', h'). By convexity its angle
+phi(s) = atan2(h', d h - s h') increases with s, and it stays within 90 degrees of the angle of f:
+
+    (d h - s h') h'' - h' (d h - s h')' = d h h'' - (d - 1) h'^2 >= 0.
+
+Let v be a pushing motion with v_n > 0. Beyond phi(mu) the pusher slides left, and beyond phi(-mu) it slides right.
+Between them it sticks, at the s with phi(s) = phi_v. The edge of the motion cone may open beyond 90 degrees from the
+normal; then no push slides past that edge. Hence the pusher slides left if and only if, at s = mu,
+
+    motion_n > 0  and  cross(motion, v) > 0.
+
+The condition for right is its mirror image. Neither needs an arctangent. (Zhou et al. 2017, section IV.A, tests the
+cross product only.)
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._internal.xla import tree_where
+from pushjax._math.vec import Scalar, Vec2, Vec3
+from pushjax.friction.limit_surface import Form
+
+
+class Contact(NamedTuple):
+    """One contact in the body frame, in scalars.
+
+    Attributes:
+        point: Contact point, m.
+        normal: Unit normal into the slider.
+        displacement: Displacement of the pusher's material point over the step, m.
+        friction: Coefficient of friction mu.
+        gap: Distance still to close along the normal, m.
+    """
+
+    point: Vec2
+    normal: Vec2
+    displacement: Vec2
+    friction: Scalar
+    gap: Scalar
+
+    def where(self, condition: Bool[Array, ""]) -> "Contact":
+        """This contact where the condition holds, else a contact out of reach.
+
+        The contact out of reach does not depend on the numbers of this one. Call this before anything is computed from
+        those numbers: a NaN that is only masked afterwards comes back in the gradient.
+
+        Args:
+            condition: Whether to keep this contact.
+
+        Returns:
+            The contact.
+        """
+        zero, one = jnp.zeros_like(self.gap), jnp.ones_like(self.gap)
+        still = Vec2(zero, zero)
+        return tree_where(condition, self, Contact(still, Vec2(one, zero), still, zero, one))
+
+    def approach(self) -> Vec2:
+        """Displacement (n, t) of the slider's contact point that keeps it with the pusher, m."""
+        normal, tangent = self.normal, self.normal.perp()
+        return Vec2(self.displacement.dot(normal) - self.gap, self.displacement.dot(tangent))
+
+    def wrench(self, force: Vec2, length: Scalar) -> Vec3:
+        """The normalized wrench of a contact force.
+
+        Args:
+            force: Contact force along (normal, tangent).
+            length: Characteristic length of the limit surface, m.
+
+        Returns:
+            The wrench (fx, fy, tau / length).
+        """
+        f = self.normal.scale(force.x) + self.normal.perp().scale(force.y)
+        return Vec3(f.x, f.y, self.point.cross(f) / length)
+
+
+class LimitCurve(NamedTuple):
+    """h along the friction cone, h(s) = sum_k c_k s^k.
+
+    Attributes:
+        c: The coefficients c_k, d + 1 of them.
+    """
+
+    c: tuple[Scalar, ...]
+
+    @staticmethod
+    def of(form: Form, contact: Contact) -> "LimitCurve":
+        """The limit curve of a contact.
+
+        Args:
+            form: H of the limit surface, in scalars.
+            contact: The contact.
+
+        Returns:
+            The curve, of the same degree as H.
+        """
+        one, zero = jnp.ones_like(contact.gap), jnp.zeros_like(contact.gap)
+        along_normal = contact.wrench(Vec2(one, zero), form.length)
+        along_tangent = contact.wrench(Vec2(zero, one), form.length)
+        return LimitCurve(form.restrict(along_normal, along_tangent))
+
+    @property
+    def degree(self) -> int:
+        """The degree d."""
+        return len(self.c) - 1
+
+    def motion(self, s: Scalar) -> Vec2:
+        """grad h at (1, s): how the contact point moves, in (n, t). Two polynomials of degree d - 1."""
+        d = self.degree
+        return Vec2(
+            _horner([(d - k) * c for k, c in enumerate(self.c[:-1])], s),
+            _horner([k * c for k, c in enumerate(self.c)][1:], s),
+        )
+
+    def bend(self, s: Scalar) -> Scalar:
+        """h''(s)."""
+        return _horner([k * (k - 1) * c for k, c in enumerate(self.c)][2:], s)
+
+    def value(self, s: Scalar) -> Scalar:
+        """h(s)."""
+        return _horner(self.c, s)
+
+
+def _horner(coefficients, s: Scalar) -> Scalar:
+    """The value of a polynomial, its coefficients given with the constant first."""
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * s + c
+    return total

@@ -1,0 +1,275 @@
+"""The contact problem as a user states it, in arrays, and `solve_contacts`, which solves it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    common_dtype,
+    concrete,
+)
+from pushjax._internal.jit import quick_jit
+from pushjax._math.vec import Vec2, Vec3, unstack
+from pushjax.contact.contact_plane import Contact
+from pushjax.contact.exhaustive import Exhaustive
+from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution, nondimensionalize
+from pushjax.contact.single import solve_single
+from pushjax.contact.single_first import single_first
+from pushjax.contact.sticking import ScalarRoot, StickingSolver
+from pushjax.friction.limit_surface import Form, LimitSurface
+
+MAX_CONTACTS = 8
+UNIT_TOLERANCE = 1e-5  # on a normal's length: a hundred times the roundoff of float32
+
+
+class Contacts(eqx.Module):
+    """Contacts between a hand and a slider, in the slider's body frame.
+
+    Attributes:
+        point: Contact points, (contacts, 2), m.
+        normal: Unit normals into the slider, (contacts, 2).
+        displacement: Displacement of the pusher's material point over the step, (contacts, 2), m.
+        friction: Coefficient of friction mu, (contacts,), or one for all.
+        gap: Distance still to close along the normal, m, (contacts,), or one for all; negative in penetration.
+        active: False for a contact that is only padding, (contacts,), or one for all. Other entries of such a contact
+            may be anything.
+
+    Raises:
+        ValueError: If shapes do not match, a number is not finite, a normal is not of unit length or a friction is
+            negative.
+    """
+
+    point: Float[Array, "contacts 2"]
+    normal: Float[Array, "contacts 2"]
+    displacement: Float[Array, "contacts 2"]
+    friction: Float[Array, "contacts"]
+    gap: Float[Array, "contacts"]
+    active: Bool[Array, "contacts"]
+
+    def __init__(
+        self,
+        point: ArrayLike,
+        normal: ArrayLike,
+        displacement: ArrayLike,
+        friction: ArrayLike,
+        gap: ArrayLike = 0.0,
+        active: ArrayLike = True,
+    ):
+        dtype = common_dtype(point, normal, displacement, friction, gap)
+        self.point = as_float(point, dtype)
+        check_shape("point", self.point, ("contacts", 2))
+        m = self.point.shape[0]
+        self.normal, self.displacement = as_float(normal, dtype), as_float(displacement, dtype)
+        check_shape("normal", self.normal, (m, 2))
+        check_shape("displacement", self.displacement, (m, 2))
+        self.friction = _each("friction", as_float(friction, dtype), m)
+        self.gap = _each("gap", as_float(gap, dtype), m)
+        self.active = _each("active", jnp.asarray(active, bool), m)
+        counts = concrete(self.active)
+        # padding may hold anything; if `active` is traced, all contacts are checked
+        used = slice(None) if counts is None or counts.all() else np.flatnonzero(counts)
+        for name in ("point", "normal", "displacement", "friction", "gap"):
+            check_finite(name, getattr(self, name)[used])
+        check_non_negative("friction", self.friction[used])
+        known = concrete(self.normal)
+        if known is not None and np.any(np.abs(np.linalg.norm(known[used], axis=1) - 1) > UNIT_TOLERANCE):
+            raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
+
+
+def _each(name: str, value: Array, contacts: int) -> Array:
+    """The value for each contact, given one for each or one for all."""
+    if value.ndim and value.shape != (contacts,):
+        raise ValueError(f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact")
+    return jnp.broadcast_to(value, (contacts,))
+
+
+class Motion(eqx.Module):
+    """The answer to a contact problem.
+
+    Attributes:
+        twist: Twist of the slider over the step, (3,), (m, m, rad). Zero where the slider does not move.
+        wrench: Wrench on H = 1, (3,), N and N m. Zero where the slider does not move.
+        force: Contact forces along the normal and the tangent t = (-n_y, n_x), (contacts, 2), N. They sum to the
+            wrench. Where several distributions do, this is the one of evenly soft fingers
+            (`pushjax.contact.force_distribution`).
+        mode: `ContactMode` of each contact, (contacts,). A contact that touches has the mode of its slip, also where
+            its force is zero.
+        status: `Status`. MOVING: every condition holds to 1e-9 of the fastest pusher and of the sum of the forces (1e-4
+            in float32). Where the slider is some ten thousand times as fast as its pushers, the conditions hold to what
+            roundoff leaves of that (1e-8 at most). FREE: nothing would be violated if the slider stayed. JAMMED: no
+            twist satisfies every contact. NOT_CONVERGED: no twist was found, which proves nothing. In float32, an
+            example is a slider that escapes from a wedge more than some 800 times as fast as its pushers: float32 has
+            too few digits to represent that to 1e-4.
+        margin: Minus the hand's squeeze power, m. The squeeze power is the most work, per unit of normal force, that
+            the fingers do in a step on forces that cancel through the slider. A positive margin guarantees a motion,
+            and is how far the fingers may still close on each other. Where the status is JAMMED the margin is negative,
+            and its size is how far the fingers would have to open. It is infinite where no forces can cancel, as with
+            one contact. It is seldom negative where there is a motion; then a jam is possible too.
+        unique: False where another twist satisfies every condition too. Only twists that the solver tries count;
+            `Exhaustive` tries all.
+    """
+
+    twist: Float[Array, "3"]
+    wrench: Float[Array, "3"]
+    force: Float[Array, "contacts 2"]
+    mode: Int[Array, "contacts"]
+    status: Int[Array, ""]
+    margin: Float[Array, ""]
+    unique: Bool[Array, ""]
+
+
+def solve_contacts(
+    surface: LimitSurface, contacts: Contacts, *, solver: ContactSolver | StickingSolver | None = None
+) -> Motion:
+    """Find the slider's motion under given displacements of its pushers.
+
+    Friction is Coulomb's at each contact, and that of the limit surface under the slider. The motion is the twist V,
+    with forces f, for which V = k grad H(sum J'f), k > 0, and, with the relative motion w = J V - displacement at each
+    contact,
+
+        0 <= f_n  _|_  w_n + gap >= 0,   |f_t| <= mu f_n,   f_t = +mu f_n where w_t < 0,  -mu f_n where w_t > 0.
+
+    Of several solutions, the one with the largest power on H = 1 is returned; of those with equal power, the one with
+    the smallest twist in the length metric. But where the slider may stay, it stays. The choice does not depend on the
+    order of the contacts, the frame or a mirror.
+
+    The motion is differentiable, in forward and reverse mode, in everything but `active`, within the contact modes of
+    the solution. While a contact sticks, the derivative of the motion with respect to its friction is zero. Where
+    forces are indeterminate, their derivatives are those of changes that keep them indeterminate. For example, there is
+    no such derivative with respect to one of the two friction coefficients of a flat push. The margin is a maximum and
+    has kinks.
+
+    Args:
+        surface: The slider's limit surface.
+        contacts: One to eight contacts.
+        solver: The contact solver. None for `ScalarRoot()` with one contact and `Exhaustive()` with more.
+            `HessianIteration()` also solves one contact.
+
+    Returns:
+        The motion, with the contact forces and the status. Traced values that are not finite, or a traced negative
+        friction, give `Status.INVALID` and no motion.
+
+    Raises:
+        ValueError: For no contact, for more than eight, or for more than one with a solver of one contact.
+
+    Examples:
+        >>> import numpy as np, pushjax as pj
+        >>> surface = pj.Ellipsoid(np.eye(3), length=0.03)
+        >>> contacts = pj.Contacts([(0.02, -0.04)], [(0.0, 1.0)], displacement=[(0.0, 0.001)], friction=0.25)
+        >>> motion = solve_contacts(surface, contacts)
+        >>> print(pj.ContactMode(int(motion.mode[0])).name, (1e3 * np.asarray(motion.twist)).round(1))
+        SLIDING_LEFT [-0.2  0.8  9.1]
+
+    Reference: Zhou et al. 2017, sections IV.A and IV.B; the gap is that of Stewart & Trinkle 1996.
+    """
+    _check_num_contacts(contacts.point.shape[0])
+    return _solved(surface, contacts, solver)
+
+
+def _check_num_contacts(contacts: int) -> None:
+    """Raise ValueError for a number of contacts that is not supported."""
+    if not 1 <= contacts <= MAX_CONTACTS:
+        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {contacts}")
+
+
+@quick_jit
+def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
+    """`solve_contacts`, compiled."""
+    form, friction = to_scalars(surface, contacts.friction)
+    each = contacts_in_scalars(contacts, friction)
+    result = solve_in_scalars(form, each, unstack(contacts.active), solver, margin=True)
+    wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
+    return Motion(
+        twist=result.twist.array(),
+        wrench=wrench.array(),
+        force=jnp.stack([f.array() for f in result.force]),
+        mode=jnp.stack(result.mode),
+        status=result.status,
+        margin=result.margin,
+        unique=result.unique,
+    )
+
+
+def solve_in_scalars(
+    form: Form,
+    contacts: tuple[Contact, ...],
+    active: tuple[Bool[Array, ""], ...],
+    solver: ContactSolver | StickingSolver | None,
+    *,
+    margin: bool,
+) -> ScalarSolution:
+    """`solve_contacts` in scalars.
+
+    Args:
+        form: H of the limit surface, in scalars.
+        contacts: The contacts. One that is not active must be out of reach (`contacts_in_scalars`).
+        active: For each contact, False if it is only padding.
+        solver: As in `solve_contacts`. Without a margin, None solves several contacts by one of them first
+            (`single_first`).
+        margin: Whether the margin is wanted. If not, it is infinite wherever there is a motion, and takes no time.
+
+    Returns:
+        The motion, in scalars.
+
+    Raises:
+        ValueError: As for `solve_contacts`.
+    """
+    _check_num_contacts(len(contacts))  # also for the contacts of a hand
+    if solver is None:
+        if len(contacts) > 1 and not margin:
+            return single_first(form, contacts, active)
+        solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
+    if not isinstance(solver, StickingSolver):
+        return solver.solve(nondimensionalize(form, contacts, active, margin=margin))
+    if len(contacts) != 1:
+        raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {len(contacts)}")
+    one = solve_single(form, contacts[0], solver)
+    far = jnp.full_like(one.twist.x, jnp.inf)
+    return ScalarSolution(one.twist, one.wrench, (one.force,), (one.mode,), one.status, far, one.unique)
+
+
+def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
+    """The limit surface in scalars, and the friction of the contacts.
+
+    If the surface has numbers that cannot be computed with, it is replaced by one with all numbers one, which keeps NaN
+    out. The friction is then replaced by NaN, which makes every contact invalid.
+
+    Args:
+        surface: The limit surface.
+        friction: Coefficients of friction, (contacts,).
+
+    Returns:
+        H in scalars, and the coefficients of friction.
+    """
+    form = surface.form()
+    known = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
+    return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), jnp.where(known, friction, jnp.nan)
+
+
+def contacts_in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, ...]:
+    """The contacts in scalars. A contact that is not active is out of reach, whatever its numbers are.
+
+    Args:
+        contacts: The contacts, in arrays.
+        friction: Coefficients of friction, (contacts,), from `to_scalars`.
+
+    Returns:
+        One `Contact` for each contact. Its friction is NaN where the normal is not of unit length.
+    """
+    rows = (contacts.point, contacts.normal, contacts.displacement)
+    found = []
+    for point, normal, displacement, mu, gap, active in zip(
+        *(unstack(row) for row in (*rows, friction, contacts.gap, contacts.active)), strict=True
+    ):
+        n = Vec2.of(normal)
+        unit = jnp.abs(n.dot(n) - 1) <= 2 * UNIT_TOLERANCE  # a traced normal has not been checked before
+        mu = jnp.where(unit, mu, jnp.nan)
+        found.append(Contact(Vec2.of(point), n, Vec2.of(displacement), mu, gap).where(active))
+    return tuple(found)

@@ -1,0 +1,126 @@
+"""Solver for one frictional contact: whether it separates, sticks or slides, and the slider's twist."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._math.vec import Scalar, Vec2, Vec3
+from pushjax.contact.contact_plane import Contact, LimitCurve
+from pushjax.contact.status import ContactMode, Status
+from pushjax.contact.sticking import StickingSolver, sticking_tolerance
+from pushjax.friction.limit_surface import Form
+
+
+class SingleSolution(NamedTuple):
+    """The answer for one contact, in scalars.
+
+    Attributes:
+        twist: Twist of the slider over the step (m, m, rad).
+        wrench: Normalized wrench on H = 1.
+        force: Contact force along (normal, tangent), N.
+        mode: `ContactMode`.
+        status: `Status`.
+        unique: False where another twist satisfies every condition too.
+    """
+
+    twist: Vec3
+    wrench: Vec3
+    force: Vec2
+    mode: Int[Array, ""]
+    status: Int[Array, ""]
+    unique: Bool[Array, ""]
+
+
+def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> SingleSolution:
+    """Compute the slider's twist from the pusher's displacement at one contact.
+
+    The contact point follows the pusher exactly along the normal. Along the tangent it follows the pusher exactly where
+    the contact sticks, else it moves along the motion cone's edge. This part of the twist is never computed from the
+    surface, so a sticking contact has zero slip up to roundoff. Only the rotation is computed from the surface.
+
+    The scale v_n / motion_n of a sliding motion needs no guard against a small motion_n. Sliding left means
+    motion_n v_t > motion_t v_n, so the scale stays below v_t / motion_t.
+
+    Args:
+        form: H of the limit surface, in scalars.
+        contact: The contact, in the body frame.
+        solver: Finds the force of a sticking contact.
+
+    Returns:
+        The motion, zero unless the status is MOVING.
+
+    Reference: Zhou et al. 2017, section IV.A.
+    """
+    known, contact = _known(contact)
+    # The motion does not depend on the scale of H, but squares of H overflow or underflow in float32. So h is divided
+    # by its own size, which is a constant to every derivative too.
+    curve = LimitCurve.of(form, contact)
+    size = jax.lax.stop_gradient(curve.c[0] + curve.c[-1])
+    size = jnp.where(size > 0, size, 1.0)
+    curve, size = compute_once((LimitCurve(tuple(c / size for c in curve.c)), size), contact.approach().x)
+    mu = contact.friction
+    v = contact.approach()
+    valid = known & jnp.isfinite(sum(curve.c))
+    pushes = decide(valid & (v.x > 0), v.x)
+    v = tree_where(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # placeholder where nothing pushes
+    curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
+
+    left_edge, right_edge = curve.motion(mu), curve.motion(-mu)
+    left = (left_edge.x > 0) & (left_edge.cross(v) > 0)
+    right = (right_edge.x > 0) & (right_edge.cross(v) < 0)
+    left, right = compute_once((left, right & ~left), v.x)
+    slides = left | right
+
+    # A sliding contact needs no root. Its search gets friction zero and ends at once, so that in a batch it does not
+    # delay the contacts that stick.
+    stuck = solver(curve, v, jnp.where(slides, 0.0, mu))
+    s = jnp.where(left, mu, jnp.where(right, -mu, stuck.ratio))
+    g = curve.motion(s)
+    g2 = g.dot(g)
+    k = jnp.where(slides, v.x / jnp.where(slides, g.x, 1.0), v.dot(g) / jnp.where(g2 > 0, g2, 1.0))
+    follow = Vec2(v.x, jnp.where(slides, k * g.y, v.y))
+
+    one = jnp.ones_like(s)
+    ray = tree_where(valid, contact.wrench(Vec2(one, s), form.length), Vec3(one, 0 * one, 0 * one))
+    omega = k * form.spin(ray) / (size * form.length)
+    normal = contact.normal
+    linear = normal.scale(follow.x) + normal.perp().scale(follow.y) - contact.point.perp().scale(omega)
+    h = curve.value(s)
+    solved = (h > 0) & (slides | (stuck.residual <= sticking_tolerance(s.dtype))) & jnp.isfinite(omega)
+    moves = decide(pushes & solved, v.x)
+    scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
+
+    def where_moving(value):
+        return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
+
+    mode = jnp.where(left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING))
+    status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
+    return SingleSolution(
+        where_moving(Vec3(linear.x, linear.y, omega)),
+        where_moving(ray.scale(scale)),
+        where_moving(Vec2(scale, scale * s)),
+        jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8),
+        jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
+        ~(valid & ~pushes & _drags(curve, mu, contact.approach())),
+    )
+
+
+def _known(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
+    """Whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
+    known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
+    return known, contact.where(known)
+
+
+def _drags(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
+    """Whether a pusher that does not approach could also hold on to the slider and drag it along.
+
+    Where the motion cone opens beyond 90 degrees, a push along the surface or slightly off it lies inside the cone. But
+    the slider may also stay behind, which satisfies every condition too. That is the answer given: nothing pushes.
+    """
+    left, right = curve.motion(mu), curve.motion(-mu)
+    drags_left = (left.x < 0) & (v.y > 0) & (left.cross(v) < 0)
+    drags_right = (right.x < 0) & (v.y < 0) & (right.cross(v) > 0)
+    return (v.x <= 0) & (drags_left | drags_right)

@@ -1,0 +1,68 @@
+"""Tolerances of a dimensionless contact problem (`scaled_problem`): what counts as zero, as equal, and as too large."""
+
+import jax.numpy as jnp
+
+from pushjax._math.vec import Scalar, Vec3
+
+
+def kinematic_tolerance(twist: Vec3) -> Scalar:
+    """Tolerance on the violation of a kinematic condition, in units of the fastest pusher.
+
+    It is `relative_tolerance` plus the roundoff of the twist. The roundoff matters where the slider moves much faster
+    than its pushers, as when it escapes from a wedge. The sum is at most 6e-9 in float64. For a twist that is too fast
+    to be an answer (`max_twist_ratio`), the tolerance is the least that roundoff leaves.
+
+    Args:
+        twist: Dimensionless twist.
+
+    Returns:
+        The tolerance.
+    """
+    dtype = twist.x.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    size = jnp.abs(twist.x) + jnp.abs(twist.y) + jnp.abs(twist.z)
+    slow = twist.dot(twist) <= max_twist_ratio(dtype) ** 2
+    return jnp.where(
+        slow, jnp.minimum(relative_tolerance(dtype) + 64 * eps * size, ill_conditioned_tolerance(dtype)), 8 * eps * size
+    )
+
+
+def ill_conditioned_tolerance(dtype) -> float:
+    """Tolerance where roundoff is magnified, because the slider moves much faster than its pushers: 6e-9 in float64.
+
+    In float32 it is the same as `relative_tolerance`, because there are no digits to spare.
+    """
+    return relative_tolerance(dtype) * (15 if jnp.finfo(dtype).bits > 32 else 1)
+
+
+def max_twist_ratio(dtype) -> float:
+    """Largest twist that can be an answer, in units of the fastest pusher; 840 in float32.
+
+    For a twist of this size roundoff alone violates a condition by all that is allowed (1e-8, or 1e-4 in float32).
+    """
+    return (1e-8 if jnp.finfo(dtype).bits > 32 else 1e-4) / float(jnp.finfo(dtype).eps)
+
+
+# Up to this factor above `max_twist_ratio`, a twist still shows that a motion exists. Beyond it, rows that are
+# dependent up to roundoff can give any number.
+TOO_FAST = 8
+
+
+def relative_tolerance(dtype) -> float:
+    """Tolerance on a condition, relative to the fastest pusher or the whole force: 4e-10, or 7e-5 in float32."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def same_solution_tolerance(dtype) -> float:
+    """Relative difference up to which two twists are one solution: roundoff through an ill-conditioned set."""
+    return max(1e-6, 10 * relative_tolerance(dtype))
+
+
+def zero_wrench_tolerance(dtype) -> float:
+    """Size up to which a wrench may be nothing but the roundoff of forces of order one that cancel in it."""
+    return float(jnp.finfo(dtype).eps) ** 0.8
+
+
+def min_determinant(dtype) -> float:
+    """Smallest determinant whose inverse, and products of a few with it, do not overflow."""
+    return float(jnp.finfo(dtype).tiny) ** 0.5

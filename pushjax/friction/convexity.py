@@ -1,0 +1,292 @@
+"""Gram matrices of a quartic: they certify that it is convex, and one of them represents it.
+
+H is convex if z' hess H(F) z >= 0 for all z and F, that is, if the form T(z, z, F, F) of its symmetric tensor T is
+nowhere negative. Let S be the symmetric part of z F', and a = (z x F) / 2. Then the ways to write that form as a
+quadratic form in (S, a), without cross terms, are
+
+    T(S, S) + <N, adj S> + a' N a,      N symmetric, 3 x 3,
+
+because adj S = -a a' for every z and F. So H is convex if, for some N, both N and the 6 x 6 matrix of the first two
+terms are positive semi-definite. For three variables and degree four the converse holds too, because there every convex
+form is sos-convex (Ahmadi & Parrilo 2013).
+
+These two blocks are the 9 x 9 Gram matrix of Zhou et al. 2017 (section V) in a basis of symmetric and antisymmetric
+parts. That matrix is not unique: there are nine directions in which it may change. N holds six of them. The other three
+are the cross terms, which improve no eigenvalue, because the form does not change if z and F are exchanged.
+
+The quartic H depends only on the 6 x 6 block G: H(F) = v' G v, where v holds the six products of two components of F.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._internal.xla import compute_once, decide
+from pushjax._math.linalg import Cholesky, Column, Lower, add_scaled, congruence, entry
+from pushjax._math.vec import Scalar
+
+# The six products v are x², y², z², xy, xz, yz.
+# The matrix of <N, adj S> in their basis. For each entry of N (xx, yy, zz, xy, xz, yz): the places in the lower
+# triangle to which it contributes, and the factors.
+ADJUGATE = (
+    {(2, 1): 0.5, (5, 5): -1.0},
+    {(2, 0): 0.5, (4, 4): -1.0},
+    {(1, 0): 0.5, (3, 3): -1.0},
+    {(5, 4): 1.0, (3, 2): -1.0},
+    {(5, 3): 1.0, (4, 1): -1.0},
+    {(4, 3): 1.0, (5, 0): -1.0},
+)
+# The same for the matrix N.
+ITSELF = ({(0, 0): 1.0}, {(1, 1): 1.0}, {(2, 2): 1.0}, {(1, 0): 1.0}, {(2, 0): 1.0}, {(2, 1): 1.0})
+# The same for the matrix of T(S, S), for each of the 15 coefficients.
+SPREAD = (
+    {(0, 0): 1.0},
+    {(1, 1): 1.0},
+    {(2, 2): 1.0},
+    {(3, 0): 1 / 2},
+    {(4, 0): 1 / 2},
+    {(3, 1): 1 / 2},
+    {(5, 1): 1 / 2},
+    {(4, 2): 1 / 2},
+    {(5, 2): 1 / 2},
+    {(1, 0): 1 / 6, (3, 3): 2 / 3},
+    {(2, 0): 1 / 6, (4, 4): 2 / 3},
+    {(2, 1): 1 / 6, (5, 5): 2 / 3},
+    {(5, 0): 1 / 6, (4, 3): 1 / 3},
+    {(4, 1): 1 / 6, (5, 3): 1 / 3},
+    {(3, 2): 1 / 6, (5, 4): 1 / 3},
+)
+BLOCKS = 9  # rows of both blocks together: the parameter of the logarithmic barrier
+MOST_ROUNDS = 60
+WEIGHTS = (4.0, 16.0)  # weight of the share relative to the barrier: initial value, and factor after each centering
+STRIDES = (1.0, 0.7, 0.4)  # step lengths that each Newton round tries
+# Candidates of the initial share, in ascending order
+FIRST = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
+
+
+class Gram(NamedTuple):
+    """The two blocks of a Gram matrix (see the header of this module), as lower triangles.
+
+    Attributes:
+        symmetric: The 6 x 6 block G, with v' G v = H.
+        antisymmetric: The 3 x 3 block N.
+    """
+
+    symmetric: Lower
+    antisymmetric: Lower
+
+    @staticmethod
+    def of(coefficients: Column, n: Column) -> "Gram":
+        """Return the Gram matrix of a quartic for a given N.
+
+        Args:
+            coefficients: The 15 coefficients, in the order of `Quartic`.
+            n: The entries (xx, yy, zz, xy, xz, yz) of N.
+        """
+        parts = (*zip(SPREAD, coefficients, strict=True), *zip(ADJUGATE, n, strict=True))
+        return Gram(_assembled(6, parts), _assembled(3, tuple(zip(ITSELF, n, strict=True))))
+
+    @staticmethod
+    def identity(like: Scalar) -> "Gram":
+        """Return the 9 x 9 identity in these blocks, with the type of the scalar `like`."""
+        zero, one = 0 * like, 0 * like + 1
+        six, three = (one, one, one, 2 * one, 2 * one, 2 * one), (2 * one,) * 3
+        return Gram(*(tuple((zero,) * i + (d,) for i, d in enumerate(diagonal)) for diagonal in (six, three)))
+
+    def plus(self, factor: Scalar, other: "Gram") -> "Gram":
+        """Return self + factor * other."""
+        return Gram(*(add_scaled(mine, factor, its) for mine, its in zip(self, other, strict=True)))
+
+
+def coefficients_of(symmetric: Lower) -> Column:
+    """Return the 15 coefficients of the quartic v' G v, for the 6 x 6 block G."""
+    return tuple(
+        sum(((1 if i == j else 2) * symmetric[i][j] for (i, j) in places), 0 * symmetric[0][0]) for places in SPREAD
+    )
+
+
+def antisymmetric_of(symmetric: Lower) -> Column:
+    """Return the N for which `symmetric` is the 6 x 6 block of the Gram matrix of its quartic."""
+    found = []
+    for places in ADJUGATE:
+        (above, a), (below, b) = ((symmetric[i][j], value) for (i, j), value in places.items())
+        found.append((4 * above - below) / 3 if b == -1.0 and a == 0.5 else (above - 2 * below) / 3)
+    return tuple(found)
+
+
+class Certificate(NamedTuple):
+    """The result of `max_feasible_scale`.
+
+    Attributes:
+        share: The share s that was found. Gram(N) - s * reference is positive definite. Unless the search stopped at
+            `enough`, hardly any larger share is possible.
+        n: The entries (xx, yy, zz, xy, xz, yz) of the N that attains it.
+        settled: Whether the search ended within `MOST_ROUNDS`.
+    """
+
+    share: Scalar
+    n: Column
+    settled: Bool[Array, ""]
+
+
+def max_feasible_scale(
+    coefficients: Column, n: Column, reference: Gram, *, enough: float, tolerance: float
+) -> Certificate:
+    """Find the largest share s for which Gram(N) - s * reference is positive semi-definite for some N.
+
+    If the quartic is convex, the largest s is not below zero. The search follows the central path of this problem: it
+    applies Newton's method to the logarithmic barrier, and each round takes the best of a few step lengths. The result
+    lies strictly inside the feasible set. So it is a proof, whatever the roundoff of the search.
+
+    Args:
+        coefficients: The 15 coefficients of the quartic, in the order of `Quartic`.
+        n: Entries (xx, yy, zz, xy, xz, yz) of the N at which the search starts.
+        reference: Gram matrix to subtract.
+        enough: The search stops once s is at least this.
+        tolerance: The search stops once s is known to be within this of the largest.
+
+    Returns:
+        The share, its N, and whether the search ended.
+    """
+    start = _begin(coefficients, n, reference)
+    zero = 0 * start
+    state = (start, n, zero + WEIGHTS[0], jnp.zeros((), jnp.int32), start >= enough)
+
+    def body(state):
+        s, n, weight, rounds, done = state
+        s_new, n_new, moved = _newton(coefficients, n, s, reference, weight)
+        centered = moved < 1
+        # Close to the border roundoff may make the result of a round not finite. Then keep the previous one.
+        lost = ~jnp.isfinite(s_new + sum(n_new))
+        done_now = lost | (s_new >= enough) | (centered & (BLOCKS / weight < tolerance))
+        weight_new = jnp.where(centered, WEIGHTS[1] * weight, weight)
+
+        def kept(new, old, held):
+            return jax.tree.map(lambda a, b: jnp.where(held, b, a), new, old)
+
+        s_new, n_new = kept((s_new, n_new), (s, n), lost)
+        return kept((s_new, n_new, weight_new, rounds + 1, done_now), state, done)
+
+    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MOST_ROUNDS), body, state)
+    return Certificate(s, n, done)
+
+
+def _begin(coefficients: Column, n: Column, reference: Gram) -> Scalar:
+    """Return the largest share in `FIRST` for which Gram(n) - share * reference is positive definite.
+
+    It is zero if zero is possible.
+    """
+    gram = Gram.of(coefficients, n)
+
+    def nearer(start, share):
+        return jnp.where(_barrier(gram.plus(-share, reference)).positive, share, start), None
+
+    return jax.lax.scan(nearer, 0 * n[0] + FIRST[0], jnp.asarray(FIRST, n[0].dtype))[0]
+
+
+class _Barrier(NamedTuple):
+    """The logarithmic barrier at a Gram matrix.
+
+    Attributes:
+        logdet: Sum of the log determinants of both blocks. It has no meaning unless `positive`.
+        positive: Whether both blocks are positive definite.
+    """
+
+    logdet: Scalar
+    positive: Bool[Array, ""]
+
+
+def _barrier(gram: Gram) -> _Barrier:
+    """Evaluate the logarithmic barrier."""
+    six, three = (Cholesky.of(block) for block in gram)
+    return _Barrier(six.logdet() + three.logdet(), six.positive & three.positive)
+
+
+def _newton(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight: Scalar):
+    """Do one Newton round that maximizes weight * s + logdet of both blocks of Gram(N) - s * reference.
+
+    Returns:
+        The new s, the new N, and the Newton decrement.
+    """
+    gram = Gram.of(coefficients, n).plus(-s, reference)
+    slopes = [0 * s] * 6 + [weight]
+    bends = [[0 * s] * (i + 1) for i in range(7)]
+    value = weight * s
+    for block, ref, table in zip(gram, reference, (ADJUGATE, ITSELF), strict=True):
+        factor = Cholesky.of(block)
+        value = value + factor.logdet()
+        x = compute_once(factor.inverse(), s)
+        across = compute_once(congruence(x, ref), s)
+        for i, mine in enumerate(table):
+            slopes[i] = slopes[i] + _trace(x, mine)
+            for j in range(i + 1):
+                bends[i][j] = bends[i][j] + _twice(x, mine, table[j])
+            bends[6][i] = bends[6][i] - _trace(across, mine)
+        slopes[6] = slopes[6] - _product_trace(x, ref)
+        bends[6][6] = bends[6][6] + _product_trace(across, ref)
+    slopes, bends = compute_once((tuple(slopes), tuple(tuple(row) for row in bends)), s)
+    step = compute_once(Cholesky.of(bends).solve(slopes), s)
+    squared = sum((a * b for a, b in zip(slopes, step, strict=True)), 0 * s)
+    decrement = jnp.sqrt(jnp.maximum(squared, 0))
+    strides = jnp.stack([*(0 * s + stride for stride in STRIDES), 1 / (1 + decrement)])
+
+    def longer(state, stride):
+        best, most = state
+        at_s, at_n = _along(s, n, step, stride)
+        reached = _barrier(Gram.of(coefficients, at_n).plus(-at_s, reference))
+        value = weight * at_s + reached.logdet
+        better = decide(reached.positive & (value > most), s)
+        return (jnp.where(better, stride, best), jnp.where(better, value, most)), None
+
+    best = jax.lax.scan(longer, (0 * s, value), strides)[0][0]
+    s, n = compute_once(_along(s, n, step, best), weight)
+    return s, n, decrement
+
+
+def _along(s: Scalar, n: Column, step: Column, stride):
+    """Return s and N after a step of length `stride`. The step holds six entries for N, then one for s."""
+    return s + stride * step[6], tuple(a + stride * b for a, b in zip(n, step, strict=False))
+
+
+def _assembled(size: int, parts) -> Lower:
+    """Return the lower triangle of a sum of matrices, given as pairs of (factors by place, scale)."""
+    rows = [[None] * (i + 1) for i in range(size)]
+    zero = 0 * parts[0][1]
+    for places, scale in parts:
+        for (i, j), value in places.items():
+            term = scale if value == 1.0 else value * scale
+            rows[i][j] = term if rows[i][j] is None else rows[i][j] + term
+    return tuple(tuple(zero if e is None else e for e in row) for row in rows)
+
+
+def _both(places):
+    """Yield all entries (i, j, value) of the symmetric matrix whose lower triangle is `places`."""
+    for (i, j), value in places.items():
+        yield i, j, value
+        if i != j:
+            yield j, i, value
+
+
+def _trace(x: Lower, places) -> Scalar:
+    """Return trace(x E) for the symmetric matrix E whose lower triangle is `places`."""
+    return sum((value * entry(x, i, j) for i, j, value in _both(places)), 0 * x[0][0])
+
+
+def _twice(x: Lower, first, second) -> Scalar:
+    """Return trace(x E x E') for the symmetric matrices E and E' whose lower triangles are `first` and `second`."""
+    total = 0 * x[0][0]
+    for i, j, a in _both(first):
+        for k, l, b in _both(second):
+            total = total + a * b * entry(x, j, k) * entry(x, l, i)
+    return total
+
+
+def _product_trace(x: Lower, m: Lower) -> Scalar:
+    """Return trace(x m) of two symmetric matrices."""
+    total = 0 * x[0][0]
+    for i, row in enumerate(m):
+        for j, value in enumerate(row):
+            total = total + (1 if i == j else 2) * x[i][j] * value
+    return total

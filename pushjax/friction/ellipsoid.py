@@ -1,0 +1,105 @@
+"""The limit surface of degree two: the ellipsoid."""
+
+from typing import ClassVar, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
+from pushjax._internal.xla import compute_once
+from pushjax._math.linalg import Symmetric3
+from pushjax._math.vec import Scalar, Vec3
+from pushjax.friction.limit_surface import InverseMap, LimitSurface, angle_between, angle_tolerance, checked_length
+
+
+class _EllipsoidFields(NamedTuple):
+    a: Symmetric3
+    length: Scalar
+
+
+class EllipsoidForm(_EllipsoidFields):
+    """H(F) = F' A F in scalars.
+
+    Attributes:
+        a: The matrix A, 1/N^2.
+        length: Characteristic length, m.
+    """
+
+    degree: ClassVar[int] = 2
+
+    def scaled(self, factor: Scalar) -> "EllipsoidForm":
+        return EllipsoidForm(Symmetric3(*(factor * entry for entry in self.a)), self.length)
+
+    def gradient(self, f: Vec3) -> Vec3:
+        return self.a.times(f).scale(2.0)
+
+    def value(self, f: Vec3) -> Scalar:
+        return f.dot(self.a.times(f))
+
+    def spin(self, f: Vec3) -> Scalar:
+        return 2 * (self.a.xz * f.x + self.a.yz * f.y + self.a.zz * f.z)
+
+    def hessian(self, f: Vec3) -> Symmetric3:
+        return Symmetric3(*(2 * entry for entry in self.a))
+
+    def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
+        ga, gb = self.a.times(a), self.a.times(b)
+        return a.dot(ga), 2 * b.dot(ga), b.dot(gb)
+
+
+class Ellipsoid(LimitSurface):
+    """The limit surface of H(F) = F' A F, with the normalized wrench F = (fx, fy, tau / length).
+
+    Attributes:
+        A: Symmetric positive definite matrix, shape (3, 3), 1/N^2.
+        length: Characteristic length, m.
+
+    Raises:
+        ValueError: If `A` is not finite, symmetric and positive definite, or `length` is not positive.
+    """
+
+    A: Float[Array, "3 3"]
+    length: Float[Array, ""]
+    degree: ClassVar[int] = 2
+
+    def __init__(self, A: ArrayLike, length: ArrayLike):
+        matrix = as_float(A)
+        check_shape("A", matrix, (3, 3))
+        check_finite("A", matrix)
+        known = concrete(matrix)
+        if known is not None:
+            if np.abs(known - known.T).max() > 1e-4 * np.abs(known).max():
+                raise ValueError(f"A must be symmetric; A - A' reaches {np.abs(known - known.T).max():.3g}")
+            lowest = np.linalg.eigvalsh((known + known.T).astype(np.float64) / 2)[0]
+            if not lowest > 0:
+                raise ValueError(f"A must be positive definite; its smallest eigenvalue is {lowest:.3g}")
+        self.A = (matrix + matrix.T) / 2
+        self.length = checked_length(length, matrix.dtype)
+
+    def form(self) -> EllipsoidForm:
+        m = self.A
+        return EllipsoidForm(Symmetric3(m[0, 0], m[1, 1], m[2, 2], m[0, 1], m[0, 2], m[1, 2]), self.length)
+
+    def is_convex(self) -> bool:
+        return bool(np.linalg.eigvalsh(np.asarray(self.A, np.float64))[0] > 0)
+
+    def inverse(self, twist: ArrayLike) -> InverseMap:
+        """Solve A F = V, and refine the solution twice; see `LimitSurface.inverse`.
+
+        Refinement is needed because the solve uses the adjugate. By itself it loses twice as many digits as the
+        condition number implies.
+        """
+        v, usable = self._normalized_twist(twist)
+        form = self.form()
+        f = compute_once(form.a.solve(v), v.x)
+        for _ in range(2):
+            more = form.a.solve(v - form.a.times(f))
+            # Round it only once, so that the refinement, the check and the result use the same bits.
+            f = compute_once(f + more, v.x)
+        h = form.value(f)
+        angle = angle_between(form.gradient(f), v)
+        solved = usable & (h > 0) & (angle <= angle_tolerance(angle))
+        scale = jnp.where(solved, 1 / jnp.sqrt(jnp.where(solved, h, 1.0)), 0.0)
+        wrench = jnp.where(solved, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
+        return InverseMap(wrench, solved, jnp.ones((), jnp.int32), angle)

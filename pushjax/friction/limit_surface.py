@@ -1,0 +1,262 @@
+"""The interface that limit surfaces of all degrees share: `LimitSurface`, and its scalar `Form`.
+
+A limit surface is the level set H(F) = 1 of a convex polynomial H. H is homogeneous of even degree d in the normalized
+wrench F = (fx, fy, tau / length). While the slider slides, its normalized twist (vx, vy, length * omega) is a positive
+multiple of grad H(F). The code uses Euler's identities throughout: F . grad H = d H and hess H F = (d - 1) grad H.
+
+Reference: Zhou et al. 2016; Zhou et al. 2017, section III.A.
+"""
+
+from abc import abstractmethod
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, concrete
+from pushjax._internal.files import load_json, save_json, to_list
+from pushjax._math.linalg import Symmetric3
+from pushjax._math.vec import Scalar, Vec3
+
+FORMAT, VERSION = "pushjax limit surface", 1
+
+
+class Form(Protocol):
+    """H as a function of the normalized wrench, in scalars. The contact solvers and rollouts compute with it.
+
+    Forms are pytrees. `value`, `gradient` and `hessian` are H and its derivatives by the normalized wrench.
+
+    Attributes:
+        degree: Degree d of H.
+        length: Characteristic length of the surface, m.
+    """
+
+    @property
+    def degree(self) -> int: ...
+
+    @property
+    def length(self) -> Scalar: ...
+
+    def scaled(self, factor: Scalar) -> "Form":
+        """Return the form of factor * H."""
+        ...
+
+    def value(self, f: Vec3) -> Scalar: ...
+
+    def gradient(self, f: Vec3) -> Vec3: ...
+
+    def spin(self, f: Vec3) -> Scalar:
+        """Return the third component of the gradient."""
+        ...
+
+    def hessian(self, f: Vec3) -> Symmetric3: ...
+
+    def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
+        """Return the degree + 1 coefficients c_k of H(a + s b) = sum_k c_k s^k."""
+        ...
+
+
+class InverseMap(NamedTuple):
+    """The wrench on the level set H = 1 for a twist direction, and how accurately it was found.
+
+    Attributes:
+        wrench: Wrench (fx, fy, tau), shape (3,), N and N m. Zero if not converged.
+        converged: Whether the wrench was found. False also for a twist that is zero or not finite.
+        rounds: Number of Newton rounds.
+        angle: Angle between the given twist and that of the wrench, both normalized, rad.
+    """
+
+    wrench: Float[Array, "3"]
+    converged: Bool[Array, ""]
+    rounds: Int[Array, ""]
+    angle: Float[Array, ""]
+
+
+class LimitSurface(eqx.Module):
+    """A limit surface: the boundary H = 1, for a convex polynomial H, of the wrenches that friction can resist.
+
+    Attributes:
+        length: Characteristic length that normalizes torques and angular velocities, m.
+        degree: Degree of H.
+    """
+
+    length: eqx.AbstractVar[Float[Array, ""]]
+    degree: eqx.AbstractClassVar[int]
+
+    @abstractmethod
+    def form(self) -> Form:
+        """Return H in scalars."""
+
+    @abstractmethod
+    def is_convex(self) -> bool:
+        """Return whether H is convex, up to roundoff. The surface must not be traced."""
+
+    @abstractmethod
+    def inverse(self, twist: ArrayLike) -> InverseMap:
+        """Find the wrench on H = 1 whose twist has the direction of `twist`.
+
+        Differentiable, by the implicit function theorem.
+
+        Args:
+            twist: Body twist (vx, vy, omega), shape (3,). Only its direction matters.
+
+        Returns:
+            The wrench, and whether it was found.
+
+        Raises:
+            ValueError: If the twist is zero or not finite, unless it is traced.
+        """
+
+    def _normalized(self, wrench: ArrayLike) -> Vec3:
+        w = as_float(wrench, self.length.dtype)
+        check_shape("wrench", w, (3,))
+        check_finite("wrench", w)
+        return Vec3(w[0], w[1], w[2] / self.length)
+
+    def value(self, wrench: ArrayLike) -> Float[Array, ""]:
+        """Return H of a wrench: friction holds the slider where H < 1, and the slider slides where H = 1.
+
+        Args:
+            wrench: Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
+
+        Returns:
+            H, a scalar.
+        """
+        return self.form().value(self._normalized(wrench))
+
+    def twist(self, wrench: ArrayLike) -> Float[Array, "3"]:
+        """Return the direction of the body twist under a wrench, from grad H.
+
+        Args:
+            wrench: Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
+
+        Returns:
+            Twist (vx, vy, omega), shape (3,). Its norm has no meaning. Zero for a zero wrench.
+        """
+        g = self.form().gradient(self._normalized(wrench))
+        return jnp.stack([g.x, g.y, g.z / self.length])
+
+    def hessian(self, wrench: ArrayLike) -> Float[Array, "3 3"]:
+        """Return the second derivatives of H by the wrench.
+
+        Args:
+            wrench: Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
+
+        Returns:
+            Hessian, shape (3, 3). It is positive semi-definite if the surface is convex.
+        """
+        scale = jnp.stack([jnp.ones_like(self.length), jnp.ones_like(self.length), 1 / self.length])
+        return self.form().hessian(self._normalized(wrench)).array() * (scale[:, None] * scale[None])
+
+    def wrench(self, twist: ArrayLike) -> Float[Array, "3"]:
+        """Return the wrench on H = 1 whose twist has the direction of `twist`.
+
+        `inverse` also returns whether the wrench was found.
+
+        Args:
+            twist: Body twist (vx, vy, omega), shape (3,). Only its direction matters.
+
+        Returns:
+            Wrench (fx, fy, tau), shape (3,), N and N m. Zero for a traced twist that is zero or not finite.
+
+        Raises:
+            ValueError: If the twist is zero or not finite, unless it is traced.
+        """
+        return self.inverse(twist).wrench
+
+    def on_level_set(self, wrench: ArrayLike) -> Float[Array, "3"]:
+        """Scale a wrench along its ray to H = 1.
+
+        Args:
+            wrench: Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
+
+        Returns:
+            The scaled wrench, shape (3,). A zero wrench stays zero.
+        """
+        w = as_float(wrench, self.length.dtype)
+        check_shape("wrench", w, (3,))
+        # Scale the wrench to order one first, because powers of a small wrench underflow. Neither the result nor its
+        # derivative depends on this scale.
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(jnp.stack([w[0], w[1], w[2] / self.length]))))
+        w = w / jnp.where(size > 0, size, 1.0)
+        h = self.value(w)
+        return jnp.where(h > 0, w * jnp.where(h > 0, h, 1.0) ** (-1 / self.degree), 0.0)
+
+    def save(self, path: str | Path) -> None:
+        """Write the surface to a JSON file, from which `load` reads the same bits.
+
+        Args:
+            path: File to write.
+        """
+        record = {field.name: to_list(getattr(self, field.name)) for field in fields(self)}
+        save_json(path, FORMAT, VERSION, self.length.dtype, record | {"kind": type(self).__name__.lower()})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a surface that `save` wrote.
+
+        Args:
+            path: File to read.
+
+        Returns:
+            The surface, an instance of the class it is called on.
+
+        Raises:
+            ValueError: If the file does not contain a surface of this class.
+        """
+        surface = load_json(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface)
+        if not isinstance(surface, cls):
+            raise ValueError(f"{path} holds a {type(surface).__name__}, not a {cls.__name__}")
+        return surface
+
+    def _normalized_twist(self, twist: ArrayLike) -> tuple[Vec3, Array]:
+        """Return the normalized twist as a unit vector, and whether it exists (if not, +x avoids NaN downstream)."""
+        v = as_float(twist, self.length.dtype)
+        check_shape("twist", v, (3,))
+        check_finite("twist", v)
+        known = concrete(v)
+        if known is not None and not known.any():
+            raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
+        n = jnp.stack([v[0], v[1], v[2] * self.length])
+        size = jnp.max(jnp.abs(n))  # scale to order one first, so that squares neither underflow nor overflow
+        usable = jnp.isfinite(size) & (size > 0)
+        n = jnp.where(usable, n / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], n.dtype))
+        return Vec3.of(n / jnp.sqrt(jnp.sum(n * n))), usable
+
+
+def _surface(record: dict[str, Any], dtype: Any) -> LimitSurface:
+    """Build the surface that a record describes."""
+    kinds = {kind.__name__.lower(): kind for kind in LimitSurface.__subclasses__()}
+    if record["kind"] not in kinds:
+        raise ValueError(f"{record['kind']!r} is no kind of surface; there are {', '.join(sorted(kinds))}")
+    kind: Any = kinds[record["kind"]]
+    return kind(**{field.name: jnp.asarray(record[field.name], dtype) for field in fields(kind)})
+
+
+def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
+    """Return `length` as a scalar array, or raise ValueError unless it is finite and positive."""
+    value = as_float(length, dtype)
+    check_shape("length", value, ())
+    check_finite("length", value)
+    check_positive("length", value)
+    return value
+
+
+def angle_between(a: Vec3, b: Vec3) -> Scalar:
+    """Return the angle between two vectors, rad. Small angles are accurate too. Zero if a vector is zero."""
+    return jnp.arctan2(norm(a.cross(b)), a.dot(b))
+
+
+def angle_tolerance(angle: Scalar) -> float:
+    """Return the largest angle, rad, of a converged inverse map: some 1e-3 in float32 and 1e-12 in float64."""
+    return 1e4 * float(jnp.finfo(angle.dtype).eps)
+
+
+def norm(a: Vec3) -> Scalar:
+    """Return the Euclidean norm. Its derivative at the zero vector is zero."""
+    squared = a.dot(a)
+    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)

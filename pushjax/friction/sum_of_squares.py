@@ -1,0 +1,118 @@
+"""Convex limit surfaces of degree d as sums of powers of quadratic forms: H(F) = sum_k (F' P_k F)^(d/2).
+
+F is the normalized wrench (fx, fy, tau / length). For d = 4, H is a sum of squares. H is convex if all P_k are positive
+semi-definite. So each P_k is parameterized by a lower triangular factor L_k: P_k = L_k L_k'.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from pushjax._internal.autodiff import without_derivatives
+from pushjax._math.directions import fibonacci_hemisphere
+from pushjax.friction.quartic import MONOMIALS
+
+# With this many terms, a fit reaches the optimum over all convex quartics. `pushjax.friction.fit` says how closely.
+TERMS = 5
+MAX_STEPS = 100
+_LOWER = np.tril_indices(3)
+
+
+def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
+    """Return the coefficients of sum_k (F' P_k F)^2 in the order of `Quartic`, for symmetric P_k, (terms, 3, 3)."""
+    products = jnp.einsum("kij,klm->ijlm", p, p)
+    return jnp.asarray(_COLLECT, p.dtype) @ products.reshape(81)
+
+
+def of_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+    """Return P_k = L_k L_k', given the lower triangles of L_k, row by row."""
+    full = triangles(lower)
+    return full @ jnp.swapaxes(full, 1, 2)
+
+
+def triangles(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+    """Return the matrices L_k, given their lower triangles, row by row."""
+    return jnp.zeros((lower.shape[0], 3, 3), lower.dtype).at[:, *_LOWER].set(lower)
+
+
+def initial_factors(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 6"]:
+    """Return the lower triangles of the L_k at which a search begins.
+
+    Each P_k is a multiple of the identity, stretched along a direction of its own. Equal terms would stay equal
+    throughout the search. A single term is not stretched.
+    """
+    u = fibonacci_hemisphere(terms)
+    spread = 0.5 if terms > 1 else 0.0
+    lower = np.linalg.cholesky(np.eye(3) + spread * (3 * u[:, :, None] * u[:, None] - np.eye(3)))
+    size = terms ** (-1 / degree)
+    return jnp.asarray(size * lower[:, *_LOWER], dtype)
+
+
+class Terms(NamedTuple):
+    """A quartic as a sum of squares.
+
+    Attributes:
+        lower: The factors L_k, shape (terms, 3, 3).
+        error: Largest error of a coefficient of the sum, relative to the largest coefficient.
+    """
+
+    lower: Float[Array, "terms 3 3"]
+    error: Float[Array, ""]
+
+
+def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> Terms:
+    """Write a quartic as a sum of squares of quadratic forms.
+
+    The terms are not unique. These are the ones that the Levenberg-Marquardt method reaches from `initial_factors`.
+    Every result of `fit_limit_surface` is such a sum. Not every convex quartic is; if it is not, `error` is large.
+
+    The L_k can be differentiated with respect to the coefficients. A change of the coefficients may be met by many
+    changes of the L_k. The derivative is the smallest of them.
+
+    Args:
+        coefficients: Coefficients of the quartic, shape (15,), in the order of `Quartic`.
+        terms: Number of terms.
+
+    Returns:
+        The factors of the terms, and the error of their sum.
+    """
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
+    target = coefficients / size
+    found = without_derivatives(_search, target, initial_factors(4, terms, coefficients.dtype))
+    slope = jax.lax.stop_gradient(jax.jacobian(_sum)(found).reshape(len(MONOMIALS), -1))
+    off = target - jax.lax.stop_gradient(target)
+    found = found + (jnp.linalg.pinv(slope) @ off).reshape(found.shape)
+    return Terms(triangles(found) * size**0.25, jnp.max(jnp.abs(_sum(found) - target)))
+
+
+def _sum(lower: Float[Array, "terms 6"]) -> Float[Array, "15"]:
+    return squared_quadratics(of_lower(lower))
+
+
+def _search(target: Float[Array, "15"], start: Float[Array, "terms 6"]) -> Float[Array, "terms 6"]:
+    # The solver keeps its own numbers in the widest float type that is enabled, and it does not mix two types.
+    wide = jnp.result_type(float)
+    tolerance = 1e-12 if wide == jnp.float64 else 1e-6
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    target, first = target.astype(wide), start.astype(wide)
+    found = optx.least_squares(lambda x, _: _sum(x) - target, solver, first, max_steps=MAX_STEPS, throw=False)
+    return found.value.astype(start.dtype)
+
+
+def _collect() -> np.ndarray:
+    """Return the matrix (15, 81) that turns a flattened 3 x 3 x 3 x 3 array into the coefficients of a quartic.
+
+    The entry (i, j, l, m) of the array is a factor of F_i F_j F_l F_m. For each monomial, its entries are summed.
+    """
+    table = np.zeros((len(MONOMIALS), 81))
+    for flat, index in enumerate(np.ndindex(3, 3, 3, 3)):
+        exponent = np.bincount(index, minlength=3)
+        table[int(np.argmax((MONOMIALS == exponent).all(axis=1))), flat] = 1
+    return table
+
+
+_COLLECT = _collect()

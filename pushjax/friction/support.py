@@ -1,0 +1,370 @@
+"""Support points under the slider, which represent its pressure distribution, and their exact Coulomb friction.
+
+A support point at r carries a part p of the weight. Its friction limit is l = mu_s p, where mu_s is the coefficient of
+friction with the table. All forces and wrenches are those that the hand applies to balance the friction of the table,
+so wrench . twist >= 0. A point that slides with velocity v(r) takes the force l v/|v|. The sum over the points gives
+the exact limit surface.
+
+A twist whose center of rotation lies on a support point does not slide that point. The force there may then be any
+vector of length up to l. The wrenches of that twist form a flat facet of the limit surface.
+
+Reference: Goyal, Ruina & Papadopoulos 1991, for the facets.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_positive,
+    check_shape,
+    common_dtype,
+    concrete,
+    in_numpy,
+    normalized_weights,
+    on_device,
+)
+from pushjax._internal.jit import quick_jit
+from pushjax.geometry.shape import Shape
+
+FACET_SHARE = 0.1  # fraction of the wrench-twist pairs that lie on a facet
+
+
+class WrenchTwistPairs(NamedTuple):
+    """Wrench-twist pairs on a limit surface. The fields are in the order of the arguments of `fit_limit_surface`.
+
+    Attributes:
+        wrench: Wrenches (fx, fy, tau), shape (pairs, 3), N and N m.
+        twist: Twists (vx, vy, omega), shape (pairs, 3). Each has unit norm as (vx, vy, length * omega).
+        length: Characteristic length, m.
+    """
+
+    wrench: Float[Array, "pairs 3"]
+    twist: Float[Array, "pairs 3"]
+    length: Float[Array, ""]
+
+
+class Support(eqx.Module):
+    """Support points in the body frame, with the friction limit of each.
+
+    Attributes:
+        point: Support points in the body frame, shape (points, 2), m.
+        limit: Largest friction force at each point, shape (points,), N.
+
+    Raises:
+        ValueError: If an array has the wrong shape or is not finite, or if the limits are negative or all zero.
+    """
+
+    point: Float[Array, "points 2"]
+    limit: Float[Array, "points"]
+
+    def __init__(self, point: ArrayLike, limit: ArrayLike):
+        dtype = common_dtype(point, limit)
+        self.point, self.limit = as_float(point, dtype), as_float(limit, dtype)
+        check_shape("point", self.point, ("points", 2))
+        check_shape("limit", self.limit, (self.point.shape[0],))
+        check_finite("point", self.point)
+        check_finite("limit", self.limit)
+        check_non_negative("limit", self.limit)
+        known = concrete(self.limit)
+        if known is not None and not known.sum() > 0:
+            raise ValueError("limit: at least one support point must carry a load; all are zero")
+
+    @staticmethod
+    def points(point: ArrayLike, weights: ArrayLike | None = None, load: ArrayLike = 1.0) -> "Support":
+        """Distribute a total friction limit over given points, in proportion to `weights`.
+
+        Args:
+            point: Support points in the body frame, shape (points, 2), m.
+            weights: Relative share of each point in the load, shape (points,). Equal by default.
+            load: Total friction limit mu m g, N.
+
+        Returns:
+            The support.
+
+        Raises:
+            ValueError: If an array has the wrong shape or is not finite, the weights are negative or all zero, or the
+                load is not positive.
+        """
+        dtype = common_dtype(point, weights, load)
+        array, total = as_float(point, dtype), as_float(load, dtype)
+        check_shape("point", array, ("points", 2))
+        share = normalized_weights(weights, array.shape[0], dtype)
+        check_shape("load", total, ())
+        check_finite("load", total)
+        check_positive("load", total)
+        return Support(array, in_numpy(_shares)(total, share))
+
+    @staticmethod
+    def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
+        """Distribute the load over three points by statics, with the weight above `center`.
+
+        Args:
+            point: Support points in the body frame, shape (3, 2), m.
+            load: Total friction limit mu m g, N.
+            center: Point in the body frame above which the weight acts, shape (2,), m.
+
+        Returns:
+            The support.
+
+        Raises:
+            ValueError: If the center lies outside the triangle (one point would have to pull), or the points lie on a
+                line. Not checked for traced arguments.
+        """
+        dtype = common_dtype(point, load, center)
+        array, c = as_float(point, dtype), as_float(center, dtype)
+        check_shape("point", array, (3, 2))
+        check_shape("center", c, (2,))
+        check_finite("point", array)
+        check_finite("center", c)
+        # The share of a point is proportional to the area of the triangle of the center and the other two points.
+        one, two = jnp.roll(array, -1, axis=0) - c[None], jnp.roll(array, -2, axis=0) - c[None]
+        opposite = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
+        total = jnp.sum(opposite)
+        known = concrete(total)
+        side = array - jnp.roll(array, 1, axis=0)
+        if known is not None and abs(known) <= 1e-6 * float(jnp.max(jnp.sum(side**2, axis=1))):
+            raise ValueError("point: the three support points lie on a line")
+        share = opposite / total
+        known = concrete(share)
+        if known is not None and not np.all(known >= -1e-6):
+            raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
+        return Support.points(array, jnp.maximum(share, 0), load)
+
+    @staticmethod
+    def uniform(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+        """Represent uniform pressure over a shape by one support point for each cell of a grid.
+
+        The cells are nearly square. The load of a cell is in proportion to the area of its part inside the outline, and
+        the support point is the center of that part. The spacing is chosen such that the number of cells is as close to
+        `points` as possible. A rectangle gets exactly `points` if it can be divided into that many squares. For
+        example, a square with 64 points gets 8 by 8.
+
+        Args:
+            shape: Shape of the slider's base. It must not be traced.
+            points: Desired number of support points.
+            load: Total friction limit mu m g, N.
+
+        Returns:
+            The support.
+
+        Raises:
+            ValueError: If `points` is less than one, or the shape is traced.
+        """
+        if points < 1:
+            raise ValueError(f"points must be at least 1; got {points}")
+        low, high = (concrete(corner) for corner in shape.bounds)
+        if low is None or high is None:
+            raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
+        dtype, low, high = low.dtype, low.astype(np.float64), high.astype(np.float64)
+        # If no cell is cut, the area of the shape determines the spacing. Cut cells require a coarser one. So try
+        # spacings around the value from the area, the nearest first.
+        around = np.linspace(-0.1, 0.4, 26)
+        spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
+        grids = [_cells(low, high, spacing) for spacing in spacings]
+        most = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
+        best: tuple[np.ndarray, np.ndarray] | None = None
+        for samples, middles in grids:
+            padded = np.concatenate([samples, np.broadcast_to(low, (most - len(samples), 2))])
+            inside = np.asarray(_inside(shape, on_device(padded.astype(dtype))))[: len(samples)]
+            found = _covered(samples, middles, inside)
+            if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
+                best = found
+            if len(best[0]) == points:
+                break
+        assert best is not None
+        return Support.points(best[0].astype(dtype), best[1].astype(dtype), load)
+
+    @staticmethod
+    def rim(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
+        """Represent pressure on the outline only, by equally spaced support points.
+
+        Args:
+            shape: Shape of the slider's base.
+            points: Number of support points on the outline.
+            load: Total friction limit mu m g, N.
+
+        Returns:
+            The support.
+
+        Raises:
+            ValueError: If `points` is less than one.
+        """
+        if points < 1:
+            raise ValueError(f"points must be at least 1; got {points}")
+        return Support.points(shape.boundary(points), load=load)
+
+    @property
+    def load(self) -> Float[Array, ""]:
+        """Total friction limit mu m g, N: the force that slides the support without rotation."""
+        return in_numpy(lambda xp, limit: xp.sum(limit))(self.limit)
+
+    @property
+    def center(self) -> Float[Array, "2"]:
+        """Center of pressure in the body frame, shape (2,), m."""
+        return in_numpy(_center)(self.point, self.limit)
+
+    @property
+    def radius_of_gyration(self) -> Float[Array, ""]:
+        """Root mean square distance of the pressure from its center, m."""
+        return in_numpy(_gyration)(self.point, self.limit)
+
+    def wrench(self, twist: ArrayLike, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
+        """Return the wrench with which a hand balances friction while the slider moves with `twist`.
+
+        If the center of rotation lies on a support point, every wrench of a facet balances friction. Then the result
+        is the center of the facet, or a wrench drawn uniformly from it if a `key` is given. A zero twist does not
+        determine a wrench. Its result is the center of all wrenches, which is zero.
+
+        Args:
+            twist: Body twist (vx, vy, omega), shape (3,). Only its direction matters.
+            key: PRNG key to draw from a facet, or None for its center.
+
+        Returns:
+            Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
+
+        Raises:
+            ValueError: If the twist has the wrong shape or is not finite.
+        """
+        v = as_float(twist, self.point.dtype)
+        check_shape("twist", v, (3,))
+        check_finite("twist", v)
+        moved = jnp.any(v != 0)
+        v = v / jnp.where(moved, jnp.max(jnp.abs(v)), 1.0)  # so that squares neither underflow nor overflow
+        velocity = jnp.stack([v[0] - v[2] * self.point[:, 1], v[1] + v[2] * self.point[:, 0]], axis=1)
+        speed2 = jnp.sum(velocity**2, axis=1)
+        # A point does not slide if its speed is within the roundoff of the products above.
+        reach = jnp.abs(v[2]) * jnp.max(jnp.abs(self.point)) + jnp.max(jnp.abs(v[:2]))
+        still = speed2 <= (8 * jnp.finfo(speed2.dtype).eps * reach) ** 2
+        force = jnp.where(still[:, None], 0.0, velocity / jnp.sqrt(jnp.where(still, 1.0, speed2))[:, None])
+        if key is not None:
+            force = jnp.where((still & moved)[:, None], _in_unit_disc(key, len(self.point), v.dtype), force)
+        f = self.limit[:, None] * force
+        torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
+        return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
+
+    def wrench_twist_pairs(
+        self, key: Key[Array, ""], pairs: int = 400, length: ArrayLike | None = None
+    ) -> WrenchTwistPairs:
+        """Draw wrench-twist pairs on the exact limit surface.
+
+        Nine in ten twists are uniform on the unit sphere of (vx, vy, length * omega). One in ten rotates about a
+        support point, which is drawn with a probability in proportion to its load; the wrench is then drawn from the
+        facet. The pairs are in random order.
+
+        Args:
+            key: PRNG key.
+            pairs: Number of pairs.
+            length: Characteristic length, m. By default the radius of gyration, or 1 m if that vanishes (one point).
+
+        Returns:
+            The pairs, and the length.
+
+        Raises:
+            ValueError: If `pairs` is less than one, or the length is not positive.
+        """
+        if pairs < 1:
+            raise ValueError(f"pairs must be at least 1; got {pairs}")
+        rho = in_numpy(_length)(self.point, self.limit) if length is None else as_float(length, self.point.dtype)
+        check_shape("length", rho, ())
+        check_finite("length", rho)
+        check_positive("length", rho)
+        return _pairs(self, key, pairs, rho)
+
+
+def _shares(xp, total, weights):
+    return total * weights / xp.sum(weights)
+
+
+def _center(xp, point, limit):
+    return xp.sum(limit[:, None] * point, axis=0) / xp.sum(limit)
+
+
+def _gyration(xp, point, limit):
+    squared = xp.sum((point - _center(xp, point, limit)[None]) ** 2, axis=1)
+    return xp.sqrt(xp.sum(limit * squared) / xp.sum(limit))
+
+
+def _length(xp, point, limit):
+    """Return the radius of gyration, or 1 m if it is only roundoff."""
+    gyration = _gyration(xp, point, limit)
+    rounding = 16 * xp.finfo(gyration.dtype).eps * xp.max(xp.abs(point))
+    return xp.where(gyration > rounding, gyration, 1.0)
+
+
+@quick_jit
+def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
+    """Draw the pairs of `Support.wrench_twist_pairs`, with `rho` as the length."""
+    dtype = support.point.dtype
+    k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
+    free = jax.random.normal(k_free, (pairs, 3), dtype)
+    about = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
+    # A rotation about r moves the origin with (r_y, -r_x) omega.
+    spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
+    pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
+    facets = round(FACET_SHARE * pairs)
+    on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facets)
+    normalized = jnp.where(on_facet[:, None], pivot, free)
+    normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
+    twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
+    wrench = jax.vmap(support.wrench)(twist, jax.random.split(k_facet, pairs))
+    return WrenchTwistPairs(wrench, twist, rho)
+
+
+SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
+
+
+def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Divide a box into cells whose sides are as close to `spacing` as the box allows.
+
+    Returns:
+        Sample points, shape (cells * SAMPLES^2, 2), and the centers of the cells, shape (cells, 2).
+    """
+    count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
+    cell = (high - low) / count
+    x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
+    middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
+    offsets = np.stack(np.meshgrid(offset * cell[0], offset * cell[1], indexing="ij"), axis=-1).reshape(-1, 2)
+    return (middles[:, None] + offsets[None]).reshape(-1, 2), middles
+
+
+def _covered(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each cell with a sample inside, the mean of its inside samples and the fraction of it inside."""
+    inside = inside.reshape(len(middles), -1)
+    share = inside.mean(axis=1)
+    mean = (
+        np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
+        / np.maximum(inside.sum(axis=1), 0.5)[:, None]
+    )
+    mean = np.where((share == 1)[:, None], middles, mean)
+    return mean[share > 0], share[share > 0]
+
+
+@quick_jit
+def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
+    """Return 1 for a point inside, 0 outside, and one half on the outline, where roundoff would decide."""
+    low, high = shape.bounds
+    border = 64 * jnp.finfo(points.dtype).eps * jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)))
+
+    def share(point):
+        distance = shape.signed_distance(point)
+        return jnp.where(distance < -border, 1.0, jnp.where(distance <= border, 0.5, 0.0))
+
+    return jax.lax.map(share, points, batch_size=4096)  # in parts, because points times edges may be many
+
+
+def _in_unit_disc(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
+    """Draw points uniformly from the unit disk."""
+    k_r, k_angle = jax.random.split(key)
+    radius = jnp.sqrt(jax.random.uniform(k_r, (count, 1), dtype))
+    angle = jax.random.uniform(k_angle, (count, 1), dtype, maxval=2 * jnp.pi)
+    return radius * jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=1)

@@ -1,0 +1,172 @@
+"""A table whose friction depends on position or direction.
+
+Such a table transforms the wrenches of a limit surface: H(F) becomes H(T F). T stretches the force and takes the torque
+about another point. The twist becomes T' grad H(T F), which preserves power.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
+from pushjax._math.linalg import Symmetric3
+from pushjax._math.vec import Scalar, Vec3, cos_sin, unstack
+from pushjax.friction.limit_surface import Form
+
+SIZES = {"grain": 2, "slope": 2, "curvature": 3, "origin": 2}
+NEAR_ZERO = 1e-3  # value of r^2 below which cosh(r) and sinh(r) / r are computed by their series
+
+
+class WrenchTransform(NamedTuple):
+    """The linear map T F = (S f, tau - c x f) of normalized wrenches F = (f, tau).
+
+    Attributes:
+        xx: Entry of the symmetric matrix S.
+        yy: Entry of S.
+        xy: Entry of S.
+        cx: x of the center of pressure c, divided by the characteristic length.
+        cy: y of c, divided by the characteristic length.
+    """
+
+    xx: Scalar
+    yy: Scalar
+    xy: Scalar
+    cx: Scalar
+    cy: Scalar
+
+    def times(self, f: Vec3) -> Vec3:
+        """Return T f."""
+        return Vec3(
+            self.xx * f.x + self.xy * f.y,
+            self.xy * f.x + self.yy * f.y,
+            f.z - self.cx * f.y + self.cy * f.x,
+        )
+
+    def transposed(self, g: Vec3) -> Vec3:
+        """Return T' g."""
+        return Vec3(
+            self.xx * g.x + self.xy * g.y + self.cy * g.z,
+            self.xy * g.x + self.yy * g.y - self.cx * g.z,
+            g.z,
+        )
+
+
+class _WarpedFields(NamedTuple):
+    base: Form
+    warp: WrenchTransform
+
+
+class TransformedForm(_WarpedFields):
+    """H(T F) in scalars.
+
+    Attributes:
+        base: The form H.
+        warp: The map T.
+    """
+
+    @property
+    def degree(self) -> int:
+        return self.base.degree
+
+    @property
+    def length(self) -> Scalar:
+        return self.base.length
+
+    def scaled(self, factor: Scalar) -> "TransformedForm":
+        return TransformedForm(self.base.scaled(factor), self.warp)
+
+    def value(self, f: Vec3) -> Scalar:
+        return self.base.value(self.warp.times(f))
+
+    def gradient(self, f: Vec3) -> Vec3:
+        return self.warp.transposed(self.base.gradient(self.warp.times(f)))
+
+    def spin(self, f: Vec3) -> Scalar:
+        return self.base.spin(self.warp.times(f))
+
+    def hessian(self, f: Vec3) -> Symmetric3:
+        base, t = self.base.hessian(self.warp.times(f)), self.warp
+        zero, one = 0 * t.xx, 0 * t.xx + 1
+        x, y, z = Vec3(t.xx, t.xy, t.cy), Vec3(t.xy, t.yy, -t.cx), Vec3(zero, zero, one)
+        bx, by, bz = base.times(x), base.times(y), base.times(z)
+        return Symmetric3(x.dot(bx), y.dot(by), z.dot(bz), x.dot(by), x.dot(bz), y.dot(bz))
+
+    def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
+        return self.base.restrict(self.warp.times(a), self.warp.times(b))
+
+
+class Table(eqx.Module):
+    """Anisotropic, position-dependent friction between slider and table, in the world frame.
+
+    If all attributes are zero, friction is uniform. Only ratios of friction matter, not its magnitude.
+
+    Friction that rises to one side moves the center of pressure to that side, by length^2 / 2 times the slope at the
+    slider's origin, where length is that of the limit surface. This is exact to first order for pressure on a ring
+    whose radius is that length. For other pressure distributions it differs by a factor. Friction that depends on
+    direction stretches the forces of the limit surface. This is exact for translations.
+
+    Attributes:
+        grain: Anisotropy, shape (2,). Friction along x is exp(2 grain[0]) times that along y. Friction along the
+            diagonal is exp(2 grain[1]) times that across it.
+        slope: Relative increase of friction per meter along x and y at `origin`, shape (2,), 1/m.
+        curvature: Change of the slope with position, shape (3,), 1/m^2: the second derivatives xx, yy, xy of the
+            logarithm of friction.
+        origin: Point of the table at which `slope` is given, shape (2,), m.
+
+    Raises:
+        ValueError: If an array has the wrong shape or is not finite.
+
+    Reference: Extends Zhou et al. 2017, where the table is uniform.
+    """
+
+    grain: Float[Array, "2"]
+    slope: Float[Array, "2"]
+    curvature: Float[Array, "3"]
+    origin: Float[Array, "2"]
+
+    def __init__(
+        self,
+        grain: ArrayLike = (0.0, 0.0),
+        slope: ArrayLike = (0.0, 0.0),
+        curvature: ArrayLike = (0.0, 0.0, 0.0),
+        origin: ArrayLike = (0.0, 0.0),
+    ):
+        given = {"grain": grain, "slope": slope, "curvature": curvature, "origin": origin}
+        dtype = common_dtype(*given.values())
+        for name, value in given.items():
+            array = as_float(value, dtype)
+            check_shape(name, array, (SIZES[name],))
+            check_finite(name, array)
+            setattr(self, name, array)
+
+    def warp(self, pose: Vec3, length: Scalar) -> WrenchTransform:
+        """Return the map T of the wrenches of a slider, in its body frame.
+
+        Args:
+            pose: Pose (x, y, angle) of the slider in the world frame, m and rad.
+            length: Characteristic length of its limit surface, m.
+
+        Returns:
+            The map T.
+        """
+        angle = cos_sin(pose.z)
+        # The entries of a symmetric matrix of trace zero rotate by twice the angle.
+        a, b = unstack(self.grain)
+        cos, sin = angle.x * angle.x - angle.y * angle.y, 2 * angle.x * angle.y
+        a, b = cos * a + sin * b, cos * b - sin * a
+        squared = a * a + b * b
+        small = squared < NEAR_ZERO
+        r = jnp.sqrt(jnp.where(small, 1.0, squared))
+        even = jnp.where(small, 1 + squared / 2 * (1 + squared / 12 * (1 + squared / 30)), jnp.cosh(r))
+        odd = jnp.where(small, 1 + squared / 6 * (1 + squared / 20 * (1 + squared / 42)), jnp.sinh(r) / r)
+        sx, sy = unstack(self.slope)
+        xx, yy, xy = unstack(self.curvature)
+        ox, oy = unstack(self.origin)
+        x, y = pose.x - ox, pose.y - oy
+        rise_x, rise_y = sx + xx * x + xy * y, sy + xy * x + yy * y
+        half = length / 2  # length^2 / 2, divided by the length, because c is normalized
+        cx, cy = half * (angle.x * rise_x + angle.y * rise_y), half * (angle.x * rise_y - angle.y * rise_x)
+        # S = exp(-grain): where friction is higher along x, S shrinks forces along x.
+        return WrenchTransform(even - odd * a, even + odd * a, -odd * b, cx, cy)

@@ -1,0 +1,284 @@
+"""Smooth closed curves: cubic B-splines as shapes, with interpolation and least-squares fits."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
+from pushjax._internal.xla import compute_once
+from pushjax._math.vec import Vec2
+from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, signed_area
+from pushjax.geometry.spline import SAMPLES, SplineOutline
+from pushjax.geometry.spline_segment import spline_segments
+
+# Nodes per segment for the arc length. The speed is smooth between two nodes.
+ARC_NODES = 8
+# Rounds of a fit. Each one fits the curve and moves every parameter towards the closest point on the curve.
+FIT_ROUNDS = 20
+
+
+class Curve(Shape):
+    """A smooth closed curve in the body frame: a uniform cubic B-spline, with continuous curvature.
+
+    The curve runs near its control points, not through them. `Curve.through` interpolates points, and `Curve.fit`
+    approximates a dense outline. The control points are stored counter-clockwise, as for `Polygon`. While they are
+    traced (under `jit`, `grad` or `vmap`), they are taken as they are and must be counter-clockwise already.
+
+    A query costs the same for all query points, in proportion to the number of control points.
+
+    Args:
+        control: Control points, shape (controls, 2), m, at least four, in either orientation. The first point is not
+            repeated at the end.
+        convex: Whether a finger touches the curve in one place only. None: determined from the control points; if they
+            are traced, convexity is not assumed.
+
+    Raises:
+        ValueError: If there are fewer than four control points, or NaN or repeated points among them; if the curve
+            crosses itself, encloses no area or has a cusp; or if it is not convex although `convex` is True.
+    """
+
+    control: Float[Array, "controls 2"]
+    convex: bool = eqx.field(static=True)
+
+    def __init__(self, control: ArrayLike, *, convex: bool | None = None):
+        array = _checked("control", control, least=4)
+        known = concrete(array)
+        if known is not None:
+            if _check_curve(known.astype(np.float64)) < 0:
+                array = jnp.roll(array[::-1], 1, axis=0)
+        self.control = array
+        self.convex = _is_convex(array, convex)
+
+    @staticmethod
+    def through(points: ArrayLike, *, convex: bool | None = None) -> "Curve":
+        """Create the curve that passes through the given points, with one control point for each.
+
+        Args:
+            points: Points, shape (points, 2), m, body frame, at least four. They should be about evenly spaced along
+                the curve.
+            convex: As for `Curve`.
+
+        Returns:
+            The interpolating curve.
+
+        Raises:
+            ValueError: As for `Curve`.
+        """
+        array = _checked("points", points, least=4)
+        one = jnp.eye(len(array), dtype=array.dtype)
+        at_points = (4 * one + jnp.roll(one, 1, axis=0) + jnp.roll(one, -1, axis=0)) / 6
+        return Curve(jnp.linalg.solve(at_points, array), convex=convex)
+
+    @staticmethod
+    def fit(points: ArrayLike, controls: int = 24, *, convex: bool | None = None) -> "Curve":
+        """Fit a curve to a dense outline by least squares.
+
+        Each point is weighted by the length of the outline around it. Distances are measured to the closest point of
+        the curve, not to the point at the same fraction of the length.
+
+        Args:
+            points: Vertices in order along the outline, shape (points, 2), m, body frame, at least twice as many as
+                `controls`. They must be known, not traced.
+            controls: Number of control points of the curve, at least four.
+            convex: As for `Curve`.
+
+        Returns:
+            The fitted curve.
+
+        Raises:
+            ValueError: If the points are traced, `controls` is out of range, or as for `Curve`.
+        """
+        array = _checked("points", points, least=4)
+        known = concrete(array)
+        if known is None:
+            raise ValueError("points are traced; a curve is fitted only to known points, outside jit, grad and vmap")
+        if not 4 <= controls <= len(known) // 2:
+            raise ValueError(f"controls must be from 4 to half the number of points, {len(known) // 2}; got {controls}")
+        return Curve(jnp.asarray(_fitted(known.astype(np.float64), controls), array.dtype), convex=convex)
+
+    @property
+    def area(self) -> Float[Array, ""]:
+        x, y, dx, dy, weight = self._by_gauss()
+        return jnp.sum(weight * (x * dy - y * dx)) / 2
+
+    @property
+    def centroid(self) -> Float[Array, "2"]:
+        x, y, dx, dy, weight = self._by_gauss()
+        moment = jnp.stack([jnp.sum(weight * x * x * dy), -jnp.sum(weight * y * y * dx)]) / 2
+        return self.control[0] + moment / (jnp.sum(weight * (x * dy - y * dx)) / 2)
+
+    def _by_gauss(self) -> tuple[Array, ...]:
+        """Return points, derivatives and weights of Gauss-Legendre quadrature along the curve.
+
+        The five points per segment are exact for integrands up to degree nine.
+        """
+        # Points are relative to the first control point, so that a curve far from the origin does not lose digits.
+        pieces = jax.tree.map(lambda field: field[:, None], spline_segments(self.control - self.control[:1]))
+        at, weight = (jnp.asarray(part / 2, self.control.dtype)[None] for part in np.polynomial.legendre.leggauss(5))
+        point, velocity, _ = pieces.at(at + 0.5)
+        return *point, *velocity, weight
+
+    @property
+    def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        pieces = spline_segments(self.control)
+        low, high = zip(*(_range(*fields) for fields in zip(*pieces[:4], strict=True)), strict=True)
+        return jnp.stack(low), jnp.stack(high)
+
+    @property
+    def perimeter(self) -> Float[Array, ""]:
+        """Length of the curve, m."""
+        at, weight = (part / 2 for part in np.polynomial.legendre.leggauss(5))
+        fine = (np.arange(ARC_NODES)[:, None] + at + 0.5).ravel() / ARC_NODES
+        pieces = jax.tree.map(lambda field: field[:, None], spline_segments(self.control))
+        _, velocity, _ = pieces.at(jnp.asarray(fine, self.control.dtype)[None])
+        weights = jnp.asarray(np.tile(weight, ARC_NODES) / ARC_NODES, self.control.dtype)
+        return jnp.sum(jnp.hypot(*velocity) * weights[None])
+
+    def boundary(self, points: int) -> Float[Array, "points 2"]:
+        count = len(self.control)
+        nodes = jnp.linspace(0, count, count * ARC_NODES + 1, dtype=self.control.dtype)
+        at, _ = equally_spaced(lambda at: jnp.hypot(*self._at(at)[1]), nodes, points)
+        return jnp.stack(self._at(at)[0], axis=1)
+
+    def _at(self, parameter: Array):
+        """Evaluate the point and the derivatives at parameters of any shape, counted in segments."""
+        count = len(self.control)
+        index = jnp.clip(jnp.floor(parameter).astype(int), 0, count - 1)
+        return spline_segments(self.control).chosen(index).at(parameter - index)
+
+    def outline(self) -> SplineOutline:
+        pieces = spline_segments(self.control)
+        at = jnp.arange(SAMPLES, dtype=self.control.dtype) / SAMPLES
+        node, velocity, _ = jax.tree.map(lambda field: field[:, None], pieces).at(at[None])
+        flat, slow = (Vec2(field.x.reshape(-1), field.y.reshape(-1)) for field in (node, velocity))
+        # Computed once here, and not again for each query of a batch.
+        outline = SplineOutline(pieces, flat, slow.scale(1 / SAMPLES), self.perimeter, self.convex)
+        return compute_once(outline, self.control[0, 0])
+
+
+def _range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
+    """Return the least and largest value of one coordinate over all segments.
+
+    The candidates are the ends of the segments and the stationary points between them.
+    """
+    inside = c2 * c2 - 3 * c1 * c3
+    half = -(c2 + jnp.where(c2 < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(inside > 0, inside, 0.0)))
+    turns = half / jnp.where(c3 == 0, jnp.inf, 3 * c3), c1 / jnp.where(half == 0, jnp.inf, half)
+    places = [jnp.zeros_like(c0), *(jax.lax.stop_gradient(jnp.clip(t, 0, 1)) for t in turns)]
+    values = jnp.stack([c0 + t * (c1 + t * (c2 + t * c3)) for t in places])
+    return jnp.min(values), jnp.max(values)
+
+
+def _checked(name: str, points: ArrayLike, least: int) -> Array:
+    """Return the argument `name` as an array; raise unless it holds at least `least` finite, distinct points."""
+    array = as_float(points)
+    check_shape(name, array, (name, 2))
+    if len(array) < least:
+        raise ValueError(f"{name}: a curve needs at least {least}; got {len(array)}")
+    check_finite(name, array)
+    known = concrete(array)
+    if known is not None:
+        gap = np.linalg.norm(np.roll(known, -1, axis=0) - known, axis=1)
+        if gap.min() <= 1e-9 * np.max(np.ptp(known, axis=0)):
+            first = int(np.argmin(gap))
+            raise ValueError(
+                f"{name}: {first} and {(first + 1) % len(known)} are the same point; each is given once, and the "
+                "first is not repeated at the end"
+            )
+    return array
+
+
+# Maps the four control points around a segment (before it, at its two ends, after it) to its power coefficients.
+_BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+
+
+def _known_at(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Evaluate points and first and second derivatives of a known curve.
+
+    This repeats `spline_segments` and `SplineSegment.at` in NumPy, to compute in float64 whatever precision JAX runs
+    in.
+    """
+    index = np.floor(parameter).astype(int)
+    t = (parameter - index)[:, None]
+    around = np.stack([control[(index + k) % len(control)] for k in (-1, 0, 1, 2)])
+    c0, c1, c2, c3 = np.tensordot(_BASIS, around, axes=1)
+    return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3), 2 * c2 + 6 * t * c3
+
+
+def _check_curve(control: np.ndarray) -> float:
+    """Return the approximate signed area, m^2; raise if the curve encloses no area, has a cusp or crosses itself."""
+    samples = max(4, min(16, 1200 // len(control)))  # per segment; all pairs of samples are compared
+    points, velocity, _ = _known_at(control, np.arange(len(control) * samples) / samples)
+    size, area = float(np.max(np.ptp(points, axis=0))), signed_area(points)
+    if abs(area) <= 1e-9 * size**2:
+        raise ValueError(f"control: the curve encloses no area ({abs(area):.3g} m^2)")
+    speed = np.linalg.norm(velocity, axis=1)
+    if speed.min() <= 1e-6 * speed.max():
+        raise ValueError(f"control: the curve has a cusp near control point {int(np.argmin(speed)) // samples}")
+    crossed = find_self_intersection(points, 1e-9 * size)
+    if crossed is not None:
+        raise ValueError(
+            "control: the curve crosses or touches itself (near control points "
+            f"{crossed[0] // samples} and {crossed[1] // samples}, counted from 0)"
+        )
+    return area
+
+
+def _is_convex(control: Array, claimed: bool | None) -> bool:
+    """Whether the curve turns inwards nowhere, up to roundoff; if traced, as claimed."""
+    known = concrete(control)
+    if known is None:
+        return bool(claimed)
+    count = len(known)
+    points, velocity, second = _known_at(known.astype(np.float64), np.arange(32 * count) / 32)
+    curvature = velocity[:, 0] * second[:, 1] - velocity[:, 1] * second[:, 0]
+    curvature /= np.linalg.norm(velocity, axis=1) ** 3
+    # Error of the curvature from roundoff in the second differences of the control points.
+    slack = (
+        16
+        * float(jnp.finfo(control.dtype).eps)
+        * count**2
+        * np.max(np.abs(known))
+        / np.max(np.ptp(points, axis=0)) ** 2
+    )
+    convex = bool(curvature.min() >= -slack)
+    if claimed and not convex:
+        near = int(np.argmin(curvature)) // 32
+        raise ValueError(f"convex is True, but the curve is not: it turns inwards near control point {near}")
+    return convex if claimed is None else bool(claimed)
+
+
+def _fitted(points: np.ndarray, controls: int) -> np.ndarray:
+    """Fit control points by alternating least squares.
+
+    Each round solves for the control points at fixed parameters, then moves the parameter of every point towards the
+    closest point of the curve. A point's parameter starts at its fraction of the outline's length. The first rounds
+    minimize the whole distance between a point and the curve's point at its parameter. The later rounds weight mostly
+    the distance across the curve, because the parameter can compensate for the distance along it.
+    """
+    before, after = (np.linalg.norm(points - np.roll(points, k, axis=0), axis=1) for k in (1, -1))
+    weight = np.sqrt((before + after) / 2)[:, None]
+    arc = np.concatenate([[0], np.cumsum(after)])
+    parameter = arc[:-1] / arc[-1] * controls
+    across, along = np.broadcast_to(np.eye(2)[:, None], (2, len(points), 2))
+    for turn in range(FIT_ROUNDS):
+        index = np.floor(parameter).astype(int)
+        share = (parameter - index)[:, None] ** np.arange(4)[None] @ _BASIS
+        design = np.zeros((len(points), controls))
+        for k in range(4):
+            design[np.arange(len(points)), (index + k - 1) % controls] += share[:, k]
+        slack = 1.0 if turn < FIT_ROUNDS // 4 else 0.1
+        ways = [weight * scale * way for scale, way in ((1.0, across), (slack, along))]
+        matrix = np.concatenate([(way[:, :, None] * design[:, None]).reshape(len(points), -1) for way in ways])
+        value = np.concatenate([np.sum(way * points, axis=1) for way in ways])
+        control = np.linalg.lstsq(matrix, value, rcond=None)[0].reshape(2, controls).T
+        at, first, second = _known_at(control, parameter)
+        squared = np.sum(first**2, axis=1)
+        stiff = np.maximum(squared - np.sum((points - at) * second, axis=1), 0.5 * squared)
+        parameter = parameter + np.clip(np.sum((points - at) * first, axis=1) / stiff, -0.25, 0.25)
+        along = _known_at(control, parameter)[1]
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    return control

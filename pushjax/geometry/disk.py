@@ -1,0 +1,78 @@
+"""Disks: closest point and sweep in closed form."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
+from pushjax._internal.xla import tree_where
+from pushjax._math.vec import Scalar, Vec2
+from pushjax.geometry.shape import ClosestPoint, Outline, Shape, ray_circle_intersection
+
+
+class DiskOutline(Outline):
+    """Outline of a disk.
+
+    Attributes:
+        center: Center, m, body frame.
+        radius: Radius, m.
+    """
+
+    center: Vec2
+    radius: Scalar
+
+    def closest(self, x: Vec2) -> ClosestPoint:
+        rel = x - self.center
+        squared = rel.dot(rel)
+        at_center = squared <= jnp.finfo(squared.dtype).tiny
+        length = jnp.sqrt(jnp.where(at_center, 1.0, squared))
+        # At the center all boundary points are equally close. The choice of +x keeps the result finite.
+        aside = Vec2(jnp.ones_like(length), jnp.zeros_like(length))
+        normal = tree_where(at_center, aside, rel.scale(1 / length))
+        distance = jnp.where(at_center, normal.dot(rel), length) - self.radius
+        return ClosestPoint(distance, self.center + normal.scale(self.radius), normal)
+
+    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
+        return ray_circle_intersection(x - self.center, path, self.radius + radius)
+
+
+class Disk(Shape):
+    """A disk.
+
+    Attributes:
+        radius: Radius, m, positive.
+        center: Center in the body frame, shape (2,), m. Default: the body origin.
+
+    Raises:
+        ValueError: If the radius is not a positive finite scalar, or the center has another shape or is not finite.
+    """
+
+    radius: Float[Array, ""]
+    center: Float[Array, "2"]
+
+    def __init__(self, radius: ArrayLike, center: ArrayLike = (0.0, 0.0)):
+        dtype = common_dtype(radius, center)
+        self.radius, self.center = as_float(radius, dtype), as_float(center, dtype)
+        check_shape("radius", self.radius, ())
+        check_shape("center", self.center, (2,))
+        for name, value in (("radius", self.radius), ("center", self.center)):
+            check_finite(name, value)
+        check_positive("radius", self.radius)
+
+    @property
+    def area(self) -> Float[Array, ""]:
+        return jnp.pi * self.radius**2
+
+    @property
+    def centroid(self) -> Float[Array, "2"]:
+        return self.center
+
+    @property
+    def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        return self.center - self.radius, self.center + self.radius
+
+    def boundary(self, points: int) -> Float[Array, "points 2"]:
+        angle = 2 * jnp.pi * (jnp.arange(points, dtype=self.radius.dtype) + 0.5) / points
+        return self.center[None] + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+
+    def outline(self) -> DiskOutline:
+        return DiskOutline(Vec2.of(self.center), self.radius)

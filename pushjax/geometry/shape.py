@@ -1,0 +1,332 @@
+"""Base classes of shapes and of their outlines, and helpers that several shapes share."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
+from pushjax._math.vec import Scalar, Vec2
+
+
+class ClosestPoint(NamedTuple):
+    """Signed distance, closest boundary point and outward normal for one query point.
+
+    If the closest point is a corner, the normal lies along the line from the corner to the query point: towards the
+    query point if that is outside, away from it if that is inside. If the query point lies on the boundary, the normal
+    is that of the edge, or at a corner the bisector.
+
+    Attributes:
+        distance: Signed distance, m, negative inside.
+        point: Closest point on the boundary, m, body frame.
+        normal: Outward unit normal there, body frame.
+    """
+
+    distance: Scalar
+    point: Vec2
+    normal: Vec2
+
+
+class SupportPoints(NamedTuple):
+    """Points of an outline that face a given direction, as arrays of static length with a mask.
+
+    Attributes:
+        point: Points on the outline, m, body frame; its coordinates have shape (places,).
+        real: Which of the entries exist, shape (places,).
+    """
+
+    point: Vec2
+    real: Bool[Array, "places"]
+
+
+class Outline(eqx.Module):
+    """A shape prepared for queries: all that does not depend on the query point is computed once."""
+
+    @abstractmethod
+    def closest(self, x: Vec2) -> ClosestPoint:
+        """Find the closest boundary point to a body point.
+
+        Args:
+            x: Query point, m, body frame.
+
+        Returns:
+            Signed distance, closest point and outward normal.
+        """
+
+    def touches(self, x: Vec2) -> tuple[ClosestPoint, ...]:
+        """Find all places where a round finger centered at `x` can touch the outline at the same time.
+
+        The first place is `closest(x)`. An outline that may not be convex returns a second place, for a finger wedged
+        in a concave corner. It is the nearest of the other boundary points that face `x` and are local minima of the
+        distance to `x`. Its distance is negative if `x` is behind the edge on which the place lies. If there is no such
+        point, the second place has the point and normal of the first. Its distance is then the first distance plus the
+        perimeter, which is out of reach of any finger.
+
+        Args:
+            x: Center of the finger, m, body frame.
+
+        Returns:
+            The places, nearest first. Their number is static.
+        """
+        return (self.closest(x),)
+
+    @abstractmethod
+    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
+        """Find the fraction of a straight path after which a disk first touches the outline.
+
+        The result is exact for any length of the path, so a fast disk cannot tunnel through the outline.
+
+        Args:
+            x: Center of the disk at the start, m, body frame. The disk starts outside, or in contact up to roundoff.
+            path: Displacement of the disk, m, body frame.
+            radius: Radius of the disk, m.
+
+        Returns:
+            Fraction of `path` at first contact, from 0 to 1. It is 0 if the disk starts in contact and approaches, and
+            infinite if the disk does not touch within the path.
+        """
+
+    def facing(self, direction: Vec2) -> SupportPoints:
+        """Find the points of a smooth outline where the outward normal is `direction` and the curvature is convex.
+
+        A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
+
+        Args:
+            direction: Unit vector, body frame.
+
+        Returns:
+            The points, and a mask of those that exist.
+
+        Raises:
+            NotImplementedError: If the outline has corners (its class does not define this query).
+        """
+        raise NotImplementedError(f"{type(self).__name__} has corners")
+
+
+class Shape(eqx.Module):
+    """Base class for the shape of a rigid planar slider, in its body frame, in m."""
+
+    @abstractmethod
+    def outline(self) -> Outline:
+        """Prepare the shape for queries."""
+
+    @property
+    @abstractmethod
+    def area(self) -> Float[Array, ""]:
+        """Enclosed area, m^2."""
+
+    @property
+    @abstractmethod
+    def centroid(self) -> Float[Array, "2"]:
+        """Centroid of the area in the body frame, m."""
+
+    @property
+    @abstractmethod
+    def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+        """Lower and upper corner of the axis-aligned box around the shape, m."""
+
+    @abstractmethod
+    def boundary(self, points: int) -> Float[Array, "points 2"]:
+        """Sample points equally spaced along the outline.
+
+        Args:
+            points: Number of points.
+
+        Returns:
+            The points in counter-clockwise order, shape (points, 2), m, body frame.
+        """
+
+    def closest(self, point: ArrayLike) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]:
+        """Find the signed distance, closest boundary point and outward unit normal for a body point.
+
+        Use `vmap` for batches of points. The distance is differentiable in the point and in the parameters of the
+        shape. The exceptions are the medial axis and the corners themselves: there the gradient is that of one
+        neighboring feature, and is finite.
+
+        Args:
+            point: Query point, shape (2,), m, body frame.
+
+        Returns:
+            A tuple of the signed distance (m, negative inside), the closest boundary point, shape (2,), m, and the
+            outward unit normal, shape (2,). Both vectors are in the body frame.
+
+        Raises:
+            ValueError: If `point` has another shape, or is NaN or infinite.
+        """
+        query = as_float(point, common_dtype(self, point))
+        check_shape("point", query, (2,))
+        check_finite("point", query)
+        found = self.outline().closest(Vec2.of(query))
+        return found.distance, found.point.array(), found.normal.array()
+
+    def signed_distance(self, point: ArrayLike) -> Float[Array, ""]:
+        """Compute the signed distance from a body point to the outline.
+
+        Args:
+            point: Query point, shape (2,), m, body frame.
+
+        Returns:
+            Distance, m, negative inside.
+
+        Raises:
+            ValueError: If `point` has another shape, or is NaN or infinite.
+        """
+        return self.closest(point)[0]
+
+    def contains(self, point: ArrayLike) -> Array:
+        """Test whether a body point lies inside or on the outline.
+
+        Args:
+            point: Query point, shape (2,), m, body frame.
+
+        Returns:
+            Boolean scalar.
+
+        Raises:
+            ValueError: If `point` has another shape, or is NaN or infinite.
+        """
+        return self.signed_distance(point) <= 0
+
+
+def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
+    """Find the fraction of a path at which a moving point comes within `reach` of the origin.
+
+    This is the smaller root of |x + t path|^2 = reach^2, in a form without cancellation. It is valid only for a point
+    that approaches and starts outside, or inside by no more than roundoff.
+
+    Args:
+        x: Start of the point, m.
+        path: Displacement of the point, m.
+        reach: Distance from the origin, m.
+
+    Returns:
+        Fraction of `path`, from 0 to 1, or inf if the point does not come that close within the path.
+    """
+    a = path.dot(path)
+    b = x.dot(path)
+    squared = x.dot(x)
+    c = squared - reach * reach
+    # disc is the discriminant b^2 - a c. In that form it would be a small difference of large numbers for a distant
+    # start. So it is computed as a reach^2 - (x cross path)^2, which is equal.
+    side = x.cross(path)
+    disc = a * reach * reach - side * side
+    hits = (b < 0) & (c >= -roundoff(16 * squared)) & (disc > 0)
+    root = jnp.sqrt(jnp.where(hits, disc, 1.0))
+    fraction = jnp.maximum(c / jnp.where(hits, root - b, 1.0), 0)
+    return jnp.where(hits & (fraction <= 1), fraction, jnp.inf)
+
+
+def roundoff(size: Scalar) -> Scalar:
+    """Bound the roundoff of a few operations on numbers of magnitude up to `size`: 16 eps size."""
+    return 16 * jnp.finfo(size.dtype).eps * size
+
+
+def equally_spaced(
+    speed: Callable[[Array], Array], nodes: Float[Array, "nodes"], points: int
+) -> tuple[Float[Array, "points"], Float[Array, ""]]:
+    """Find parameters of points that are equally spaced in arc length along a closed smooth outline.
+
+    Args:
+        speed: Function from an array of parameters to the arc length per parameter there.
+        nodes: Increasing parameters from start to end, dense enough that the speed is smooth between two of them.
+        points: Number of points.
+
+    Returns:
+        A tuple of the parameters, shape (points,), and the length of the outline. The first point is half a spacing
+        from the start.
+    """
+    at, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
+    at = at + 0.5
+
+    def along(start, width):
+        """Arc length over the parameters from `start` to `start + width`, by Gauss-Legendre quadrature."""
+        return width * jnp.sum(weights[None] * speed(start[:, None] + width[:, None] * at[None]), axis=1)
+
+    width = jnp.diff(nodes)
+    arc = jnp.concatenate([jnp.zeros(1, nodes.dtype), jnp.cumsum(along(nodes[:-1], width))])
+    wanted = (jnp.arange(points, dtype=nodes.dtype) + 0.5) / points * arc[-1]
+    node = jnp.clip(jnp.searchsorted(arc, wanted, side="right") - 1, 0, width.size - 1)
+    start, rest, most = nodes[node], wanted - arc[node], width[node]
+    offset = most * rest / (arc[node + 1] - arc[node])
+    for _ in range(4):  # Newton's method; the speed hardly changes between two nodes
+        offset = jnp.clip(offset + (rest - along(start, offset)) / speed(start + offset), 0, most)
+    return start + offset, arc[-1]
+
+
+def signed_area(v: np.ndarray) -> float:
+    """Compute the signed area of a closed polyline, m^2, positive if it runs counter-clockwise.
+
+    Args:
+        v: Vertices, shape (vertices, 2), m.
+
+    Returns:
+        Signed area, m^2.
+    """
+    rel = v - v[0]
+    after = np.roll(rel, -1, axis=0)
+    return float(np.sum(rel[:, 0] * after[:, 1] - after[:, 0] * rel[:, 1]) / 2)
+
+
+def check_simple_polygon(name: str, v: np.ndarray) -> None:
+    """Check that a closed polyline encloses an area and does not touch itself.
+
+    Args:
+        name: Name of the argument, for the error message.
+        v: Vertices, shape (vertices, 2), m.
+
+    Raises:
+        ValueError: If two vertices coincide, the polyline encloses no area, or it crosses or touches itself.
+    """
+    n, size = len(v), float(np.max(np.ptp(v, axis=0)))
+    gap = np.linalg.norm(v[:, None] - v[None], axis=-1) + size * np.eye(n)
+    if size == 0 or gap.min() <= 1e-9 * size:
+        i, j = np.unravel_index(np.argmin(gap), gap.shape)
+        raise ValueError(
+            f"{name}: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
+            "first is not repeated at the end"
+        )
+    if abs(signed_area(v)) <= 1e-12 * size**2:
+        raise ValueError(f"{name} enclose no area ({abs(signed_area(v)):.3g} m^2)")
+    crossed = find_self_intersection(v, 1e-9 * size)
+    if crossed is not None:
+        i, j = crossed
+        raise ValueError(f"{name}: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
+
+
+def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] | None:
+    """Find two edges of a closed polyline that cross or touch, other than at a shared vertex.
+
+    Args:
+        v: Vertices, shape (vertices, 2), m.
+        tolerance: Distance within which a vertex touches an edge, m.
+
+    Returns:
+        The indices of the two edges, or None if there are no such edges.
+    """
+    n = len(v)
+    a, b = v, np.roll(v, -1, axis=0)
+
+    def side(p, q, r):
+        return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+
+    p, q, r, s = a[:, None], b[:, None], a[None], b[None]
+    crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
+    on_edge = _touches(p, q, r, tolerance)  # a vertex on an edge; its own edges are excluded below
+    index = np.arange(n)
+    own = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
+    bad = crossing | (on_edge & ~own)
+    if not bad.any():
+        return None
+    i, j = np.argwhere(bad)[0]
+    return int(i), int(j)
+
+
+def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether the point `r` lies within `tolerance` of the segment from `p` to `q`."""
+    edge = q - p
+    s = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
+    return np.linalg.norm(r - p - s[..., None] * edge, axis=-1) <= tolerance

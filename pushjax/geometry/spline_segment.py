@@ -1,0 +1,95 @@
+"""Segments of a closed cubic spline."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from pushjax._math.vec import Scalar, Vec2
+
+
+class SplineSegment(NamedTuple):
+    """One segment, or an array of segments: p(t) = c0 + c1 t + c2 t^2 + c3 t^3 for t from 0 to 1.
+
+    With the jumps of c3, a segment also represents its two neighbors, for t from -1 to 2.
+
+    Attributes:
+        c0: Constant coefficient, m.
+        c1: Coefficient of t, m.
+        c2: Coefficient of t^2, m.
+        c3: Coefficient of t^3, m.
+        left: Jump of c3 from the previous segment to this one, m.
+        right: Jump of c3 from this segment to the next, m.
+    """
+
+    c0: Vec2
+    c1: Vec2
+    c2: Vec2
+    c3: Vec2
+    left: Vec2
+    right: Vec2
+
+    def at(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
+        """Evaluate the point and its first and second derivative with respect to t.
+
+        Args:
+            t: Parameter, from -1 to 2.
+
+        Returns:
+            A tuple of the point and the two derivatives, m.
+        """
+        over, under = jnp.maximum(t - 1, 0), jnp.maximum(-t, 0)
+        point = self.c0 + (self.c1 + (self.c2 + self.c3.scale(t)).scale(t)).scale(t)
+        first = self.c1 + (self.c2.scale(2) + self.c3.scale(3 * t)).scale(t)
+        second = self.c2.scale(2) + self.c3.scale(6 * t)
+        return (
+            point + self.right.scale(over * over * over) + self.left.scale(under * under * under),
+            first + self.right.scale(3 * over * over) - self.left.scale(3 * under * under),
+            second + self.right.scale(6 * over) + self.left.scale(6 * under),
+        )
+
+    def third(self, t: Scalar) -> Vec2:
+        """Evaluate the third derivative with respect to t, for t from -1 to 2, m."""
+        right, left = jnp.where(t > 1, 6.0, 0.0), jnp.where(t < 0, 6.0, 0.0)
+        return self.c3.scale(6) + self.right.scale(right) - self.left.scale(left)
+
+    def chosen(self, index) -> "SplineSegment":
+        """Index every field: select one segment, or several, from an array of segments."""
+        return jax.tree.map(lambda field: field[index], self)
+
+
+def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
+    """Convert the control points of a closed uniform cubic B-spline to segments.
+
+    Args:
+        control: Control points, shape (controls, 2), m.
+
+    Returns:
+        An array of segments, one for each control point. The first segment starts near the first control point.
+    """
+    before, here, after, next_ = (jnp.roll(control, k, axis=0) for k in (1, 0, -1, -2))
+    c3 = (next_ - before) / 6 + (here - after) / 2
+    fields = (
+        (before + 4 * here + after) / 6,
+        (after - before) / 2,
+        (before - 2 * here + after) / 2,
+        c3,
+        c3 - jnp.roll(c3, 1, axis=0),
+        jnp.roll(c3, -1, axis=0) - c3,
+    )
+    return SplineSegment(*(Vec2(field[:, 0], field[:, 1]) for field in fields))
+
+
+def outward_normal(velocity: Vec2) -> tuple[Vec2, Scalar]:
+    """Return the outward unit normal and the speed of a counter-clockwise outline.
+
+    Args:
+        velocity: Derivative of the outline's point with respect to its parameter.
+
+    Returns:
+        A tuple of the outward unit normal and the length of `velocity`.
+    """
+    squared = velocity.dot(velocity)
+    speed = jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
+    return Vec2(velocity.y / speed, -velocity.x / speed), speed

@@ -1,0 +1,331 @@
+"""Identification of noise: how much pushes scatter about their prediction.
+
+In the model of the noise, each push has its own limit surface, sampled about the identified one with `dof` degrees of
+freedom. It has its own friction, uniform about the identified one, up to `spread` away from it. Its hand is displaced
+by `offset` in x and in y. Its final pose has an error in x, y and length * theta, whose scale combines three parts in
+quadrature: the measurement error `sigma`; a fraction `relative[0]` of the distance between the slider's start and end;
+and a fraction `relative[1]` of length times the angle that it turned. So a push that hardly moves the slider is
+predicted far better than one that turns it around. All of these errors are normal except for a common random factor, so
+together they have Student's distribution with `tails` degrees of freedom. The tails describe pushes that slip where no
+model predicts it. These are few, but more than a normal distribution would have.
+
+The search minimizes the mean score of the recorded final poses. The score is proper: in expectation, no other noise
+scores better than the true one. The expectation of "energy" does not depend on the number of samples of a push, and
+"energy" is hardly sensitive to the tails. "density" is the negative log density, where the density is the mean over
+samples that each have a measurement error. It is most sensitive to the tails, and overestimates them slightly when few
+samples are drawn.
+
+Samples are smooth functions of the noise, except that for a fixed key a sample may jump with dof (rejections in the
+sampler of the gamma distribution). Derivatives are correct in expectation. Therefore the score is not minimized for one
+key, but by Adam with a new key for every step.
+"""
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pushjax._internal.checks import check_positive
+from pushjax._internal.files import load_json, save_json, to_list
+from pushjax._internal.jit import jit
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax.friction.random import FrictionModel, Sampler
+from pushjax.identification.predictive import (
+    ConditionSampler,
+    NoiseParameters,
+    PoseJacobian,
+    PredictiveModel,
+    RandomInputs,
+    log_density,
+    predict,
+)
+from pushjax.identification.pushes import Pushes
+from pushjax.identification.result import Identified, from_record, to_record
+from pushjax.metrics import energy_score
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import Slider
+
+Score = Literal["energy", "density"]
+FORMAT, VERSION = "pushjax noise", 1
+ARRAYS = ("dof", "friction", "offset", "sigma", "relative", "tails", "score", "history")
+SAMPLES = 32  # samples of each push in each step of the search
+STEPS = 80
+CHUNK = 10  # steps between two calls of `progress`
+RATE, LAST = 0.1, 0.1  # learning rate of the logarithms, and the fraction of it that is left at the end
+AVERAGED = 30  # number of last steps whose parameters and scores are averaged
+START = {"dof": 60.0, "spread": 0.1, "offset": 5e-4, "relative": (0.05, 0.05), "tails": 6.0}
+LEAST_DOF, LEAST_TAILS = 9.0, 1.0
+
+
+class Noise(eqx.Module):
+    """Distribution of pushes about their prediction.
+
+    Attributes:
+        found: What `identify` returned.
+        dof: Degrees of freedom of the limit surface.
+        friction: (..., 2) range on which mu is uniform, for each condition.
+        offset: Scale in m of the hand's displacement against the slider, in x and in y, which differs from push to
+            push.
+        sigma: Scale in m of the error of a final pose in x, y and length * theta, however far the slider moved.
+        relative: (2,) scale of the additional error per distance that the slider moved, and per length * angle that it
+            turned.
+        tails: Degrees of freedom of Student's distribution of all of these errors.
+        score: Mean score of the final poses at the end of the search (energy: m).
+        history: (steps,) mean score during the search.
+        sampler: Sampler of the limit surfaces; see `FrictionModel`.
+    """
+
+    found: Identified
+    dof: Float[Array, ""]
+    friction: Float[Array, "*conditions 2"]
+    offset: Float[Array, ""]
+    sigma: Float[Array, ""]
+    relative: Float[Array, "2"]
+    tails: Float[Array, ""]
+    score: Float[Array, ""]
+    history: Float[Array, "steps"]
+    sampler: Sampler = eqx.field(static=True)
+
+    @property
+    def model(self) -> FrictionModel:
+        """Friction model for rollouts and `monte_carlo` around `found.surface`.
+
+        Raises:
+            ValueError: If several conditions were identified.
+        """
+        if not self.found.single:
+            raise ValueError("model is for what was found of one condition; of several there is `predict`")
+        return FrictionModel(self.dof, self.friction, self.sampler)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a JSON file that `load` reads back to the same bits."""
+        record = {"sampler": self.sampler, "found": to_record(self.found)}
+        record |= {name: to_list(getattr(self, name)) for name in ARRAYS}
+        save_json(path, FORMAT, VERSION, self.score.dtype, record)
+
+    @staticmethod
+    def load(path: str | Path) -> "Noise":
+        """Read a file that `save` wrote.
+
+        Raises:
+            ValueError: If the file holds something else.
+        """
+        return load_json(path, "noise that pushjax identified", FORMAT, VERSION, _noise)
+
+    def predict(
+        self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
+    ) -> Float[Array, "*conditions pushes n 3"]:
+        """Sample measured final poses of these or other pushes of the same conditions.
+
+        Args:
+            key: PRNG key.
+            pushes: Pushes of the same conditions.
+            slider: Slider, as given to `identify`.
+            hand: Hand, as given to `identify`.
+            n: Number of samples of each push.
+
+        Returns:
+            (..., pushes, n, 3) final poses, world, m and rad.
+        """
+        predictive = PredictiveModel.of(self.found, pushes, slider, hand, self.sampler)
+        drawn = predict(key, predictive, self._values, n)
+        return drawn[0] if self.found.single else drawn
+
+    def log_density(
+        self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
+    ) -> Float[Array, "*conditions pushes"]:
+        """Return the log of the predicted density at the recorded final poses.
+
+        The density is the mean of Student's densities about `n` sampled poses; their width is the error of the final
+        pose. Here this error and the hand's displacement have no common factor.
+
+        Args:
+            key: PRNG key.
+            pushes: Pushes of the same conditions, those of `identify` or others.
+            slider: Slider, as given to `identify`.
+            hand: Hand, as given to `identify`.
+            n: Number of samples of each push.
+
+        Returns:
+            (..., pushes) log density per cubic meter of (x, y, length * theta).
+        """
+        predictive = PredictiveModel.of(self.found, pushes, slider, hand, self.sampler)
+        density = log_density(key, predictive, self._values, n)
+        return density[0] if self.found.single else density
+
+    def about(self, found: Identified) -> "Noise":
+        """Return the same noise about an estimate from other pushes.
+
+        Args:
+            found: The other estimate, of one condition or of several.
+
+        Returns:
+            The noise. If the range of friction differs between conditions, it has the widest range.
+        """
+        spread = jnp.max(self.friction[..., 1] - self.found.friction)
+        friction = jnp.stack([jnp.maximum(found.friction - spread, 0), found.friction + spread], axis=-1)
+        return eqx.tree_at(lambda noise: (noise.found, noise.friction), self, (found, friction))
+
+    @property
+    def _values(self) -> NoiseParameters:
+        friction = self.friction[None] if self.found.single else self.friction
+        return NoiseParameters(self.dof, friction, self.offset, self.sigma, self.relative, self.tails)
+
+
+def identify_noise(
+    key: PRNGKeyArray,
+    found: Identified,
+    pushes: Pushes,
+    slider: Slider,
+    hand: Hand,
+    *,
+    sampler: Sampler = "sum_of_squares",
+    score: Score = "energy",
+    samples: int = SAMPLES,
+    steps: int = STEPS,
+    progress: ProgressCallback = no_progress,
+) -> Noise:
+    """Identify the noise that predicts the pushes best, by the energy score or by the density.
+
+    The range of friction of each condition is centered at its identified friction. Conditions share all other
+    parameters.
+
+    Args:
+        key: PRNG key.
+        found: What `identify` returned for these conditions, preferably from other pushes: the residuals of the pushes
+            from which it was identified are smaller.
+        pushes: Pushes of the same conditions.
+        slider: Slider, as given to `identify`.
+        hand: Hand, as given to `identify`.
+        sampler: Sampler of the limit surfaces; see `FrictionModel`.
+        score: Score to minimize, "energy" or "density".
+        samples: Number of samples of each push in every step.
+        steps: Number of steps of the search.
+        progress: Function called with the number of steps done and the total number.
+
+    Returns:
+        The noise.
+
+    Raises:
+        ValueError: If `score` is another score, or if `samples` is less than 2 or `steps` is not positive.
+
+    Reference: Zhou et al. 2017, section VII, states the problem. Gneiting & Raftery 2007, section 4.3, describes the
+    score.
+    """
+    if score not in get_args(Score):
+        raise ValueError(f"score must be one of {', '.join(get_args(Score))}; got {score!r}")
+    if samples < 2:
+        raise ValueError(f"samples must be at least 2; got {samples}")
+    check_positive("steps", steps)
+    predictive = PredictiveModel.of(found, pushes, slider, hand, sampler)
+    scatter = _first(found)
+    state, values, visited = _rule(steps).init(scatter), [], []
+    keys = jax.random.split(key, steps)
+    for begin in range(0, steps, CHUNK):
+        part = keys[begin : begin + CHUNK]
+        scatter, state, each, passed = _descend(scatter, state, part, predictive, samples, steps, score)
+        values.append(each)
+        visited.append(passed)
+        progress(begin + len(part), steps)
+    history = jnp.concatenate(values)
+    passed = jax.tree.map(lambda *parts: jnp.concatenate(parts), *visited)
+    last = min(AVERAGED, steps)
+    best = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), passed).values(predictive.theta.friction)
+    if found.single:
+        best = best._replace(friction=best.friction[0])
+    return Noise(found, score=jnp.mean(history[-last:]), history=history, sampler=sampler, **best._asdict())
+
+
+def _rule(steps: int) -> optax.GradientTransformation:
+    """Return the optimizer: Adam with a cosine decay of the learning rate."""
+    return optax.adam(optax.cosine_decay_schedule(RATE, steps, LAST))
+
+
+class _Scatter(NamedTuple):
+    """The parameters that are optimized, as unbounded numbers (logarithms of the distance to the lower bound)."""
+
+    dof: Float[Array, ""]
+    spread: Float[Array, ""]
+    offset: Float[Array, ""]
+    sigma: Float[Array, ""]
+    relative: Float[Array, "2"]
+    tails: Float[Array, ""]
+
+    def values(self, center: Float[Array, "conditions"]) -> NoiseParameters:
+        """Return the parameters of the noise; `center` is the identified friction of each condition."""
+        spread = jnp.exp(self.spread)
+        friction = jnp.stack([jnp.maximum(center - spread, 0), center + spread], axis=-1)
+        dof, tails = LEAST_DOF + jnp.exp(self.dof), LEAST_TAILS + jnp.exp(self.tails)
+        return NoiseParameters(dof, friction, jnp.exp(self.offset), jnp.exp(self.sigma), jnp.exp(self.relative), tails)
+
+
+def _first(found: Identified) -> _Scatter:
+    """Return the initial parameters."""
+    least = {"dof": LEAST_DOF, "tails": LEAST_TAILS}
+    first = {name: jnp.asarray(value, found.z.dtype) - least.get(name, 0.0) for name, value in START.items()}
+    return _Scatter(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
+
+
+@jit
+def _descend(scatter, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
+    """Take one optimizer step per key; return the state, and the scores and parameters of all steps."""
+    rule = _rule(steps)
+
+    def step(carry, key):
+        scatter, state = carry
+        value, slope = _score(scatter, key, predictive, samples, score)
+        updates, state = rule.update(slope, state)
+        scatter = optax.apply_updates(scatter, updates)
+        return (scatter, state), (value, scatter)
+
+    (scatter, state), (values, passed) = jax.lax.scan(step, (scatter, state), keys)
+    return scatter, state, values, passed
+
+
+def _score(
+    scatter: _Scatter, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
+) -> tuple[Array, _Scatter]:
+    """Return the mean score and its derivative.
+
+    A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
+    forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
+    """
+
+    def local(
+        drawing: ConditionSampler, key: PRNGKeyArray, values: NoiseParameters
+    ) -> tuple[RandomInputs, tuple[Array, PoseJacobian]]:
+        chances = drawing.chances(key, samples)
+        return chances, drawing.slopes(chances, values)
+
+    center, pushes = predictive.theta.friction, predictive.pushes
+    start = scatter.values(center)
+    chances, (poses, slopes) = predictive.over_conditions(local, key, start)
+    before = jax.lax.stop_gradient(start.own(chances))
+
+    def mean(scatter: _Scatter) -> Array:
+        values = scatter.values(center)
+        dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
+        errors = chances.errors(values.tails)
+        there = poses + slopes.dof * dof + slopes.mu * mu
+        aside = values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
+        if score == "density":
+            each = -predictive.log_density(there + aside, pushes, values)
+        else:
+            # `there` does not include the hand's displacement: a relative error of that would be a product of two
+            # heavy-tailed variables, whose mean may be infinite
+            error = predictive.error(there, pushes, values)
+            off = predictive.measured(there + aside, error, errors) - pushes.end[..., None, :]
+            each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
+        return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
+
+    return jax.value_and_grad(mean)(scatter)
+
+
+def _noise(record: dict[str, Any], dtype: Any) -> Noise:
+    """Return the noise of a record, in a floating dtype."""
+    arrays = {name: jnp.asarray(record[name], dtype) for name in ARRAYS}
+    return Noise(found=from_record(record["found"], dtype), sampler=record["sampler"], **arrays)

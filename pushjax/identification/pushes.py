@@ -1,0 +1,202 @@
+"""Recorded pushes as arrays, the data of identification."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    check_type,
+    common_dtype,
+)
+from pushjax.datasets.pushes import PushLog
+from pushjax.datasets.recordings import Recordings
+from pushjax.geometry.shape import Shape
+from pushjax.identification.recordings import push_arrays
+
+STEPS = 50
+ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist", "age", "side")
+
+
+class PushInput(NamedTuple):
+    """What is known of a push before it happens; see `Pushes` for the fields."""
+
+    start: Float[Array, "*pushes 3"]
+    path: Float[Array, "*pushes steps+1 dof"]
+    age: Float[Array, "*pushes"]
+    side: Float[Array, "*pushes"]
+
+
+class Pushes(eqx.Module):
+    """Pushes of one slider by one hand; with a leading axis, pushes of several conditions.
+
+    The poses of one push share a total weight of one, because their errors are correlated. Likewise its pairs.
+
+    Attributes:
+        start: (pushes, 3) slider's pose before each push, world, m and rad.
+        path: (pushes, steps + 1, dof) path of the hand, world, as in `rollout`.
+        end: (pushes, 3) slider's pose after each push, world, m and rad. The angle is the one that the slider really
+            turned to (not wrapped).
+        weight: (pushes,) weight of each push; zero leaves it out. Default: ones.
+        along: (pushes, k, 3) slider's poses during the push, after the path's steps `rows`: at equal parts of it.
+            Default: none.
+        wrench: (pushes, p, 3) wrenches on the slider, in the body frame about its origin, of any scale. Default: none.
+        twist: (pushes, p, 3) motion of the slider under each wrench, in the body frame about its origin, of any scale.
+            If the wrench or the motion is zero, the pair does not count. Default: none.
+        age: (pushes,) time of each push, from 0 (the first) to 1 (the last). The friction may depend on it, if
+            `Unknowns.drift` is given. Default: zeros.
+        side: (pushes,) side of the slider that was pushed, from 0. The friction may depend on it, if `Unknowns.side` is
+            given. A side beyond `Unknowns.sides` counts as the last. Default: zeros.
+
+    Raises:
+        ValueError: If an array has the wrong shape or is not finite, or if a weight or side is negative.
+    """
+
+    start: Float[Array, "*conditions pushes 3"]
+    path: Float[Array, "*conditions pushes steps+1 dof"]
+    end: Float[Array, "*conditions pushes 3"]
+    weight: Float[Array, "*conditions pushes"]
+    along: Float[Array, "*conditions pushes seen 3"]
+    wrench: Float[Array, "*conditions pushes pairs 3"]
+    twist: Float[Array, "*conditions pushes pairs 3"]
+    age: Float[Array, "*conditions pushes"]
+    side: Float[Array, "*conditions pushes"]
+
+    def __init__(
+        self,
+        start: ArrayLike,
+        path: ArrayLike,
+        end: ArrayLike,
+        weight: ArrayLike | None = None,
+        *,
+        along: ArrayLike | None = None,
+        wrench: ArrayLike | None = None,
+        twist: ArrayLike | None = None,
+        age: ArrayLike | None = None,
+        side: ArrayLike | None = None,
+    ):
+        dtype = common_dtype(start, path, end)
+        self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
+        if self.start.ndim not in (2, 3):
+            raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
+        many = self.start.shape[:-1]
+        none = jnp.zeros((*many, 0, 3), dtype)
+        self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
+        self.along, self.wrench, self.twist = (
+            none if value is None else as_float(value, dtype) for value in (along, wrench, twist)
+        )
+        self.age, self.side = (
+            jnp.zeros(many, dtype) if value is None else as_float(value, dtype) for value in (age, side)
+        )
+        check_shape("end", self.end, (*many, 3))
+        check_shape("path", self.path, (*many, "steps + 1", "dof"))
+        check_shape("weight", self.weight, many)
+        check_shape("age", self.age, many)
+        check_shape("side", self.side, many)
+        check_shape("along", self.along, (*many, "k", 3))
+        check_shape("wrench", self.wrench, (*many, "p", 3))
+        check_shape("twist", self.twist, self.wrench.shape)
+        steps, seen = self.path.shape[-2] - 1, self.along.shape[-2]
+        if steps < 1:
+            raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
+        if seen >= steps:
+            raise ValueError(f"along has {seen} poses on the way; between {steps} steps there are {steps - 1}")
+        for name in ARRAYS:
+            check_finite(name, getattr(self, name))
+        check_non_negative("weight", self.weight)
+        check_non_negative("side", self.side)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(k + 1,) steps of the path after which the slider's pose was measured; the last is the end."""
+        parts = self.along.shape[-2] + 1
+        return np.round(np.arange(1, parts + 1) / parts * (self.path.shape[-2] - 1)).astype(int)
+
+    @property
+    def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
+        """All poses measured after the start, including the last."""
+        return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
+
+    @property
+    def given(self) -> "PushInput":
+        """What is known of every push before it happens."""
+        return PushInput(self.start, self.path, self.age, self.side)
+
+    @property
+    def paired(self) -> Bool[Array, "*conditions pushes pairs"]:
+        """True where there is a wrench with a motion."""
+        return jnp.any(self.wrench != 0, axis=-1) & jnp.any(self.twist != 0, axis=-1)
+
+    def as_conditions(self) -> "Pushes":
+        """Return the pushes with a leading axis of conditions, of length one if there is none yet."""
+        return jax.tree.map(lambda leaf: leaf[None], self) if self.weight.ndim == 1 else self
+
+    @staticmethod
+    def of(log: Any, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
+        """Make pushes from the usable pushes of a log.
+
+        Args:
+            log: A `pushjax.datasets.PushLog`, or the `Recordings` that `load_recordings` returns.
+            steps: Number of steps of each path.
+            parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked
+                during all pushes. Otherwise only the final pose is used.
+            shape: Outline of the slider. If it is given and the forces of a single finger were recorded, wrenches are
+                used too.
+
+        Returns:
+            The pushes.
+
+        Raises:
+            ValueError: If `steps` or `parts` is less than one, or if `parts` is not less than `steps`.
+            TypeError: If `log` is of another type.
+        """
+        check_type("log", log, PushLog, Recordings)
+        recordings = log if isinstance(log, Recordings) else Recordings.of_log(log)
+        return Pushes(**push_arrays(recordings, steps, parts, shape))
+
+    @staticmethod
+    def conditions(several: Sequence["Pushes"]) -> "Pushes":
+        """Stack the pushes of several conditions.
+
+        Args:
+            several: Pushes of each condition. A condition with fewer pushes is padded with pushes of weight zero.
+
+        Returns:
+            Pushes with a leading axis of conditions.
+
+        Raises:
+            ValueError: If `several` is empty, or if the conditions' arrays differ in shape.
+        """
+        if not several:
+            raise ValueError("several: expected at least one condition's pushes; got none")
+        most = max(one.weight.shape[0] for one in several)
+        for name in ARRAYS:
+            shapes = {getattr(one, name).shape[1:] for one in several}
+            if len(shapes) > 1:
+                raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
+
+        def filled(name: str) -> Array:
+            rows = []
+            for one in several:
+                value = getattr(one, name)
+                rest = most - value.shape[0]
+                again = jnp.broadcast_to(value[:1], (rest, *value.shape[1:]))
+                rows.append(jnp.concatenate([value, 0 * again if name == "weight" else again]))
+            return jnp.stack(rows)
+
+        return Pushes(**{name: filled(name) for name in ARRAYS})
+
+    def weighted(self, weight: ArrayLike) -> "Pushes":
+        """Return the same pushes with other weights (pushes,), for example a training set or a bootstrap sample."""
+        value = as_float(weight, self.weight.dtype)
+        check_shape("weight", value, self.weight.shape)
+        return eqx.tree_at(lambda p: p.weight, self, value)

@@ -1,0 +1,284 @@
+"""The result of identification: estimates and their posterior distribution."""
+
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from scipy.stats import norm
+
+from pushjax._internal.files import load_json, save_json, to_list
+from pushjax._internal.jit import quick_jit
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.identification import uncertainty
+from pushjax.identification.model import Scene, apply_inset, correct_path, surfaces, trajectories
+from pushjax.identification.pushes import Pushes
+from pushjax.identification.unknowns import SPREADS, Layout, Parameters, Prior, PriorSurface, Unknowns
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import Slider, Trajectory
+
+FORMAT, VERSION = "pushjax identified", 1
+ARRAYS = ("z", "precision", "sigma", "direction", "gap", "residual", "information", "loss", "length")
+APPLIED = ("friction", "surface", "center", "inset", "end", "lag", "offset")
+LOGISTIC_VARIANCE = np.pi**2 / 3
+
+
+class Identified(eqx.Module):
+    """Most probable values of the unknowns, with a normal approximation of the posterior about them (Laplace's method).
+
+    All properties have a leading axis of conditions if the pushes had one. Values that conditions share are repeated.
+
+    Attributes:
+        z: (size,) most probable values, in the coordinates of `prior`.
+        precision: (size, size) inverse covariance of z.
+        prior: Prior of the unknowns; it converts z to physical parameters.
+        sigma: Standard deviation in m of each of x, y and length * theta of a measured pose about its prediction.
+        direction: Standard deviation of each component of the unit vector along the motion under a measured wrench;
+            zero if no wrench was recorded.
+        gap: Standard deviation in m of the gap at the end of a push; zero unless `touching`.
+        residual: (..., pushes, 3) predicted less measured final pose, in x, y and length * theta, m.
+        information: (..., pushes, size) contribution of each push to the diagonal of the precision.
+        loss: The minimized loss: twice the negative log posterior density, up to a constant.
+        length: Length of the metric, m.
+        steps: Number of steps of the optimizer.
+        converged: Whether the optimizer converged.
+        single: Whether the pushes had no axis of conditions.
+        robust: As given to `identify`.
+        touching: As given to `identify`.
+    """
+
+    z: Float[Array, "size"]
+    precision: Float[Array, "size size"]
+    prior: Prior
+    sigma: Float[Array, ""]
+    direction: Float[Array, ""]
+    gap: Float[Array, ""]
+    residual: Float[Array, "*conditions pushes 3"]
+    information: Float[Array, "*conditions pushes size"]
+    loss: Float[Array, ""]
+    length: Float[Array, ""]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+    single: bool = eqx.field(static=True)
+    robust: float | None = eqx.field(static=True)
+    touching: bool = eqx.field(static=True, default=False)
+
+    @property
+    def physical(self) -> Parameters:
+        """All parameters that a push depends on, as arrays."""
+        return self._own(self.prior.physical(self.z))
+
+    @property
+    def friction(self) -> Float[Array, "*conditions"]:
+        """Friction coefficient mu between the fingers and the slider."""
+        return self.physical.friction
+
+    @property
+    def surface(self) -> LimitSurface:
+        """Limit surface, center of pressure included; with conditions, its arrays have a leading axis of conditions."""
+        return self._own(surfaces(self.prior, self.prior.physical(self.z)))
+
+    @property
+    def covariance(self) -> Float[Array, "size size"]:
+        """Covariance of z, (size, size)."""
+        return jnp.linalg.inv(self.precision)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Label of each number of z."""
+        return self.prior.layout.labels
+
+    @property
+    def variance_reduction(self) -> dict[str, float]:
+        """Reduction of the variance of each number of z, by label: 1 - posterior variance / prior variance.
+
+        The prior variance of a friction is that of the uniform distribution over its range. Near zero, the pushes do
+        not determine the number.
+        """
+        before = np.where(self.prior.layout.flat_prior > 0, 1.0, LOGISTIC_VARIANCE)
+        share = 1 - np.diagonal(np.asarray(self.covariance, float)) / before
+        return dict(zip(self.labels, np.clip(share, 0, 1).tolist(), strict=True))
+
+    def information_share(self, name: str) -> Float[Array, "*conditions pushes"]:
+        """Return the fraction of the total information about `name` that each push contributes.
+
+        Args:
+            name: Name of an unknown (friction, surface, ...).
+
+        Returns:
+            (..., pushes) fractions that add up to one over all conditions and pushes.
+
+        Raises:
+            ValueError: If `name` was not identified.
+        """
+        if name not in self.prior.layout.names:
+            raise ValueError(f"name must be one of {', '.join(self.prior.layout.names)}; got {name!r}")
+        index = self.prior.layout.index[:, self.prior.layout.local[name]]
+        places = np.unique(index)
+        each = jnp.sum(self.information[..., places], axis=-1)
+        total = jnp.sum(each)
+        return each / jnp.where(total > 0, total, 1.0)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything to a JSON file that `load` reads back to the same bits."""
+        save_json(path, FORMAT, VERSION, self.z.dtype, to_record(self))
+
+    @staticmethod
+    def load(path: str | Path) -> "Identified":
+        """Read a file that `save` wrote.
+
+        Raises:
+            ValueError: If the file holds something else.
+        """
+        return load_json(path, "what pushjax identified", FORMAT, VERSION, from_record)
+
+    def draws(self, key: PRNGKeyArray, n: int) -> Parameters:
+        """Sample `n` values from the posterior distribution.
+
+        Args:
+            key: PRNG key.
+            n: Number of samples.
+
+        Returns:
+            Independent samples; fields as in `physical`, with a leading axis (n,).
+        """
+        return jax.vmap(lambda z: self._own(self.prior.physical(z)))(self._draws(key, n))
+
+    def _draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n size"]:
+        """Sample `n` vectors z from the posterior distribution."""
+        upper = jnp.linalg.cholesky(self.precision).T
+        normal = jax.random.normal(key, (len(self.z), n), self.z.dtype)
+        return self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
+
+    def interval(self, level: float = 0.9) -> dict[str, tuple[Array, Array]]:
+        """Return an interval for each unknown except the surface.
+
+        Each interval is that of its own number of z, so that a friction stays in its range.
+
+        Args:
+            level: Probability that each interval contains.
+
+        Returns:
+            Lowest and highest value by name; arrays shaped like the estimates.
+
+        Raises:
+            ValueError: If `level` is not between 0 and 1.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level must be between 0 and 1; got {level!r}")
+        reach = float(norm.ppf(0.5 + level / 2)) * jnp.sqrt(jnp.diagonal(self.covariance))
+        low, high = (self._own(self.prior.physical(self.z + sign * reach)) for sign in (-1, 1))
+        names = [name for name in self.prior.layout.names if name != "surface"]
+        return {name: (getattr(low, name), getattr(high, name)) for name in names}
+
+    def profile(self, pushes: Pushes, slider: Slider, hand: Hand, label: str, **options: Any) -> uncertainty.Profile:
+        """Compute how much worse all pushes are explained if one number is held at other values.
+
+        See `uncertainty.profile` for the arguments and options. `label` is one of `labels`.
+        """
+        return uncertainty.profile(self, pushes, slider, hand, label, **options)
+
+    def bootstrap(self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int) -> Parameters:
+        """Identify from `n` sets of pushes that are drawn from the given ones with replacement.
+
+        See `uncertainty.bootstrap`.
+
+        Returns:
+            The estimates, with a leading axis (n,).
+        """
+        return uncertainty.bootstrap(key, self, pushes, slider, hand, n)[0]
+
+    def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
+        """Return slider, hand and path as they really are, for use in rollouts.
+
+        Args:
+            slider: Slider, as given to `identify`.
+            hand: Hand, as given to `identify`.
+            path: (steps + 1, dof) path of the hand as logged.
+
+        Returns:
+            Slider, hand and path with the identified surface and calibration.
+
+        Raises:
+            ValueError: If several conditions were identified, or if an unknown was identified that slider, hand and
+                path cannot represent, such as the table.
+        """
+        if not self.single:
+            raise ValueError("applied is for what was found of one condition; of several there is `predict`")
+        more = [name for name in self.prior.layout.names if name not in APPLIED]
+        if more:
+            raise ValueError(f"applied cannot tell of {', '.join(more)}; for what was found of them there is `predict`")
+        own = self.physical
+        shape, hand = apply_inset(slider.shape, hand, own.inset)
+        return Slider(shape, self.surface), hand, correct_path(path, own.end, own.lag, own.offset)
+
+    def predict(self, pushes: Pushes, slider: Slider, hand: Hand) -> Trajectory:
+        """Predict these or other pushes of the same conditions.
+
+        Args:
+            pushes: Pushes of the same conditions.
+            slider: Slider; only its outline is used.
+            hand: Hand, as given to `identify`.
+
+        Returns:
+            Trajectories; every array has leading axes (..., pushes).
+        """
+        theta = self.prior.physical(self.z)
+        body = Scene(slider.shape, hand, self.prior.origin)
+        each = _trajectories(theta, surfaces(self.prior, theta), body, pushes.as_conditions())
+        return self._own(each)
+
+    def _own(self, several: Any) -> Any:
+        """Drop the axis of conditions if the pushes had none."""
+        return jax.tree.map(lambda leaf: leaf[0], several) if self.single else several
+
+
+_trajectories = quick_jit(trajectories)
+
+
+def to_record(found: Identified) -> dict[str, Any]:
+    """Return the result as numbers and lists, for a JSON file."""
+    unknowns, mean = found.prior.unknowns, found.prior.mean
+    record: dict[str, Any] = {"single": found.single, "robust": found.robust, "touching": found.touching}
+    record |= {"steps": int(found.steps), "converged": bool(found.converged), "labels": found.labels}
+    record |= {name: to_list(getattr(found, name)) for name in ARRAYS}
+    record["unknowns"] = {name: to_list(getattr(unknowns, name)) for name in ("friction", "dof", *SPREADS)}
+    record["sides"] = unknowns.sides
+    record["shared"] = unknowns.shared
+    record["origin"] = to_list(found.prior.origin)
+    record["known_friction"] = to_list(found.prior.friction)
+    record["mean"] = {name: to_list(getattr(mean, name)) for name in ("lower", "spread", "length")}
+    # for people who read the file: not read back
+    estimates = found.physical._asdict()
+    record["estimates"] = {name: to_list(value) for name, value in estimates.items() if value is not None}
+    return record
+
+
+def from_record(record: dict[str, Any], dtype: Any) -> Identified:
+    """Return the result that `to_record` wrote, in a floating dtype."""
+
+    def array(value: Any) -> Any:
+        return None if value is None else jnp.asarray(value, dtype)
+
+    known = {name: array(value) for name, value in record["unknowns"].items()}
+    unknowns = Unknowns(known.pop("friction"), **known, sides=record["sides"], shared=tuple(record["shared"]))
+    mean = PriorSurface(**{name: array(value) for name, value in record["mean"].items()})
+    conditions, terms = mean.lower.shape[:2]
+    layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
+    origin = array(record["origin"])
+    prior = Prior(unknowns, array(record["known_friction"]), mean, origin, layout)
+    arrays = {name: array(record[name]) for name in ARRAYS}
+    if arrays["z"].shape != (layout.size,) or arrays["precision"].shape != (layout.size, layout.size):
+        raise ValueError(f"its z has shape {arrays['z'].shape}; what it says was unknown has ({layout.size},)")
+    return Identified(
+        **arrays,
+        prior=prior,
+        steps=jnp.asarray(record["steps"], jnp.int32),
+        converged=jnp.asarray(record["converged"], bool),
+        single=bool(record["single"]),
+        robust=record["robust"],
+        touching=record["touching"],
+    )

@@ -1,0 +1,198 @@
+"""Uncertainty of estimates without the assumption of a normal posterior: profiles and the bootstrap."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+from scipy.stats import norm
+
+from pushjax._internal.jit import jit
+from pushjax.identification.fit import FixedEntries, Schedule, compiled_fit, fit
+from pushjax.identification.model import Problem, surfaces
+from pushjax.identification.pushes import Pushes
+from pushjax.identification.unknowns import Parameters
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import Slider
+
+if TYPE_CHECKING:
+    from pushjax.identification.result import Identified
+
+POINTS, REACH = 3, 2.7  # points of a profile on either side, and its half-width in standard deviations
+ENOUGH = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
+
+
+class Profile(NamedTuple):
+    """How much worse the pushes are explained if one number is held at other values.
+
+    Attributes:
+        label: Label of that number of z.
+        value: (points,) values at which it is held, in its own unit (m; mu).
+        rise: (points,) increase of half the loss, which is the negative log posterior density. All other unknowns are
+            optimized. A 90 % interval is where it is below 1.35.
+        normal: (points,) the same increase if the posterior were normal in z.
+    """
+
+    label: str
+    value: np.ndarray
+    rise: np.ndarray
+    normal: np.ndarray
+
+
+def profile(
+    found: "Identified",
+    pushes: Pushes,
+    slider: Slider,
+    hand: Hand,
+    label: str,
+    *,
+    points: int = POINTS,
+    reach: float = REACH,
+) -> Profile:
+    """Compute the profile of one number of z that is not part of the surface.
+
+    Args:
+        found: What `identify` returned.
+        pushes: Pushes, as given to `identify`.
+        slider: Slider, as given to `identify`.
+        hand: Hand, as given to `identify`.
+        label: One of `found.labels`, except those of the surface.
+        points: Number of values on either side of the estimate.
+        reach: Distance from the estimate to the outermost values, in standard deviations.
+
+    Returns:
+        The profile, with 2 * points + 1 values.
+
+    Raises:
+        ValueError: If `label` is another label.
+    """
+    names = scalars(found)
+    if label not in names:
+        raise ValueError(f"label must be one of {', '.join(names)}; got {label!r}")
+    index = names[label]
+    several, setup = _setup(found, pushes, slider, hand)
+    deviation = float(np.sqrt(np.asarray(found.covariance)[index, index]))
+    apart = reach * np.arange(-points, points + 1) / points
+    # from the center outwards: each fit starts from the one before
+    order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]
+    loss, values = np.zeros(len(apart)), np.zeros(len(apart))
+    # the direction in which all other numbers would move if the posterior were normal
+    along = found.covariance[index] / found.covariance[index, index] * deviation
+    z, last = found.z, 0.0
+    for k in order:
+        if k in (points, points + 1):
+            z, last = found.z, 0.0
+        z, last = z + (apart[k] - last) * along, apart[k]
+        held = FixedEntries(jnp.arange(len(z)) == index, z)
+        effort = Schedule.of(z.dtype, 1, ENOUGH)
+        known = jnp.array([True, True, True])
+        fitted = compiled_fit(setup, several, z, _sigma(found), known, held, effort, robust=found.robust)
+        z, loss[k] = fitted.z, float(fitted.loss)
+        values[k] = _value(found, fitted.z, label)
+    rise = (loss - loss.min()) / 2
+    return Profile(label, values, rise, apart**2 / 2)
+
+
+def bootstrap(
+    key: PRNGKeyArray, found: "Identified", pushes: Pushes, slider: Slider, hand: Hand, n: int
+) -> tuple[Parameters, Float[Array, "n size"]]:
+    """Identify from `n` sets of pushes that are drawn from the given ones with replacement, in each condition.
+
+    All sets are fitted at once. Each fit starts from the estimate of all pushes.
+
+    Args:
+        key: PRNG key.
+        found: What `identify` returned.
+        pushes: Pushes, as given to `identify`.
+        slider: Slider, as given to `identify`.
+        hand: Hand, as given to `identify`.
+        n: Number of sets.
+
+    Returns:
+        The estimates, with a leading axis (n,), and their z, (n, size).
+    """
+    several, setup = _setup(found, pushes, slider, hand)
+    weights = np.asarray(several.weight)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+    there = weights > 0
+    counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in there] for _ in range(n)])
+    z = _refitted(setup, several, found.z, _sigma(found), jnp.asarray(counts * weights, found.z.dtype), found.robust)
+    return jax.vmap(lambda one: found._own(found.prior.physical(one)))(z), z
+
+
+@jit
+def _refitted(setup: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
+    """Fit z to each row of `weights`, with sigma fixed."""
+    held, known, once = FixedEntries.none(start), jnp.array([True, True, True]), Schedule.of(start.dtype, 1, ENOUGH)
+
+    def one(weight):
+        return fit(setup, pushes.weighted(weight), start, sigma, robust, known, held, once).z
+
+    return jax.vmap(one)(weights)
+
+
+def scalars(found: "Identified") -> dict[str, int]:
+    """Return the index in z of every number that is not part of the surface, by label."""
+    return {label: k for k, label in enumerate(found.labels) if not label.startswith("surface")}
+
+
+def normal_interval(found: "Identified", label: str, level: float = 0.9) -> tuple[float, float]:
+    """Compute the interval of one number from the covariance of z.
+
+    Args:
+        found: What `identify` returned.
+        label: One of `found.labels`, except those of the surface.
+        level: Probability that the interval contains.
+
+    Returns:
+        Lowest and highest value, in the number's own unit.
+    """
+    index = scalars(found)[label]
+    reach = float(norm.ppf(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[index, index]))
+    low, high = (_value(found, found.z.at[index].add(sign * reach), label) for sign in (-1, 1))
+    return low, high
+
+
+def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float]:
+    """Compute the interval of a profile.
+
+    Args:
+        profile: A profile.
+        level: Probability that the interval contains.
+
+    Returns:
+        The values between which the rise stays below that of the interval of a normal distribution. If the profile does
+            not rise so far on one side, its outermost value on that side.
+    """
+    least = int(np.argmin(profile.rise))
+    limit = norm.ppf(0.5 + level / 2) ** 2 / 2
+    ends = []
+    for values, rise in (
+        (profile.value[least::-1], profile.rise[least::-1]),
+        (profile.value[least:], profile.rise[least:]),
+    ):
+        risen = np.maximum.accumulate(rise)
+        ends.append(float(np.interp(limit, risen, values)))
+    return ends[0], ends[1]
+
+
+def _setup(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
+    """Return pushes with a leading axis of conditions, and the setup of the fit, in the dtype of `found`."""
+    dtype = found.z.dtype
+    pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
+    own = surfaces(found.prior, found.prior.physical(found.z))
+    return pushes.as_conditions(), Problem(slider.shape, hand, own, found.prior, found.length, found.touching)
+
+
+def _sigma(found: "Identified") -> Array:
+    """Return the (3,) estimated sigma; 1 for kinds that were not recorded."""
+    return jnp.stack([found.sigma, *(jnp.where(each > 0, each, 1.0) for each in (found.direction, found.gap))])
+
+
+def _value(found: "Identified", z: Array, label: str) -> float:
+    """Return a number of z in its own unit, by its label, such as "friction[1]" or "center.0"."""
+    name, _, part = label.partition(".")
+    name, _, condition = name.partition("[")
+    value = np.asarray(getattr(found.prior.physical(z), name))[int(condition.rstrip("]") or 0) if condition else 0]
+    return float(value[int(part)] if part else value)

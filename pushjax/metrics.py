@@ -1,0 +1,286 @@
+"""Error metrics for predicted poses and for predicted distributions of poses.
+
+A distribution is given by `samples`, poses (n, 3) drawn from the prediction. The poses that occurred are `observed`, of
+shape (3,) or (observations, 3). Poses are (x, y, theta) in m and rad. `length`, in m, makes angles commensurate with
+positions. Angles are compared modulo a full turn.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_positive,
+    check_shape,
+    common_dtype,
+)
+
+# The smallest bandwidth of a density estimate, in m. No tracker resolves less, and grasps end in distributions that
+# have no density.
+MIN_BANDWIDTH = 1e-4
+
+
+def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[Array, "*batch"]:
+    """Return the paper's distance between two poses: |difference in position| + length * |smaller angle between them|.
+
+    The distance has a corner at equal positions and at equal angles. Its gradient there is zero.
+
+    Args:
+        pose_a: Poses (..., 3), in m and rad.
+        pose_b: Poses (..., 3), in m and rad, broadcast against `pose_a`.
+        length: Length that weighs the angle, in m. The paper uses the object's characteristic length.
+
+    Returns:
+        The distances, in m.
+
+    Raises:
+        ValueError: If a pose has another shape, or `length` is not positive and finite.
+
+    Examples:
+        >>> print(f"{1e3 * deviation((0.003, 0.004, 0.0), (0.0, 0.0, 0.1), length=0.05):.1f} mm")
+        10.0 mm
+
+    Reference: Zhou et al. 2017, section VI.A.
+    """
+    check_finite("length", length)
+    check_positive("length", length)
+    dtype = common_dtype(pose_a, pose_b, length)
+    a, b, scale = (as_float(value, dtype) for value in (pose_a, pose_b, length))
+    for name, pose in (("pose_a", a), ("pose_b", b)):
+        if pose.ndim == 0 or pose.shape[-1] != 3:
+            raise ValueError(f"{name} has shape {pose.shape}; expected (..., 3)")
+    shape = jnp.broadcast_shapes(a.shape, b.shape)
+    delta = jnp.broadcast_to(a, shape) - jnp.broadcast_to(b, shape)
+    squared = delta[..., 0] ** 2 + delta[..., 1] ** 2
+    zero = squared == 0
+    distance = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    # `abs` has the derivative one at zero; this has zero
+    angle = delta[..., 2] * jnp.sign(delta[..., 2]) % (2 * jnp.pi)
+    return distance + scale * jnp.minimum(angle, 2 * jnp.pi - angle)
+
+
+def energy_score(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> Float[Array, "*observations"]:
+    """Return the energy score E d(X, y) - E d(X, X') / 2 of a predicted distribution; lower is better.
+
+    The score is strictly proper: in the mean over the observations, no other distribution scores as well as the true
+    one.
+
+    d is the Euclidean distance between points (x, y, length cos theta, length sin theta). For small angles it is the
+    distance between points (x, y, length theta). The paper's `deviation` is not suitable as d: the sum of a position
+    distance and an angle distance is blind to the correlation of position and angle, and arc length on a circle does
+    not make the score strictly proper. The second mean is over pairs of different samples, so that the expected score
+    does not depend on n. Differentiable in the samples.
+
+    Args:
+        samples: Poses (n, 3) drawn from the prediction, in m and rad; at least two.
+        observed: Observed poses (3,) or (observations, 3), in m and rad.
+        length: Length that weighs the angle, in m.
+
+    Returns:
+        The score of each observed pose, in m: a scalar or (observations,).
+
+    Raises:
+        ValueError: If a shape is different, there are fewer than two samples, a value is not finite, or `length` is not
+            positive.
+
+    Reference: Gneiting & Raftery 2007, section 4.3.
+    """
+    return _energy_score(*_checked(samples, observed, length))
+
+
+@jax.jit
+def _energy_score(x: Array, y: Array, scale: Array) -> Array:
+    n = x.shape[0]
+    # row by row, because all pairs at once would take the memory of n^2 numbers
+    within = jax.lax.map(lambda row: jnp.mean(_apart(row[None], x, scale)), x, batch_size=min(n, 64))
+    spread = jnp.mean(within) * (n / (n - 1))
+    to = jax.lax.map(lambda one: jnp.mean(_apart(one[None], x, scale)), y.reshape(-1, 3), batch_size=64)
+    return to.reshape(y.shape[:-1]) - spread / 2
+
+
+def _apart(a: Array, b: Array, length: Array) -> Array:
+    """Return the distance d of `energy_score`; its derivative at distance zero, where it has a corner, is zero."""
+    a, b = jnp.broadcast_arrays(a, b)
+    rel = a - b
+    chord = 2 * length * jnp.sin(rel[..., 2] / 2)
+    squared = rel[..., 0] ** 2 + rel[..., 1] ** 2 + chord**2
+    same = squared == 0
+    return jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, squared)))
+
+
+def log_density(
+    samples: ArrayLike, observed: ArrayLike, length: ArrayLike, *, min_bandwidth: float = MIN_BANDWIDTH
+) -> Float[Array, "*observations"]:
+    """Return the logarithm of a kernel density estimate at the observed poses.
+
+    The kernel is Gaussian. Its covariance is that of the samples times n^(-2/7) (Scott's rule in three dimensions),
+    plus `min_bandwidth` squared in every direction. It is repeated after a full turn. Differentiable.
+
+    Args:
+        samples: Poses (n, 3) drawn from the prediction, in m and rad; at least two.
+        observed: Observed poses (3,) or (observations, 3), in m and rad.
+        length: Length that weighs the angle, in m.
+        min_bandwidth: Standard deviation that is added to the kernel in every direction, in m.
+
+    Returns:
+        The logarithm of the density per cubic meter of (x, y, length * theta): a scalar or (observations,).
+
+    Raises:
+        ValueError: If an argument is one that `energy_score` refuses, or `min_bandwidth` is not positive.
+    """
+    x, y, scale = _checked(samples, observed, length)
+    check_positive("min_bandwidth", min_bandwidth)
+    return _log_density(x, y, scale, as_float(min_bandwidth, x.dtype))
+
+
+@jax.jit
+def _log_density(x: Array, y: Array, scale: Array, min_bandwidth: Array) -> Array:
+    points, at = _unrolled(x, y, scale)
+    kernel = _Kernel(points, min_bandwidth, scale)
+    flat = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log(p)), at.reshape(-1, 3))
+    return flat.reshape(at.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
+
+
+def coverage(
+    samples: ArrayLike,
+    observed: ArrayLike,
+    length: ArrayLike,
+    levels: Sequence[float] = (0.5, 0.9),
+    *,
+    min_bandwidth: float = MIN_BANDWIDTH,
+) -> Float[Array, "levels"]:
+    """Return the fraction of the observed poses inside the prediction's highest-density region of each level.
+
+    The region of a level is the one of highest density that contains this fraction of the prediction. For a calibrated
+    prediction, coverage and level are equal.
+
+    The density is that of `log_density`. The region's border is a quantile of the samples' densities, where the density
+    at each sample is estimated from the other samples (leave-one-out).
+
+    Args:
+        samples: Poses (n, 3) drawn from the prediction, in m and rad; at least two.
+        observed: Observed poses (3,) or (observations, 3), in m and rad.
+        length: Length that weighs the angle, in m.
+        levels: Fractions of the prediction that the regions contain, between 0 and 1.
+        min_bandwidth: As in `log_density`, in m.
+
+    Returns:
+        The fraction of the observed poses inside the region of each level, (levels,).
+
+    Raises:
+        ValueError: If an argument is one that `energy_score` refuses, a level is outside (0, 1), or `min_bandwidth`
+            is not positive.
+    """
+    x, y, scale = _checked(samples, observed, length)
+    asked = np.asarray(levels, float)
+    check_positive("min_bandwidth", min_bandwidth)
+    if asked.ndim != 1 or not np.all((asked > 0) & (asked < 1)):
+        raise ValueError(f"levels must be numbers between 0 and 1; got {levels!r}")
+    return _coverage(x, y, scale, jnp.asarray(asked, x.dtype), as_float(min_bandwidth, x.dtype))
+
+
+@jax.jit
+def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Array) -> Array:
+    points, at = _unrolled(x, y, scale)
+    kernel = _Kernel(points, min_bandwidth, scale)
+
+    def without(index: Array) -> Array:
+        log = kernel.log(points[index])
+        return jax.nn.logsumexp(jnp.where(jnp.arange(len(points)) == index, -jnp.inf, log))
+
+    own = jax.lax.map(without, jnp.arange(len(points)))
+    seen = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log(p)), at.reshape(-1, 3))
+    border = jnp.quantile(own, 1 - levels)
+    # leave-one-out densities sum n - 1 kernels, those of observations n: give both the same normalization
+    seen = seen - jnp.log(jnp.asarray(len(points) / (len(points) - 1), own.dtype))
+    return jnp.mean(seen[None] >= border[:, None], axis=1, dtype=own.dtype)
+
+
+def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:
+    """Return the total variation distance between two histograms on the same edges, from 0 to 1.
+
+    It is the fraction of one histogram that would have to move to make it equal to the other.
+
+    Args:
+        counts_a: Counts of the first histogram, of any dimension.
+        counts_b: Counts of the second histogram, of the same shape.
+
+    Returns:
+        The distance of the histograms after each is normalized to a sum of one.
+
+    Raises:
+        ValueError: If the shapes differ, or counts are negative, not finite, or all zero.
+    """
+    shares = []
+    for name, counts in (("counts_a", counts_a), ("counts_b", counts_b)):
+        values = np.asarray(counts, float)
+        check_finite(name, values)
+        check_non_negative(name, values)
+        if not values.sum() > 0:
+            raise ValueError(f"{name} must not all be zero")
+        shares.append(values / values.sum())
+    a, b = shares
+    if a.shape != b.shape:
+        raise ValueError(f"counts_a and counts_b must have one shape; got {a.shape} and {b.shape}")
+    return float(np.abs(a - b).sum() / 2)
+
+
+class _Kernel:
+    """Gaussian kernels centered at the samples (n, 3), each repeated one full turn away on either side."""
+
+    def __init__(self, points: Array, min_bandwidth: Array, length: Array):
+        n = points.shape[0]
+        self.turn = 2 * jnp.pi * length
+        centered = points - jnp.mean(points, axis=0, keepdims=True)
+        covariance = centered.T @ centered / (n - 1) * n ** (-2 / 7)
+        self.factor = jnp.linalg.cholesky(covariance + min_bandwidth**2 * jnp.eye(3, dtype=points.dtype))
+        self.points = self._white(points)
+        self.norm = jnp.sum(jnp.log(jnp.diagonal(self.factor))) + 1.5 * float(np.log(2 * np.pi))
+
+    def _white(self, points: Array) -> Array:
+        return jax.scipy.linalg.solve_triangular(self.factor, points.T, lower=True).T
+
+    def log(self, at: Float[Array, "3"]) -> Float[Array, "n"]:
+        images = jnp.stack([at.at[2].add(k * self.turn) for k in (-1, 0, 1)])
+        apart = self.points[None] - self._white(images)[:, None]
+        return jax.nn.logsumexp(-jnp.sum(apart**2, axis=2) / 2, axis=0) - self.norm
+
+
+def _unrolled(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
+    """Return samples and observations as (x, y, length * theta), relative to the mean of the samples.
+
+    Angles are unwrapped to within half a turn of the samples' mean direction. Positions are relative to their mean,
+    because float32 has no digits to lose.
+    """
+    theta = samples[:, 2]
+    middle = jnp.arctan2(jnp.mean(jnp.sin(theta)), jnp.mean(jnp.cos(theta)))
+    center = jnp.concatenate([jnp.mean(samples[:, :2], axis=0), middle[None]])
+
+    def about(poses: Array) -> Array:
+        rel = poses - jnp.broadcast_to(center, poses.shape)
+        angle = rel[..., 2] - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(rel[..., 2] / (2 * jnp.pi)))
+        return jnp.concatenate([rel[..., :2], (length * angle)[..., None]], axis=-1)
+
+    return about(samples), about(observed)
+
+
+def _checked(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return the arguments as arrays of one dtype, or raise ValueError."""
+    dtype = common_dtype(samples, observed, length)
+    x, y, scale = (as_float(value, dtype) for value in (samples, observed, length))
+    if x.ndim != 2 or x.shape[1] != 3 or x.shape[0] < 2:
+        raise ValueError(f"samples has shape {x.shape}; expected (n, 3), at least two")
+    if y.ndim not in (1, 2) or y.shape[-1] != 3:
+        raise ValueError(f"observed has shape {y.shape}; expected (3,) or (observations, 3)")
+    for name, value in (("samples", x), ("observed", y), ("length", scale)):
+        check_finite(name, value)
+    check_shape("length", scale, ())
+    check_positive("length", scale)
+    return x, y, scale

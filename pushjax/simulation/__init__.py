@@ -1,0 +1,1 @@
+"""Simulation of pushes and grasps: hands, paths, contact detection, steps, rollouts, Monte Carlo runs."""

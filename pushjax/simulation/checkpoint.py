@@ -1,0 +1,155 @@
+"""Checkpoints of a Monte Carlo run in a folder: a manifest that identifies the run, and the pushes in blocks.
+
+Each file is written under a temporary name and renamed when it is complete, so a run that is killed leaves no
+incomplete file. Before a run continues from a folder, each part of the manifest is compared with what the run asks for.
+"""
+
+import hashlib
+import json
+import os
+import re
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+MANIFEST, NAME = "manifest.json", re.compile(r"pushes-\d{12}-\d{12}\.npz")
+FORMAT = 1
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that a run cannot continue from, or that cannot be written."""
+
+
+def digest(*trees: Any) -> str:
+    """Hash of pytrees: of their structure, static parts included, and of every bit of their arrays."""
+    found = hashlib.sha256()
+    leaves, structure = jax.tree.flatten(trees)
+    found.update(_plain(structure).encode())
+    for leaf in leaves:
+        array = np.asarray(leaf)
+        found.update(f"{array.dtype} {array.shape}".encode())
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:16]
+
+
+def _plain(structure: Any) -> str:
+    """Text of a tree structure without memory addresses of functions, which differ between processes.
+
+    What a hand's function does shows in where it puts the fingers.
+    """
+    words = str(structure).split(" at 0x")
+    return words[0] + "".join(word[word.find(">") :] for word in words[1:])
+
+
+class Checkpoint:
+    """Folder of a run.
+
+    A block is a range (first, last + 1) of pushes. Blocks are in order, without gaps.
+
+    Args:
+        folder: The folder.
+        parts: What identifies the run, by name; values that JSON can hold.
+        writes: Whether this process writes files.
+
+    Raises:
+        CheckpointError: If the folder holds another run, or is damaged.
+    """
+
+    def __init__(self, folder: Path, parts: dict[str, Any], writes: bool = True):
+        """Open the folder, and write its manifest if it has none."""
+        self.folder, self.writes = folder, writes
+        wanted = {"format": FORMAT} | parts
+        path = folder / MANIFEST
+        if path.exists():
+            self._same(path, wanted)
+        elif self._files():
+            raise CheckpointError(
+                f"checkpoint: {folder} has pushes but no {MANIFEST} to say whose; give another folder"
+            )
+        elif writes:
+            self._write(path, lambda file: file.write(json.dumps(wanted, indent=2).encode()))
+
+    def _same(self, path: Path, wanted: dict[str, Any]) -> None:
+        """Raise CheckpointError unless the manifest at `path` equals `wanted`."""
+        try:
+            there = json.loads(path.read_text())
+            others = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
+        except (ValueError, AttributeError, OSError) as error:
+            why = error.strerror if isinstance(error, OSError) else "it is damaged"
+            raise CheckpointError(f"checkpoint: {path} cannot be read ({why}); give another folder") from None
+        if others:
+            name = others[0]
+            raise CheckpointError(
+                f"checkpoint: {self.folder} holds another run: {', '.join(others)} differ ({name} was "
+                f"{there.get(name)!r}, is {wanted.get(name)!r}); give another folder"
+            )
+
+    def _files(self) -> list[Path]:
+        return sorted(path for path in self.folder.glob("pushes-*.npz") if NAME.fullmatch(path.name))
+
+    def blocks(self) -> list[tuple[int, int, Path]]:
+        """The blocks that exist, in order, up to the first gap."""
+        found, reached = [], 0
+        for path in self._files():
+            first, last = (int(word) for word in path.stem.split("-")[1:])
+            if first != reached:
+                break
+            found.append((first, last, path))
+            reached = last
+        return found
+
+    def read(self, path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Read the named arrays of a block.
+
+        Raises:
+            CheckpointError: If the block is incomplete. The other blocks are left as they are.
+        """
+        try:
+            with np.load(path) as file:
+                return {name: file[name] for name in names}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(
+                f"checkpoint: {path} is damaged ({type(error).__name__}); remove it, and what follows it is computed "
+                "again"
+            ) from None
+
+    def write(self, first: int, last: int, arrays: dict[str, np.ndarray]) -> None:
+        """Write a block.
+
+        Args:
+            first: Index of the first push.
+            last: Index after the last push.
+            arrays: The arrays of the block, by name.
+
+        Raises:
+            CheckpointError: If it cannot be written. All earlier blocks are left as they are.
+        """
+        if self.writes:
+            self._write(
+                self.folder / f"pushes-{first:012d}-{last:012d}.npz",
+                lambda file: np.savez(file, allow_pickle=False, **arrays),
+            )
+
+    def _write(self, path: Path, put: Any) -> None:
+        """Write a file with `put` under a temporary name, and rename it to `path` when it is complete."""
+        partial = None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for left in self.folder.glob(".partial-*"):  # from a run that was killed while it wrote
+                left.unlink(missing_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".partial-", delete=False) as file:
+                partial = Path(file.name)
+                put(file)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except OSError as error:
+            if partial is not None:
+                partial.unlink(missing_ok=True)
+            raise CheckpointError(
+                f"checkpoint: {path} cannot be written ({error.strerror or error}); what was written before is kept"
+            ) from None

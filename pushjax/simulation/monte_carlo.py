@@ -1,0 +1,232 @@
+"""Monte Carlo simulation: many pushes under random friction, for the distribution of the slider's final pose."""
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jaxtyping import PRNGKeyArray
+
+from pushjax._internal.checks import ArrayLike, traced
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.sticking import StickingSolver
+from pushjax.friction.random import FrictionModel
+from pushjax.friction.table import Table
+from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.monte_carlo_result import MonteCarlo
+from pushjax.simulation.monte_carlo_tiles import Devices, Outcome, Setup, fetch, placed, submit
+from pushjax.simulation.rollout import Slider, checked_rollout_arguments, checked_table
+
+TILE = 2048
+GRAIN = 64  # a tile for fewer pushes is a multiple of this
+# At most this is between two files of a checkpoint: pushes, and s; in both cases plus the rest of a round.
+BLOCK, PATIENCE = 16 * TILE, 20.0
+
+
+def monte_carlo(
+    key: PRNGKeyArray,
+    n: int,
+    slider: Slider,
+    hand: Hand,
+    path: ArrayLike,
+    *,
+    pose: ArrayLike,
+    model: FrictionModel,
+    solver: ContactSolver | StickingSolver | None = None,
+    table: Table | None = None,
+    trajectories: bool = False,
+    batch_size: int | None = None,
+    devices: Sequence[Any] | None = None,
+    checkpoint: str | Path | None = None,
+    progress: bool | ProgressCallback = False,
+) -> MonteCarlo:
+    """Push the slider `n` times along one path, each time under other friction.
+
+    Push i is `random_rollout(fold_in(key, i), ...)`. Its bits depend on key, `batch_size`, `trajectories` and machine,
+    but not on the number of devices and processes. Each device compiles its own program, once. Memory does not depend
+    on `n`, except for the results, some 60 bytes a push.
+
+    This function runs on the host. Under `jit`, `vmap` or `grad`, use `random_rollout`.
+
+    Args:
+        key: PRNG key of everything random.
+        n: Number of pushes.
+        slider: The slider; its surface is the mean of the sampled surfaces.
+        hand: The hand.
+        path: Configurations of the hand, as in `rollout`.
+        pose: Pose of the slider at the start, world, m and rad: (3,), or (n, 3) for a start of each push.
+        model: Distribution from which friction is drawn around `slider.surface`.
+        solver: Solver of contact problems, as in `rollout`.
+        table: A table whose friction depends on direction or place, as in `rollout`.
+        trajectories: Whether to keep every pose of every push (12 bytes a step in float32), not only the last.
+        batch_size: Number of pushes that a device computes at once, in one compiled program. Default 2048, or for fewer
+            pushes the next multiple of 64.
+        devices: Devices to use. By default all, including those of other processes (`jax.distributed`), which must then
+            all make the same call.
+        checkpoint: Folder in which finished pushes are kept; all processes must have access to it. A run that finds its
+            beginning there continues from it, and gives the same bits.
+        progress: True for a progress bar on the terminal, or a function of (done, n).
+
+    Returns:
+        The pushes, in numpy.
+
+    Raises:
+        ValueError: As in `rollout` and `FrictionModel.around`. Also for `n` or `batch_size` below one.
+        CheckpointError: A ValueError, for a checkpoint that belongs to another run, is damaged, or cannot be written.
+            What the folder holds is kept.
+        TypeError: Under `jit`, `vmap` or `grad`.
+
+    Reference: Zhou et al. 2017, sections V and VI.
+    """
+    begun = time.perf_counter()
+    if traced((key, slider, hand, path, pose, model, table)):
+        raise TypeError(
+            "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
+        )
+    for name, value in (("n", n), ("batch_size", TILE if batch_size is None else batch_size)):
+        if not isinstance(value, (int, np.integer)) or value < 1:
+            raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
+    n = int(n)
+    slider, hand, p, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
+    width = int(batch_size) if batch_size is not None else min(TILE, -(-n // GRAIN) * GRAIN)
+    raw, impl = _raw(key)
+    on = Devices.of(devices)
+    if on.several:
+        # connect the processes now: after compiling, one may be later than the 30 s that the others wait
+        multihost_utils.sync_global_devices("pushjax monte_carlo")
+    shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver, checked_table(table, start.dtype)
+    run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), trajectories)
+    kept: Checkpoint | None = None
+    if checkpoint is not None:
+        parts = {"n": n, "batch_size": width, "trajectories": trajectories, "key": digest(raw, impl)}
+        parts |= {"slider": digest(slider), "hand": digest(hand, hand.poses(p)), "path": digest(p)}
+        parts |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
+        parts |= {"table": digest(table) if table else "uniform"}
+        versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
+        parts |= versions | {"platform": on.mine[0].platform}
+        folder = Path(checkpoint)
+        kept = run.together(lambda: Checkpoint(folder, parts, writes=on.writes))
+    with _shown(progress) as report:
+        found = run.all(kept, report)
+    starts = np.broadcast_to(run.start, (n, 3))
+    return MonteCarlo(starts, *found, time.perf_counter() - begun)
+
+
+def _shown(progress: bool | ProgressCallback) -> Any:
+    """Context that gives the function to report progress to."""
+    if progress is True:
+        # drawing on terminals is not needed by those who only import this
+        from pushjax._internal.progress_bar import progress_bar
+
+        return progress_bar()
+    return nullcontext(progress or no_progress)
+
+
+def _raw(key: Any) -> tuple[Any, Any]:
+    """The raw data of a key, and the name of its PRNG implementation."""
+    message = f"key must be one key, of jax.random.key or PRNGKey; got {key!r}"
+    if not isinstance(key, (jax.Array, np.ndarray)):
+        raise ValueError(message)
+    try:
+        typed = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(jnp.asarray(key))
+    except (TypeError, ValueError):
+        raise ValueError(message) from None
+    if typed.shape != ():
+        raise ValueError(message)
+    return jax.random.key_data(typed), str(jax.random.key_impl(typed))
+
+
+class _Run:
+    """A run, and its state."""
+
+    def __init__(self, n: int, tile: int, setup: Setup, impl: Any, devices: Devices, start: np.ndarray, keep: bool):
+        self.n, self.tile, self.impl, self.devices, self.start, self.keep = n, tile, impl, devices, start, keep
+        self.setups, self.round = placed(setup, devices), tile * devices.count
+
+    def together(self, action: Callable[[], Any]) -> Any:
+        """Return `action()`; if it fails in one process, fail in all, so that none waits for another."""
+        error, value = None, None
+        try:
+            value = action()
+        except CheckpointError as caught:
+            error = caught
+        failed = error is not None
+        if self.devices.several:
+            failed = bool(np.any(multihost_utils.process_allgather(np.int32(failed))))
+        if failed:
+            raise error or CheckpointError("checkpoint: another process could not go on; it says why")
+        return value
+
+    def _due(self, pushes: int, seconds: float) -> bool:
+        """Whether a block of the checkpoint is to be written; all processes get the answer of the first."""
+        due = pushes >= BLOCK or seconds >= PATIENCE
+        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.several else due
+
+    def all(self, kept: Checkpoint | None, report: ProgressCallback) -> Outcome:
+        """Compute all pushes that `kept` does not hold, and return all pushes."""
+        with ThreadPoolExecutor(len(self.setups)) as pool:
+            return self._all(kept, report, pool)
+
+    def _all(self, kept: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor) -> Outcome:
+        parts, done = self._resumed(kept)
+        # block: pushes that are not in the checkpoint yet; begun: index of the first of them
+        block, begun, since = [], done, time.perf_counter()
+        waiting: tuple[int, int, list[Outcome]] | None = None
+        report(done, self.n)
+        while done < self.n or waiting is not None:
+            # the devices compute the next round while the host copies this one
+            ahead = self._submit(done, pool) if done < self.n else None
+            if waiting is not None:
+                first, last, outcome = waiting
+                host = fetch(outcome, self.devices)
+                block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], host))
+                if kept is not None and (last == self.n or self._due(last - begun, time.perf_counter() - since)):
+                    parts.append(_joined(block))
+                    self.together(partial(kept.write, begun, last, _named(parts[-1])))
+                    block, begun, since = [], last, time.perf_counter()
+                report(last, self.n)
+            waiting = ahead
+            done = done if ahead is None else ahead[1]
+        return _joined(parts + block)
+
+    def _submit(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[Outcome]]:
+        """Start the round that begins with push `first`; the last round repeats its last push."""
+        last = min(first + self.round, self.n)
+        indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
+        poses = np.broadcast_to(self.start, (self.n, 3))[indices]
+        return first, last, submit(self.setups, self.impl, self.devices, indices, poses, self.keep, pool)
+
+    def _resumed(self, kept: Checkpoint | None) -> tuple[list[Outcome], int]:
+        """Pushes that the checkpoint holds, in blocks, and their number."""
+        if kept is None:
+            return [], 0
+        blocks = kept.blocks()
+        reached = blocks[-1][1] if blocks else 0
+        names = tuple(name for name in Outcome._fields if self.keep or name != "trajectory")
+
+        def read() -> list[Outcome]:
+            if self.devices.several and len(np.unique(multihost_utils.process_allgather(np.int32(reached)))) > 1:
+                raise CheckpointError(
+                    f"checkpoint: not every process sees the same in {kept.folder}; give a shared one"
+                )
+            return [Outcome(**({"trajectory": None} | kept.read(path, names))) for _, _, path in blocks]
+
+        return self.together(read), reached
+
+
+def _joined(parts: list[Outcome]) -> Outcome:
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _named(outcome: Outcome) -> dict[str, np.ndarray]:
+    return {name: leaf for name, leaf in outcome._asdict().items() if leaf is not None}

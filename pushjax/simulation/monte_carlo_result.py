@@ -1,0 +1,110 @@
+"""Result of a Monte Carlo run, on the host."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pushjax.contact.status import ContactMode, Status
+
+QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
+COORDINATES = ("x", "y", "theta")
+
+
+@dataclass(frozen=True)
+class MonteCarlo:
+    """Result of n pushes, in numpy.
+
+    Push i was made with the key `fold_in(key, i)`. A jam and a grasp stay to the end of a push, so the status of the
+    last step shows them.
+
+    Attributes:
+        start: Poses before the pushes, (n, 3), world, m and rad.
+        pose: Poses after the pushes, (n, 3), world, m and rad.
+        status: `Status` of the last step, (n,).
+        mode: `ContactMode` of each contact in the last step, (n, contacts).
+        steps_in_mode: Number of steps that each contact was in each `ContactMode`, (n, contacts, 4).
+        failed: Number of steps that failed (`Status.failed`), (n,).
+        first_failure: Index of the first step that failed, or -1, (n,).
+        stopped: Index of the step at which the hand jammed or grasped, or -1, (n,).
+        friction: Sampled coefficients of friction mu, (n, draws).
+        shrinkage: How far each sampled quartic was moved toward the mean to be convex, (n, draws).
+        trajectory: All poses, (n, steps + 1, 3), world, m and rad, if they were kept; else None.
+        seconds: Duration of the run, s, compiling included.
+    """
+
+    start: np.ndarray
+    pose: np.ndarray
+    status: np.ndarray
+    mode: np.ndarray
+    steps_in_mode: np.ndarray
+    failed: np.ndarray
+    first_failure: np.ndarray
+    stopped: np.ndarray
+    friction: np.ndarray
+    shrinkage: np.ndarray
+    trajectory: np.ndarray | None
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    @property
+    def delta(self) -> np.ndarray:
+        """Displacement of the slider in each push, (n, 3), world, m and rad."""
+        return self.pose - self.start
+
+    def outcomes(self) -> dict[str, int]:
+        """Count the pushes by outcome; the counts add up to n.
+
+        Returns:
+            Counts of "grasped", "jammed", "free" (neither grasped nor jammed) and "failed" (a step failed).
+        """
+        failed = self.failed > 0
+        grasped, jammed = (~failed & (self.status == kind) for kind in (Status.GRASPED, Status.JAMMED))
+        counted = {"grasped": grasped, "jammed": jammed, "free": ~(failed | grasped | jammed), "failed": failed}
+        return {name: int(np.sum(which)) for name, which in counted.items()}
+
+    def histogram(self, values: np.ndarray, bins: int | np.ndarray = 40) -> dict[str, np.ndarray]:
+        """Histogram of one number per push.
+
+        Args:
+            values: The numbers, (n,).
+            bins: Number of bins, or their edges.
+
+        Returns:
+            "edges" (bins + 1,) and "counts" (bins,).
+        """
+        counts, edges = np.histogram(np.asarray(values, np.float64), bins=bins)
+        return {"edges": edges, "counts": counts}
+
+    def summary(self) -> dict[str, Any]:
+        """Summarize the run in plain numbers, by name: counts, fractions, moments and quantiles."""
+        pose = np.asarray(self.pose, np.float64)
+        quantiles = np.quantile(pose, QUANTILES, axis=0)
+        in_mode = self.steps_in_mode.sum(axis=0, dtype=np.int64)
+        statuses, counts = np.unique(self.status, return_counts=True)
+        repaired = self.shrinkage > 0
+        return {
+            "n": len(self),
+            "outcomes": self.outcomes(),
+            "statuses": {Status(int(s)).name: int(c) for s, c in zip(statuses, counts, strict=True)},
+            "modes": [
+                {mode.name: float(c / max(total, 1)) for mode, c in zip(ContactMode, contact, strict=True)}
+                for contact, total in zip(in_mode, in_mode.sum(axis=1), strict=True)
+            ],
+            "pose": {
+                name: {
+                    "mean": float(pose[:, k].mean()),
+                    "std": float(pose[:, k].std(ddof=1)) if len(self) > 1 else 0.0,
+                    "quantiles": {str(q): float(v) for q, v in zip(QUANTILES, quantiles[:, k], strict=True)},
+                }
+                for k, name in enumerate(COORDINATES)
+            },
+            "friction": {"mean": float(self.friction.mean()), "std": float(self.friction.std())},
+            "repaired": {
+                "share": float(repaired.mean()),
+                "mean_shrinkage": float(self.shrinkage[repaired].mean()) if repaired.any() else 0.0,
+            },
+            "seconds": self.seconds,
+        }

@@ -1,0 +1,134 @@
+"""Paths of a hand: arrays of configurations, one row for the start of each step and one for the end of the path."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype, concrete, in_numpy
+
+
+def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
+    """Straight path of equal steps between two configurations, both included.
+
+    Args:
+        start: First configuration, (dof,).
+        end: Last configuration, (dof,).
+        steps: Number of steps.
+
+    Returns:
+        The path, (steps + 1, dof).
+
+    Raises:
+        ValueError: For fewer than one step, or for configurations that differ in shape or are not finite.
+
+    Examples:
+        >>> line((0.0, 0.0), (0.5, 0.0), steps=2).tolist()
+        [[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]]
+    """
+    _check_steps(steps)
+    dtype = common_dtype(start, end)
+    a, b = as_float(start, dtype), as_float(end, dtype)
+    check_shape("start", a, ("dof",))
+    check_shape("end", b, (a.shape[0],))
+    check_finite("start", a)
+    check_finite("end", b)
+    return _line(a, b, steps=steps)
+
+
+@in_numpy
+def _line(xp: Any, start: Array, end: Array, *, steps: int) -> Array:
+    t = xp.arange(steps + 1, dtype=start.dtype)[:, None] / steps
+    return start[None] * (1 - t) + end[None] * t  # exact at both ends
+
+
+def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Array, "points dof"]:
+    """Path that goes straight from each way point to the next and meets all of them exactly.
+
+    Args:
+        configurations: Way points, (points, dof).
+        steps: Number of equal steps on each stretch between way points: one number for all stretches, or one for each.
+
+    Returns:
+        The path, with one row more than it has steps.
+
+    Raises:
+        ValueError: For fewer than two way points, for fewer than one step on a stretch, for a wrong number of `steps`,
+            or for values that are not finite.
+    """
+    p = checked_path(configurations, None)
+    stretches = p.shape[0] - 1
+    each: list[Any] = np.broadcast_to(steps, stretches).tolist() if np.ndim(steps) == 0 else np.ravel(steps).tolist()
+    if len(each) != stretches:
+        raise ValueError(f"steps must be one number, or one for each of {stretches} stretches; got {len(each)}")
+    return jnp.concatenate([p[:1], *(line(p[k], p[k + 1], n)[1:] for k, n in enumerate(each))])
+
+
+def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
+    """Resample a recorded path into steps of equal length along it; its first and last points stay.
+
+    Length is measured in the units of the configuration, straight from point to point. Interpolation would turn an
+    angle that jumps from pi to -pi back through zero, so unwrap such angles first. A path that does not move repeats
+    its first point.
+
+    Args:
+        path: Recorded configurations, (points, dof).
+        steps: Number of steps of the result.
+
+    Returns:
+        The path, (steps + 1, dof).
+
+    Raises:
+        ValueError: For fewer than two points or one step, or for values that are not finite.
+    """
+    _check_steps(steps)
+    p = checked_path(path, None)
+    arc = arc_length(p)
+    return interpolate_arc_length(p, arc, jnp.arange(steps + 1, dtype=p.dtype) / steps * arc[-1])
+
+
+def arc_length(points: Float[Array, "points n"]) -> Float[Array, "points"]:
+    """Length from the first point to each point, straight from point to point."""
+    squared = jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1)
+    moves = squared > 0  # the derivative of the square root is infinite where a recording pauses
+    hops = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
+    return jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(hops)])
+
+
+def interpolate_arc_length(path: Array, arc: Float[Array, "points"], at: Float[Array, "k"]) -> Float[Array, "k dof"]:
+    """Interpolate a path at the lengths `at`.
+
+    Args:
+        path: Points of the path, (points, dof).
+        arc: Length from the first point to each point, as from `arc_length`.
+        at: Lengths at which the result is wanted.
+    """
+    return jnp.stack([jnp.interp(at, arc, column) for column in path.T], axis=1)
+
+
+def _check_steps(steps: int) -> None:
+    """Raise ValueError unless `steps` is a whole number of at least 1."""
+    if not isinstance(steps, (int, np.integer)):
+        raise ValueError(f"steps must be a whole number; got {steps!r}")
+    if steps < 1:
+        raise ValueError(f"steps must be at least 1; got {steps}")
+
+
+def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:
+    """Return a path as a floating array.
+
+    Raises:
+        ValueError: For a wrong shape, fewer than two configurations, or values that are not finite.
+    """
+    p = as_float(path, dtype)
+    check_shape("path", p, ("steps + 1", "dof" if dof is None else dof))
+    if p.shape[0] < 2:
+        raise ValueError(f"path needs at least one step, two configurations; got {p.shape[0]}")
+    known = concrete(p)
+    if known is not None:
+        bad = np.flatnonzero(~np.isfinite(known).all(axis=1))
+        if bad.size:
+            raise ValueError(f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}")
+    return p

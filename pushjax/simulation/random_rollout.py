@@ -1,0 +1,142 @@
+"""Rollout of one push under random friction."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pushjax._internal.checks import ArrayLike
+from pushjax._internal.jit import quick_jit
+from pushjax.contact.problem import to_scalars
+from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.sticking import StickingSolver
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.friction.table import Table
+from pushjax.geometry.shape import Shape
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import Slider, Trajectory, checked_rollout_arguments, checked_table, on_table, simulate
+
+
+class Draws(NamedTuple):
+    """Friction that was sampled for a push.
+
+    Attributes:
+        surface: Limit surfaces, with a leading axis of draws.
+        friction: Coefficients of friction mu, (draws,).
+        shrinkage: How far each surface was moved toward the mean to be convex, (draws,); as in `SurfaceSample`.
+    """
+
+    surface: LimitSurface
+    friction: Float[Array, "draws"]
+    shrinkage: Float[Array, "draws"]
+
+
+class RandomRollout(NamedTuple):
+    """A push under random friction.
+
+    Attributes:
+        push: The push, step by step.
+        draws: The friction that was sampled for it.
+    """
+
+    push: Trajectory
+    draws: Draws
+
+
+def draw(key: PRNGKeyArray, around: SurfaceDistribution, model: FrictionModel, steps: int) -> Draws:
+    """Sample the friction of one push.
+
+    A single draw equals that of `model.sample(key, surface)`. Of several draws, draw k equals that with the key
+    `fold_in(key, k)`.
+
+    Args:
+        key: PRNG key.
+        around: `model.around(surface)`.
+        model: Distribution of friction.
+        steps: Number of steps of the push.
+    """
+
+    def one(key):
+        first, second = jax.random.split(key)
+        sample = around.sample(first)
+        return Draws(sample.surface, model.sample_friction(second), sample.shrinkage)
+
+    if model.resample_every is None:
+        return jax.tree.map(lambda leaf: leaf[None], one(key))
+    indices = jnp.arange(-(-steps // model.resample_every))
+    return jax.vmap(lambda k: one(jax.random.fold_in(key, k)))(indices)
+
+
+def push_under(
+    draws: Draws,
+    shape: Shape,
+    hand: Hand,
+    path: Array,
+    pose: Array,
+    solver: ContactSolver | StickingSolver | None,
+    resample_every: int | None,
+    table: Table | None,
+) -> Trajectory:
+    """Roll out a push under friction that was sampled before; after `resample_every` steps, the next draw is used."""
+    friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
+    forms = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
+
+    def drawn(index):
+        return jax.tree.map(lambda leaf: leaf[index], forms)
+
+    only = drawn(0)
+
+    def friction_at(step, pose):
+        return only if resample_every is None else drawn(step // resample_every)
+
+    return simulate(shape, hand, path, pose, solver, on_table(table, friction_at))
+
+
+def random_rollout(
+    key: PRNGKeyArray,
+    slider: Slider,
+    hand: Hand,
+    path: ArrayLike,
+    *,
+    pose: ArrayLike,
+    model: FrictionModel,
+    solver: ContactSolver | StickingSolver | None = None,
+    table: Table | None = None,
+) -> RandomRollout:
+    """Push the slider along a path under friction sampled from `model` around the slider's surface.
+
+    The result is differentiable as that of `rollout`, and also in the range of the model's friction and in its `dof`.
+    Derivatives in `dof` are correct in the mean over keys, not for a single key, whose sample jumps; with the sampler
+    "gram" they are correct except for its repairs.
+
+    Use `vmap` over keys for batches. For large batches `monte_carlo` is faster and shows progress.
+
+    Args:
+        key: PRNG key of everything random.
+        slider: The slider; its surface is the mean of the sampled surfaces.
+        hand: The hand.
+        path: Configurations of the hand, as in `rollout`.
+        pose: Pose of the slider at the start, (3,), world, m and rad.
+        model: Distribution of limit surface and friction.
+        solver: Solver of contact problems, as in `rollout`.
+        table: A table whose friction depends on direction or place, as in `rollout`.
+
+    Returns:
+        The push, and the friction that was sampled for it.
+
+    Raises:
+        ValueError: As in `rollout` and `FrictionModel.around`.
+
+    Reference: Zhou et al. 2017, section V.
+    """
+    slider, hand, p, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
+    table = checked_table(table, start.dtype)
+    return _random_rollout(key, model.around(slider.surface), slider.shape, hand, p, start, model, solver, table)
+
+
+@quick_jit
+def _random_rollout(key, around, shape, hand, path, pose, model, solver, table) -> RandomRollout:
+    draws = draw(key, around, model, len(path) - 1)
+    return RandomRollout(push_under(draws, shape, hand, path, pose, solver, model.resample_every, table), draws)

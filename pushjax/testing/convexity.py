@@ -1,0 +1,122 @@
+"""Check of the convexity of quartics by a sweep of the Hessian, for millions of quartics at once.
+
+It does not use the certificates of convexity that it is there to check.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.experimental
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._math.directions import fibonacci_hemisphere
+from pushjax.friction.quartic import MONOMIALS
+
+RAYS, REFINED, ROUNDS = 200, 4, 12
+BATCH = 20_000
+
+
+def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
+    """Return the smallest curvature of each quartic: the minimum of z' hess H(F) z over unit F and z.
+
+    The Hessian is evaluated at 200 rays. From the four lowest, F and z are improved in turns: z becomes the eigenvector
+    of the smallest eigenvalue of the Hessian at F, then F that of the Hessian at z (the form is symmetric in F and z).
+    Each step can only lower the value. Computed in float64, whatever the dtype of the coefficients.
+
+    Args:
+        coefficients: Coefficients (n, 15) in the order of `Quartic`.
+
+    Returns:
+        The smallest curvatures, (n,), each divided by the largest |coefficient| of its quartic.
+    """
+    c = np.asarray(coefficients, np.float64)
+    found = []
+    for first in range(0, len(c), BATCH):
+        part = c[first : first + BATCH]
+        padded = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)]) if len(c) > BATCH else part
+        with _float64():
+            found.append(np.asarray(_sweep(jnp.asarray(padded)))[: len(part)])
+    return np.concatenate(found)
+
+
+def _float64() -> Any:
+    """Return a context that enables 64-bit floats, in newer and older versions of JAX."""
+    where: Any = jax if hasattr(jax, "enable_x64") else jax.experimental
+    return where.enable_x64(True)
+
+
+@jax.jit
+def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
+    c = c / jnp.max(jnp.abs(c), axis=1, keepdims=True)
+    rays = jnp.asarray(fibonacci_hemisphere(RAYS), c.dtype)
+    table = jnp.asarray(_HESSIAN, c.dtype)  # (6, 6, 15): Hessian entry, product of two coordinates of F, coefficient
+    hessians = jnp.einsum("epm,rp,nm->ern", table, _products(rays), c)
+    lowest = _least_eigenvalue(*hessians)
+    best = jax.lax.top_k(-lowest.T, REFINED)[1].T  # (refined, n)
+    refine = jax.vmap(jax.vmap(partial(_refined, table)), in_axes=(0, None))
+    return jnp.min(refine(rays[best], c), axis=0)
+
+
+def _refined(table: Array, f: Float[Array, "3"], c: Float[Array, "15"]) -> Array:
+    def half(carry, _):
+        at, least = carry
+        entries = jnp.einsum("epm,p,m->e", table, _products(at[None])[0], c)
+        z = _eigenvector(entries, _least_eigenvalue(*entries))
+        # at a double eigenvalue the root of the cubic has only half of the digits, so take the value at z
+        value = _products(z[None])[0] @ (entries * jnp.asarray([1.0, 1, 1, 2, 2, 2], c.dtype))
+        return (z, jnp.minimum(least, value)), None
+
+    return jax.lax.scan(half, (f, jnp.asarray(jnp.inf, c.dtype)), None, length=2 * ROUNDS)[0][1]
+
+
+def _products(f: Float[Array, "n 3"]) -> Float[Array, "n 6"]:
+    x, y, z = f[:, 0], f[:, 1], f[:, 2]
+    return jnp.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
+
+
+def _least_eigenvalue(xx, yy, zz, xy, xz, yz):
+    """Return the smallest eigenvalue of a symmetric 3 x 3 matrix, by the trigonometric solution of its cubic."""
+    mean = (xx + yy + zz) / 3
+    a, b, d = xx - mean, yy - mean, zz - mean
+    p = (a * a + b * b + d * d + 2 * (xy * xy + xz * xz + yz * yz)) / 6
+    size = jnp.sqrt(jnp.maximum(p, jnp.finfo(p.dtype).tiny))
+    det = a * (b * d - yz * yz) - xy * (xy * d - yz * xz) + xz * (xy * yz - b * xz)
+    cubed = jnp.maximum(2 * size**3, jnp.finfo(p.dtype).tiny)  # a multiple of the identity has no angle
+    angle = jnp.arccos(jnp.clip(det / cubed, -1, 1)) / 3
+    return mean + 2 * size * jnp.cos(angle + 2 * np.pi / 3)
+
+
+def _eigenvector(entries, value):
+    """Return the unit eigenvector of an eigenvalue of a symmetric 3 x 3 matrix.
+
+    It is the longest cross product of two rows of the matrix minus the eigenvalue times the identity.
+    """
+    xx, yy, zz, xy, xz, yz = entries
+    m = jnp.array([[xx - value, xy, xz], [xy, yy - value, yz], [xz, yz, zz - value]])
+    crosses = jnp.stack([jnp.cross(m[0], m[1]), jnp.cross(m[0], m[2]), jnp.cross(m[1], m[2])])
+    squared = jnp.sum(crosses**2, axis=1)
+    best = jnp.argmax(squared)
+    tiny = squared[best] <= jnp.finfo(value.dtype).tiny
+    return jnp.where(tiny, jnp.array([1.0, 0, 0]), crosses[best] / jnp.sqrt(jnp.where(tiny, 1.0, squared[best])))
+
+
+def _hessian_table() -> np.ndarray:
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    products = [np.bincount(pair, minlength=3) for pair in pairs]
+    table = np.zeros((6, 6, len(MONOMIALS)))
+    for m, exponent in enumerate(MONOMIALS):
+        for e, (i, j) in enumerate(pairs):
+            left = exponent.copy()
+            factor = left[i]
+            left[i] -= 1
+            factor *= left[j]
+            if factor > 0:
+                left[j] -= 1
+                table[e, [tuple(p) for p in products].index(tuple(left)), m] = factor
+    return table
+
+
+_HESSIAN = _hessian_table()

@@ -1,0 +1,340 @@
+"""Random contact problems of a given difficulty, for tests and benchmarks.
+
+Everything is drawn from a PRNG key. For a batch, use `vmap` over split keys.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+from pushjax._math.vec import Vec3
+from pushjax.contact.problem import Contacts
+from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.quartic import Quartic, QuarticForm
+from pushjax.friction.sum_of_squares import squared_quadratics
+
+
+class ContactProblem(NamedTuple):
+    """One contact on a random limit surface, in the body frame.
+
+    Attributes:
+        surface: Limit surface.
+        point: Contact point, (2,), in m.
+        normal: Unit normal that points into the slider, (2,).
+        displacement: Displacement of the pusher, (2,), in m.
+        friction: Friction coefficient mu.
+    """
+
+    surface: LimitSurface
+    point: Float[Array, "2"]
+    normal: Float[Array, "2"]
+    displacement: Float[Array, "2"]
+    friction: Float[Array, ""]
+
+
+def random_contact_problem(
+    key: Key[Array, ""], *, degree: int = 4, condition: float = 1e3, friction: float = 3.0
+) -> ContactProblem:
+    """Draw a problem with one contact anywhere on a slider of some 0.1 m.
+
+    The direction of the push is uniform over the half plane of directions that push. The length of the displacement is
+    log-uniform from 0.1 to 10 mm.
+
+    Args:
+        key: PRNG key.
+        degree: Degree of the limit surface, 2 or 4.
+        condition: The condition number of the Hessian over the unit sphere is log-uniform up to about this number.
+        friction: mu is uniform from 0 to this number.
+
+    Returns:
+        The problem.
+    """
+    k_surface, k_point, k_normal, k_push, k_mu, k_speed, k_length = jax.random.split(key, 7)
+    length = jax.random.uniform(k_length, minval=0.02, maxval=0.1)
+    surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
+    point = jax.random.uniform(k_point, (2,), minval=-0.1, maxval=0.1)
+    angle = jax.random.uniform(k_normal, maxval=2 * jnp.pi)
+    push = angle + jax.random.uniform(k_push, minval=-jnp.pi / 2, maxval=jnp.pi / 2)
+    size = 10 ** jax.random.uniform(k_speed, minval=-4.0, maxval=-2.0)
+    return ContactProblem(
+        surface,
+        point,
+        jnp.stack([jnp.cos(angle), jnp.sin(angle)]),
+        size * jnp.stack([jnp.cos(push), jnp.sin(push)]),
+        jax.random.uniform(k_mu, maxval=friction),
+    )
+
+
+def random_surface(
+    key: Key[Array, ""], *, degree: int = 4, condition: float | Array = 1e3, length: float | Array = 0.05
+) -> LimitSurface:
+    """Draw a limit surface whose Hessian has a condition number that is log-uniform up to about `condition`.
+
+    A surface of degree 2 has random axes and eigenvalues. A surface of degree 4 is a sum of squares of five quadratics.
+    Some of these are squares of a single linear form, which leaves almost flat directions. A multiple of |F|^4, whose
+    own condition number is 3, is added so that the condition number over a sweep of the sphere is the one that was
+    drawn.
+
+    Args:
+        key: PRNG key.
+        degree: Degree of the surface, 2 or 4.
+        condition: Upper end of the range of the condition number.
+        length: Characteristic length, in m.
+
+    Returns:
+        An `Ellipsoid` (degree 2) or a `Quartic` (degree 4).
+
+    Raises:
+        ValueError: If the degree is neither 2 nor 4.
+    """
+    k_shape, k_rank, k_scale, k_condition = jax.random.split(key, 4)
+    worst = 10 ** jax.random.uniform(k_condition, minval=0.0, maxval=jnp.log10(condition))
+    if degree == 2:
+        q, _ = jnp.linalg.qr(jax.random.normal(k_shape, (3, 3)))
+        # the ends of the spectrum are one and 1 / worst; the middle eigenvalue is log-uniform between them
+        middle = jax.random.uniform(k_scale)
+        eigenvalues = jnp.stack([jnp.ones_like(worst), worst**-middle, 1 / worst])
+        return Ellipsoid(q @ jnp.diag(eigenvalues) @ q.T, length)
+    if degree != 4:
+        raise ValueError(f"degree must be 2 or 4; got {degree}")
+    factors = jax.random.normal(k_shape, (5, 3, 3))
+    thin = jax.random.bernoulli(k_rank, 0.5, (5,))
+    kept = ~thin[:, None, None] | (jnp.arange(3) == 0)[None, None, :]  # a thin factor keeps its first column: rank one
+    factors = jnp.where(kept, factors, 0.0)
+    weights = jax.random.exponential(k_scale, (5,))
+    c = squared_quadratics(jnp.sqrt(weights)[:, None, None] * factors @ jnp.swapaxes(factors, 1, 2))
+    low, high = _spectrum(c)
+    worst = jnp.maximum(worst, 3.5)
+    # (high + 12 e) / (low + 4 e) = worst
+    round_part = jnp.maximum(0.0, (high - worst * low) / (4 * worst - 12))
+    ball = squared_quadratics(jnp.eye(3)[None])
+    c = c + round_part * ball
+    return Quartic(c / _spectrum(c)[1], length)
+
+
+def _spectrum(c: Float[Array, "15"]) -> tuple[Array, Array]:
+    """Return the smallest and the largest eigenvalue of the Hessian over a sweep of the half sphere."""
+    k = jnp.arange(200) + 0.5
+    height, angle = 1 - k / 200, jnp.pi * (1 + 5**0.5) * k
+    ring = jnp.sqrt(1 - height**2)
+    form = QuarticForm(tuple(c), jnp.ones(()))
+    hessian = jax.vmap(lambda x, y, z: form.hessian(Vec3(x, y, z)).array())(
+        ring * jnp.cos(angle), ring * jnp.sin(angle), height
+    )
+    values = jnp.linalg.eigvalsh(hessian)
+    return jnp.min(values), jnp.max(values)
+
+
+class ContactsProblem(NamedTuple):
+    """Several contacts on a random limit surface.
+
+    Attributes:
+        surface: Limit surface.
+        contacts: The contacts, in the body frame.
+    """
+
+    surface: LimitSurface
+    contacts: Contacts
+
+
+def random_contacts_problem(
+    key: Key[Array, ""],
+    *,
+    contacts: int | Int[Array, ""],
+    degree: int = 4,
+    condition: float | Float[Array, ""] = 1e3,
+    friction: float | Float[Array, ""] = 1.5,
+    gaps: float | Float[Array, ""] = 0.5,
+    slots: int | None = None,
+) -> ContactsProblem:
+    """Draw a problem with several contacts on a slider of some 0.1 m, from the mix of cases that a solver must handle.
+
+    Each of the following choices is drawn anew for each problem.
+
+    The contact points and normals are of one of five kinds, with equal probability:
+
+    - anywhere on an ellipse;
+    - anywhere, with any normals;
+    - two or more on one straight edge, the others on the ellipse;
+    - alternating between the flat faces of two parallel jaws, in half of these problems exactly opposite each other;
+    - two that form a wedge at the limit of holding itself, the others on the ellipse: the friction cone of each of the
+      two misses the other contact, or contains it, by 1e-1 to 1e-5 rad.
+
+    The pushers move in one of four ways, with equal probability:
+
+    - as one rigid hand, in half of these problems without rotation;
+    - towards the middle of the slider, in half of these problems exactly and equally fast, in the others unevenly and
+      with some drift;
+    - independently, three quarters of them into the slider;
+    - such that one of them slides along the slider and moves it alone, often while it recedes, and the others stay
+      behind or only just touch.
+
+    The size of the displacements is log-uniform from 0.1 to 10 mm. In half of the problems all contacts have the same
+    friction coefficient.
+
+    All arguments but `degree` and `slots` may be traced, so that one compiled program draws all problems.
+
+    Args:
+        key: PRNG key.
+        contacts: Number of active contacts.
+        degree: Degree of the limit surface, see `random_surface`.
+        condition: Upper end of the range of its condition number, see `random_surface`.
+        friction: A tenth of the friction coefficients are zero, a tenth are uniform up to four times this number, and
+            the others are uniform up to this number.
+        gaps: Fraction of the problems with gaps. In these, two fifths of the contacts touch, two fifths are up to 3 mm
+            apart, and a fifth overlap by up to 0.5 mm. In the other problems all contacts touch.
+        slots: Number of contacts that the arrays hold. Default: `contacts`. The additional contacts are inactive, at
+            random places in the arrays, with numbers of their own.
+
+    Returns:
+        The problem.
+    """
+    k_surface, k_uniform, k_normal = jax.random.split(key, 3)
+    m = int(contacts) if slots is None else slots
+    # all numbers of a kind are drawn in one call, because each call takes a quarter of a second to compile
+    uniform = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * m,)))
+    gauss = _Numbers(jax.random.normal(k_normal, (3 + 2 * m,)))
+    length = 0.02 + 0.08 * uniform.take()
+    surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
+    mu = _random_friction(uniform, m, friction)
+    point, normal, middle = _random_places(uniform, mu, contacts)
+    size = 10 ** (2 * uniform.take() - 4)
+    gap = _random_gaps(uniform, m, gaps)
+    push, dragged = _random_pushes(uniform, gauss, surface, mu, point, normal, middle)
+    push = size * push + jnp.where(dragged, gap, 0.0)[:, None] * normal
+    order = jnp.argsort(uniform.take(m))
+    active = jnp.arange(m) < contacts
+    return ContactsProblem(surface, Contacts(*(a[order] for a in (point, normal, push, mu, gap, active))))
+
+
+class _Numbers:
+    """An array of random numbers that are taken one after another."""
+
+    def __init__(self, values: Array):
+        self.values, self.taken = values, 0
+
+    def take(self, *shape: int) -> Array:
+        begin, self.taken = self.taken, self.taken + math.prod(shape)
+        assert self.taken <= self.values.size
+        return self.values[begin : self.taken].reshape(shape)
+
+
+def _unit(angle: Array) -> Array:
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+
+def _aside(v: Array) -> Array:
+    """Return the vectors rotated by +90 degrees."""
+    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def _random_places(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple[Array, Array, Array]:
+    """Draw the points and normals of `random_contacts_problem`.
+
+    Returns:
+        points: Contact points, (m, 2), in m.
+        normals: Inward normals, (m, 2).
+        middle: Middle of the slider, (1, 2), in m.
+    """
+    m = mu.size
+    all_ = uniform.take(12)
+    phase, x, y, angle, along = uniform.take(5, m)
+    middle = 0.04 * all_[None, :2] - 0.02
+    axes = 0.02 + 0.06 * all_[None, 2:4]
+    ahead = _unit(2 * jnp.pi * all_[4:5])
+    turned = jnp.concatenate([ahead, _aside(ahead)])  # (a, b) @ turned: a along `ahead`, b orthogonal to it
+
+    on_circle = _unit(2 * jnp.pi * phase)
+    on_ellipse = middle + (on_circle * axes) @ turned
+    outward = (on_circle / axes) @ turned
+    inward = -outward / jnp.linalg.norm(outward, axis=1, keepdims=True)
+
+    anywhere = 0.2 * jnp.stack([x, y], axis=1) - 0.1
+
+    index, along = jnp.arange(m)[:, None], 2 * along[:, None] - 1
+    on_edge = index < 2 + jnp.floor(all_[5] * (jnp.maximum(contacts, 2) - 1))
+    edge_point = middle + jnp.concatenate([jnp.full_like(along, -axes[0, 0]), axes[0, 1] * along], axis=1) @ turned
+
+    side = jnp.where(index % 2 == 0, 1.0, -1.0)
+    place = jnp.where(all_[6] < 0.5, along[2 * (index[:, 0] // 2)], along)
+    jaw_point = middle + jnp.concatenate([-axes[0, 0] * side, axes[0, 1] * place], axis=1) @ turned
+
+    in_wedge = index < 2
+    miss = jnp.where(all_[8] < 0.5, 1.0, -1.0) * 10 ** (-1 - 4 * all_[9])
+    lean = jnp.where(all_[10:12] < 0.5, 1.0, -1.0)[jnp.minimum(index[:, 0], 1)] * (jnp.arctan(mu) + miss)
+    wedge_normal = side * _unit(lean) @ turned
+    wedge_point = middle - axes[0, 0] * side * ahead
+
+    which = jnp.floor(5 * all_[7]).astype(int)
+    points = jnp.stack(
+        [
+            on_ellipse,
+            anywhere,
+            jnp.where(on_edge, edge_point, on_ellipse),
+            jaw_point,
+            jnp.where(in_wedge, wedge_point, on_ellipse),
+        ]
+    )
+    normals = jnp.stack(
+        [
+            inward,
+            _unit(2 * jnp.pi * angle),
+            jnp.where(on_edge, ahead, inward),
+            side * ahead,
+            jnp.where(in_wedge, wedge_normal, inward),
+        ]
+    )
+    return points[which], normals[which], jnp.where(which == 1, 0.0, middle)
+
+
+def _random_pushes(
+    uniform: _Numbers, gauss: _Numbers, surface: LimitSurface, mu: Array, point: Array, normal: Array, middle: Array
+) -> tuple[Array, Array]:
+    """Draw the displacements of `random_contacts_problem`, up to their size.
+
+    Returns:
+        push: Displacements, (m, 2), the largest of length about one.
+        dragged: Whether they are of the last kind, to which the gaps have to be added.
+    """
+    m = point.shape[0]
+    all_, (fast, into) = uniform.take(6), uniform.take(2, m, 1)
+    spin_, drift, free = gauss.take(), gauss.take(1, 2), gauss.take(m, 2)
+    # the rotation moves contacts at a distance of some 0.05 m about as far as the translation does
+    spin = jnp.where(all_[0] < 0.5, 20 * spin_, 0.0)
+    rigid = _unit(2 * jnp.pi * all_[1:2]) + spin * _aside(point)
+    to_middle = middle - point
+    to_middle /= jnp.maximum(jnp.linalg.norm(to_middle, axis=1, keepdims=True), 1e-3)
+    uneven = (0.3 + 0.7 * fast) * to_middle + 0.5 * drift
+    close = jnp.where(all_[2] < 0.5, to_middle, uneven)
+    leaving = jnp.sum(free * normal, axis=1, keepdims=True) < 0
+    independent = jnp.where(leaving & (into < 0.5), -free, free)
+
+    # the force of the first contact is on the edge of its friction cone, and this force alone moves the slider
+    side, mover = jnp.where(all_[4] < 0.5, 1.0, -1.0), jnp.arange(m)[:, None] == 0
+    force = normal[0] + side * mu[0] * _aside(normal[0])
+    torque = point[0, 0] * force[1] - point[0, 1] * force[0]
+    twist = surface.form().gradient(Vec3(force[0], force[1], torque / surface.length))
+    moved = jnp.stack([twist.x, twist.y])[None] + twist.z / surface.length * _aside(point)
+    moved /= jnp.max(jnp.linalg.norm(moved, axis=1))
+    behind = jnp.where(into < 0.3, 0.0, into)
+    drag = moved + jnp.where(mover, side * 2 * all_[5] * _aside(normal), free[:, :1] * _aside(normal) - behind * normal)
+
+    kind = jnp.floor(4 * all_[3]).astype(int)
+    push = jnp.stack([rigid, close, independent, drag])[kind]
+    return push / jnp.max(jnp.linalg.norm(push, axis=1)), kind == 3
+
+
+def _random_friction(uniform: _Numbers, m: int, most: float | Array) -> Array:
+    same, (mu, kind) = uniform.take(), uniform.take(2, m)
+    mu = most * jnp.where(kind < 0.1, 0.0, jnp.where(kind < 0.2, 4 * mu, mu))
+    return jnp.where(same < 0.5, mu[0], mu)
+
+
+def _random_gaps(uniform: _Numbers, m: int, share: float | Array) -> Array:
+    some, (kind, size) = uniform.take(), uniform.take(2, m)
+    gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
+    return jnp.where(some < share, gap, 0.0)

@@ -1,0 +1,314 @@
+"""Search for any solution of a contact problem, by a method that is independent of the solvers."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pushjax.testing.batch import ProblemBatch, products
+from pushjax.testing.conditions import CLEAN, level, violations
+
+# Number of starts that are followed together, so that their numbers stay in the processor's cache.
+CHUNK = 4000
+# Parameters of the descents. MOST_STEPS: largest number of steps. STALLED: a descent ends if nine steps do not reduce
+# |residual|^2 below this factor of its value. DAMPING: range of the initial damping, as powers of ten. RHO_SPREAD:
+# standard deviation of log(rho) between starts. MODE_SHARE: fraction of starts that begin with a guess of the modes.
+MOST_STEPS, STALLED, DAMPING, RHO_SPREAD, MODE_SHARE = 120, 0.97, (-8.0, -2.0), 1.0, 0.8
+# The six entries of a symmetric 3 x 3 matrix, and their places in it.
+UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+
+
+class Searched(NamedTuple):
+    """The result of `search`. Twist, force and wrench are those of the first solution found, or zero without one.
+
+    Attributes:
+        found: Whether a solution without a violation above CLEAN was found, (N,).
+        twist: Twists, (N, 3), in m, m, rad.
+        force: Contact forces along normal and tangent, (N, m, 2), in N.
+        wrench: Wrenches on H = 1, (N, 3), in N and N m.
+        tried: Number of starts that were followed to their end, (N,).
+        reached: Number of these starts that ended at a solution, (N,).
+    """
+
+    found: np.ndarray
+    twist: np.ndarray
+    force: np.ndarray
+    wrench: np.ndarray
+    tried: np.ndarray
+    reached: np.ndarray
+
+
+def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> Searched:
+    """Search for any solution of each problem, from random starts.
+
+    From each start the conditions, written as smooth equations (`_Equations`), are solved by the Levenberg-Marquardt
+    method, and the result is accepted if it passes `violations`. A problem whose slider does not move is solved at
+    once, by zero. If the search finds nothing, that proves nothing, but it is stronger evidence with more starts.
+
+    Args:
+        batch: The problems.
+        starts: Number of random starts of each problem.
+        seed: Seed of the starts. Other batches or portions draw other starts from the same seed.
+        portions: Sizes of the first groups of starts; the last group has all the rest. After each group, problems that
+            have a solution leave the search.
+
+    Returns:
+        The solutions found.
+    """
+    n, m = batch.friction.shape
+    batch, order = batch.gathered()  # the time grows with the square of the number of contacts, padding included
+    rng = np.random.default_rng(seed)
+    twist, force, wrench = np.zeros((n, 3)), np.zeros((*order.shape, 2)), np.zeros((n, 3))
+    still = violations(batch, twist, force).worst() <= CLEAN
+    result = Searched(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
+    done = 0
+    for portion in (*portions, starts):
+        portion = min(portion, starts - done)
+        done += portion
+        left = np.flatnonzero(~result.found)
+        size = max(CHUNK // max(portion, 1), 1)
+        for begin in range(0, len(left) if portion else 0, size):
+            where = left[begin : begin + size]
+            with np.errstate(all="ignore"):  # a start may diverge to infinity; `violations` then rejects it
+                answers = _follow(batch.take(where), portion, rng)
+            for field, values in zip(result, answers, strict=True):
+                field[where] += values
+    every = np.zeros((n, m, 2))
+    every[np.arange(n)[:, None], order] = result.force
+    return result._replace(force=every)
+
+
+def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searched:
+    """Follow `starts` starts of each problem, and return the first solution of each."""
+    n = len(batch)
+    equations = _Equations(batch, np.repeat(np.arange(n), starts), rng)
+    y = equations.start(rng)
+    y = equations.follow_modes(y, rng)
+    y = equations.descend(y, 10 ** rng.uniform(*DAMPING, y.shape[1]))
+    twist, force, wrench = equations.answer(y, batch)
+    clean = violations(batch.take(equations.problem), twist, force, wrench).worst() <= CLEAN
+    clean = clean.reshape(n, starts)
+    first = np.arange(n) * starts + clean.argmax(axis=1)
+    found = np.asarray(clean.any(axis=1))
+    twist, force, wrench = (
+        np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a[first], 0.0) for a in (twist, force, wrench)
+    )
+    return Searched(found, twist, force, wrench, np.full(n, starts), clean.sum(axis=1))
+
+
+class _Equations:
+    """The conditions as 2 m smooth equations in the 2 m force components, for many starts at once on the last axis.
+
+    H is scaled so that its mean Hessian over the sphere has trace 3. Lengths are relative to the problem's speed. The
+    equation V = grad H(F) has no free factor, so the size of the forces is an unknown too. The unknowns are y, with
+    f = y / rho, where rho is about the derivative of w_n by f_n. With phi(a, b) = a + b - |(a, b)| (Fischer 1992),
+    which is zero where 0 <= a _|_ b >= 0, the equations of a contact are
+
+        phi(f_n, w_n + gap) = 0,      phi(mu f_n + f_t, -phi(mu f_n - f_t, -w_t)) = 0.
+
+    The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
+    where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
+    """
+
+    def __init__(self, batch: ProblemBatch, problem: np.ndarray, rng: np.random.Generator):
+        n, m = batch.friction.shape
+        on = batch.active
+        table = batch.hessian_table()
+        mean = table.mean(axis=3) if batch.degree == 2 else table[..., :3].mean(axis=3)
+        size = np.trace(mean, axis1=1, axis2=2) / 3
+        mean = mean / size[:, None, None]
+        rows = np.where(on[..., None, None], batch.rows(), 0.0)
+        ahead = np.where(on[..., None], batch.approach() / batch.speed()[:, None, None], -1.0)
+        rho = np.where(on, np.einsum("nmi,nij,nmj->nm", rows[:, :, 0], mean, rows[:, :, 0]), 1.0)
+        upper = np.stack([table[:, i, j] for i, j in UPPER], axis=1) / size[:, None, None]
+        flat = rows.reshape(n, 2 * m, 3)
+
+        def each(array: np.ndarray) -> np.ndarray:
+            return np.moveaxis(array, 0, -1)[..., problem]
+
+        self.degree, self.problem = batch.degree, problem
+        self.table = each(upper)  # (6, q, B)
+        self.rows = each(flat)  # (2 m, 3, B)
+        self.ahead = each(ahead.reshape(n, 2 * m))  # (2 m, B)
+        self.friction = each(np.where(on, batch.friction, 0.0))  # (m, B)
+        self.active = each(on)  # (m, B)
+        spread = np.exp(RHO_SPREAD * rng.normal(size=len(problem)))
+        self.rho = np.repeat(each(rho), 2, axis=0) * spread  # (2 m, B)
+        # maps a twist to forces whose wrench approximately causes it
+        self.resisting = np.linalg.pinv(np.swapaxes(flat, 1, 2)) @ np.linalg.inv(mean)
+
+    def take(self, keep: np.ndarray) -> "_Equations":
+        part = object.__new__(_Equations)
+        part.degree = self.degree
+        for name in ("problem", "table", "rows", "ahead", "friction", "active", "rho"):
+            setattr(part, name, getattr(self, name)[..., keep])
+        return part
+
+    def flow(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the wrench (3, B), the Hessian of H (3, 3, B) and the twist grad H (3, B)."""
+        wrench = np.einsum("ib,ijb->jb", y / self.rho, self.rows)
+        upper = self.table[:, 0] if self.degree == 2 else np.einsum("ijb,jb->ib", self.table, products(wrench, 4))
+        hessian = upper[FULL]
+        return wrench, hessian, np.einsum("ijb,jb->ib", hessian, wrench) / (self.degree - 1)
+
+    def slips(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return w (2 m, B), with the gap added to its normal part, and its derivative by y (2 m, 2 m, B)."""
+        _, hessian, twist = self.flow(y)
+        slip = np.einsum("ijb,jb->ib", self.rows, twist) - self.ahead
+        through = np.einsum("ijb,kjb->ikb", hessian, self.rows)
+        return slip, np.einsum("kjb,jib->kib", self.rows, through) / self.rho
+
+    def residual(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the left sides of the equations (2 m, B) and their derivative by y (2 m, 2 m, B)."""
+        slip, by_y = self.slips(y)
+        normal, tangent, limit = y[0::2], y[1::2], self.friction * y[0::2]
+        value = np.empty_like(y)
+        value[0::2], by_normal, by_gap = _fischer_burmeister(normal, slip[0::2])
+        upper, by_upper, by_slip = _fischer_burmeister(limit - tangent, -slip[1::2])
+        value[1::2], by_lower, by_rest = _fischer_burmeister(tangent + limit, -upper)
+        by_y[0::2] *= by_gap[:, None]
+        by_y[1::2] *= (by_rest * by_slip)[:, None]
+        n = np.arange(0, len(y), 2)
+        by_y[n, n] += by_normal
+        by_y[n + 1, n] += self.friction * (by_lower - by_rest * by_upper)
+        by_y[n + 1, n + 1] += by_lower + by_rest * by_upper
+        return value, by_y
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """Draw the starts y (2 m, B): random forces in the friction cones.
+
+        Half of them are scaled so that the normal motion of some contacts is about right. The other half resist a
+        random twist, because on an ill-conditioned surface random forces hardly ever do.
+        """
+        m, count = self.friction.shape
+        pushes = np.where((rng.random((m, count)) < 0.6) & self.active, rng.exponential(size=(m, count)), 0.0)
+        side = rng.uniform(-1, 1, (m, count))
+        side = np.where(rng.random((m, count)) < 0.5, np.sign(side), side)
+        force = _interleave(pushes, side * self.friction * pushes)
+        twist = self.flow(force * self.rho)[2]
+        motion = np.einsum("ijb,jb->ib", self.rows[0::2], twist)
+        wanted, given = (motion * self.ahead[0::2] * pushes).sum(axis=0), (motion**2 * pushes).sum(axis=0)
+        unit = 1 / np.maximum(np.linalg.norm(twist, axis=0), 1e-6)  # the factor that scales the twist to length one
+        factor = wanted / np.where(given > 0, given, 1.0)
+        force *= np.where(factor > 1e-3 * unit, np.minimum(factor, 10 * unit), unit) ** (1 / (self.degree - 1))
+
+        other = np.einsum("bij,jb->ib", self.resisting[self.problem], rng.normal(size=(3, count)))
+        other *= np.where(other[0::2].sum(axis=0) < 0, -1.0, 1.0)
+        force = np.where(rng.random(count) < 0.5, self.in_cone(other), force)
+        return force * self.rho * 10 ** (0.3 * rng.normal(size=count))
+
+    def in_cone(self, force: np.ndarray) -> np.ndarray:
+        """Return the forces clipped to the friction cones."""
+        normal = np.maximum(force[0::2], 0.0)
+        limit = self.friction * normal
+        return _interleave(normal, np.clip(force[1::2], -limit, limit))
+
+    def follow_modes(self, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Move most starts a few Newton steps towards a random choice of contact modes.
+
+        The choice need not have a solution. It consists of one to three edges of friction cones, which are enough for
+        a solution because wrenches have three dimensions. A contact sticks if both of its edges are chosen.
+        """
+        count = y.shape[1]
+        drawn = rng.random(y.shape) + np.repeat(2.0 * ~self.active, 2, axis=0)
+        rank = drawn.argsort(axis=0).argsort(axis=0)
+        chosen = rank < rng.choice([1, 2, 3], p=[0.1, 0.3, 0.6], size=count)
+        left, right = chosen[0::2] & self.active, chosen[1::2] & self.active
+        apart, stick = ~(left | right), left & right
+        slope = self.friction * np.where(left, 1.0, -1.0)
+        damping = 10 ** rng.uniform(-13, -6, count)
+        n = np.arange(0, len(y), 2)
+        end = y
+        for _ in range(4 if self.degree == 2 else 8):
+            slip, by_y = self.slips(end)
+            normal, tangent = end[0::2], end[1::2]
+            value = _interleave(
+                np.where(apart, normal, slip[0::2]),
+                np.where(stick, slip[1::2], tangent - np.where(apart, 0.0, slope) * normal),
+            )
+            by_y *= _interleave(~apart, stick)[:, None]
+            by_y[n, n] += apart
+            by_y[n + 1, n] -= np.where(apart | stick, 0.0, slope)
+            by_y[n + 1, n + 1] += ~stick
+            end = end - _damped_step(value, by_y, damping)
+        taken = (rng.random(count) < MODE_SHARE) & np.isfinite(end).all(axis=0)
+        return np.where(taken, end, y)
+
+    def descend(self, y: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """Minimize |residual|^2 by the Levenberg-Marquardt method, until it is zero or hardly decreases any more."""
+        equations, end, index = self, y.copy(), np.arange(y.shape[1])
+        value, by_y = equations.residual(y)
+        merit = (value**2).sum(axis=0)
+        earlier = merit
+        for k in range(1, MOST_STEPS + 1):
+            trial = y - _damped_step(value, by_y, damping)
+            trial_value, trial_by_y = equations.residual(trial)
+            trial_merit = (trial_value**2).sum(axis=0)
+            better = trial_merit < merit
+            damping = np.where(better, np.maximum(0.15 * damping, 1e-15), np.minimum(6 * damping, 1e12))
+            y, value, by_y = (
+                np.where(better, new, old) for new, old in ((trial, y), (trial_value, value), (trial_by_y, by_y))
+            )
+            merit = np.where(better, trial_merit, merit)
+            if k % 3:
+                continue
+            finished = ~(merit > 1e-26)
+            if k % 9 == 0:
+                finished |= ~(merit < STALLED * earlier)
+                earlier = merit
+            if k < MOST_STEPS and finished.mean() < 0.1:
+                continue
+            end[:, index] = y
+            index, equations = index[~finished], equations.take(~finished)
+            y, value, by_y, merit, damping, earlier = (
+                a[..., ~finished] for a in (y, value, by_y, merit, damping, earlier)
+            )
+            if not len(index):
+                break
+        return end
+
+    def answer(self, y: np.ndarray, batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return twist (B, 3), force (B, m, 2) and wrench (B, 3) in the units of `batch`, with the wrench on H = 1."""
+        force = self.in_cone(y / self.rho)
+        wrench, _, twist = self.flow(force * self.rho)
+        part = batch.take(self.problem)
+        size = level(part, wrench.T)
+        size = np.where(size > 0, size, 1.0)[:, None]
+        one = np.ones_like(part.length)
+        arms = np.stack([one, one, part.length], axis=1)
+        return (
+            twist.T * part.speed()[:, None] / arms,
+            force.T.reshape(*part.friction.shape, 2) / size[..., None],
+            wrench.T * arms / size,
+        )
+
+
+def _fischer_burmeister(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a + b - |(a, b)| and its derivatives; at the corner, one of its generalized derivatives."""
+    size = np.sqrt(a * a + b * b) + np.finfo(float).tiny
+    return a + b - size, 1 - a / size, 1 - b / size
+
+
+def _interleave(normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """Interleave two arrays (m, B) into one (2 m, B): each contact's normal entry, then its tangential entry."""
+    return np.stack([normal, tangent], axis=1).reshape(-1, *normal.shape[1:])
+
+
+def _damped_step(value: np.ndarray, by_y: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return (J'J + damping)^-1 J' value for each entry of the last axis, by Gaussian elimination."""
+    r = np.einsum("kib,kb->ib", by_y, value)
+    n, a = len(r), np.empty_like(by_y)
+    for i in range(n):
+        a[i, i:] = np.einsum("kb,kjb->jb", by_y[:, i], by_y[:, i:])
+        a[i:, i] = a[i, i:]
+    a[np.arange(n), np.arange(n)] += damping
+    for k in range(n):
+        inverse = 1 / a[k, k]
+        below = a[k + 1 :, k] * inverse
+        a[k + 1 :, k + 1 :] -= below[:, None] * a[k, k + 1 :]
+        r[k + 1 :] -= below * r[k]
+        a[k, k + 1 :] *= inverse
+        r[k] *= inverse
+    for k in range(n - 2, -1, -1):
+        r[k] -= (a[k, k + 1 :] * r[k + 1 :]).sum(axis=0)
+    return r

@@ -1,0 +1,322 @@
+"""Results of `python -m benchmarks` for speed and accuracy; no test depends on how long anything takes."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from benchmarks import cases, contacts, grasps, numerics, outlines, speed, tasks, timing
+from benchmarks.__main__ import SCRIPTS, listing, main
+from benchmarks.hlo import traffic
+from benchmarks.peers import rows
+from benchmarks.peers.figure import speed_figure
+from pushjax.testing.problems import random_contacts_problem
+
+
+def test_errors_fall_with_the_square_of_the_step():
+    by_steps = tasks.errors("quartic", "float64")
+    assert by_steps[8] < tasks.ALLOWED_MM < by_steps[5]
+    assert tasks.fewest_steps(by_steps) in (6, 8)
+    assert by_steps[64] < by_steps[16] / 10
+    single = tasks.errors("quartic", "float32")
+    assert single[16] == pytest.approx(by_steps[16], abs=2e-3)
+    with pytest.raises(ValueError, match="within 1e-09 mm"):
+        tasks.fewest_steps(by_steps, 1e-9)
+
+
+def test_no_slip_where_it_sticks():
+    """A sticking tip rolls as the side turns; the slip that is left is the discretization error, nanometers."""
+    coarse, fine = (max(rows.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
+    assert coarse < 0.01
+    assert fine < coarse / 10
+    assert max(rows.slip_um("float32", (0.004, 0.01))) < 0.1  # roundoff of 50 steps
+    with pytest.raises(ValueError, match="does not stick"):
+        rows.slip_um("float64", (0.03,))
+
+
+def test_rows(tmp_path):
+    """There is one row per case, type and batch; `slower` compares cost, and a record is not slower than itself."""
+    seen = []
+    record = speed.run(("push",), ("float32",), (64, 128), keep=lambda r: seen.append(len(r["rows"])))
+    assert seen == [1, 2]
+    for row, batch in zip(record["rows"], (64, 128), strict=True):
+        assert (row["case"], row["dtype"], row["batch"]) == ("push_quartic", "float32", batch)
+        assert row["steps"] == 8
+        assert row["pose_error_mm"] <= tasks.ALLOWED_MM
+        assert row["run_s_middle_half"][0] <= row["run_s"] <= row["run_s_middle_half"][1]
+        assert row["multiply_adds_per_step"] > 300  # a step needs some 750 operations
+        # counts of the compiled program, which computes some values more than once; bytes are those moved between
+        # kernels, not between memory and them
+        assert 750 < row["flops_per_step"] < 10_000
+        assert 1000 < row["bytes_per_step"] < 100_000
+        assert 0 < row["near_copy_fraction"] < 1
+        assert row["per_processor_s"] == pytest.approx(batch / row["processor_s"])
+    lines = speed.summary(record).splitlines()
+    assert lines[1].split()[:4] == ["push_quartic", "float32", "64", "8"]
+    assert lines[1].index("mm") == lines[2].index("mm")
+    rows = record["rows"]
+    assert speed.slower(rows, record) == ([], [])
+    half = [row | {"multiply_adds_per_step": row["multiply_adds_per_step"] / 2} for row in rows]
+    found, new = speed.slower(rows, {"rows": half})
+    assert [row["times"] for row in found] == pytest.approx([2, 2])
+    # half the cost per step with twice the steps is the same cost
+    assert speed.slower(rows, {"rows": [row | {"steps": 2 * row["steps"]} for row in half]}) == ([], [])
+    found, new = speed.slower(rows, {"rows": half[:1]})
+    assert (len(found), [row["batch"] for row in new]) == (1, [128])
+    assert "not in the baseline: push_quartic, float32, 128" in speed.summary(record | {"new": new})
+    with pytest.raises(ValueError, match="no row of what was measured"):
+        speed.slower(rows, {"rows": []})
+    (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half, "settings": {"cores": 1}}))
+    assert speed.kept(tmp_path / "half.json", 1)["rows"] == half
+    with pytest.raises(ValueError, match="is of --cores 1; got all"):
+        speed.kept(tmp_path / "half.json", None)
+
+
+def test_traffic_counts_rounds():
+    """Count a loop as often as it runs, a kernel's operands and result, and all branches of a conditional."""
+    x = jnp.ones(1000, jnp.float32)
+
+    def of(function):
+        return traffic(jax.jit(function).lower(x).compile().as_text())
+
+    once, often = of(lambda x: x * 2.5 + 1.5), of(lambda x: jax.lax.fori_loop(0, 7, lambda k, x: x * 2.5 + 1.5, x))
+    assert once == (2000, 8000, 1)
+    assert once.times(3) == (6000, 24000, 1)
+    assert often.flops == pytest.approx(7 * once.flops, rel=0.01)  # and the loop's own counter
+    assert 7 * once.bytes <= often.bytes < 7.2 * once.bytes + 8000  # and a copy of the initial value
+    # arrays that are read and written in place count by row
+    rows = jax.jit(lambda x: jax.lax.map(lambda row: 2 * row, x)).lower(jnp.ones((50, 1000), jnp.float32)).compile()
+    assert 50 * 8000 <= traffic(rows.as_text()).bytes < 50 * 8000 * 3
+    product = traffic(jax.jit(lambda x: x @ x.T).lower(jnp.ones((40, 30))).compile().as_text())
+    assert product.flops == pytest.approx(2 * 40 * 40 * 30)
+
+
+def test_cases_work():
+    """Each case runs, and moves what it should."""
+    problems = cases.solve("float64", 16, 2)
+    twist = np.asarray(jax.jit(problems.function)(*problems.args))
+    assert twist.shape == (16, 3)
+    assert np.abs(twist).max() > 0
+    sampled = cases.sampling("float64", 4)
+    surface = jax.jit(sampled.function)(*sampled.args)
+    assert all(pj.Quartic(c, surface.length[0]).is_convex() for c in surface.coefficients)
+    one, args = cases.each_push("quartic", "float64", 3, 2)
+    by = jax.jit(jax.grad(lambda *args: jnp.sum(jax.vmap(one)(*args).pose[:, -1]), argnums=(0, 1, 2)))(*args)
+    assert all(np.isfinite(leaf).all() and np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(by))
+    # with a surface for each grasp the square turns as with one shared surface: the surfaces differ by a scale only
+    shared, own = (cases.grasp("float64", 4, steps=4, varied=varied) for varied in (False, True))
+    assert (shared.case, own.case) == ("grasp_two_fingers", "grasp_surfaces")
+    poses = [np.asarray(jax.jit(work.function)(*work.args)) for work in (shared, own)]
+    np.testing.assert_allclose(*poses, rtol=0, atol=1e-12)
+
+
+def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
+    poses = grasps.random_poses(jax.random.key(2), 8, "float64")
+    square = pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)
+    for (x, y, theta), path in zip(np.asarray(poses), np.asarray(grasps.paths(poses, 3)), strict=True):
+        opening = path[:, 3]
+        away = np.array([[0, opening[0] / 2], [0, -opening[0] / 2]]) - [x, y]
+        cos, sin = np.cos(theta), np.sin(theta)
+        centers = away @ np.array([[cos, -sin], [sin, cos]])
+        nearest = min(float(square.signed_distance(center)) for center in centers)
+        assert nearest == pytest.approx(tasks.RADIUS, abs=1e-12)
+        assert opening[-1] == pytest.approx(grasps.FLAT + grasps.LEFT)
+        assert np.all(np.diff(opening) < 0)
+    by_steps = grasps.errors("float64")
+    assert by_steps[4] < tasks.ALLOWED_MM < by_steps[3]
+    assert by_steps[12] < by_steps[4] / 20  # the step in which the second finger touches limits the error from here on
+    assert by_steps[64] < 5e-4
+    turned = np.abs(grasps.reference()[:, 2])
+    # If both fingers touch, the angle is geometry. If one finger arrives far before the other, it turns the square
+    # more.
+    assert turned.max() == pytest.approx(grasps.TURNED, abs=1e-9)
+    assert np.median(turned) == pytest.approx(grasps.TURNED, abs=1e-9)
+
+
+def needed_by(which):
+    """Return the FLOPs of a push before the compiler optimizes it, and the work."""
+    work = outlines.push("float64", 2, which)
+    costs = jax.jit(work.function).lower(*work.args).cost_analysis() or {}
+    return costs["flops"], work
+
+
+def test_smooth_outlines_cost_the_same_whatever_they_were_traced_with():
+    """The cost depends on the control points of a curve, or on the vertices of a polygon."""
+    coarse, fine = (needed_by(("curve", 12, traced))[0] for traced in outlines.TRACED)
+    assert coarse == fine
+    few, many, most = (needed_by(("polygon", n, 0))[0] for n in (4, 16, 64))
+    assert few < many < most
+    # in proportion: an additional vertex costs the same at 16 vertices as at 64
+    assert (most - many) / 48 == pytest.approx((many - few) / 12, rel=0.2)
+    flops, work = needed_by(("disk", 0, 0))
+    assert flops < few
+    mode = jax.vmap(lambda *each: outlines.task("float64", ("disk", 0, 0)).push(*each).mode)(*work.args)
+    assert np.all(np.asarray(mode) != pj.ContactMode.SEPARATED)  # the finger touches in every step
+
+
+@pytest.mark.parametrize("which", [("polygon", 6, 0), ("polygon", 64, 0), ("curve", 24, 1024), ("ellipse", 0, 0)])
+def test_outlines_are_touched_where_the_pushes_begin(which):
+    shape = outlines.outline(*which)
+    distance = float(shape.signed_distance(np.array([-outlines.HALF - 0.01, 0.0])))
+    assert distance == pytest.approx(0.01, abs=1e-6)
+
+
+def test_rows_of_fits_and_of_monte_carlo():
+    """Cases that are not pushes have rows with the same names."""
+    names = None
+    for case, kind in (("fit", "float64"), ("monte_carlo", "float32")):
+        record = speed.run((case,), (kind,), (64,))
+        for row in record["rows"]:
+            names = names or set(row)
+            assert set(row) == names
+            assert (row["dtype"], row["batch"]) == (kind, 64)
+            assert row["run_s"] > 0
+            assert row["compile_s"] >= 0
+        assert record["rows"][0]["case"] in speed.summary(record)
+    work = cases.monte_carlo("float32", 64)
+    found = work.function(*work.args)
+    assert found["n"] == 64
+    assert found["modes"][0]["SEPARATED"] == 0  # the finger touches in every step
+
+
+def test_tiles_change_nothing(monkeypatch):
+    monkeypatch.setattr(cases, "TILE", 16)
+    work = cases.push("float64", 40)
+    assert " while(" in jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(cases, "on_cpu", lambda: False)
+        whole = jax.jit(lambda x: cases.in_tiles(lambda x: 2 * x, (x,), 40)).lower(jnp.ones(40)).as_text("hlo")
+    assert " while(" not in whole
+    tiled = np.asarray(jax.jit(work.function)(*work.args))
+    monkeypatch.setattr(cases, "TILE", 64)
+    np.testing.assert_array_equal(tiled, np.asarray(jax.jit(cases.push("float64", 40).function)(*work.args)))
+
+
+def test_float32_beside_float64(monkeypatch):
+    monkeypatch.setattr(numerics, "MODELS", ("quartic",))
+    monkeypatch.setattr(numerics, "STEPS", (8,))
+    monkeypatch.setattr(numerics, "CHUNK", 128)
+    record = numerics.run(scale=0.002)
+    assert len(record["rows"]) == 1
+    for row in record["rows"]:
+        assert row["pushes"] == 200
+        assert row["failed_steps"] == 0
+        assert row["same_bits_again"]
+        assert 0 < row["median_mm"] < 1e-3
+        assert row["mode_flips"] < 1e-2
+    assert record["steps_for_mm"]["quartic, float32"]["0.1"] == 8
+    assert "same bits" in numerics.summary(record)
+    with pytest.raises(ValueError, match="one push"):
+        numerics.run(scale=1e-9)
+
+
+def test_turns():
+    """All programs run equally often, medians lie between quartiles, and the kernels compute what they claim."""
+    calls = []
+    timings = timing.alternate({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    assert set(timings) == {"a", "b"}
+    for each in timings.values():
+        assert each.low <= each.median <= each.high
+    top = timing.ceiling("float32")
+    values = np.asarray(top.multiply_add.run())
+    assert values.dtype == np.float32
+    assert np.isfinite(values).all()
+    assert top.multiply_add.traffic.flops == pytest.approx(top.flops, rel=0.1)
+    copied = 2 * 4 * timing.NEAR * timing.NEAR_PASSES
+    assert top.near.traffic.bytes == pytest.approx(copied, rel=0.01)
+    np.testing.assert_allclose(np.asarray(top.near.run()), 1.000001**timing.NEAR_PASSES, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["contacts", "--contacts", "2", "9"], "contacts must be from 1 to 8; got 9"),
+        (["push", "--batch", "0"], "batch must be positive; got 0"),
+        (["push", "--cores", "0"], "--cores must be from 1 to"),
+        (["sampling", "--peers"], "--peers is for push, grasp, fit, solve; got it with sampling"),
+        (["push", "--baseline", "README.md"], "holds no record of python -m benchmarks"),
+    ],
+)
+def test_wrong_options(arguments, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 1
+    assert message in capsys.readouterr().err
+
+
+def test_every_case_is_listed_with_a_line(capsys):
+    main([])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == listing().splitlines()
+    assert {"push", "contacts", "table1_causes", *SCRIPTS} <= {line.split()[0] for line in lines}
+    assert all(len(line.split()) > 2 for line in lines)
+
+
+def test_picture():
+    axes = speed_figure({"a": [(2e-6, 0.01), (1e-6, 0.1)], "b": [(1e-3, 0.2)]}, 0.1).axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["a", "b"]
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [1, 2])
+    np.testing.assert_allclose(axes.lines[0].get_xdata(), [0.1, 0.01])
+    assert "mm" in axes.get_xlabel()
+    assert "µs" in axes.get_ylabel()
+
+
+def test_only_new_shapes_are_compiled():
+    """Only new shapes compile; new values of outline, path, friction, or more batches of `monte_carlo` do not."""
+    here = tasks.task("quartic", "float64")
+    path = tasks.paths(jnp.array([0.01]), jnp.array([0.1]), 6)[0]
+    model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
+    made = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **more: made.append(event) if event.endswith("backend_compile_duration") else None
+    )
+
+    def other(scale):
+        surface = pj.Quartic(scale * here.slider.surface.coefficients, here.slider.surface.length)
+        slider = pj.Slider(pj.Polygon.rectangle(0.09 * scale, 0.09), surface)
+        here._replace(slider=slider, pose=here.pose + 1e-4 * scale).push(path - 1e-3 * scale, 0.3 * scale)
+
+    def slope(scale):
+        """Take the gradient directly, not inside a `jit` of the user."""
+        jax.grad(lambda mu: here.push(path * scale, mu).pose[-1, 2])(0.3 * scale)
+
+    def grasp(scale):
+        poses = scale * grasps.random_poses(jax.random.key(3), 1, "float64")
+        hand = pj.Hand.two_fingers(tasks.RADIUS * scale)
+        pj.rollout(here.slider, hand, grasps.paths(poses, 2)[0], pose=poses[0], friction=0.1 * scale)
+
+    def solved(scale):
+        problem = random_contacts_problem(jax.random.key(5), contacts=1)
+        pj.solve_contacts(pj.Quartic(scale * problem.surface.coefficients, problem.surface.length), problem.contacts)
+
+    def many(n):
+        pj.monte_carlo(jax.random.key(n), n, here.slider, here.hand, path, pose=here.pose, model=model, batch_size=64)
+
+    def compiled_by(*calls):
+        before = len(made)
+        for call in calls:
+            call()
+        return len(made) - before
+
+    calls = (other, slope, grasp, solved)
+    assert all(compiled_by(lambda call=call: call(1.0)) > 0 for call in (*calls, lambda _: many(128)))
+    assert [compiled_by(lambda call=call: call(1.01)) for call in calls] == [0] * len(calls)
+    assert compiled_by(lambda: many(320), lambda: many(1000)) == 0
+
+
+def test_contacts(monkeypatch):
+    """Judge two thousand problems of two contacts by the independent solver."""
+    monkeypatch.setattr(contacts, "MODELS", {"quartic": 4})
+    kept = []
+    record = contacts.run(scale=0.0, contacts=(2,), starts=20, keep=lambda so_far: kept.append(len(so_far["rows"])))
+    assert kept == [len(record["rows"])] == [1]
+    for row in record["rows"]:
+        assert row["problems"] == 2000
+        assert row["wrong"] == row["not_converged"] == 0
+        assert row["solved"] + row["jammed"] == 2000
+        assert row["jammed"] > 100
+        assert row["worst_violation"] < 1e-8
+    assert "wrong" in contacts.summary(record)

@@ -1,0 +1,89 @@
+"""Contact problems in which mostly one contact does all the work."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax._math.vec import unstack
+from pushjax.contact.problem import contacts_in_scalars, solve_in_scalars, to_scalars
+from pushjax.testing.problems import random_contacts_problem
+
+
+def solved(problem, solver, displacement):
+    """Solve as a rollout does: without a margin and, by default, one contact first."""
+    given = problem.contacts
+    contacts = pj.Contacts(given.point, given.normal, displacement, given.friction, given.gap, given.active)
+    form, mu = to_scalars(problem.surface, contacts.friction)
+    found = solve_in_scalars(form, contacts_in_scalars(contacts, mu), unstack(contacts.active), solver, margin=False)
+    return found.twist.array(), found.status, found.unique
+
+
+def test_the_same_motion_or_a_second_one():
+    """On random problems, the answer and its derivative are those of `Exhaustive`, unless the motion is not unique."""
+    count = 400
+    keys = jax.random.split(jax.random.key(4), count)
+    problems = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=4, degree=4)))(keys)
+
+    def both(problem, solver):
+        twist, status, unique = solved(problem, solver, problem.contacts.displacement)
+        slope = jax.jacfwd(lambda displacement: solved(problem, solver, displacement)[0])
+        return twist, status, unique, slope(problem.contacts.displacement)
+
+    quick = jax.jit(jax.vmap(lambda problem: both(problem, None)))(problems)
+    exact = jax.jit(jax.vmap(lambda problem: both(problem, pj.Exhaustive())))(problems)
+    twist, status, _, slope = map(np.asarray, quick)
+    wanted, exact_status, unique, wanted_slope = map(np.asarray, exact)
+    moves = exact_status == pj.Status.MOVING
+    np.testing.assert_array_equal(status[unique], exact_status[unique])
+    size = np.linalg.norm(wanted, axis=1)
+    apart = np.linalg.norm(twist - wanted, axis=1) > 1e-3 * size
+    assert not np.any(apart & unique & moves)
+    assert 0 < np.sum(moves & ~apart) < count
+    alike = moves & ~apart & (status == pj.Status.MOVING)
+    assert np.all(np.isfinite(slope))
+    error = np.abs(slope - wanted_slope).max(axis=(1, 2, 3)) / np.maximum(np.abs(wanted_slope).max(axis=(1, 2, 3)), 1)
+    assert np.mean(error[alike] < 1e-2) > 0.99
+
+
+OPEN, CLOSED = 0.32, 0.02  # m
+
+
+@pytest.fixture(scope="module")
+def grasps():
+    """Two fingers close on a rectangle: final poses and openings, by number of steps and solver."""
+    slider = pj.Slider(pj.Polygon.rectangle(0.09, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), length=0.03))
+    hand = pj.Hand.two_fingers(0.008)
+    keys = jax.random.split(jax.random.key(1), 2)
+    friction = jax.random.uniform(keys[0], (200,), minval=0.05, maxval=0.6)
+    pose = jax.random.uniform(keys[1], (200, 3), minval=-1, maxval=1) * jnp.array([[0.02, 0.02, np.pi]])
+
+    def final(steps, solver):
+        path = pj.line((0, 0, 0, OPEN), (0, 0, 0, CLOSED), steps)
+        push = jax.vmap(lambda p, mu: pj.rollout(slider, hand, path, pose=p, friction=mu, solver=solver))
+        ends = jax.jit(push)(pose, friction)
+        return np.asarray(ends.pose[:, -1]), np.asarray(ends.configuration[:, -1, 3])
+
+    return {"one first": final(100, None), "largest": final(100, pj.Exhaustive()), "fine": final(1600, None)}
+
+
+def test_a_coarse_grasp_goes_on_as_a_fine_one(grasps):
+    """In a coarse grasp, trying one contact first is nearer to fine steps than the motion of largest power.
+
+    With steps of 3 mm one finger pushes before the other arrives. There an explicit `Exhaustive` takes the motion of
+    largest power, which often is another one, and the slider ends farther from the result of fine steps.
+    """
+    one_first, largest, fine = (grasps[name][0] for name in ("one first", "largest", "fine"))
+    differs = np.abs(one_first - largest).max(axis=1) > 1e-4
+    assert 2 <= np.sum(differs) <= 40
+    error, other = (np.abs(end - fine)[differs].max(axis=1) for end in (one_first, largest))
+    assert np.median(error) < np.median(other) / 4
+
+
+def test_a_coarse_grasp_stops_where_a_fine_one_does(grasps):
+    """A coarse grasp locates its jam to a sixteenth of a step; the earlier steps move the jam a little."""
+    step = (OPEN - CLOSED) / 100
+    apart = np.abs(grasps["one first"][1] - grasps["fine"][1])
+    assert np.median(apart) < step / 16
+    assert np.quantile(apart, 0.9) < step / 8

@@ -1,0 +1,620 @@
+"""A user's own recorded pushes: every kind of file gives the same structure, and damaged ones a clear error."""
+
+import gzip
+import json
+import math
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pushjax.datasets import LogError, Recordings, load_push_npz, load_recordings, load_triangle_log
+from pushjax.datasets.clocks import LONGEST_GAP
+from pushjax.datasets.recordings import Recording
+
+MIT_JSONS = (
+    "motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349.json",
+    "motion_surface=plywood_shape=rect1_a=0_v=100_i=0.000_s=0.000_t=0.000.json",
+    "motion_surface=plywood_shape=rect1_a=0_v=100_i=1.000_s=0.900_t=-1.396.json",
+    "motion_surface=plywood_shape=rect1_a=0_v=100_i=2.000_s=0.000_t=0.349.json",
+    "motion_surface=plywood_shape=rect1_a=0_v=100_i=3.000_s=0.100_t=1.047.json",
+)
+# The curated arrays are the raw numbers minus a time: only the last digit may differ.
+EXACT = 1e-12
+# Linear motion, interpolated at other times of the order of a second.
+LINEAR = 1e-9
+
+
+def fails(path: Path, *words: str) -> LogError:
+    """Check the error for a file: one line that contains the words and names the file."""
+    with pytest.raises(LogError) as caught:
+        load_recordings(path)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert str(path) in text
+    for word in words:
+        assert word in text
+    return caught.value
+
+
+def only_problem(found: Recordings) -> LogError:
+    assert len(found.problems) == 1, [str(problem) for problem in found.problems]
+    return found.problems[0]
+
+
+def same(a: Recording, b: Recording, tolerance: float) -> None:
+    for name in ("hand", "pose", "force", "time"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=tolerance, err_msg=name)
+    np.testing.assert_array_equal(a.seen, b.seen)
+
+
+def known(values: np.ndarray | None) -> np.ndarray:
+    assert values is not None
+    return values
+
+
+# --- tables ---
+
+HEADER = "push,hand_x,hand_y,object_x,object_y,object_theta"
+TABLE = [
+    HEADER,
+    "0,0.10,0.20,0.3,0.4,3.1",
+    "0,0.11,0.20,,,",
+    "0,0.12,0.20,0.3,0.4,-3.1",
+    "1,0.20,0.20,0.3,0.4,0.1",
+    "1,0.21,0.20,0.3,0.4,0.2",
+]
+
+
+def table(tmp_path: Path, lines: list[str], name: str = "log.csv") -> Path:
+    path = tmp_path / name
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_table_is_read_as_written(tmp_path):
+    found = load_recordings(table(tmp_path, TABLE))
+    assert (found.problems, found.source) == ((), str(tmp_path / "log.csv"))
+    assert [found.vertices, found.length, found.tip_radius, found.support_points] == [None] * 4
+    first, second = found.pushes
+    assert (first.index, second.index) == (0, 1)
+    np.testing.assert_array_equal(first.hand, [[0.10, 0.2], [0.11, 0.2], [0.12, 0.2]])
+    np.testing.assert_array_equal(first.seen, [True, False, True])
+    assert np.isnan(first.pose[1]).all()
+    # from 3.1 to -3.1 the short way, through pi
+    np.testing.assert_allclose(first.pose[[0, 2]], [[0.3, 0.4, 3.1], [0.3, 0.4, 2 * math.pi - 3.1]], atol=EXACT)
+    assert first.force is None
+    assert first.time is None
+    assert second.seen.all()
+
+
+def test_columns_in_any_order_and_all_of_them(tmp_path):
+    lines = [
+        "time, force_y,force_x,object_theta,object_y,object_x,hand_distance,hand_theta,hand_y,hand_x,push",
+        "0.5,2,1,0.3,0.2,0.1,0.05,3.1,0.02,0.01,north",
+        "",
+        '0.6,,,,,,0.05,-3.1,0.04,"0.03",north',
+        "0.7,4,3,0.3,0.2,0.1,0.05,-3.0,0.06,0.05,north",
+        "0.1,2,1,0.3,0.2,0.1,0.05,3.1,0.02,0.01,south",
+        "0.2,2,1,0.3,0.2,0.1,0.05,3.1,0.02,0.01,south",
+    ]
+    path = tmp_path / "log.CSV"
+    path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
+    north, south = load_recordings(path).pushes
+    assert (north.index, south.index) == (0, 1)
+    turned = 2 * math.pi
+    np.testing.assert_allclose(
+        north.hand,
+        [[0.01, 0.02, 3.1, 0.05], [0.03, 0.04, turned - 3.1, 0.05], [0.05, 0.06, turned - 3.0, 0.05]],
+        atol=EXACT,
+    )
+    np.testing.assert_array_equal(north.time, [0.5, 0.6, 0.7])
+    np.testing.assert_array_equal(north.force, [[1, 2], [np.nan, np.nan], [3, 4]])
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "words"),
+    [
+        (1, "0,,0.2,0.3,0.4,3.1", "expected a number in column hand_x, found a blank"),
+        (2, "0,0.1,nan,,,", "expected a finite number in column hand_y, found nan"),
+        (2, "0,0.1,0.2,inf,0.4,1", "expected a finite number in column object_x, found inf"),
+        (3, "0,0.1,0.2,0.3,0.4,1.2.3", "expected a number in column object_theta, found '1.2.3'"),
+        (1, "0,0.1,0.2,,,", "expected the object to be seen in the first row, found no object_x"),
+        (3, "0,0.1,0.2,nan,nan,nan", "expected the object to be seen in the last row, found no object_x"),
+        (2, "0,0.1,0.2,0.3,,1", "for object_y (or none of object_x, object_y, object_theta), found none"),
+        (2, "0,0.1,0.2,0.3", "expected 6 cells, as in the header, found 4"),
+        (2, "0,0.1,0.2,0.3,0.4,1,7", "expected 6 cells, as in the header, found 7"),
+        (2, "0,0.1,1e300,,,", "below 1e+12 for hand_y, found 1e+300"),
+    ],
+)
+def test_a_bad_row_costs_its_push_only(tmp_path, line, text, words):
+    lines = [*TABLE[:line], text, *TABLE[line + 1 :]]
+    found = load_recordings(table(tmp_path, lines))
+    problem = only_problem(found)
+    assert words in problem.message
+    assert (problem.push, problem.line) == (0, line + 1)
+    assert [push.index for push in found.pushes] == [1]
+
+
+def test_a_push_that_never_sees_the_object(tmp_path):
+    found = load_recordings(table(tmp_path, [*TABLE, "2,0.1,0.2,,,", "2,0.1,0.2,,,", "3,0.1,0.2,0.3,0.4,0.5"]))
+    assert [push.index for push in found.pushes] == [0, 1]
+    unseen, short = found.problems
+    assert (unseen.push, unseen.line) == (2, 7)
+    assert "seen in the first row" in unseen.message
+    assert (short.push, short.line) == (3, 9)
+    assert "at least two rows, found 1" in short.message
+
+
+def test_a_row_of_no_push(tmp_path):
+    found = load_recordings(table(tmp_path, [*TABLE, " ,0.1,0.2,0.3,0.4,0.5"]))
+    assert "number of the push in column push, found a blank" in only_problem(found).message
+    assert only_problem(found).line == 7
+
+
+def test_a_table_whose_time_goes_back(tmp_path):
+    lines = [f"{line},{time}" for line, time in zip(TABLE, ["time", 0.0, 0.1, 0.05, 0.0, 0.0], strict=True)]
+    found = load_recordings(table(tmp_path, lines))
+    problem = only_problem(found)
+    assert "found a step of -0.05 s in row 2 of the push" in problem.message
+    assert (problem.push, problem.line) == (0, 4)
+    np.testing.assert_array_equal(found.pushes[0].time, [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("push,hand_x,object_x,object_y,object_theta", ["found no hand_y", "expected columns out of push, hand_x"]),
+        (HEADER.replace("hand_x", "hnd_x"), ["found no hand_x; unknown 'hnd_x'"]),
+        (HEADER + ",hand_x", ["found more than one hand_x"]),
+        (HEADER + ",force_x", ["found no force_y"]),
+        (HEADER + ",force_y", ["found no force_x"]),
+        (HEADER + ",hand_distance", ["found no hand_theta"]),
+        (HEADER.replace(",", ";"), ["separated by commas", "found no push, hand_x"]),
+        (HEADER + ",", ["unknown ''"]),
+        ("1,2,3", ["found no push"]),
+    ],
+)
+def test_columns_must_be_known_and_enough(tmp_path, header, words):
+    error = fails(table(tmp_path, [header, *TABLE[1:]]), *words)
+    assert error.line == 1
+
+
+def test_tables_without_a_push(tmp_path):
+    fails(table(tmp_path, [HEADER]), "expected at least one push, found none")
+    fails(table(tmp_path, ["", " ", ",,"]), "expected a header of columns (push, hand_x", "found an empty file")
+    error = fails(
+        table(tmp_path, [HEADER, "0,x,0,0,0,0", "1,0,0,0,0,0"]),
+        "no usable push: expected a number in column hand_x, found 'x' (and 1 more problem",
+    )
+    assert (error.push, error.line) == (0, 2)
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(bytes(range(128, 256)) * 20)
+    fails(binary, "expected a table in UTF-8 text")
+    binary.write_bytes(HEADER.encode() + b"\n0,0,0,0,\x00,0\n")
+    fails(binary, "found")
+    binary.write_text(HEADER + "\n0,0,0,0,0," + "1" * 200_000)
+    fails(binary, "expected a table in UTF-8 text", "field larger than field limit")
+
+
+# --- plain archives ---
+
+
+def arrays(pushes: int = 3, samples: int = 5, dof: int = 2) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "start": rng.normal(size=(pushes, 3)),
+        "path": rng.normal(size=(pushes, samples, dof)),
+        "end": rng.normal(size=(pushes, 3)),
+    }
+
+
+def saved(tmp_path: Path, content: dict[str, np.ndarray], name: str = "log.npz") -> Path:
+    path = tmp_path / name
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **content)
+    return path
+
+
+def test_archive_of_both_ends(tmp_path):
+    given = {**arrays(dof=4), "force": np.ones((3, 5, 2)), "time": np.tile(np.arange(5.0), (3, 1))}
+    given["path"][:, :, 2] = [3.0, 3.1, -3.1, -3.0, -2.9]
+    given["start"][:, 2], given["end"][:, 2] = 3.0, -3.0
+    given["force"][1, 0] = np.nan
+    found = load_recordings(saved(tmp_path, given))
+    assert [push.index for push in found.pushes] == [0, 1, 2]
+    for index, push in enumerate(found.pushes):
+        assert push.seen.tolist() == [True, False, False, False, True]
+        np.testing.assert_array_equal(push.pose[0], given["start"][index])
+        np.testing.assert_allclose(push.pose[-1], [*given["end"][index, :2], 2 * math.pi - 3.0], atol=EXACT)
+        np.testing.assert_array_equal(push.hand[:, [0, 1, 3]], given["path"][index][:, [0, 1, 3]])
+        assert np.abs(np.diff(push.hand[:, 2])).max() < 0.2
+        np.testing.assert_array_equal(push.force, given["force"][index])
+        np.testing.assert_array_equal(push.time, np.arange(5.0))
+
+
+def test_archive_of_poses_all_along(tmp_path):
+    pose = np.zeros((2, 4, 3), np.float32)
+    pose[..., 2] = [3.0, np.nan, -3.0, -2.8]
+    pose[:, 1, :2] = np.nan
+    found = load_recordings(saved(tmp_path, {"path": np.zeros((2, 4, 3), int), "pose": pose}))
+    for push in found.pushes:
+        assert push.seen.tolist() == [True, False, True, True]
+        assert push.pose.dtype == push.hand.dtype == np.float64
+        np.testing.assert_allclose(push.pose[push.seen, 2], [3.0, 2 * math.pi - 3.0, 2 * math.pi - 2.8], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a["path"].__setitem__((1, 2, 1), np.nan), "for hand_y, found none in row 2 of the push"),
+        (lambda a: a["start"].__setitem__((1, 0), np.inf), "for object_x (or none of"),
+        (lambda a: a["end"].__setitem__(1, np.nan), "expected the object to be seen in the last row"),
+        (
+            lambda a: a.update(time=np.array([[0, 1, 2, 3, 4], [0, 1, 3, 2, 4], [0, 0, 0, 0, 0]])),
+            "step of -1 s in row 3",
+        ),
+        (lambda a: a.update(force=np.where(np.arange(30).reshape(3, 5, 2) == 13, np.nan, 1.0)), "for force_y (or none"),
+    ],
+)
+def test_a_bad_row_of_an_archive(tmp_path, change, words):
+    given = arrays()
+    change(given)
+    found = load_recordings(saved(tmp_path, given))
+    assert words in only_problem(found).message
+    assert only_problem(found).push == 1
+    assert [push.index for push in found.pushes] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop("end"), "found no end"),
+        (lambda a: a.pop("path"), "expected arrays of pushes: path (n, k, dof)"),
+        (lambda a: a.update(forces=np.ones((3, 5, 2))), "found unknown arrays forces"),
+        (lambda a: a.update(pose=np.ones((3, 5, 3))), "expected either start and end or pose, found both"),
+        (lambda a: a.update(path=np.ones((3, 5))), "expected path of shape (n, k, dof)"),
+        (lambda a: a.update(path=np.ones((3, 1, 2))), "dof and k at least 2; found (3, 1, 2)"),
+        (lambda a: a.update(path=np.ones((0, 5, 2))), "expected path of shape (n, k, dof)"),
+        (lambda a: a.update(start=np.ones((2, 3))), "expected start of shape (3, 3) to go with path (3, 5, 2)"),
+        (lambda a: a.update(time=np.ones(5)), "expected time of shape (3, 5)"),
+        (lambda a: a.update(end=np.full((3, 3), "x")), "expected numbers in end"),
+        (lambda a: a["path"].fill(np.nan), "no usable push: expected a number for hand_x, found none"),
+    ],
+)
+def test_archives_that_are_none(tmp_path, change, words):
+    given = arrays()
+    change(given)
+    fails(saved(tmp_path, given), words)
+
+
+# --- triangle logs ---
+
+
+def test_a_log_sees_both_ends_and_interpolates_the_force(data, tmp_path):
+    with np.load(data / "three_point_push" / "extra_hardboard_3pts3.npz") as archive:
+        content = dict(archive)
+    content["valid"][1] = False
+    file = saved(tmp_path, content)
+    log, found = load_push_npz(file), load_recordings(file)
+    assert only_problem(found).push == content["push_index"][1]
+    assert [str(problem) for problem in found.problems] == [str(problem) for problem in log.problems]
+    assert found.source == str(file)
+    assert found.vertices.shape == (3, 2)
+    assert found.support_points.shape == (3, 2)
+    assert (found.length, found.tip_radius) == (log.length, log.tip_radius)
+    for push, recorded in zip(log.pushes, found.pushes, strict=True):
+        assert recorded.index == push.index
+        np.testing.assert_array_equal(recorded.hand, push.tip)
+        np.testing.assert_array_equal(recorded.pose[[0, -1]], [push.pose_start, push.pose_end])
+        assert recorded.seen[[0, -1]].all()
+        assert recorded.seen.sum() == 2
+        force = known(recorded.force)
+        measured = np.isfinite(force[:, 0])
+        inside = (push.tip_time >= push.force_time[0]) & (push.tip_time <= push.force_time[-1])
+        np.testing.assert_array_equal(measured, inside)
+        assert np.abs(force[measured]).max() <= np.abs(push.force).max()
+
+
+def test_text_log(data):
+    file = sorted((data / "raw" / "three_point_push").glob("plywood_3pts2__*.txt.gz"))[0]
+    log, found = load_triangle_log(file), load_recordings(file)
+    assert [push.index for push in found.pushes] == [push.index for push in log.pushes]
+    same(found.pushes[3], Recordings.of_log(log).pushes[3], 0.0)
+    np.testing.assert_array_equal(found.support_points, log.support_points)
+
+
+# --- the layout of the MIT data set ---
+
+START, SPEED = 1.4e9, 0.1
+
+
+def tables(
+    tip: np.ndarray | None = None, body: np.ndarray | None = None, wrench: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """Return tip, object and wrench of a push along x, at the times given (s after START).
+
+    The object turns at a constant rate through pi, and the wrench grows.
+    """
+    tip = np.linspace(0.0, 1.0, 41) if tip is None else tip
+    body = np.linspace(-0.3, 0.8, 34) if body is None else body
+    wrench = np.linspace(0.1, 1.1, 51) if wrench is None else wrench
+    theta = (3.0 + 0.5 * body + math.pi) % (2 * math.pi) - math.pi
+    columns = {
+        "tip_pose": (tip, 0.3 + SPEED * tip, 0 * tip, 0 * tip),
+        "object_pose": (body, 0.4 + SPEED * body, 0.01 * body, theta),
+        "ft_wrench": (wrench, -2 * wrench, 1 + wrench, 0 * wrench),
+    }
+    made = {name: np.column_stack(values) for name, values in columns.items()}
+    for rows in made.values():
+        rows[:, 0] += START
+    return made
+
+
+def write_json(path: Path, made: dict[str, np.ndarray]) -> Path:
+    path.write_text(json.dumps({name: rows.tolist() for name, rows in made.items()}))
+    return path
+
+
+def write_hdf5(path: Path, made: dict[str, np.ndarray]) -> Path:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, rows in made.items():
+            file[name] = rows
+    return path
+
+
+def write_npz(path: Path, made: dict[str, np.ndarray]) -> Path:
+    tip, body, wrench = (made[name] for name in ("tip_pose", "object_pose", "ft_wrench"))
+    content = {"tip_t": tip[:, 0], "tip_xy": tip[:, 1:3], "object_t": body[:, 0], "object_pose": body[:, 1:]}
+    return saved(path.parent, {**content, "ft_t": wrench[:, 0], "ft_wrench": wrench[:, 1:]}, path.name)
+
+
+WRITERS = {".json": write_json, ".h5": write_hdf5, ".hdf5": write_hdf5, ".npz": write_npz}
+KINDS = pytest.mark.parametrize("suffix", WRITERS)
+
+
+def mit_log(folder: Path, made: dict[str, np.ndarray], suffix: str = ".json") -> Path:
+    return WRITERS[suffix](folder / f"log{suffix}", made)
+
+
+@KINDS
+def test_streams_are_brought_to_the_tips_stamps(tmp_path, suffix):
+    found = load_recordings(mit_log(tmp_path, tables(), suffix))
+    (push,) = found.pushes
+    assert (found.problems, push.index) == ((), 0)
+    # the object is tracked until 0.8 s, the tip from 0 s
+    time = np.linspace(0.0, 0.8, 33)
+    np.testing.assert_allclose(push.time, time, atol=1e-6)
+    np.testing.assert_allclose(push.hand, np.column_stack([0.3 + SPEED * time, 0 * time]), atol=LINEAR)
+    assert push.seen.all()
+    # time stamps of 2.4e-7 s resolution, at up to 1.4e9
+    expected = np.column_stack([0.4 + SPEED * time, 0.01 * time, 3.0 + 0.5 * time])
+    np.testing.assert_allclose(push.pose - push.pose[0] + expected[0], expected, atol=1e-6)
+    np.testing.assert_allclose(np.cos(push.pose[:, 2] - expected[:, 2]), 1.0, atol=1e-9)
+    force = known(push.force)
+    assert np.isnan(force[:4]).all()
+    np.testing.assert_allclose(force[4:], np.column_stack([2 * time, -1 - time])[4:], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", MIT_JSONS)
+def test_raw_logs_agree_with_the_curated_arrays(data, tmp_path, name):
+    raw = data / "raw" / "mit_push_full" / name
+    for path in sorted((data / "mit_push_full").glob("*.npz")):
+        with np.load(path) as archive:
+            content = dict(archive)
+        if str(content["source_file"]) == name:
+            break
+    else:
+        pytest.skip(f"no curated archive of {name}")
+    ours, curated = load_recordings(raw), load_recordings(path)
+    (push,) = ours.pushes
+    same(push, curated.pushes[0], EXACT)
+    np.testing.assert_array_equal(curated.vertices, content["vertices_body"])
+    assert (curated.length, curated.tip_radius) == (content["rho"], content["tip_radius"])
+    # the common window of tip and object, without losing a row
+    time, seen = content["tip_t"], content["object_t"]
+    inside = (time >= seen[0]) & (time <= seen[-1])
+    np.testing.assert_allclose(push.time, time[inside], atol=EXACT)
+    np.testing.assert_allclose(push.hand, content["tip_xy"][inside], atol=EXACT)
+    for column in range(3):
+        expected = np.interp(time[inside], seen, content["object_pose"][:, column])
+        np.testing.assert_allclose(push.pose[:, column], expected, atol=EXACT)
+    copy = write_hdf5(tmp_path / "log.h5", {key: np.array(rows) for key, rows in json.loads(raw.read_text()).items()})
+    same(load_recordings(copy).pushes[0], push, 0.0)
+
+
+def test_force_on_the_object_does_work_on_it(data):
+    """The logged wrench is the reaction: with its sign the tip would brake the object.
+
+    This does not hold in every log, because the sensor has an offset and the tip sometimes slides along the object.
+    """
+    power = []
+    for path in sorted((data / "mit_push_full").glob("*.npz")):
+        (push,) = load_recordings(path).pushes
+        velocity = np.gradient(push.hand, push.time, axis=0)
+        power.append(np.nanmean(np.sum(velocity * push.force, axis=1)))
+    assert np.mean(np.array(power) > 0) > 0.8
+
+
+def test_stamps_of_a_tracker_may_jitter_but_not_jump(tmp_path):
+    made = tables()
+    body = made["object_pose"]
+    body[[10, 11]] = body[[11, 10]]
+    (push,) = load_recordings(mit_log(tmp_path, made)).pushes
+    same(push, load_recordings(mit_log(tmp_path, tables())).pushes[0], 0.0)
+    body[20:, 0] -= 0.3
+    fails(mit_log(tmp_path, made), "stamps of object_pose that do not go back by more than 0.05 s", "in row 20")
+    for name in ("tip_pose", "ft_wrench"):
+        made = tables()
+        made[name][[5, 6]] = made[name][[6, 5]]
+        fails(mit_log(tmp_path, made), f"stamps of {name} that do not go back at all", "in row 6")
+
+
+def test_an_object_lost_for_long_is_not_seen(tmp_path):
+    lost = np.linspace(-0.3, 0.8, 34)
+    lost = lost[(lost < 0.15) | (lost > 0.15 + LONGEST_GAP)]
+    (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
+    before, after = lost[lost < 0.15][-1], lost[lost > 0.15][0]
+    hidden = (push.time > before + 1e-6) & (push.time < after - 1e-6)
+    np.testing.assert_array_equal(push.seen, ~hidden)
+    assert np.isnan(push.pose[hidden]).all()
+    assert push.seen[[0, -1]].all()
+    assert 0 < hidden.sum() < len(hidden)
+    # samples that contain no numbers are left out
+    made = tables()
+    made["object_pose"][(made["object_pose"][:, 0] > START + 0.15) & (made["object_pose"][:, 0] < START + 0.66), 1:] = (
+        np.nan
+    )
+    np.testing.assert_array_equal(load_recordings(mit_log(tmp_path, made)).pushes[0].seen, push.seen)
+
+
+def test_a_push_begins_and_ends_where_the_object_is_seen(tmp_path):
+    lost = np.array([-0.3, 0.31, 0.33, 0.5, 0.6, 1.5])
+    (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
+    assert push.seen.all()
+    np.testing.assert_allclose(known(push.time)[[0, -1]], [0.325, 0.6], atol=1e-6)
+
+
+def test_streams_that_do_not_overlap(tmp_path):
+    later = np.linspace(5.0, 6.0, 20)
+    text = (
+        "expected streams that overlap in time, found tip_pose from 0.000 s to 1.000 s and {} from 5.000 s to 6.000 s"
+    )
+    fails(mit_log(tmp_path, tables(body=later)), text.format("object_pose"))
+    fails(mit_log(tmp_path, tables(wrench=later)), text.format("ft_wrench"))
+    fails(mit_log(tmp_path, tables(body=np.array([-1.0, 0.01]))), "seen at two samples of tip_pose at least, found 0")
+    made = tables()
+    made["object_pose"][:, 1:] = np.nan
+    fails(mit_log(tmp_path, made), "seen at two samples of tip_pose at least, found 0")
+
+
+@KINDS
+@pytest.mark.parametrize(
+    ("name", "row", "column", "words"),
+    [
+        ("tip_pose", 7, 1, "for hand_x, found none in row 7 of tip_pose"),
+        ("ft_wrench", 0, 2, "for force_y, found none in row 0 of ft_wrench"),
+        ("object_pose", 3, 0, "for time, found none in row 3 of object_pose"),
+        ("object_pose", 3, 3, "for object_theta (or none of"),
+    ],
+)
+def test_streams_with_nan(tmp_path, suffix, name, row, column, words):
+    made = tables()
+    made[name][row, column] = np.nan
+    error = fails(mit_log(tmp_path, made, suffix), "no usable push", words)
+    assert error.push == 0
+
+
+@pytest.mark.parametrize("suffix", [".json", ".h5"])
+def test_logs_of_another_layout(tmp_path, suffix):
+    made = tables()
+    fails(
+        mit_log(tmp_path, {**made, "tip_pose": made["tip_pose"][:, :3]}, suffix), "tip_pose to have rows of 4 numbers"
+    )
+    fails(mit_log(tmp_path, {**made, "tip_pose": made["tip_pose"][:0]}, suffix), "tip_pose")
+    fails(mit_log(tmp_path, {**made, "tip_pose": made["tip_pose"][:1]}, suffix), "at least two samples in tip_pose")
+    fails(
+        mit_log(tmp_path, {"poses": made["tip_pose"]}, suffix), "found no tip_pose, object_pose, ft_wrench, but poses"
+    )
+    fails(mit_log(tmp_path, {}, suffix), "but nothing")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[1, 2]", "expected a JSON object with tip_pose, object_pose, ft_wrench, found a list"),
+        ('{"tip_pose": [[1, 2, 3, 4], [1, 2]], "object_pose": [], "ft_wrench": []}', "something else: row 1 is [1, 2]"),
+        ('{"tip_pose": "x", "object_pose": [], "ft_wrench": []}', "tip_pose to have rows of 4 numbers"),
+        ('{"tip_pose": {"t": 1}, "object_pose": [], "ft_wrench": []}', "tip_pose to have rows of 4 numbers"),
+        ("[" * 100_000, "expected a JSON log of a push, found something else"),
+        ("\ufeff{", "expected a JSON log of a push, found something else"),
+        (" ", "expected a JSON log of a push, found something else"),
+    ],
+)
+def test_json_that_is_no_log(tmp_path, text, words):
+    path = tmp_path / "log.json"
+    path.write_text(text)
+    fails(path, words)
+
+
+def test_archives_of_streams_that_are_none(tmp_path):
+    made = tables()
+    path = mit_log(tmp_path, made, ".npz")
+    with np.load(path) as archive:
+        content = dict(archive)
+    for change, words in (
+        ({"tip_xy": content["tip_xy"][1:]}, "expected tip_xy of shape (41, 2), found (40, 2)"),
+        ({"ft_t": content["ft_t"][None]}, "expected ft_t of shape (51,), found (1, 51)"),
+        ({"object_pose": content["object_pose"].astype(str)}, "expected numbers in object_pose"),
+        ({"vertices_body": np.ones(4)}, "expected vertices_body of shape"),
+        ({"rho": np.array(np.nan)}, "expected finite numbers in rho"),
+    ):
+        fails(saved(tmp_path, {**content, **change}), words)
+    del content["ft_t"]
+    fails(saved(tmp_path, content), "found no ft_t")
+
+
+def test_hdf5_without_its_reader(tmp_path, monkeypatch):
+    path = mit_log(tmp_path, tables(), ".h5")
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    fails(path, "h5py", "pip install '.[hdf5]'")
+    assert "h5py" not in vars(sys.modules["pushjax.datasets.mit"])
+
+
+# --- detection of the kind of file ---
+
+
+def test_the_kind_is_told_by_content_before_the_name(tmp_path):
+    for suffix in (".h5", ".npz"):
+        wrong = tmp_path / "named.csv"
+        shutil.copy(mit_log(tmp_path, tables(), suffix), wrong)
+        assert len(load_recordings(wrong).pushes) == 1
+    zipped = tmp_path / "log.csv"
+    zipped.write_bytes(gzip.compress(b"An unrelated text\n"))
+    fails(zipped, "expected the number of pushes")
+
+
+def test_files_of_no_kind(tmp_path):
+    fails(tmp_path / "absent.csv", "cannot read the file: No such file")
+    fails(tmp_path, "cannot read the file: Is a directory")
+    for suffix in (".csv", ".npz", ".json", ".h5", ".txt", ".gz", ""):
+        empty = tmp_path / f"empty{suffix}"
+        empty.touch()
+        fails(empty, "found an empty file")
+    junk = bytes(range(128, 256)) * 20
+    for suffix, words in (
+        (".csv", "expected a table in UTF-8 text"),
+        (".npz", "expected an .npz archive of pushes"),
+        (".json", "expected a JSON log of a push"),
+        (".h5", "expected an HDF5 log of a push"),
+        (".txt", "expected the number of pushes"),
+        (".bag", "by its suffix: .csv, .npz, .json, .h5, .hdf5, .txt, .gz; found '.bag'"),
+        ("", "by its suffix: .csv, .npz, .json, .h5, .hdf5, .txt, .gz; found none"),
+    ):
+        path = tmp_path / f"junk{suffix}"
+        path.write_bytes(junk)
+        fails(path, words)
+    saved(tmp_path, {"poses": np.ones(3)}, "other.npz")
+    fails(tmp_path / "other.npz", "expected arrays of pushes", "found the arrays poses")
+    np.save(tmp_path / "single.npy", np.ones(3))
+    shutil.copy(tmp_path / "single.npy", tmp_path / "single.npz")
+    fails(tmp_path / "single.npz", "found a single array")
+
+
+@pytest.mark.parametrize("suffix", [".json", ".h5", ".npz"])
+def test_files_cut_short_or_damaged_never_fail_otherwise(tmp_path, suffix, rng):
+    whole = mit_log(tmp_path, tables(), suffix).read_bytes()
+    path = tmp_path / f"damaged{suffix}"
+    for part in np.linspace(0.01, 0.99, 25):
+        path.write_bytes(whole[: int(part * len(whole))])
+        fails(path)
+    for at in rng.integers(0, len(whole), 150):
+        path.write_bytes(whole[:at] + bytes([int(rng.integers(256))]) + whole[at + 1 :])
+        try:
+            found = load_recordings(path)
+        except LogError:
+            continue
+        assert np.isfinite(found.pushes[0].hand).all()

@@ -1,0 +1,182 @@
+"""Programs are compiled once, and traced while Python's garbage collector is paused."""
+
+import gc
+import signal
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax._internal import jit as _programs
+from pushjax._internal.jit import jit, outermost, quick_jit, without_gc
+
+
+@pytest.fixture
+def collector(monkeypatch):
+    """Enable the collector with its default settings and nothing frozen, and restore it afterwards.
+
+    The restoration is not exact: if anything was frozen before, all objects alive at the end are frozen.
+    """
+    on, aside, threshold = gc.isenabled(), gc.get_freeze_count(), gc.get_threshold()
+    gc.enable()
+    gc.unfreeze()
+    gc.set_threshold(700, 10, 10)
+    monkeypatch.setattr(_programs, "ASIDE", 0)
+    yield gc
+    gc.set_threshold(*threshold)
+    if aside:
+        gc.freeze()
+    if not on:
+        gc.disable()
+
+
+def many() -> list[list[int]]:
+    """Create more new objects than a call that traces nothing."""
+    return [[k] for k in range(2 * _programs.MANY)]
+
+
+def test_the_collector_pauses_for_the_call_and_only_for_it(collector):
+    seen = []
+    assert without_gc(lambda x, *, y: seen.append(collector.isenabled()) or x + y)(1, y=2) == 3
+    assert seen == [False]
+    assert collector.isenabled()
+
+
+def test_the_collector_is_on_again_after_an_error(collector):
+    def fails():
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError, match="no"):
+        without_gc(fails)()
+    assert collector.isenabled()
+
+
+def test_a_collector_that_was_off_stays_off(collector):
+    collector.disable()
+    without_gc(lambda: None)()
+    assert not collector.isenabled()
+    # a program that is called by another one leaves the collector off for the rest of the outer call
+    collector.enable()
+    after = []
+    without_gc(lambda: (without_gc(lambda: None)(), after.append(collector.isenabled())))()
+    assert after == [False]
+    assert collector.isenabled()
+
+
+def test_many_objects_made_in_a_call_are_old_after_it(collector):
+    kept = without_gc(many)()
+    assert any(one is kept[0] for one in collector.get_objects(generation=2))
+    assert collector.get_freeze_count() == 0
+
+
+def test_what_was_put_aside_stays_aside_and_nothing_is_added(collector):
+    collector.freeze()
+    before = collector.get_freeze_count()
+    kept = without_gc(many)()
+    assert before - 100 < collector.get_freeze_count() <= before
+    assert len(kept) == 2 * _programs.MANY
+
+
+def test_calls_that_make_little_leave_the_collector_to_its_work(collector):
+    """Cyclic garbage that is created between calls does not accumulate."""
+
+    class Cycle:
+        def __init__(self):
+            self.itself = self
+
+    call = without_gc(lambda: None)
+    for _ in range(3000):
+        for _ in range(20):
+            Cycle()
+        call()
+    assert sum(isinstance(one, Cycle) for one in collector.get_objects()) < 3000
+
+
+def test_the_collector_is_on_again_after_an_interrupt(collector):
+    """An interrupt may come at any point of the call."""
+    end = time.monotonic() + 1
+    interrupts = 0
+    previous = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    call = without_gc(lambda: None)
+    try:
+        while time.monotonic() < end:
+            try:
+                signal.setitimer(signal.ITIMER_REAL, 1e-4)
+                while True:
+                    call()
+            except KeyboardInterrupt:
+                interrupts += 1
+                assert collector.isenabled()
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, previous)
+    assert interrupts > 100
+
+
+def test_a_program_is_traced_once_for_all_values_of_arrays():
+    traces = []
+
+    @jit
+    def power(x, exponent):
+        traces.append(exponent)
+        return x**exponent
+
+    assert float(power(jnp.asarray(3.0), 2)) == 9
+    assert float(power(jnp.asarray(4.0), 2)) == 16
+    assert float(power(jnp.asarray(2.0), 3)) == 8
+    assert traces == [2, 3]
+    assert power.__name__ == "power"
+
+
+@quick_jit
+def squared(x, power=2):
+    return {"value": x**power}
+
+
+def test_what_compiles_quickly_works_within_everything():
+    """By itself it has compiler options of its own, which JAX rejects inside `jit`; both work."""
+    plain = squared(jnp.array(3.0))["value"]
+    assert plain == 9
+    assert jax.jit(lambda x: squared(x)["value"])(3.0) == 9
+    assert jax.jit(lambda: squared(jnp.array(3.0))["value"])() == 9  # applied to a constant
+    assert jax.grad(lambda x: squared(x)["value"])(3.0) == 6
+    assert jax.jit(jax.hessian(lambda x: squared(x)["value"]))(3.0) == 2
+    assert jax.grad(jax.checkpoint(lambda x: squared(x)["value"]))(3.0) == 6
+    assert jax.vmap(lambda x: squared(x, power=3)["value"])(jnp.arange(3.0)).tolist() == [0, 1, 8]
+    last, _ = jax.lax.scan(lambda x, _: (squared(x)["value"], None), 3.0, length=2)
+    assert last == 81
+
+
+def test_whether_anything_is_traced():
+    seen = []
+
+    def look(x):
+        seen.append(outermost())
+        return x
+
+    look(1.0)
+    jax.jit(look)(1.0)
+    jax.grad(look)(1.0)
+    jax.vmap(look)(jnp.ones(2))
+    look(1.0)
+    assert seen == [True, False, False, False, True]
+
+
+def test_what_is_known_compiles_nothing(caplog):
+    """Shapes, supports and paths compile nothing; op by op, each new shape of an array would compile programs."""
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        block = pj.Polygon.rectangle(0.0913, 0.0607)
+        pj.Polygon([(0, 0), (0.05, 0.05), (0.0917, 0)])
+        support = pj.Support.points(np.random.default_rng(0).uniform(size=(37, 2)), load=2.0)
+        assert float(support.radius_of_gyration) > 0
+        assert support.center.shape == (2,)
+        assert float(block.area) > 0
+        assert block.centroid.shape == (2,)
+        assert pj.line((0.0, 0.1, 0.2), (0.1, 0.2, 0.3), 37).shape == (38, 3)
+        known = list(caplog.records)
+        jax.jit(lambda x: x + 37)(1.0)
+    assert len(caplog.records) > len(known)
+    assert [record.getMessage() for record in known if "ompil" in record.getMessage()] == []

@@ -1,0 +1,1 @@
+"""Independent implementations that give the same answers, to compare with in tests."""

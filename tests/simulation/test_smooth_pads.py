@@ -1,0 +1,146 @@
+"""Pads against smooth outlines: the points that face them, when they meet, and where a jaw closes."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax._math.vec import Vec2
+from pushjax.experiments.grasps.sliders import butterfly
+from pushjax.simulation.detection import OUT_OF_REACH, FingerPose, contact_candidates, penetration_depth, time_of_impact
+from pushjax.simulation.hand import Pad
+
+SEMI = np.array([0.02, 0.014])
+LENGTH = 0.015
+
+
+def wavy() -> pj.Curve:
+    """Return a curve with four hollows of different depths."""
+    angle = 2 * np.pi * np.arange(32) / 32
+    r = 0.02 + 0.003 * np.cos(4 * angle) + 0.001 * np.cos(3 * angle)
+    return pj.Curve.through(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
+
+
+def shapes():
+    return {"ellipse": pj.Ellipse(*SEMI, center=(0.002, -0.001)), "curve": wavy(), "butterfly": butterfly().shape}
+
+
+def dense(shape, count=40_000) -> np.ndarray:
+    return np.asarray(shape.boundary(count))
+
+
+@pytest.mark.parametrize("name", ["ellipse", "curve", "butterfly"])
+def test_facing_is_every_place_that_stands_out(name):
+    """`facing` finds all local maxima of the height over a direction where a dense outline is convex, and no others."""
+    shape = shapes()[name]
+    points, found = dense(shape), jax.jit(lambda d: shape.outline().facing(d))
+    # the axes of the ellipse and of the butterfly are where their pieces join
+    for angle in (*np.linspace(0.01, 6.2, 12), *(k * np.pi / 2 for k in range(4))):
+        d = np.array([np.cos(angle), np.sin(angle)])
+        height = points @ d
+        # the outward normal: clockwise from the direction of travel
+        velocity = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+        outward = velocity[:, 1] * d[0] - velocity[:, 0] * d[1] > 0
+        peaks = (height > np.roll(height, 1)) & (height >= np.roll(height, -1)) & outward
+        facing = found(Vec2.of(jnp.asarray(d)))
+        mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.real)]
+        assert len(np.unique(np.round(mine / 1e-5), axis=0)) >= peaks.sum() > 0
+        apart = np.linalg.norm(mine[:, None] - points[peaks][None], axis=-1)
+        assert np.all(apart.min(axis=1) < 1e-5)
+        assert np.all(apart.min(axis=0) < 1e-5)
+
+
+def test_derivatives_of_facing():
+    outline = wavy().outline()
+
+    def point(angle):
+        facing = outline.facing(Vec2(jnp.cos(angle), jnp.sin(angle)))
+        return jnp.stack([jnp.where(facing.real, facing.point.x, 0.0), jnp.where(facing.real, facing.point.y, 0.0)])
+
+    angle, h = 0.7, 1e-6
+    slope = jax.jit(jax.jacfwd(point))(angle)
+    np.testing.assert_allclose(slope, (point(angle + h) - point(angle - h)) / (2 * h), atol=1e-8)
+    assert np.abs(np.asarray(slope)).max() > 1e-3
+
+
+def pad() -> Pad:
+    return pj.Hand.parallel_jaw(0.027, 0.010).fingers[0]
+
+
+def inside(points: np.ndarray, bounds, center, turn: float) -> float:
+    """Return the deepest overlap by brute force: outline points in the pad, from `bounds`, about `center`."""
+    cos, sin = np.cos(turn), np.sin(turn)
+    local = (points - center) @ np.array([[cos, -sin], [sin, cos]])
+    return float(np.max(np.minimum(local - bounds[0], bounds[1] - local).min(axis=1)))
+
+
+def placed(x, y, turn) -> FingerPose:
+    return FingerPose(Vec2(jnp.asarray(x), jnp.asarray(y)), Vec2(jnp.asarray(np.cos(turn)), jnp.asarray(np.sin(turn))))
+
+
+@pytest.mark.parametrize("name", ["ellipse", "butterfly"])
+def test_meets_where_brute_force_does(name, rng):
+    shape, finger = shapes()[name], pad()
+    outline, points, bounds = shape.outline(), dense(shape, 4000), [np.asarray(b) for b in finger.shape.bounds]
+    met = jax.jit(lambda at, path: time_of_impact(finger, outline, at, path, jnp.asarray(LENGTH)))
+    deep = jax.jit(lambda at: penetration_depth(finger, outline, at))
+    hits = 0
+    for _ in range(25):
+        turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
+        at, path = placed(aside, 0.04, turn), Vec2(jnp.asarray(rng.uniform(-0.01, 0.01)), jnp.asarray(-0.05))
+        start = float(met(at, path))
+        shares, begin, way = np.linspace(0, 1, 101), np.array([aside, 0.04]), np.array([float(path.x), float(path.y)])
+        depth = np.array([inside(points, bounds, begin + share * way, turn) for share in shares])
+        first = shares[np.argmax(depth > 0)] if (depth > 0).any() else 1.0
+        hits += start < 1
+        # brute force uses outline points only, and detects late a corner that enters between two of them
+        assert start - 0.002 <= first <= start + 0.0125 or (first == 1.0 and start > 0.98)
+        touching = placed(*(begin + start * way), turn)
+        if start < 1:
+            assert abs(float(deep(touching))) < 1e-9
+    assert hits > 10
+
+
+@pytest.mark.parametrize("name", ["ellipse", "butterfly"])
+def test_places_are_at_their_distance(name):
+    """With a pad over the outline, contacts lie on it, at their stated distance from the pad along the normal."""
+    shape, finger = shapes()[name], pad()
+    still = Vec2(jnp.zeros(()), jnp.zeros(()))
+    seen = jax.jit(lambda at: contact_candidates(finger, shape.outline(), at, still, jnp.asarray(LENGTH)))
+    deep = jax.jit(lambda at: penetration_depth(finger, shape.outline(), at))
+    for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
+        at = placed(aside, 0.025, turn)
+        touches = seen(at)
+        near = np.flatnonzero(np.asarray(touches.distance) < OUT_OF_REACH / 2)
+        assert near.size
+        points = dense(shape)
+        for k in near:
+            point = np.array([float(touches.point.x[k]), float(touches.point.y[k])])
+            assert np.linalg.norm(points - point, axis=1).min() < 1e-5
+            assert np.hypot(float(touches.normal.x[k]), float(touches.normal.y[k])) == pytest.approx(1)
+        assert min(float(d) for d in touches.distance) == pytest.approx(-float(deep(at)), abs=1e-9)
+
+
+def test_a_jaw_closes_to_the_width():
+    """A wide jaw closes to the ellipse's width.
+
+    In float32, the opening is never less than the width of the ellipse at its angle. It ends at that width, near the
+    short axis.
+    """
+    dtype = "float32"
+    slider = pj.Slider(pj.Ellipse(*SEMI.astype(dtype)), pj.Ellipsoid(np.eye(3, dtype=dtype), np.asarray(LENGTH, dtype)))
+    hand = pj.Hand.parallel_jaw(np.asarray(0.08, dtype), np.asarray(0.01, dtype))
+    path = np.linspace((0, 0, 0, 0.05), (0, 0, 0, 0.027), 400).astype(dtype)
+    poses = np.array([(0, 0.003, 0.9), (0.004, -0.002, -0.4), (0, 0, 1.3)], dtype)
+    mu = jnp.asarray(0.1, dtype)
+    grasps = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, hand, path, pose=pose, friction=mu)))(poses)
+    assert not np.asarray(grasps.failed).any()
+    assert np.all(np.asarray(grasps.status[:, -1]) == pj.Status.GRASPED)
+    pose, opening = np.asarray(grasps.pose, float), np.asarray(grasps.configuration, float)[..., 3]
+    width = 2 * np.hypot(SEMI[0] * np.sin(pose[..., 2]), SEMI[1] * np.cos(pose[..., 2]))
+    assert np.all(opening >= width - 5e-6)
+    step = 0.023 / 399
+    np.testing.assert_allclose(opening[:, -1], width[:, -1], atol=1.1 * step)
+    # friction of 0.1 leaves this tilt
+    assert np.all(np.abs(pose[:, -1, 2]) < 0.2)
