@@ -21,7 +21,7 @@ from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.options import cli_option
 from pushjax._internal.progress_bar import progress_bar
 from pushjax._internal.record import write_json
-from pushjax.datasets import find_data
+from pushjax.cli.main import data_folder
 
 TimedCase = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling", "fit", "monte_carlo", "outline"]
 TIMED = {
@@ -128,7 +128,7 @@ class Study:
     out: Path = Path("pushjax-out")
     """Folder for pictures, and for what is known so far."""
     json: Annotated[Path | None, cli_option("FILE")] = None
-    """File for every figure that is printed."""
+    """File for every figure that is printed. Default: NAME.json in --out."""
     seed: int = 0
     """Seed of everything random."""
 
@@ -170,12 +170,9 @@ def _study(name: str) -> Callable:
 
     def run(given: Study, progress: Callable, keep: Callable) -> Result:
         study = import_module(f"benchmarks.robot.{name.removeprefix('table1_')}")
-        folder = given.data or find_data()
-        if folder is None:
-            raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
         chosen = {part: getattr(given, part) for part in ("surface", "object", "steps")}
         chosen = {part: value for part, value in chosen.items() if value is not None}
-        record = study.run(folder, given.seed, given.out, progress=progress, **chosen)
+        record = study.run(data_folder(given.data), given.seed, given.out, progress=progress, **chosen)
         return record, study.summary(record)
 
     return run
@@ -222,8 +219,11 @@ def main(arguments: list[str]) -> None:
         with progress_bar() as progress:
             record, text = run(given, progress, keep)
         print(text)
+        if isinstance(given, Study) and given.json is None:
+            given.json = given.out / f"{record['experiment']}.json"
         keep(record)
         if isinstance(given, Study):
+            print(f"wrote {given.json}")
             CellCache.delete(record["experiment"], given.out)
         if isinstance(given, Timed) and record["slower"]:
             raise ValueError(f"slower than {given.baseline}: see above")

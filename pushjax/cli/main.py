@@ -154,10 +154,7 @@ def _reproduce(command: Reproduce, progress: ProgressCallback) -> Result:
     if "friction" in given and name != "capture" and len(given["friction"]) != 2:
         raise ValueError(f"--friction: {name} takes two, lowest and highest; got {len(given['friction'])}")
     if "data" in takes:
-        folder = given.pop("data", None) or find_data()
-        if folder is None:
-            raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
-        given["folder"] = folder
+        given["folder"] = data_folder(given.pop("data", None))
     if name not in ("squeeze", "jam"):
         given["progress"] = progress
     experiment: Any
@@ -169,6 +166,18 @@ def _reproduce(command: Reproduce, progress: ProgressCallback) -> Result:
         experiment = import_module(f"pushjax.experiments.{name.replace('-', '_')}")
     record = experiment.run(seed=command.seed, out=command.out, **given)
     return record, experiment.summary(record)
+
+
+def data_folder(given: Path | None) -> Path:
+    """Return the folder of the recorded pushes: the given one, else the one that `find_data` finds.
+
+    Raises:
+        ValueError: If there is none.
+    """
+    folder = given or find_data()
+    if folder is None:
+        raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
+    return folder
 
 
 def _identify(command: Identify, progress: Reporter) -> Result:
