@@ -23,12 +23,16 @@ from pushjax._internal.progress_bar import progress_bar
 from pushjax._internal.record import write_json
 from pushjax.cli.main import data_folder
 
-TimedCase = Literal["push", "ellipsoid", "gradient", "grasp", "solve", "sampling", "fit", "monte_carlo", "outline"]
+TimedCase = Literal[
+    "push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo", "outline"
+]
 TIMED = {
     "push": "pushes of a square, 50 mm, in as few steps as 0.1 mm takes",
     "ellipsoid": "the same, with an ellipsoid for a limit surface",
     "gradient": "their derivatives by surface, path and friction",
     "grasp": "two fingers close on the square",
+    "t": "pushes of a T, of its convex hull, and into an inner corner of the T",
+    "hands": "pushes with two fingers side by side, and grasps of the square by a parallel jaw",
     "solve": "random contact problems, of one to eight contacts",
     "sampling": "random limit surfaces",
     "fit": "limit surfaces from 400 pairs",

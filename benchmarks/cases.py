@@ -14,6 +14,8 @@ from benchmarks.timing import on_cpu
 from pushjax.testing.problems import random_contacts_problem
 
 TILE = 4000  # pushes of a larger batch that are computed together, so that their data stay in the cache
+MANY_STEPS = 8  # of a push or grasp whose error is not measured
+SPACING = 0.03  # distance between the centers of two fingers that push side by side, m
 PAIRS = 400  # wrench-twist pairs of a fit
 
 
@@ -92,6 +94,68 @@ def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False
         surface = tasks.task("quartic", dtype).slider.surface
         name, args = "grasp_surfaces", (*args, _surfaces(surface, jax.random.key(0), batch))
     return Work(name, dtype, batch, steps, final, args, by_steps.get(steps))
+
+
+def push_t(dtype: str, batch: int, where: str = "side") -> Work:
+    """Make a program for the final poses of random pushes of a T by 50 mm, each with its own path and friction.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of pushes.
+        where: "side" for the pushes of the square, here on the bar of the T. "hull" for the same on the convex hull of
+            the T. "corner" for pushes into an inner corner, where every finger touches bar and stem.
+    """
+    here = tasks.task("quartic", dtype)
+    block = tasks.cast(tasks.t_block(hull=where == "hull"), dtype)
+    here = here._replace(slider=pj.Slider(block, here.slider.surface))
+    _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)
+    if where == "corner":
+        start = jnp.array([-tasks.SIDE / 4 + tasks.RADIUS, tasks.SIDE / 8 + tasks.RADIUS], dtype)
+        diagonal = jnp.array([[-1, -1], [1, -1]], dtype) / 2**0.5  # from the normal of the side to that of the corner
+        path = start + (path - path[:, :1]) @ diagonal
+
+    def final(*args):
+        return in_tiles(lambda *each: here.push(*each).pose[-1], args, batch)
+
+    name = {"side": "push_t", "hull": "push_t_hull", "corner": "push_t_corner"}[where]
+    return Work(name, dtype, batch, MANY_STEPS, final, (path, friction))
+
+
+def push_two_fingers(dtype: str, batch: int) -> Work:
+    """Make a program for the final poses of random pushes of the square by two fingers side by side, by 50 mm.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of pushes.
+    """
+    here = tasks.task("quartic", dtype)._replace(hand=grasps.hand(dtype))
+    _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)
+    path = path.at[..., 1].multiply(0.5)  # both fingers stay on the side
+    still = jnp.zeros_like(path[..., 0])
+    path = jnp.stack([path[..., 0], path[..., 1], still, still + SPACING], axis=-1)
+
+    def final(*args):
+        return in_tiles(lambda *each: here.push(*each).pose[-1], args, batch)
+
+    return Work("push_two_fingers", dtype, batch, MANY_STEPS, final, (path, friction))
+
+
+def grasp_jaw(dtype: str, batch: int) -> Work:
+    """Make a program for the final poses of random grasps of the askew square by a parallel jaw.
+
+    The jaw closes as the two fingers of `grasp` do, by their distance between centers less a diameter.
+
+    Args:
+        dtype: Floating type.
+        batch: Number of grasps.
+    """
+    one, (pose, path) = each_grasp(tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype), dtype, batch, MANY_STEPS)
+    path = path.at[..., 3].add(-2 * tasks.RADIUS)
+
+    def final(*args):
+        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
+
+    return Work("grasp_jaw", dtype, batch, MANY_STEPS, final, (pose, path))
 
 
 def solve(dtype: str, batch: int, contacts: int) -> Work:

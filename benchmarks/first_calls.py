@@ -239,16 +239,11 @@ def work(case: str, dtype: str) -> tuple:
 
 def push_of_t(dtype: str):
     """Return the function of one push of a T, which is as large as the square, against its bar."""
-    import numpy as np
-
     import pushjax as pj
     from benchmarks import tasks
 
-    bar, stem = -tasks.SIDE / 4, tasks.SIDE / 8
-    upper = [(tasks.SIDE / 2, stem), (bar, stem), (bar, tasks.SIDE / 2), (-tasks.SIDE / 2, tasks.SIDE / 2)]
-    shape = pj.Polygon(np.array(upper + [(x, -y) for x, y in reversed(upper)]))
     task = tasks.task("quartic", dtype)
-    task = task._replace(slider=pj.Slider(tasks.cast(shape, dtype), task.slider.surface))
+    task = task._replace(slider=pj.Slider(tasks.cast(tasks.t_block(), dtype), task.slider.surface))
     return lambda path, friction: task.push(path, friction)
 
 

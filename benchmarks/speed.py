@@ -18,6 +18,8 @@ CASES: dict[str, tuple[Make, ...]] = {
     "ellipsoid": (partial(cases.push, model="ellipsoid"),),
     "gradient": (cases.gradient,),
     "grasp": (cases.grasp, partial(cases.grasp, varied=True)),
+    "t": tuple(partial(cases.push_t, where=where) for where in ("side", "hull", "corner")),
+    "hands": (cases.push_two_fingers, cases.grasp_jaw),
     "solve": tuple(partial(cases.solve, contacts=m) for m in range(1, 9)),
     "sampling": (cases.sampling,),
     "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),

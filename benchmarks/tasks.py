@@ -48,6 +48,14 @@ def square(model: str) -> pj.Slider:
     return pj.Slider(block, pj.fit_limit_surface(*pairs, degree={"quartic": 4, "ellipsoid": 2}[model]))
 
 
+def t_block(hull: bool = False) -> pj.Polygon:
+    """Return a T as large as the square, with its bar at the side that is pushed, or its convex hull."""
+    bar, stem, half = -SIDE / 4, SIDE / 8, SIDE / 2
+    inner = [] if hull else [(bar, stem)]
+    upper = [(half, stem), *inner, (bar, half), (-half, half)]
+    return pj.Polygon(np.array(upper + [(x, -y) for x, y in reversed(upper)]))
+
+
 def task(model: str, dtype: str) -> Task:
     """Return the push of the square with the limit surface `model`, in `dtype`."""
     return cast(Task(square(model), pj.Hand.finger(RADIUS), jnp.zeros(3)), dtype)

@@ -14,7 +14,15 @@ from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import update_if
 
-TILE = 128  # examples that are computed together
+TILE = 128  # examples that are computed together on a CPU, so that their data stay in the cache
+# The same on an accelerator. There a tile costs the start of its kernels, whatever its size: on an H200, 100 000 grasps
+# take 10 s in tiles of 128 and a quarter of a second in tiles of 8192.
+ACCELERATOR_TILE = 1 << 17
+
+
+def tile_size() -> int:
+    """Return the number of examples that are computed together on the default backend."""
+    return TILE if jax.default_backend() == "cpu" else ACCELERATOR_TILE
 
 
 def only_where(needed: Bool[Array, ""], work: Callable[..., Any], instead: Any, *args: Any) -> Any:
@@ -98,7 +106,7 @@ def _in_tiles(work: Callable[..., Any], own: Any, needed, instead, args):
         args: Arguments of `work`.
     """
     size = needed.shape[0]
-    tile = min(TILE, size)
+    tile = min(tile_size(), size)
     count = jnp.sum(needed.astype(jnp.int32))
     # Indices of the examples that need the computation, then `size` as padding. A padded entry of a tile computes the
     # last example again (`which`), and its result is dropped, because its index (`at`) is out of range.

@@ -27,7 +27,8 @@ from pushjax.simulation.monte_carlo_result import MonteCarlo
 from pushjax.simulation.monte_carlo_tiles import Devices, Outcome, Setup, fetch, placed, submit
 from pushjax.simulation.rollout import Slider, checked_rollout_arguments, checked_table
 
-TILE = 2048
+TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
+ACCELERATOR_TILE = 1 << 18  # the same for an accelerator, whose kernels take long to start but compute many at once
 GRAIN = 64  # a tile for fewer pushes is a multiple of this
 # At most this is between two files of a checkpoint: pushes, and s; in both cases plus the rest of a round.
 BLOCK, PATIENCE = 16 * TILE, 20.0
@@ -69,8 +70,8 @@ def monte_carlo(
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
         trajectories: Whether to keep every pose of every push (12 bytes a step in float32), not only the last.
-        batch_size: Number of pushes that a device computes at once, in one compiled program. Default 2048, or for fewer
-            pushes the next multiple of 64.
+        batch_size: Number of pushes that a device computes at once, in one compiled program. Default 2048 on a
+            CPU and 262 144 on an accelerator, or for fewer pushes the next multiple of 64.
         devices: Devices to use. By default all, including those of other processes (`jax.distributed`), which must then
             all make the same call.
         checkpoint: Folder in which finished pushes are kept; all processes must have access to it. A run that finds its
@@ -93,14 +94,15 @@ def monte_carlo(
         raise TypeError(
             "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
         )
-    for name, value in (("n", n), ("batch_size", TILE if batch_size is None else batch_size)):
+    for name, value in (("n", n), ("batch_size", 1 if batch_size is None else batch_size)):
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
     n = int(n)
     slider, hand, p, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
-    width = int(batch_size) if batch_size is not None else min(TILE, -(-n // GRAIN) * GRAIN)
     raw, impl = _raw(key)
     on = Devices.of(devices)
+    tile = TILE if on.mine[0].platform == "cpu" else ACCELERATOR_TILE
+    width = int(batch_size) if batch_size is not None else min(tile, -(-n // GRAIN) * GRAIN)
     if on.several:
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         multihost_utils.sync_global_devices("pushjax monte_carlo")
