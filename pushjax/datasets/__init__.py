@@ -1,10 +1,10 @@
 """Loaders of published push logs. They use NumPy only and return SI units."""
 
-from pushjax.datasets.folder import find_data as find_data
+from pushjax.datasets.data_folder import find_data as find_data
 from pushjax.datasets.load import load_recordings as load_recordings
 from pushjax.datasets.mit_folder import find_mit_pushes as find_mit_pushes
 from pushjax.datasets.mit_folder import load_mit_folder as load_mit_folder
-from pushjax.datasets.mit_names import PushName as PushName
+from pushjax.datasets.mit_names import PushParameters as PushParameters
 from pushjax.datasets.mit_names import parse_push_name as parse_push_name
 from pushjax.datasets.mit_pushes import MitPushes as MitPushes
 from pushjax.datasets.mit_pushes import StraightPushes as StraightPushes
@@ -19,5 +19,5 @@ from pushjax.datasets.pushes import PushLog as PushLog
 from pushjax.datasets.pushes import contact_onset as contact_onset
 from pushjax.datasets.pushes import force_filter as force_filter
 from pushjax.datasets.recordings import Recordings as Recordings
-from pushjax.datasets.tidy import load_push_npz as load_push_npz
 from pushjax.datasets.triangle import load_triangle_log as load_triangle_log
+from pushjax.datasets.triangle_archive import load_push_npz as load_push_npz

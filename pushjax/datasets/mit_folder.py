@@ -23,37 +23,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets.mit import load_mit_hdf5, load_mit_json
-from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushName, parse_push_name
+from pushjax.datasets.mit_logs import load_mit_hdf5, load_mit_json
+from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushParameters, parse_push_name
 from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, wrap_to_pi
 from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
 from pushjax.datasets.pushes import Floats, LogError, rotation
 from pushjax.datasets.recordings import interpolated
 
-LEAST = 10  # smallest number of pushes, of which a few are used for training
+MIN_PUSHES = 10  # smallest number of pushes, of which a few are used for training
 SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
-# Fractions of the time. Before the first, the finger may not touch the object yet. After the second, the tip may have
-# stopped.
-MIDDLE = (0.1, 0.9)
-PARTS = 6
-# While the tip travels JUMP_PATH (m), a pushed object moves by much less than JUMP (m) and turns by much less than
-# JUMP_TURN (rad).
-JUMP_PATH, JUMP, JUMP_TURN = 0.005, 0.020, np.deg2rad(30)
-# Parts of a push with less motion than LEAST_MOTION (m) or less force than LEAST_FORCE (N) carry no information about
-# friction. Neither do parts whose force is farther than WIDEST_CONE (rad) from the contact normal. The force of a
+# Fractions of the duration between which pushes are tested and wrenches are taken. Before the first, the finger may not
+# touch the object yet. After the second, the tip may have stopped.
+MIDDLE_PART = (0.1, 0.9)
+NUM_PARTS = 6  # parts of that time, each of which gives one pair of wrench and twist
+# While the tip travels JUMP_WINDOW (m), a pushed object moves by much less than MAX_WINDOW_MOTION (m) and turns by much
+# less than MAX_WINDOW_TURN (rad). A tracker that reports more has jumped.
+JUMP_WINDOW, MAX_WINDOW_MOTION, MAX_WINDOW_TURN = 0.005, 0.020, np.deg2rad(30)
+# Parts of a push with less motion than MIN_MOTION (m) or less force than MIN_FORCE (N) carry no information about
+# friction. Neither do parts whose force is farther than MAX_FORCE_ANGLE (rad) from the contact normal. The force of a
 # sliding tip is some 15 deg from it. A larger angle may come from an offset of the force sensor: in a third of the logs
 # of rect1 on plywood at 100 mm/s, the offset is 1.6 N, with or without contact.
-LEAST_MOTION, LEAST_FORCE, WIDEST_CONE = 0.0002, 0.1, np.deg2rad(30)
+MIN_MOTION, MIN_FORCE, MAX_FORCE_ANGLE = 0.0002, 0.1, np.deg2rad(30)
 # The rules of the curated archives for pushes whose tracker can be trusted:
-# - At the start, the tip is less than MOST_GAP (m) from the outline, outside or inside.
-# - At the end, it is less than MOST_OVERLAP (m) inside the outline.
-# - The object moves farther than the tip by at most MOST_AHEAD (m).
-# - The object turns by less than MOST_TURN (rad).
-# - The path of the tip is longer than LEAST_PATH times the median path.
-MOST_GAP, MOST_OVERLAP, MOST_AHEAD, MOST_TURN, LEAST_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
+# - At the start, the tip is less than MAX_GAP (m) from the outline, outside or inside.
+# - At the end, it is less than MAX_OVERLAP (m) inside the outline.
+# - The object moves farther than the tip by at most MAX_AHEAD (m).
+# - The object turns by less than MAX_TURN (rad).
+# - The path of the tip is longer than MIN_PATH times the median path.
+MAX_GAP, MAX_OVERLAP, MAX_AHEAD, MAX_TURN, MIN_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
 
 
-def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> list[tuple[PushName, Path]]:
+def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> list[tuple[PushParameters, Path]]:
     """Find the files of one object's pushes in a folder and the folders below it.
 
     Of several files with the same name, JSON is preferred to HDF5. Files with names of another form are ignored.
@@ -69,7 +69,7 @@ def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> li
     Raises:
         LogError: If the folder is missing, or if it has no file of that object on that surface.
     """
-    return _named(Path(folder), surface, shape)[0]
+    return _find_files(Path(folder), surface, shape)[0]
 
 
 def load_mit_folder(
@@ -78,7 +78,7 @@ def load_mit_folder(
     shape: str,
     *,
     speed: float = 0.010,
-    fast: float = 0.020,
+    fast_speed: float = 0.020,
     train_share: float = 0.3,
     seed: int = 0,
     progress: ProgressCallback = no_progress,
@@ -94,8 +94,8 @@ def load_mit_folder(
             own.
         surface: Name of the surface, as in the file names.
         shape: Name of the object, as in the file names; one of MIT_SHAPES.
-        speed: Speed of the pushes in `whole`, in m/s. Files with neither this speed nor `fast` are not read.
-        fast: Speed of the pushes in `fast`, in m/s.
+        speed: Speed of the pushes in `whole`, in m/s. Files with neither this speed nor `fast_speed` are not read.
+        fast_speed: Speed of the pushes in `fast`, in m/s.
         train_share: Fraction of `whole` to use for training, drawn at random. The rest is `middle`.
         seed: Seed of that draw.
         progress: Called after each file with the number of files read and the number of files to read.
@@ -109,14 +109,14 @@ def load_mit_folder(
         ValueError: If the outline of the shape is unknown, if the speeds are equal, or if `train_share` is not between
             0 and 1.
     """
-    about = mit_shape(shape)
+    body = mit_shape(shape)
     if not 0 < train_share < 1:
         raise ValueError(f"train_share must be between 0 and 1; got {train_share}")
-    if abs(speed - fast) < SAME_SPEED:
-        raise ValueError(f"speed and fast must differ; got {speed} and {fast}")
-    found, misnamed = _named(Path(folder), surface, shape)
+    if abs(speed - fast_speed) < SAME_SPEED:
+        raise ValueError(f"speed and fast_speed must differ; got {speed} and {fast_speed}")
+    found, misnamed = _find_files(Path(folder), surface, shape)
     steady = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
-    read: dict[float, list[_Push]] = {speed: [], fast: []}
+    read: dict[float, list[_Push]] = {speed: [], fast_speed: []}
     problems = list(misnamed)
     wanted = [(at, *each) for each in steady for at in read if abs(each[1].speed - at) < SAME_SPEED]
     for done, (at, index, name, path) in enumerate(wanted):
@@ -125,28 +125,28 @@ def load_mit_folder(
         except LogError as error:
             problems.append(error)
         progress(done + 1, len(wanted))
-    whole, quick = read[speed], read[fast]
-    if len(whole) < LEAST:
+    whole, fast = read[speed], read[fast_speed]
+    if len(whole) < MIN_PUSHES:
         raise _too_few(Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), steady, problems)
-    learned = np.zeros(len(whole), bool)
+    is_training = np.zeros(len(whole), bool)
     count = int(np.clip(round(train_share * len(whole)), 1, len(whole) - 1))
-    learned[np.random.default_rng(seed).permutation(len(whole))[:count]] = True
-    tested = np.flatnonzero(~learned)
-    pushes = _straight(whole, (0.0, 1.0), about)
-    taught = np.flatnonzero(learned & pushes.valid)
-    pairs = np.array([pair for row in taught for pair in _pairs(whole[row], about)]).reshape(-1, 2, 3)
+    is_training[np.random.default_rng(seed).permutation(len(whole))[:count]] = True
+    test_rows = np.flatnonzero(~is_training)
+    pushes = _push_group(whole, (0.0, 1.0), body)
+    training_rows = np.flatnonzero(is_training & pushes.valid)
+    pairs = np.array([pair for row in training_rows for pair in _training_pairs(whole[row], body)]).reshape(-1, 2, 3)
     log = MitPushes(
         whole=pushes,
-        middle=_straight([whole[row] for row in tested], MIDDLE, about),
-        fast=_straight(quick, (0.0, 1.0), about),
-        learned=learned,
-        middle_of=tested.astype(np.int64),
-        repeats=_repeats(quick, whole),
+        middle=_push_group([whole[row] for row in test_rows], MIDDLE_PART, body),
+        fast=_push_group(fast, (0.0, 1.0), body),
+        is_training=is_training,
+        middle_of=test_rows.astype(np.int64),
+        repeats=_repeats(fast, whole),
         wrench=pairs[:, 0],
         twist=pairs[:, 1],
-        vertices=about.vertices,
-        length=about.length,
-        tip_radius=about.tip_radius,
+        vertices=body.vertices,
+        length=body.length,
+        tip_radius=body.tip_radius,
         surface=surface,
         shape=shape,
         source=str(folder),
@@ -167,7 +167,7 @@ class _Push(NamedTuple):
     """
 
     index: int
-    name: PushName
+    name: PushParameters
     time: Floats
     tip: Floats
     pose: Floats
@@ -184,7 +184,7 @@ class _Push(NamedTuple):
         return interpolated(when, self.time, self.pose), interpolated(when, self.time, self.tip)
 
 
-def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName, Path]], list[LogError]]:
+def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushParameters, Path]], list[LogError]]:
     """Return what `find_mit_pushes` returns, and an error for each misnamed file of the same surface and object."""
     if not folder.is_dir():
         raise LogError(folder, "expected a folder of the MIT pushing data set, found none")
@@ -192,7 +192,7 @@ def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName,
     logs = [path for path in files if path.suffix.lower() in SUFFIXES and path.name.startswith(PREFIX)]
     wrong: list[LogError] = []
     there: dict[tuple[str, str], set[str]] = {}
-    found: dict[str, tuple[PushName, Path]] = {}
+    found: dict[str, tuple[PushParameters, Path]] = {}
     for path in sorted(logs, key=lambda path: SUFFIXES.index(path.suffix.lower())):
         try:
             name = parse_push_name(path)
@@ -205,18 +205,18 @@ def _named(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName,
             found.setdefault(path.stem, (name, path))
     if not found:
         raise LogError(
-            folder, _nothing(surface, shape, there, [path for path in files if path.suffix.lower() == ".zip"])
+            folder, _describe_missing(surface, shape, there, [path for path in files if path.suffix.lower() == ".zip"])
         )
-    return sorted(found.values(), key=_order), wrong
+    return sorted(found.values(), key=_sort_key), wrong
 
 
-def _order(named: tuple[PushName, Path]) -> tuple[float, ...]:
+def _sort_key(named: tuple[PushParameters, Path]) -> tuple[float, ...]:
     """Return the key by which pushes are sorted."""
     _, _, *numbers, repetition = named[0]
     return (*numbers, -1 if repetition is None else repetition)
 
 
-def _nothing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
+def _describe_missing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
     """Describe what was found in place of the wanted files."""
     wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
     if there:
@@ -228,17 +228,17 @@ def _nothing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], z
 
 
 def _too_few(
-    folder: Path, what: str, count: int, steady: list[tuple[int, PushName, Path]], problems: list[LogError]
+    folder: Path, what: str, count: int, steady: list[tuple[int, PushParameters, Path]], problems: list[LogError]
 ) -> LogError:
     """Make the error for a folder with too few usable pushes."""
     speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in steady})) or "none"
-    message = f"expected at least {LEAST} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
+    message = f"expected at least {MIN_PUSHES} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
     if problems:
         message += f"; {len(problems)} files cannot be used: {Path(problems[0].path).name}: {problems[0].message}"
     return LogError(folder, message)
 
 
-def _read(index: int, name: PushName, path: Path) -> _Push:
+def _read(index: int, name: PushParameters, path: Path) -> _Push:
     """Read the push of a file.
 
     Raises:
@@ -247,13 +247,13 @@ def _read(index: int, name: PushName, path: Path) -> _Push:
     (push,) = (load_mit_json if path.suffix.lower() == ".json" else load_mit_hdf5)(path).pushes
     assert push.force is not None  # these files always have force and time
     assert push.time is not None
-    rows = _known(path, push.time, push.seen & np.isfinite(push.force[:, 0]))
+    rows = _known_span(path, push.time, push.seen & np.isfinite(push.force[:, 0]))
     time, tip, pose = push.time[rows], push.hand[rows], push.pose[rows]
     _check_no_jump(path, time, tip, pose)
     return _Push(index, name, time, tip, pose, push.force[rows])
 
 
-def _known(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
+def _known_span(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
     """Return the range from the first to the last sample (m,) that is known.
 
     Raises:
@@ -279,20 +279,20 @@ def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
         LogError: If it jumps.
     """
     travel = float(np.linalg.norm(tip[-1] - tip[0]))
-    window = len(time) if travel <= JUMP_PATH else max(2, round(len(time) * JUMP_PATH / travel))
+    window = len(time) if travel <= JUMP_WINDOW else max(2, round(len(time) * JUMP_WINDOW / travel))
     ranges = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
     distance, turn = np.hypot(ranges[:, 0], ranges[:, 1]), ranges[:, 2]
-    worst = np.maximum(distance / JUMP, turn / JUMP_TURN)
+    worst = np.maximum(distance / MAX_WINDOW_MOTION, turn / MAX_WINDOW_TURN)
     row = int(np.argmax(worst))
     if worst[row] > 1:
         found = f"{1e3 * distance[row]:.0f} mm and {np.rad2deg(turn[row]):.0f} deg"
-        limits = f"{1e3 * JUMP:g} mm and {np.rad2deg(JUMP_TURN):.0f} deg"
-        where = f"while the tip goes {1e3 * JUMP_PATH:g} mm"
+        limits = f"{1e3 * MAX_WINDOW_MOTION:g} mm and {np.rad2deg(MAX_WINDOW_TURN):.0f} deg"
+        where = f"while the tip goes {1e3 * JUMP_WINDOW:g} mm"
         message = f"expected an object that moves by less than {limits} {where}, found {found} from {time[row]:.2f} s"
         raise LogError(path, f"{message}: the tracker jumps")
 
 
-def _straight(pushes: Sequence[_Push], shares: tuple[float, float], about: MitShape) -> StraightPushes:
+def _push_group(pushes: Sequence[_Push], shares: tuple[float, float], body: MitShape) -> StraightPushes:
     """Make a group of pushes from the states at two fractions of the duration."""
     ends = [push.at(shares) for push in pushes]
     pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
@@ -300,27 +300,27 @@ def _straight(pushes: Sequence[_Push], shares: tuple[float, float], about: MitSh
     start, end = pose[:, 0], pose[:, 1]
     end[:, 2] = start[:, 2] + wrap_to_pi(end[:, 2] - start[:, 2])
     index = np.array([push.index for push in pushes], np.int64)
-    return StraightPushes(index, start, end, tip[:, 0], tip[:, 1], _believable(pose, tip, about), toolbox={})
+    return StraightPushes(index, start, end, tip[:, 0], tip[:, 1], _is_trustworthy(pose, tip, body), toolbox={})
 
 
-def _believable(pose: Floats, tip: Floats, about: MitShape) -> NDArray[np.bool_]:
+def _is_trustworthy(pose: Floats, tip: Floats, body: MitShape) -> NDArray[np.bool_]:
     """Return whether the tracker can be trusted in each of k pushes.
 
     Args:
         pose: (k, 2, 3) poses of the object before and after each push, in m and rad.
         tip: (k, 2, 2) centers of the tip before and after each push, in m.
-        about: The object.
+        body: The object.
     """
     if not len(pose):
         return np.zeros(0, bool)
     before, after = (
-        nearest_on_outline(about.vertices, _in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - about.tip_radius
+        nearest_on_outline(body.vertices, _in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - body.tip_radius
         for end in (0, 1)
     )
     moved, path = (np.linalg.norm(each[:, 1, :2] - each[:, 0, :2], axis=1) for each in (pose, tip))
-    touching = (np.abs(before) < MOST_GAP) & (after > -MOST_OVERLAP)
-    pushed = (moved - path <= MOST_AHEAD) & (np.abs(pose[:, 1, 2] - pose[:, 0, 2]) < MOST_TURN)
-    return touching & pushed & (path > LEAST_PATH * np.median(path))
+    touching = (np.abs(before) < MAX_GAP) & (after > -MAX_OVERLAP)
+    pushed = (moved - path <= MAX_AHEAD) & (np.abs(pose[:, 1, 2] - pose[:, 0, 2]) < MAX_TURN)
+    return touching & pushed & (path > MIN_PATH * np.median(path))
 
 
 def _in_body(pose: Floats, vectors: Floats) -> Floats:
@@ -328,7 +328,7 @@ def _in_body(pose: Floats, vectors: Floats) -> Floats:
     return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
 
 
-def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
+def _training_pairs(push: _Push, body: MitShape) -> Iterator[tuple[Floats, Floats]]:
     """Iterate over the wrenches and displacements of the parts in which the finger pushes.
 
     Yields:
@@ -336,13 +336,13 @@ def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
             body frame at the middle of the part.
     """
     tip, force = _in_body(push.pose, push.tip - push.pose[:, :2]), _in_body(push.pose, push.force)
-    distance, contact = nearest_on_outline(about.vertices, tip)
+    distance, contact = nearest_on_outline(body.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
     torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
-    shares = np.linspace(*MIDDLE, 2 * PARTS + 1)
+    shares = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
     poses, _ = push.at(shares)
     rows = np.searchsorted(push.time, push.when(shares))
-    for part in range(0, 2 * PARTS, 2):
+    for part in range(0, 2 * NUM_PARTS, 2):
         within = slice(rows[part], rows[part + 2])
         if within.start == within.stop:
             continue
@@ -350,10 +350,10 @@ def _pairs(push: _Push, about: MitShape) -> Iterator[tuple[Floats, Floats]]:
         moved = poses[part + 2] - poses[part]
         wrench = np.append(to_body @ push.force[within].mean(axis=0), torque[within].mean())
         twist = np.append(to_body @ moved[:2], moved[2])
-        motion = np.linalg.norm(twist[:2]) + about.length * abs(twist[2])
-        presses = np.abs(np.arctan2(across[within].mean(), along[within].mean())) < WIDEST_CONE
-        strong = np.linalg.norm(wrench[:2]) >= LEAST_FORCE
-        if presses and strong and motion >= LEAST_MOTION and wrench @ twist > 0:
+        motion = np.linalg.norm(twist[:2]) + body.length * abs(twist[2])
+        presses = np.abs(np.arctan2(across[within].mean(), along[within].mean())) < MAX_FORCE_ANGLE
+        strong = np.linalg.norm(wrench[:2]) >= MIN_FORCE
+        if presses and strong and motion >= MIN_MOTION and wrench @ twist > 0:
             yield wrench, twist
 
 
@@ -366,16 +366,16 @@ def _repeats(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]
     """Return the rows (r, 2) in `fast` and `whole` of the same nominal push with the nearest repetition."""
     rows: dict[tuple[float, ...], list[int]] = {}
     for row, push in enumerate(whole):
-        rows.setdefault(_action(push), []).append(row)
+        rows.setdefault(_nominal_push(push), []).append(row)
     found = []
     for row, push in enumerate(fast):
-        same = rows.get(_action(push), [])
+        same = rows.get(_nominal_push(push), [])
         if same:
             found.append((row, min(same, key=lambda at: abs(_repetition(whole[at]) - _repetition(push)))))
     return np.array(found, np.int64).reshape(-1, 2)
 
 
-def _action(push: _Push) -> tuple[float, ...]:
+def _nominal_push(push: _Push) -> tuple[float, ...]:
     """Return side, fraction and angle, which are equal in repetitions of a push."""
     return push.name.side, push.name.fraction, push.name.angle
 

@@ -6,7 +6,7 @@ The fields are:
 
 - `surface` and `shape`: names of the surface and of the object.
 - `a` and `v`: acceleration in mm/s^2 and speed in mm/s.
-- `i`, `s` and `t`: side, fraction and angle in rad; see `PushName`.
+- `i`, `s` and `t`: side, fraction and angle in rad; see `PushParameters`.
 - `rep`: number of the repetition, present only for repeated pushes.
 
 Reference: Yu, Bauza, Fazeli, Rodriguez, "More than a million ways to be pushed", IROS 2016.
@@ -28,7 +28,7 @@ _NUMBERS = ("a", "v", "i", "s", "t")
 _FIELD = re.compile(r"_([a-z]+)=(.*?)(?=_[a-z]+=|$)")
 
 
-class PushName(NamedTuple):
+class PushParameters(NamedTuple):
     """The parameters of a push, as given in its file name.
 
     Attributes:
@@ -52,7 +52,7 @@ class PushName(NamedTuple):
     repetition: int | None
 
 
-def parse_push_name(path: str | PathLike[str]) -> PushName:
+def parse_push_name(path: str | PathLike[str]) -> PushParameters:
     """Parse the name of a file, which need not exist.
 
     Fields may be in any order. Unknown fields are ignored.
@@ -74,7 +74,7 @@ def parse_push_name(path: str | PathLike[str]) -> PushName:
         wanted = f"expected a name like {PREFIX}abs_shape=rect1_a=0_v=10_i=0.000_s=0.500_t=0.000"
         raise LogError(path, f"{wanted}; found none of {', '.join(missing)}")
     acceleration, speed, side, fraction, angle = (_number(path, fields, key) for key in _NUMBERS)
-    return PushName(
+    return PushParameters(
         surface=fields["surface"],
         shape=fields["shape"],
         acceleration=acceleration / 1e3,

@@ -66,7 +66,7 @@ class MitPushes(NamedTuple):
         whole: Complete pushes.
         middle: The test pushes, from 10 to 90 % of their duration.
         fast: The same pushes at higher speed; no pushes if none was recorded.
-        learned: (whole,) whether a push of `whole` is used for training.
+        is_training: (whole,) whether a push of `whole` is a training push.
         middle_of: (middle,) row in `whole` of the same push.
         repeats: (r, 2) row in `fast`, and row in `whole` of the same nominal push.
         wrench: (m, 3) wrenches on the object, in the body frame about the body origin, of any scale. Each row, with the
@@ -83,7 +83,7 @@ class MitPushes(NamedTuple):
     whole: StraightPushes
     middle: StraightPushes
     fast: StraightPushes
-    learned: NDArray[np.bool_]
+    is_training: NDArray[np.bool_]
     middle_of: NDArray[np.int64]
     repeats: NDArray[np.int64]
     wrench: Floats
@@ -145,7 +145,7 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
         whole=whole,
         middle=middle,
         fast=fast,
-        learned=~data["full_in_eval"].astype(bool),
+        is_training=~data["full_in_eval"].astype(bool),
         middle_of=np.array([rows[int(index)] for index in data["eval_to_full"]], np.int64),
         repeats=np.array(repeats, np.int64).reshape(-1, 2),
         wrench=floats(data["train_wrench"])[used],
@@ -192,5 +192,9 @@ def _finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
 
 
 def wrap_to_pi(angle: Floats) -> Floats:
-    """Wrap angles, in rad, to [-pi, pi)."""
+    """Wrap angles, in rad, to [-pi, pi).
+
+    `pushes.wrap_angle` wraps to (-pi, pi] and rounds differently. Both are kept, because the poses that are read from
+    the two data sets would otherwise change in their last bits.
+    """
     return (angle + np.pi) % (2 * np.pi) - np.pi

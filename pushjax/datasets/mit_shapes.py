@@ -40,7 +40,7 @@ class MitShape(NamedTuple):
     """The outline of an object, and the tip that pushes it.
 
     Attributes:
-        vertices: (v, 2) vertices in m, body frame, counter-clockwise.
+        vertices: (v, 2) vertices in m, body frame, counterclockwise.
         length: Characteristic length, in m, which weighs rotation against translation: the mean distance of the
             vertices from their mean.
         tip_radius: Radius of the tip, in m.

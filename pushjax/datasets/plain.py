@@ -14,7 +14,7 @@ import numpy as np
 
 from pushjax.datasets._archive import Arrays, floats, read_archive
 from pushjax.datasets.pushes import Floats, LogError
-from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, checked, gathered
+from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, check_recording, collect
 from pushjax.datasets.records import Fault, quoted
 
 # Columns of a table: all of _REQUIRED, and each group of _FURTHER either as a whole or not at all.
@@ -67,7 +67,7 @@ def load_csv(path: Path) -> Recordings:
     label = names.index(_PUSH)
     # Rows that are too short to have a label form a push of their own, which becomes a problem.
     pushes = groupby(rows, key=lambda row: row.cells[label].strip() if label < len(row.cells) else "")
-    return gathered(path, (_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
+    return collect(path, (_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
 
 
 def _rows(path: Path) -> Iterator[_Row]:
@@ -117,7 +117,7 @@ def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recordi
     def columns(wanted: tuple[str, ...]) -> Floats:
         return np.array([[row[name] for name in wanted] for row in numbers], dtype=np.float64)
 
-    return checked(
+    return check_recording(
         path,
         index,
         columns(tuple(name for name in HAND if name in names)),
@@ -189,10 +189,10 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
     def row(name: str, index: int) -> Floats | None:
         return numbers[name][index] if name in numbers else None
 
-    return gathered(
+    return collect(
         path,
         (
-            checked(path, index, hand, pose[index], force=row("force", index), time=row("time", index))
+            check_recording(path, index, hand, pose[index], force=row("force", index), time=row("time", index))
             for index, hand in enumerate(numbers["path"])
         ),
     )

@@ -19,11 +19,11 @@ OBJECT = ("object_x", "object_y", "object_theta")
 FORCE = ("force_x", "force_y")
 # Largest object angle, in turns from zero; a larger one is taken to be in degrees. This is tested before unwrapping,
 # because unwrapped degrees look like any other angle.
-TURNS = 2
+MAX_TURNS = 2
 
 
-class InDegrees(LogError):
-    """The error for a push whose angles cannot be in rad."""
+class AnglesInDegrees(LogError):
+    """The error for a push whose angles are so large that they are probably in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,10 +128,10 @@ def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
+def collect(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
     """Collect the results of all pushes of a file.
 
-    If more than a quarter of the results are `InDegrees`, all other pushes become such errors too.
+    If more than a quarter of the results are `AnglesInDegrees`, all other pushes become such errors too.
 
     Args:
         path: The file.
@@ -144,10 +144,10 @@ def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
         LogError: If no push is usable.
     """
     each = list(found)
-    if 4 * sum(isinstance(one, InDegrees) for one in each) > len(each):
+    if 4 * sum(isinstance(one, AnglesInDegrees) for one in each) > len(each):
         # The others only seem to be in rad, because their angles in degrees are small.
         message = "the angles of many other pushes of the file cannot be in rad: are all in degrees?"
-        each = [InDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
+        each = [AnglesInDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
     problems = tuple(one for one in each if isinstance(one, LogError))
     pushes = tuple(one for one in each if isinstance(one, Recording))
     if not pushes:
@@ -155,7 +155,7 @@ def gathered(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
     return Recordings(pushes, problems, str(path))
 
 
-def checked(
+def check_recording(
     path: Path,
     index: int,
     hand: Floats,
@@ -194,9 +194,9 @@ def checked(
         return problem
     seen = np.isfinite(pose[:, 0])
     largest = float(np.max(np.abs(pose[seen, 2])))
-    if largest > TURNS * 2 * np.pi:
+    if largest > MAX_TURNS * 2 * np.pi:
         message = f"object_theta is up to {largest:.4g} rad; expected at most two turns from zero: is it in degrees?"
-        return InDegrees(path, message, push=index, line=lines[0] if lines else None)
+        return AnglesInDegrees(path, message, push=index, line=lines[0] if lines else None)
     pose, hand = pose.copy(), hand.copy()
     pose[seen, 2] = np.unwrap(pose[seen, 2])
     if hand.shape[1] > 2:
@@ -207,14 +207,17 @@ def checked(
 def _first_problem(
     hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, wrong: Callable[[str, int], LogError]
 ) -> LogError | None:
-    """Find the first fault in the arrays of `checked`; `wrong` makes an error of a message and a row of the push."""
-    columns = [(hand_names(hand.shape[1]), hand, False), (OBJECT, pose, True)]
+    """Find the first fault in the arrays of `check_recording`.
+
+    `wrong` makes an error of a message and a row of the push.
+    """
+    columns = [(hand_columns(hand.shape[1]), hand, False), (OBJECT, pose, True)]
     if force is not None:
         columns.append((FORCE, force, True))
     if time is not None:
         columns.append((("time",), time[:, None], False))
     for names, values, may_lack in columns:
-        fault = bad_number(names, values, may_lack)
+        fault = find_bad_number(names, values, may_lack)
         if fault is not None:
             return wrong(*fault)
     for row, where in ((0, "first"), (len(pose) - 1, "last")):
@@ -228,12 +231,12 @@ def _first_problem(
     return None
 
 
-def hand_names(dof: int) -> tuple[str, ...]:
+def hand_columns(dof: int) -> tuple[str, ...]:
     """Return the names (dof,) of the columns of a hand's configuration."""
     return (*HAND[:dof], *(f"hand_{column}" for column in range(len(HAND), dof)))
 
 
-def bad_number(names: Sequence[str], values: Floats, may_lack: bool) -> tuple[str, int] | None:
+def find_bad_number(names: Sequence[str], values: Floats, may_lack: bool) -> tuple[str, int] | None:
     """Find the first row with a number that is not finite or too large.
 
     Args:

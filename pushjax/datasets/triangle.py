@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pushjax.datasets import arrangement as setup
+from pushjax.datasets import triangle_setup
 from pushjax.datasets.pushes import (
     Floats,
     LogError,
@@ -31,14 +31,14 @@ from pushjax.datasets.records import Fault, Record, read_records
 # The norms of logged quaternions deviate from one by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
 QUATERNION_TOLERANCE = 0.01
 # Broken trials have one to three samples per push. Complete ones have some 670 force and 220 robot samples.
-FEWEST_SAMPLES = 4
+MIN_SAMPLES = 4
 # A finger that moves less than this (m) has no clear direction, because its path is logged with a resolution of 0.1 mm.
-SHORTEST_TRAVEL = 0.001
-# The motion capture has jumped in two cases. (1) The object moved more than MOST_MOTION (m, as |dx| + length |dtheta|),
-# which is more than the finger can push it. (2) At the end, the finger is more than MOST_GAP (m) away from the line of
+MIN_TRAVEL = 0.001
+# The motion capture has jumped in two cases. (1) The object moved more than MAX_MOTION (m, as |dx| + length |dtheta|),
+# which is more than the finger can push it. (2) At the end, the finger is more than MAX_GAP (m) away from the line of
 # the edge that it pushes on.
-MOST_MOTION = 0.060
-MOST_GAP = 0.003
+MAX_MOTION = 0.060
+MAX_GAP = 0.003
 
 
 def load_triangle_log(
@@ -72,7 +72,7 @@ def load_triangle_log(
     """
     file = Path(path)
     name, points = _support(file, arrangement, support_points)
-    normal_force = setup.support_force(points)
+    normal_force = triangle_setup.support_force(points)
     pushes: list[Push] = []
     problems: list[LogError] = []
     for record in read_records(file):
@@ -91,12 +91,12 @@ def load_triangle_log(
     return PushLog(
         pushes=tuple(pushes),
         problems=tuple(problems),
-        vertices=setup.VERTICES.copy(),
-        length=setup.LENGTH,
-        tip_radius=setup.TIP_RADIUS,
+        vertices=triangle_setup.VERTICES.copy(),
+        length=triangle_setup.LENGTH,
+        tip_radius=triangle_setup.TIP_RADIUS,
         support_points=points,
         support_force=normal_force,
-        surface=surface if surface is not None else setup.name_surface(file),
+        surface=surface if surface is not None else triangle_setup.name_surface(file),
         arrangement=name,
         source=str(file),
     )
@@ -104,12 +104,12 @@ def load_triangle_log(
 
 def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
     """Return the name of the arrangement and its support points (p, 2), from the arguments or else the names."""
-    name, known = setup.name_support(path) or (setup.UNKNOWN, np.empty((0, 2)))
+    name, known = triangle_setup.name_support(path) or (triangle_setup.UNKNOWN, np.empty((0, 2)))
     if arrangement is not None:
-        name, known = arrangement, setup.support_points(arrangement)
+        name, known = arrangement, triangle_setup.support_points(arrangement)
     if points is not None:
         known = np.array(points, dtype=np.float64).reshape(-1, 2)
-        name = arrangement if arrangement is not None else setup.UNKNOWN
+        name = arrangement if arrangement is not None else triangle_setup.UNKNOWN
     return name, known
 
 
@@ -141,8 +141,8 @@ def _check(record: Record) -> None:
         ("force", record.force, record.line + 2),
         ("robot", record.robot, robot_count_line),
     ):
-        if len(table) < FEWEST_SAMPLES:
-            raise Fault(f"expected at least {FEWEST_SAMPLES} {what} samples, found {len(table)}", line)
+        if len(table) < MIN_SAMPLES:
+            raise Fault(f"expected at least {MIN_SAMPLES} {what} samples, found {len(table)}", line)
     _check_quaternions(record.poses[:, 3:], record.line, "object pose")
     _check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
     _check_clock(record.force[:, 0], record.force_line, "force")
@@ -185,17 +185,17 @@ def _check_motion(push: Push, line: int) -> None:
         Fault: If a condition is violated.
     """
     travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
-    if not travel >= SHORTEST_TRAVEL:
+    if not travel >= MIN_TRAVEL:
         raise Fault(
-            f"expected the finger to move at least {SHORTEST_TRAVEL * 1e3:g} mm, found {travel * 1e3:.2g} mm",
+            f"expected the finger to move at least {MIN_TRAVEL * 1e3:g} mm, found {travel * 1e3:.2g} mm",
             line,
         )
     moved = push.pose_end - push.pose_start
-    deviation = float(np.hypot(moved[0], moved[1]) + setup.LENGTH * abs(moved[2]))
+    deviation = float(np.hypot(moved[0], moved[1]) + triangle_setup.LENGTH * abs(moved[2]))
     gap = _end_gap(push)
     # The condition is negated so that it also fails for NaN, which very large numbers can give.
-    if not (deviation <= MOST_MOTION and abs(gap) <= MOST_GAP):
-        expected = f"less than {MOST_MOTION * 1e3:g} mm and to end within {MOST_GAP * 1e3:g} mm of the finger"
+    if not (deviation <= MAX_MOTION and abs(gap) <= MAX_GAP):
+        expected = f"less than {MAX_MOTION * 1e3:g} mm and to end within {MAX_GAP * 1e3:g} mm of the finger"
         found = f"{deviation * 1e3:.4g} mm and {gap * 1e3:.4g} mm"
         raise Fault(f"the motion capture jumped: expected the object to move {expected}, found {found}", line)
 
@@ -208,11 +208,11 @@ def _end_gap(push: Push) -> float:
 
 def _edge_distances(pose: Floats, point: Floats) -> Floats:
     """Return the signed distances (3,) of a world point from the lines of the edges, positive outside."""
-    edge = np.roll(setup.VERTICES, -1, axis=0) - setup.VERTICES
+    edge = np.roll(triangle_setup.VERTICES, -1, axis=0) - triangle_setup.VERTICES
     # The vertices are in clockwise order, so the outside is to the left of an edge.
     outward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     in_body = rotation(pose[2]).T @ (point - pose[:2])
-    return np.sum((in_body - setup.VERTICES) * outward, axis=1)
+    return np.sum((in_body - triangle_setup.VERTICES) * outward, axis=1)
 
 
 def _push(record: Record) -> Push:
@@ -225,7 +225,7 @@ def _push(record: Record) -> Push:
     tip = record.robot[:, 1:3] / 1000
     yaw = continuous_angle(_yaw(record.robot[:, 4:]))
     # The sensor measures in the finger's frame, which turns a little during the push.
-    in_tool = setup.FORCE_SIGN * record.force[:, 1:] @ setup.R_TOOL.T
+    in_tool = triangle_setup.FORCE_SIGN * record.force[:, 1:] @ triangle_setup.R_TOOL.T
     force = np.einsum("kij,kj->ki", rotation(np.interp(force_time, tip_time, yaw)), in_tool - in_tool[0])
     return Push(
         index=record.index,
@@ -250,7 +250,7 @@ def _body_pose(row: Floats) -> Floats:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         ]
     )
-    position = row[:2] / 1000 + matrix @ setup.CENTER_OF_MASS
+    position = row[:2] / 1000 + matrix @ triangle_setup.CENTER_OF_MASS
     return np.append(position, wrap_angle(_yaw(row[None, 3:]))[0])
 
 

@@ -133,13 +133,14 @@ def stick_deviation(
         (...,) deviations, in m.
     """
     before, after = (
-        _seen(np.asarray(hand), np.asarray(pose)) for hand, pose in ((hand_start, pose_start), (hand_end, pose_end))
+        _in_hand_frame(np.asarray(hand), np.asarray(pose))
+        for hand, pose in ((hand_start, pose_start), (hand_end, pose_end))
     )
     change = after - before
     return np.hypot(change[..., 0], change[..., 1]) + length * np.abs(wrap_angle(change[..., 2]))
 
 
-def _seen(hand: NDArray, pose: NDArray) -> Floats:
+def _in_hand_frame(hand: NDArray, pose: NDArray) -> Floats:
     """Return the poses of the object in the frame of the hand."""
     away = np.einsum("...ji,...j->...i", rotation(hand[..., 2]), pose[..., :2] - hand[..., :2])
     return np.concatenate([away, (pose[..., 2] - hand[..., 2])[..., None]], axis=-1)

@@ -16,22 +16,22 @@ from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.motion import Animation
-from pushjax.plot.parts import placed, vertices
-from pushjax.plot.style import BETWEEN, BLUE, END, GREEN, MM, ORANGE, START, STYLE, legend_below, row
-from pushjax.plot.tracks import Moved, Track, fingers_along, track_of
+from pushjax.plot.parts import placed_outline, vertices
+from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, RED, STYLE, legend_below, panel_row
+from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
 from pushjax.simulation.hand import Hand
 
-LONGEST = 0.4  # length of the arrow of the largest force, in units of the slider's size
-WEAKEST = 1e-3  # weaker forces are not drawn, in units of the largest
-PANEL_WIDTH, HEIGHT_AROUND = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
+MAX_ARROW_LENGTH = 0.4  # length of the arrow of the largest force, in units of the slider's size
+MIN_FORCE = 1e-3  # weaker forces are not drawn, in units of the largest
+PANEL_WIDTH, EXTRA_HEIGHT = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
 LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
-RIM = 0.04  # width of the empty rim, in units of what is shown
+MARGIN = 0.04  # width of the empty margin, in units of what is shown
 
 
 def animate(
     shape: Shape,
     hand: Hand,
-    pushes: Moved | Mapping[str, Moved],
+    pushes: Animatable | Mapping[str, Animatable],
     *,
     measured: Mapping[str, np.ndarray] | None = None,
     forces: bool = True,
@@ -48,10 +48,10 @@ def animate(
         shape: Outline of the slider.
         hand: The hand.
         pushes: One push, or several by name, all of that shape and hand: trajectories of `rollout`, or recordings
-            (`Recorded`), which are shown without forces.
+            (`RecordedPush`), which are shown without forces.
         measured: Poses (points, 3) by the name of a push, world, m and rad. They are drawn dashed over that push.
-        forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend says how
-            large the longest arrow is.
+        forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
+            the largest force.
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.
 
@@ -69,11 +69,11 @@ def animate(
     unknown = sorted(set(over) - set(by_name))
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
-    tracks = [track_of(shape, hand, push, over.get(name), forces) for name, push in by_name.items()]
+    tracks = [drawn_push(shape, hand, push, over.get(name), forces) for name, push in by_name.items()]
     moments = _frame_fractions(tracks, frames)
     largest = max(track.largest for track in tracks)
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(tracks), PANEL_WIDTH, PANEL_WIDTH + HEIGHT_AROUND, shared=True)
+        figure, all_axes = panel_row(len(tracks), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
         panels = [_Panel(axes, track, largest) for axes, track in zip(all_axes, tracks, strict=True)]
         for axes, name in zip(all_axes, by_name, strict=True):
             axes.set_title(name, pad=18)  # leaves room for the words below it
@@ -94,7 +94,7 @@ def animate_cloud(
     shape: Shape,
     hand: Hand,
     path: Any,
-    trajectory: np.ndarray,
+    trajectories: np.ndarray,
     *,
     title: str = "",
     frames: int = 60,
@@ -102,13 +102,14 @@ def animate_cloud(
 ) -> Animation:
     """Animate many pushes along one path at once.
 
-    The picture shows the outlines of all pushes, faint, the paths of their centers, the start, and the hand.
+    The picture shows faint outlines of all pushes, the paths of their centers, the start, and the hand.
 
     Args:
         shape: Outline of the slider.
         hand: The hand.
         path: (steps + 1, dof), configurations of the hand.
-        trajectory: (pushes, steps + 1, 3), poses as `monte_carlo(..., trajectories=True)` keeps them, world, m and rad.
+        trajectories: (pushes, steps + 1, 3), poses as `monte_carlo(..., trajectories=True)` keeps them, world frame, m
+            and rad.
         title: Title of the picture.
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.
@@ -119,31 +120,31 @@ def animate_cloud(
     Raises:
         ValueError: If there are fewer than two frames, or the path is of another length than the trajectories.
     """
-    poses, fingers = np.asarray(trajectory, float), fingers_along(hand, path)
+    poses, fingers = np.asarray(trajectories, float), fingers_along(hand, path)
     if poses.ndim != 3 or len(fingers[0]) != poses.shape[1]:
         raise ValueError(
-            f"trajectory has shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
+            f"trajectories have shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
         )
-    lines = placed(vertices(shape), poses)
-    steps = _equally(poses.shape[1] - 1, frames).round().astype(int)
-    faint = float(np.clip(12 / len(poses), 0.05, 0.6))
+    lines = placed_outline(vertices(shape), poses)
+    steps = _equally_spaced(poses.shape[1] - 1, frames).round().astype(int)
+    opacity = float(np.clip(12 / len(poses), 0.05, 0.6))
     with plt.rc_context(STYLE):
-        figure, (axes,) = row(1, 5.4, 5.0)
-        outlines, ways = (LineCollection([], colors=BLUE, linewidths=w, alpha=faint) for w in (0.8, 0.6))
+        figure, (axes,) = panel_row(1, 5.4, 5.0)
+        outlines, paths = (LineCollection([], colors=BLUE, linewidths=w, alpha=opacity) for w in (0.8, 0.6))
         axes.add_collection(outlines)
-        axes.add_collection(ways)
-        (centers,) = axes.plot([], [], ".", color=END, ms=3, alpha=0.5, label="centers")
-        axes.plot(*lines[0, 0].T, color=START, lw=1.4, label="start")
+        axes.add_collection(paths)
+        (centers,) = axes.plot([], [], ".", color=RED, ms=3, alpha=0.5, label="centers")
+        axes.plot(*lines[0, 0].T, color=BLACK, lw=1.4, label="start")
         axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
         tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
         axes.set(title=title, xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        _range(axes, [lines.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
+        _set_limits(axes, [lines.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
         legend_below(figure, axes, columns=3)
 
     def draw(frame: int) -> None:
         k = steps[frame]
         outlines.set_segments(list(lines[:, k]))
-        ways.set_segments(list(MM * poses[:, : k + 1, :2]))
+        paths.set_segments(list(MM * poses[:, : k + 1, :2]))
         centers.set_data(*(MM * poses[:, k, :2].T))
         for tip, finger in zip(tips, fingers, strict=True):
             tip.set_data(*finger[k].T)
@@ -161,16 +162,16 @@ class _Panel:
         largest: Largest force of all panels, N, which sets the scale of the arrows.
     """
 
-    def __init__(self, axes: Axes, track: Track, largest: float):
+    def __init__(self, axes: Axes, track: DrawnPush, largest: float):
         self.track = track
         size = float(np.ptp(track.outline[0], axis=0).max())
-        self.scale = LONGEST * size / largest if largest > 0 else 0.0
-        self.weakest = WEAKEST * largest
-        axes.plot(*track.outline[0].T, color=BETWEEN, lw=1.0, label="start")
-        (self.outline,) = axes.plot([], [], color=START, lw=1.5, label="slider")
+        self.scale = MAX_ARROW_LENGTH * size / largest if largest > 0 else 0.0
+        self.weakest = MIN_FORCE * largest
+        axes.plot(*track.outline[0].T, color=GRAY, lw=1.0, label="start")
+        (self.outline,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
         (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its center")
         self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
-        (self.measured,) = axes.plot([], [], "--", color=END, lw=1.3, label="measured")
+        (self.measured,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
         (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
         zero = np.zeros(track.force.shape[1])
         quiver: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
@@ -190,7 +191,7 @@ class _Panel:
         if track.measured is not None:
             self.measured.set_data(*track.measured[round(share * (len(track.measured) - 1))].T)
         self.words.set_text(track.words[k])
-        self.words.set_color(END if 0 <= track.failed < k else "0.3")
+        self.words.set_color(RED if 0 <= track.failed < k else "0.3")
         acts = np.linalg.norm(track.force[k], axis=1) > self.weakest
         self.contacts.set_data(*track.contact[k][acts].T)
         if self.arrows is not None:
@@ -200,7 +201,7 @@ class _Panel:
             self.arrows.set_UVC(*(self.scale * force).T)
 
 
-def _frame_fractions(tracks: list[Track], frames: int) -> np.ndarray:
+def _frame_fractions(tracks: list[DrawnPush], frames: int) -> np.ndarray:
     """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
     last = 0.0
     for track in tracks:
@@ -210,34 +211,34 @@ def _frame_fractions(tracks: list[Track], frames: int) -> np.ndarray:
         # includes the step whose status says why nothing moves any more
         stop = steps if moves.size == 0 else min(moves[-1] + 2, steps)
         last = max(last, stop / steps)
-    return _equally(1.0, frames) * last
+    return _equally_spaced(1.0, frames) * last
 
 
-def _equally(end: float, frames: int) -> np.ndarray:
+def _equally_spaced(end: float, frames: int) -> np.ndarray:
     """Return equally spaced numbers from 0 to `end`, one per frame."""
     if frames < 2:
         raise ValueError(f"frames must be at least 2; got {frames}")
     return np.linspace(0, end, frames)
 
 
-def _share_limits(figure: Figure, all_axes: list[Axes], tracks: list[Track]) -> None:
+def _share_limits(figure: Figure, all_axes: list[Axes], tracks: list[DrawnPush]) -> None:
     """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
     parts = [part for track in tracks for part in (track.outline, *track.fingers)]
     parts += [track.measured for track in tracks if track.measured is not None]
-    _range(all_axes[0], [part.reshape(-1, 2) for part in parts])
+    _set_limits(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
     figure.set_layout_engine("compressed", h_pad=0.06)
-    around = HEIGHT_AROUND + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
+    around = EXTRA_HEIGHT + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
     figure.set_size_inches(
         PANEL_WIDTH * len(all_axes) + 0.5, float(np.clip(PANEL_WIDTH * high / wide, 1.5, 5.5)) + around
     )
 
 
-def _range(axes: Axes, points: list[np.ndarray]) -> None:
-    """Set the range of the axes to hold all points (..., 2), mm, with an empty rim."""
+def _set_limits(axes: Axes, points: list[np.ndarray]) -> None:
+    """Set the range of the axes to hold all points (..., 2), mm, with an empty margin."""
     low, high = (find(np.concatenate(points), axis=0) for find in (np.nanmin, np.nanmax))
-    rim = RIM * (high - low).max()
-    axes.set(xlim=(low[0] - rim, high[0] + rim), ylim=(low[1] - rim, high[1] + rim))
+    margin = MARGIN * (high - low).max()
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
 def _legend(figure: Figure, axes: Axes, measured: bool, largest: float) -> None:

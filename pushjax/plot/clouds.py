@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from pushjax.geometry.shape import Shape
 from pushjax.plot.distributions import density_panel, traces
 from pushjax.plot.parts import hand_at, outline
-from pushjax.plot.style import BETWEEN, BLUE, END, MM, START, STYLE, legend_below
+from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 from pushjax.simulation.hand import Hand
 
 QUANTILES = (0.025, 0.5, 0.975)
 Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
 
 
-def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectory: np.ndarray, title: str = "") -> Figure:
+def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.ndarray, title: str = "") -> Figure:
     """Draw many pushes that begin alike: the paths of the center, the start, and three of the ends.
 
     The three ends are those at the 2.5 %, 50 % and 97.5 % quantiles of the final angle. The hand is drawn at both ends
@@ -28,23 +28,23 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectory: np.ndar
         shape: Outline of the slider.
         hand: The hand.
         path: (steps + 1, dof), configurations of the hand.
-        trajectory: (pushes, steps + 1, 3), poses of the slider, world, m and rad.
+        trajectories: (pushes, steps + 1, 3), poses of the slider, world, m and rad.
         title: Title of the picture.
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
-        trajectory = np.asarray(trajectory)
-        traces(axes, trajectory, alpha=_faint(len(trajectory)))
-        outline(axes, shape, trajectory[0, 0], START, 1.4, label="start")
-        order = np.argsort(trajectory[:, -1, 2])
+        trajectories = np.asarray(trajectories)
+        traces(axes, trajectories, alpha=_opacity(len(trajectories)))
+        outline(axes, shape, trajectories[0, 0], BLACK, 1.4, label="start")
+        order = np.argsort(trajectories[:, -1, 2])
         for share in QUANTILES:
             style, label = ("-", "median end") if share == 0.5 else (":", "end, 2.5 and 97.5 % of θ")
-            end = trajectory[order[round(share * (len(order) - 1))], -1]
-            outline(axes, shape, end, END, 1.2, linestyle=style, label=label)
+            end = trajectories[order[round(share * (len(order) - 1))], -1]
+            outline(axes, shape, end, RED, 1.2, linestyle=style, label=label)
         fingers = np.asarray(hand.poses(jnp.asarray(path)))
-        hand_at(axes, hand, fingers[0], START, 1.0)
-        hand_at(axes, hand, fingers[-1], END, 1.0)
-        axes.plot([], [], color=BLUE, lw=0.8, label="ways of the center")
+        hand_at(axes, hand, fingers[0], BLACK, 1.0)
+        hand_at(axes, hand, fingers[-1], RED, 1.0)
+        axes.plot([], [], color=BLUE, lw=0.8, label="paths of the center")
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=title)
         handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
         axes.legend(handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -57,7 +57,7 @@ def capture_figure(
     path: np.ndarray,
     runs: Mapping[str, tuple[np.ndarray, np.ndarray]],
     density: Density | None = None,
-    ways: int = 100,
+    max_paths: int = 100,
 ) -> Figure:
     """Draw many starts and which of them end as wanted (red, the others black), one panel per run.
 
@@ -71,7 +71,7 @@ def capture_figure(
         runs: By name, the poses (pushes, steps + 1, 3), world, m and rad, and which pushes are wanted (pushes,).
         density: Density of the wanted starts of the last run, for one more panel with the start centers of that run:
             ((n, n) of x, (n, n) of y), m, and the density (n, n) there, 1/mm². None: no such panel.
-        ways: Largest number of paths in each panel; the first ones are drawn.
+        max_paths: Largest number of paths in each panel; the first ones are drawn.
     """
     with plt.rc_context(STYLE):
         ratios = [1.0] * len(runs) + ([] if density is None else [1.45])
@@ -80,32 +80,32 @@ def capture_figure(
             1, len(ratios), figsize=size, layout="constrained", width_ratios=ratios, squeeze=False
         )
         fingers = np.asarray(hand.poses(jnp.asarray(path)))
-        for axes, (name, (trajectory, wanted)) in zip(panels[0], runs.items(), strict=False):
-            _ways(axes, trajectory[:ways], wanted[:ways])
-            hand_at(axes, hand, fingers[0], BETWEEN, 2.0)
+        for axes, (name, (trajectories, wanted)) in zip(panels[0], runs.items(), strict=False):
+            _draw_paths(axes, trajectories[:max_paths], wanted[:max_paths])
+            hand_at(axes, hand, fingers[0], GRAY, 2.0)
             hand_at(axes, hand, fingers[-1], BLUE, 2.0)
             if np.any(wanted):
-                outline(axes, shape, trajectory[np.argmax(wanted), -1], BLUE, 1.0)
+                outline(axes, shape, trajectories[np.argmax(wanted), -1], BLUE, 1.0)
             axes.set(title=name, xlabel="x / mm", aspect="equal")
         panels[0, 0].set_ylabel("y / mm")
         if density is not None:
-            name, (trajectory, wanted) = list(runs.items())[-1]
-            starts = trajectory[:, 0, :2]
+            name, (trajectories, wanted) = list(runs.items())[-1]
+            starts = trajectories[:, 0, :2]
             density_panel(panels[0, -1], *density, starts[wanted], starts[~wanted])
             panels[0, -1].set_title(f"start centers, {name}")
-        for color, label in ((END, "end as wanted"), (START, "do not")):
+        for color, label in ((RED, "end as wanted"), (BLACK, "do not")):
             panels[0, 0].plot([], [], color=color, label=label)
         legend_below(figure, panels[0, 0], columns=2)
         return figure
 
 
-def _ways(axes: Axes, trajectory: np.ndarray, wanted: np.ndarray) -> None:
+def _draw_paths(axes: Axes, trajectories: np.ndarray, wanted: np.ndarray) -> None:
     """Draw the paths and the start centers, the wanted ones in red."""
-    for which, color in ((wanted, END), (~wanted, START)):
-        traces(axes, trajectory[which], color, alpha=0.5)
-        axes.plot(*(MM * trajectory[which, 0, :2].T), ".", color=color, ms=3)
+    for which, color in ((wanted, RED), (~wanted, BLACK)):
+        traces(axes, trajectories[which], color, alpha=0.5)
+        axes.plot(*(MM * trajectories[which, 0, :2].T), ".", color=color, ms=3)
 
 
-def _faint(lines: int) -> float:
+def _opacity(lines: int) -> float:
     """Return the opacity at which this many lines on top of each other still show where they are dense."""
     return float(np.clip(30 / max(lines, 1), 0.06, 0.6))

@@ -7,21 +7,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from pushjax.plot.style import BLUE, END, MM, ORANGE, START
+from pushjax.plot.style import BLACK, BLUE, MM, ORANGE, RED
 
 TICK = 1.6  # mm, length of a pose's tick
 
 
-def traces(axes: Axes, trajectory: np.ndarray, color: str = BLUE, alpha: float = 0.06) -> None:
+def traces(axes: Axes, trajectories: np.ndarray, color: str = BLUE, alpha: float = 0.06) -> None:
     """Draw the paths of the slider's origin, in mm.
 
     Args:
         axes: Axes to draw into.
-        trajectory: (n, steps + 1, 3), poses, m and rad.
+        trajectories: (n, steps + 1, 3), poses, m and rad, one trajectory per row.
         color: Color of the lines.
         alpha: Opacity of the lines.
     """
-    axes.add_collection(LineCollection(list(MM * trajectory[..., :2]), colors=color, linewidths=0.6, alpha=alpha))
+    axes.add_collection(LineCollection(list(MM * trajectories[..., :2]), colors=color, linewidths=0.6, alpha=alpha))
     axes.autoscale_view()
 
 
@@ -75,7 +75,7 @@ def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.n
         The color bar.
     """
     drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
-    axes.plot(*(MM * np.asarray(outside)).T, ".", color=START, ms=2.5)
-    axes.plot(*(MM * np.asarray(inside)).T, ".", color=END, ms=2.5)
+    axes.plot(*(MM * np.asarray(outside)).T, ".", color=BLACK, ms=2.5)
+    axes.plot(*(MM * np.asarray(inside)).T, ".", color=RED, ms=2.5)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
     return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)

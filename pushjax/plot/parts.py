@@ -10,19 +10,19 @@ from pushjax.geometry.shape import Shape
 from pushjax.plot.style import MM, PURPLE
 from pushjax.simulation.hand import Finger, Hand, Pad
 
-FINE = 200  # points along a smooth outline
+SMOOTH_OUTLINE_POINTS = 200  # points along a smooth outline
 
 
 def vertices(shape: Shape) -> np.ndarray:
     """Return an outline as the vertices of a polygon, (vertices, 2), body frame, m.
 
-    They are the vertices of the shape if it is a polygon, else `FINE` points along its boundary.
+    They are the vertices of the shape if it is a polygon, else `SMOOTH_OUTLINE_POINTS` points along its boundary.
     """
     points = getattr(shape, "vertices", None)
-    return np.asarray(shape.boundary(FINE) if points is None else points)
+    return np.asarray(shape.boundary(SMOOTH_OUTLINE_POINTS) if points is None else points)
 
 
-def placed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def placed_outline(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Return the closed outline of a body at each of several poses, in mm.
 
     Args:
@@ -49,7 +49,7 @@ def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float
         width: Width of the line, in points.
         line: Other arguments of `Axes.plot`.
     """
-    axes.plot(*placed(vertices(shape), np.asarray(pose)).T, color=color, lw=width, **line)
+    axes.plot(*placed_outline(vertices(shape), np.asarray(pose)).T, color=color, lw=width, **line)
 
 
 def hand_at(axes: Axes, hand: Hand, poses: np.ndarray, color: str, width: float) -> None:

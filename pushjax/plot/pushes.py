@@ -13,10 +13,10 @@ from matplotlib.patches import Circle
 
 from pushjax.contact.status import Status
 from pushjax.geometry.shape import Shape
-from pushjax.plot.parts import hand_at, outline, placed, vertices
-from pushjax.plot.style import BETWEEN, BLUE, END, MM, ORANGE, START, STYLE, legend_below, legend_of_moments, row
+from pushjax.plot.parts import hand_at, outline, placed_outline, vertices
+from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, legend_of_moments, panel_row
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Trajectory
+from pushjax.simulation.trajectory import Trajectory
 
 
 def push_figure(
@@ -34,14 +34,14 @@ def push_figure(
         frames: Number of moments between start and end.
     """
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(pushes), 4.0, 4.2, shared=True)
+        figure, all_axes = panel_row(len(pushes), 4.0, 4.2, shared=True)
         for axes, (name, (push, path)) in zip(all_axes, pushes.items(), strict=True):
             pose, path = np.asarray(push.pose), np.asarray(path)
             shown = np.unique(np.linspace(0, len(pose) - 1, frames + 2).round().astype(int))
             for k in [*shown[1:-1], shown[0], shown[-1]]:
-                color = START if k == 0 else END if k == shown[-1] else BETWEEN
-                outline(axes, shape, pose[k], color, 1.4 if color != BETWEEN else 0.8)
-                axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != BETWEEN, lw=0.8))
+                color = BLACK if k == 0 else RED if k == shown[-1] else GRAY
+                outline(axes, shape, pose[k], color, 1.4 if color != GRAY else 0.8)
+                axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != GRAY, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="center of the slider")
             axes.set(title=_titled(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
@@ -61,7 +61,7 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
         frames: Number of moments between start and end, among those in which the slider moves.
     """
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(grasps), 3.1, 3.9, shared=True)
+        figure, all_axes = panel_row(len(grasps), 3.1, 3.9, shared=True)
         for axes, (name, grasp) in zip(all_axes, grasps.items(), strict=True):
             pose = np.asarray(grasp.pose)
             fingers = np.asarray(hand.poses(grasp.configuration))
@@ -70,8 +70,8 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
             last = len(pose) - 1 if moves.size == 0 else min(moves[-1] + 1, len(pose) - 1)
             first = 0 if moves.size == 0 else moves[0]
             between = np.linspace(first, last, frames + 2).round().astype(int)[1:-1]
-            for k, color in [*((k, BETWEEN) for k in between), (0, START), (last, END)]:
-                width = 0.8 if color == BETWEEN else 1.4
+            for k, color in [*((k, GRAY) for k in between), (0, BLACK), (last, RED)]:
+                width = 0.8 if color == GRAY else 1.4
                 outline(axes, shape, pose[k], color, width)
                 hand_at(axes, hand, fingers[k], color, width)
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="center of the slider", zorder=4)
@@ -115,10 +115,10 @@ def real_figure(shape: Shape, pushes: Mapping[str, RealPush], hand: Hand | None 
         hand: The hand. None: it is not drawn.
     """
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(pushes), 3.6, 3.8)
+        figure, all_axes = panel_row(len(pushes), 3.6, 3.8)
         for axes, (name, push) in zip(all_axes, pushes.items(), strict=True):
-            outline(axes, shape, push.start, BETWEEN, 1.5, label="start")
-            outline(axes, shape, push.end, START, 1.5, label="measured end")
+            outline(axes, shape, push.start, GRAY, 1.5, label="start")
+            outline(axes, shape, push.end, BLACK, 1.5, label="measured end")
             _predicted(axes, shape, np.asarray(push.predicted))
             if hand is not None and push.path is not None:
                 fingers = np.asarray(hand.poses(jnp.asarray(push.path)))
@@ -137,6 +137,6 @@ def _predicted(axes: Axes, shape: Shape, poses: np.ndarray) -> None:
     if poses.ndim == 1:
         outline(axes, shape, poses, BLUE, 1.5, linestyle="--", label="predicted end")
         return
-    lines = list(placed(vertices(shape), poses))
+    lines = list(placed_outline(vertices(shape), poses))
     axes.add_collection(LineCollection(lines, colors=BLUE, linewidths=0.6, alpha=min(0.6, 8 / len(lines))))
     axes.plot([], [], color=BLUE, lw=0.8, label="predicted ends")

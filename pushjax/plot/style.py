@@ -1,4 +1,4 @@
-"""One look for all pictures: colors, line styles, units, panels and legends."""
+"""The style that all pictures share: colors, line styles, units, panels and legends."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 MM, DEGREES = 1e3, 180 / np.pi  # lengths are drawn in mm, angles in degrees
 # The colors of Okabe & Ito, which color-blind readers can tell apart
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
-# The moments of a push have three lightnesses, so that a grayscale print keeps them apart
-START, BETWEEN, END = "black", "0.72", "#C1121F"
+# Where a picture shows the start, the middle and the end of a push, they are black, gray and red. These colors differ
+# in lightness, so that a grayscale print keeps them apart.
+BLACK, GRAY, RED = "black", "0.72", "#C1121F"
 # Color, dash and marker of curves beside each other. The colors have nearly one lightness, so in grayscale dash and
 # marker tell the curves apart.
 SERIES = (
@@ -25,7 +26,7 @@ SERIES = (
     ("black", (0, (1, 3)), "x"),
 )
 MODELS = {"quartic": 0, "ellipsoid": 1}  # row of `SERIES`, the same in every picture
-LOOK = ("color", "linestyle", "marker")
+STYLE_KEYS = ("color", "linestyle", "marker")
 HATCH = "////"  # hatch of the second of two kinds of bars
 
 STYLE: Any = {
@@ -44,8 +45,8 @@ STYLE: Any = {
 }
 
 
-def row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
-    """Make a figure with panels side by side.
+def panel_row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
+    """Make a figure with panels side by side, and return it with the axes of the panels.
 
     Args:
         panels: Number of panels.
@@ -59,11 +60,11 @@ def row(panels: int, width: float, height: float, shared: bool = False) -> tuple
     return figure, list(axes[0])
 
 
-def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
+def curve_styles(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
     """Return for each curve its name, the curve, and its color, dash and marker as arguments of `Axes.plot`.
 
     Args:
-        curves: Curves by name. The quartic and the ellipsoid look the same in every picture.
+        curves: Curves by name. The quartic and the ellipsoid have the same style in every picture.
 
     Raises:
         ValueError: If there are more curves than one can tell apart.
@@ -72,11 +73,11 @@ def looks(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
         raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
     order = [MODELS[name] for name in curves] if MODELS.keys() >= curves.keys() else range(len(curves))
     rows = zip(curves.items(), order, strict=True)
-    return [(name, curve, dict(zip(LOOK, SERIES[k], strict=True))) for (name, curve), k in rows]
+    return [(name, curve, dict(zip(STYLE_KEYS, SERIES[k], strict=True))) for (name, curve), k in rows]
 
 
 def bars(color: str, hatched: bool = False) -> dict[str, Any]:
-    """Return how bars of a kind look, with their error bars, as arguments of `Axes.bar`."""
+    """Return the style of one kind of bars and of their error bars, as arguments of `Axes.bar`."""
     hatch = HATCH if hatched else None
     return {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
 
@@ -89,6 +90,6 @@ def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
 
 def legend_of_moments(figure: Figure, axes: Axes) -> None:
     """Draw the legend of pictures that show a push at its start, between, and at its end."""
-    for color, label in ((START, "start"), (BETWEEN, "between"), (END, "end")):
+    for color, label in ((BLACK, "start"), (GRAY, "between"), (RED, "end")):
         axes.plot([], [], color=color, label=label)
     legend_below(figure, axes, columns=4)

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.support import WrenchTwistPairs
-from pushjax.plot.style import STYLE, looks
+from pushjax.plot.style import STYLE, curve_styles
 
 FORCE_X, FORCE_Y, TORQUE = "$f_x$ / load", "$f_y$ / load", r"$\tau$ / (length · load)"
-NEARBY = 0.06  # in units of the load: pairs this near to a cut are drawn with it
-LONG = 0.5  # length of an arrow, in the same unit
-TOWARDS = np.radians(30), np.radians(-60)  # elevation and azimuth of the viewer
+CUT_DISTANCE = 0.06  # pairs at most this far from a cut are drawn with it, in units of the load
+ARROW_LENGTH = 0.5  # length of the arrow of a twist, in units of the load
+VIEW = np.radians(30), np.radians(-60)  # elevation and azimuth of the viewer
 
 
 def limit_surfaces(
@@ -39,12 +39,14 @@ def limit_surfaces(
         length = float(pairs.length)
         wrench = np.asarray(pairs.wrench) / load / np.array([1, 1, length])
         twist = np.asarray(pairs.twist) * np.array([1, 1, length])
-        shown = _spread(wrench, arrows)
-        for column, (name, surface, look) in enumerate(looks(surfaces)):
+        shown = _spread_out(wrench, arrows)
+        for column, (name, surface, style) in enumerate(curve_styles(surfaces)):
             axes = figure.add_subplot(grid[:, column], projection="3d")
-            _level_set(axes, surface, load, look["color"])
+            _level_set(axes, surface, load, style["color"])
             axes.scatter(*wrench.T, s=2, color="0.2", alpha=0.6, depthshade=False)
-            axes.quiver(*wrench[shown].T, *(LONG * twist[shown]).T, color="black", lw=1.1, arrow_length_ratio=0.25)
+            axes.quiver(
+                *wrench[shown].T, *(ARROW_LENGTH * twist[shown]).T, color="black", lw=1.1, arrow_length_ratio=0.25
+            )
             axes.set_title(name)
         for place, title, other in ((0, "cut through $f_y = 0$", 2), (1, "cut through $\\tau = 0$", 1)):
             axes = figure.add_subplot(grid[place, -1])
@@ -63,7 +65,7 @@ def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> No
     # few ticks, because the labels of more ticks would run into the labels of the axes
     axes.set(xlabel=FORCE_X, ylabel=FORCE_Y, xticks=[-1, 0, 1], yticks=[-1, 0, 1])
     axes.set_zlabel(TORQUE)  # type: ignore[attr-defined]
-    elevation, azimuth = np.degrees(TOWARDS)
+    elevation, azimuth = np.degrees(VIEW)
     axes.view_init(elev=elevation, azim=azimuth)  # type: ignore[attr-defined]
     axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
 
@@ -76,17 +78,17 @@ def _cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, l
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))
     circle[:, 0], circle[:, other] = np.cos(angle), np.sin(angle)
-    for name, surface, look in looks(surfaces):
+    for name, surface, style in curve_styles(surfaces):
         cut = _on_level_set(surface, circle) / load
-        axes.plot(cut[:, 0], cut[:, other], color=look["color"], linestyle=look["linestyle"], label=name)
-    near = np.abs(wrench[:, 3 - other]) < NEARBY
+        axes.plot(cut[:, 0], cut[:, other], color=style["color"], linestyle=style["linestyle"], label=name)
+    near = np.abs(wrench[:, 3 - other]) < CUT_DISTANCE
     axes.plot(wrench[near, 0], wrench[near, other], ".", color="0.2", ms=3, label="pairs nearby")
     axes.set(xlabel=FORCE_X, ylabel=TORQUE if other == 2 else FORCE_Y, aspect="equal")
 
 
-def _spread(wrench: np.ndarray, count: int) -> np.ndarray:
+def _spread_out(wrench: np.ndarray, count: int) -> np.ndarray:
     """Return indices of up to `count` wrenches on the viewer's side, each as far as possible from those before it."""
-    elevation, azimuth = TOWARDS
+    elevation, azimuth = VIEW
     viewer = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     seen = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
     if count < 1 or not len(seen):

@@ -1,4 +1,4 @@
-"""A push as it is drawn at each of its points: outlines in mm, contacts, forces, words."""
+"""A push as an animation draws it: for each of its points the outlines in mm, the contacts, the forces and a text."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -8,13 +8,13 @@ import numpy as np
 from pushjax.contact.status import ContactMode, Status
 from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import contact_forces
-from pushjax.plot.parts import FINE, placed, vertices
+from pushjax.plot.parts import SMOOTH_OUTLINE_POINTS, placed_outline, vertices
 from pushjax.plot.style import MM
 from pushjax.simulation.hand import Hand, Pad
-from pushjax.simulation.rollout import Trajectory
+from pushjax.simulation.trajectory import Trajectory
 
 
-class Recorded(NamedTuple):
+class RecordedPush(NamedTuple):
     """A push that was measured, with slider and hand at the same times; world, m and rad.
 
     Attributes:
@@ -26,8 +26,8 @@ class Recorded(NamedTuple):
     configuration: np.ndarray
 
 
-class Moved(Protocol):
-    """What can be animated: a `Trajectory` or a `Recorded`."""
+class Animatable(Protocol):
+    """What can be animated: a `Trajectory` or a `RecordedPush`."""
 
     @property
     def pose(self) -> Any: ...
@@ -36,7 +36,7 @@ class Moved(Protocol):
     def configuration(self) -> Any: ...
 
 
-class Track(NamedTuple):
+class DrawnPush(NamedTuple):
     """A push as it is drawn, in mm and N.
 
     Attributes:
@@ -46,7 +46,7 @@ class Track(NamedTuple):
         measured: Measured outlines to draw over it, or None.
         contact: (points, contacts, 2), contacts of the step that led to each point.
         force: (points, contacts, 2), forces of that step, N.
-        words: For each point a description of that step.
+        words: For each point the text that describes that step.
         failed: The first failed step, or -1.
     """
 
@@ -65,7 +65,7 @@ class Track(NamedTuple):
         return float(np.max(np.linalg.norm(self.force, axis=-1), initial=0.0))
 
 
-def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None, forces: bool) -> Track:
+def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray | None, forces: bool) -> DrawnPush:
     """Convert a push to what is drawn.
 
     Args:
@@ -73,7 +73,7 @@ def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None,
         hand: The hand.
         push: The push.
         measured: (points, 3), poses to draw over it, world, m and rad; or None.
-        forces: Whether to find contacts and forces.
+        forces: Whether to draw contacts and forces.
 
     Raises:
         ValueError: If the push has another number of configurations than of poses.
@@ -87,13 +87,13 @@ def track_of(shape: Shape, hand: Hand, push: Moved, measured: np.ndarray | None,
     if isinstance(push, Trajectory):
         words = ["", *(_words(int(s), m) for s, m in zip(push.status, np.asarray(push.mode), strict=True))]
         if forces:
-            contact, force = _in_world(pose, *contact_forces(shape, hand, push))
+            contact, force = _in_world(pose, *contact_forces(push))
         failed = int(push.first_failure)
         if failed >= 0:  # what is drawn from here on is no answer
             name = _plain(Status(int(push.status[failed])))
             words = [*words[: failed + 1], *[f"{name} at step {failed}"] * (len(pose) - failed - 1)]
-    over = None if measured is None else placed(body, np.asarray(measured, float))
-    return Track(placed(body, pose), fingers, MM * pose[:, :2], over, contact, force, words, failed)
+    over = None if measured is None else placed_outline(body, np.asarray(measured, float))
+    return DrawnPush(placed_outline(body, pose), fingers, MM * pose[:, :2], over, contact, force, words, failed)
 
 
 def _in_world(pose: np.ndarray, point: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,12 +124,12 @@ def _plain(name: ContactMode | Status) -> str:
 def fingers_along(hand: Hand, configurations: Any) -> list[np.ndarray]:
     """Return for each finger its outlines along the configurations (points, dof): (points, vertices, 2), mm."""
     poses = np.asarray(hand.poses(jnp.asarray(configurations)), float)
-    angle = np.linspace(0, 2 * np.pi, FINE // 4, endpoint=False)
+    angle = np.linspace(0, 2 * np.pi, SMOOTH_OUTLINE_POINTS // 4, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     drawn = []
     for finger, where in zip(hand.fingers, np.moveaxis(poses, 1, 0), strict=True):
         if where.shape[1] == 2:  # a hand that never turns
             where = np.column_stack([where, np.zeros(len(where))])
         body = vertices(finger.shape) if isinstance(finger, Pad) else float(finger.radius) * circle
-        drawn.append(placed(body, where))
+        drawn.append(placed_outline(body, where))
     return drawn

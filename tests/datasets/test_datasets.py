@@ -20,7 +20,7 @@ from pushjax.datasets import (
     load_push_npz,
     load_triangle_log,
 )
-from pushjax.datasets import arrangement as setup
+from pushjax.datasets import triangle_setup as setup
 from pushjax.datasets.records import MOST_SAMPLES
 
 # --- compared with the curated arrays ---

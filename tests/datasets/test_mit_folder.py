@@ -271,34 +271,34 @@ def test_known_motion(published):
     assert found.vertices.shape == (4, 2)
     assert (found.length, found.tip_radius) == (pytest.approx(0.045 * np.sqrt(2)), 0.00475)
     assert found.repeats.tolist() == [[0, 0], [1, 2], [2, 4], [3, 6]]
-    assert (found.learned.sum(), len(found.middle)) == (4, 8)
-    assert not found.learned[found.middle_of].any()
+    assert (found.is_training.sum(), len(found.middle)) == (4, 8)
+    assert not found.is_training[found.middle_of].any()
     np.testing.assert_array_equal(found.middle.index, found.whole.index[found.middle_of])
 
 
 def test_wrench_and_twist(published):
     """Each training push has six pairs, with the force on the object in its own frame and about its origin."""
     found, _ = load_mit_folder(published, "abs", "rect1")
-    learned = np.flatnonzero(found.learned)
-    assert found.wrench.shape == found.twist.shape == (6 * len(learned), 3)
-    for row, wrench, twist in zip(np.repeat(learned, 6), found.wrench, found.twist, strict=True):
+    training_rows = np.flatnonzero(found.is_training)
+    assert found.wrench.shape == found.twist.shape == (6 * len(training_rows), 3)
+    for row, wrench, twist in zip(np.repeat(training_rows, 6), found.wrench, found.twist, strict=True):
         np.testing.assert_allclose(wrench, [*FORCE, torque(row)], rtol=0, atol=TURNING)
         lasts = 0.8 * (duration(row) + LAST - FIRST) / 6
         assert twist[2] == pytest.approx(velocity(row)[2] * lasts, abs=LINEAR)
         assert np.linalg.norm(twist[:2]) == pytest.approx(0.01 * lasts, abs=LINEAR)
     # in the frame at the middle of each part, the motion turns more and more to the side that the object turned from
     middle = (np.arange(6) + 0.5) * lasts + 0.1 * (duration(row) + LAST - FIRST) + FIRST
-    side = rotation(-velocity(learned[-1])[2] * middle) @ [-0.01 * lasts, 0]
+    side = rotation(-velocity(training_rows[-1])[2] * middle) @ [-0.01 * lasts, 0]
     np.testing.assert_allclose(found.twist[-6:, :2], side, rtol=0, atol=LINEAR)
 
 
 def test_split_is_of_the_seed(published):
     first, again, other = (load_mit_folder(published, "abs", "rect1", seed=seed)[0] for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first.learned, again.learned)
+    np.testing.assert_array_equal(first.is_training, again.is_training)
     np.testing.assert_array_equal(first.wrench, again.wrench)
-    assert (first.learned != other.learned).any()
+    assert (first.is_training != other.is_training).any()
     for share, count in ((0.5, 6), (0.01, 1), (0.99, 11)):
-        assert load_mit_folder(published, "abs", "rect1", train_share=share)[0].learned.sum() == count
+        assert load_mit_folder(published, "abs", "rect1", train_share=share)[0].is_training.sum() == count
 
 
 def test_parts_without_force_are_no_pairs(download):
@@ -310,8 +310,8 @@ def test_parts_without_force_are_no_pairs(download):
         write_json(log(download, row), made)
     found, problems = load_mit_folder(download, "abs", "rect1", train_share=0.99)
     assert problems == ()
-    taught = np.flatnonzero(found.learned)
-    assert len(found.wrench) == 6 * np.sum(taught > 3)
+    training_rows = np.flatnonzero(found.is_training)
+    assert len(found.wrench) == 6 * np.sum(training_rows > 3)
     assert found.whole.valid.all()
 
 
@@ -409,7 +409,7 @@ def test_too_few(download):
     with pytest.raises(LogError, match=r"of rect1 on abs at 10 mm/s, found 9; files there are at 10, 20 mm/s; 3 files"):
         load_mit_folder(download, "abs", "rect1")
     with pytest.raises(LogError, match=r"at 50 mm/s, found 0; files there are at 10, 20 mm/s$"):
-        load_mit_folder(download, "abs", "rect1", speed=0.05, fast=0.08)
+        load_mit_folder(download, "abs", "rect1", speed=0.05, fast_speed=0.08)
 
 
 def test_only_slow_ones_of_constant_speed(download):
@@ -426,7 +426,7 @@ def test_only_slow_ones_of_constant_speed(download):
     ("options", "words"),
     [
         ({"train_share": 1.0}, "train_share must be between 0 and 1; got 1.0"),
-        ({"fast": 0.01}, "speed and fast must differ"),
+        ({"fast_speed": 0.01}, "speed and fast_speed must differ"),
         ({"shape": "rect4"}, "shape must be one of"),
     ],
 )
@@ -456,7 +456,7 @@ def test_real_pushes(data, tmp_path):
     for repetition in range(3):
         for path in files:
             shutil.copy(path, tmp_path / f"{path.stem}_rep={repetition:04d}.json")
-    found, problems = load_mit_folder(tmp_path, "plywood", "rect1", speed=0.1, fast=0.15)
+    found, problems = load_mit_folder(tmp_path, "plywood", "rect1", speed=0.1, fast_speed=0.15)
     assert problems == ()
     assert (len(found.whole), found.whole.valid.all()) == (12, True)
     assert np.all(np.sum(found.wrench * found.twist, axis=1) > 0)

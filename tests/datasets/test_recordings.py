@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pushjax.datasets import LogError, Recordings, load_push_npz, load_recordings, load_triangle_log
-from pushjax.datasets.clocks import LONGEST_GAP
 from pushjax.datasets.recordings import Recording
+from pushjax.datasets.resampling import MAX_GAP
 
 MIT_JSONS = (
     "motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349.json",
@@ -455,7 +455,7 @@ def test_stamps_of_a_tracker_may_jitter_but_not_jump(tmp_path):
 
 def test_an_object_lost_for_long_is_not_seen(tmp_path):
     lost = np.linspace(-0.3, 0.8, 34)
-    lost = lost[(lost < 0.15) | (lost > 0.15 + LONGEST_GAP)]
+    lost = lost[(lost < 0.15) | (lost > 0.15 + MAX_GAP)]
     (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
     before, after = lost[lost < 0.15][-1], lost[lost > 0.15][0]
     hidden = (push.time > before + 1e-6) & (push.time < after - 1e-6)
@@ -561,7 +561,7 @@ def test_hdf5_without_its_reader(tmp_path, monkeypatch):
     path = mit_log(tmp_path, tables(), ".h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
     fails(path, "h5py", "pip install '.[hdf5]'")
-    assert "h5py" not in vars(sys.modules["pushjax.datasets.mit"])
+    assert "h5py" not in vars(sys.modules["pushjax.datasets.mit_logs"])
 
 
 # --- detection of the kind of file ---

@@ -46,6 +46,8 @@ def slid(steps: int = 6, turn: float = 0.4, dof: int = 2) -> pj.Trajectory:
         twist=jnp.zeros((steps, 3)),
         wrench=jnp.tile(jnp.array([1.0, 0, 0]), (steps, 1)),
         force=jnp.tile(jnp.array([[1.0, 0.0]]), (steps, 1, 1)),
+        contact_point=jnp.tile(jnp.array([[-SIDE / 2, 0.0]]), (steps, 1, 1)),
+        contact_normal=jnp.tile(jnp.array([[1.0, 0.0]]), (steps, 1, 1)),
         mode=jnp.full((steps, 1), pj.ContactMode.STICKING, jnp.int8),
         status=jnp.zeros(steps, jnp.int8),
         overlap=jnp.zeros(steps),
@@ -60,9 +62,9 @@ def test_push_figure(block):
     assert [axes.get_title() for axes in figure.axes] == ["one", "two"]
     assert legend(figure) == ["center of the slider", "start", "between", "end"]
     axes = figure.axes[0]
-    for color, k in ((plot.START, 0), (plot.END, -1)):
+    for color, k in ((plot.BLACK, 0), (plot.RED, -1)):
         np.testing.assert_allclose(ends_of(axes, color)[0], in_world(push.pose[k]), atol=1e-9)
-    assert len(ends_of(axes, plot.BETWEEN)) == 3
+    assert len(ends_of(axes, plot.GRAY)) == 3
     np.testing.assert_allclose(ends_of(axes, plot.BLUE)[0], MM * np.asarray(push.pose[:, :2]), atol=1e-9)
     circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
     assert len(circles) == 5
@@ -83,7 +85,7 @@ def test_grasp_figure(block):
     axes = figure.axes[0]
     assert axes.get_title() == "held:\naskew"
     assert legend(figure) == ["center of the slider", "start", "between", "end"]
-    drawn = ends_of(axes, plot.END)
+    drawn = ends_of(axes, plot.RED)
     np.testing.assert_allclose(drawn[0], in_world(grasp.pose[6]), atol=1e-9)
     assert [len(line) for line in drawn[:3]] == [5, 5, 5]  # slider and two pads
     upper, lower = drawn[1], drawn[2]
@@ -117,7 +119,7 @@ def test_real_figure(block):
     left, right = figure.axes
     assert [axes.get_title() for axes in figure.axes] == list(pushes)
     assert legend(figure) == ["start", "measured end", "predicted end", "fingers' paths"]
-    for color, pose in ((plot.BETWEEN, start), (plot.START, end), (plot.BLUE, predicted)):
+    for color, pose in ((plot.GRAY, start), (plot.BLACK, end), (plot.BLUE, predicted)):
         np.testing.assert_allclose(ends_of(left, color)[0], in_world(pose), atol=1e-9)
     np.testing.assert_allclose(ends_of(left, plot.ORANGE)[0], MM * path)
     (circle,) = left.patches

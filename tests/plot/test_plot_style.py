@@ -40,13 +40,13 @@ def seen_by(color, eyes) -> np.ndarray:
 @pytest.mark.parametrize("eyes", [np.eye(3), *BLIND], ids=["full", "protan", "deutan", "tritan"])
 def test_colors_can_be_told_apart(eyes):
     """Colors of curves differ by at least 15, those of a push's moments by 40; a difference of 2.3 is just visible."""
-    for colors, least in (([color for color, _, _ in SERIES], 15), ((plot.START, plot.BETWEEN, plot.END), 40)):
+    for colors, least in (([color for color, _, _ in SERIES], 15), ((plot.BLACK, plot.GRAY, plot.RED), 40)):
         for a, b in itertools.combinations(colors, 2):
             assert np.linalg.norm(seen_by(a, eyes) - seen_by(b, eyes)) > least, (a, b)
 
 
-def test_moments_in_greyscale():
-    lightness = sorted(seen_by(color, np.eye(3))[0] for color in (plot.START, plot.END, plot.BETWEEN, "white"))
+def test_moments_in_grayscale():
+    lightness = sorted(seen_by(color, np.eye(3))[0] for color in (plot.BLACK, plot.RED, plot.GRAY, "white"))
     assert np.diff(lightness).min() > 20
 
 

@@ -12,7 +12,7 @@ from drawn import MM, RADIUS, SIDE, ends_of, in_world, legend, legible
 import pushjax as pj
 from benchmarks.peers.figure import speed_figure
 from pushjax import plot
-from pushjax.plot.style import looks
+from pushjax.plot.style import curve_styles
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +56,10 @@ def test_cloud_figure(block):
     legible(figure)
     (axes,) = figure.axes
     assert axes.get_title() == "40 pushes"
-    assert legend(axes) == ["start", "end, 2.5 and 97.5 % of θ", "median end", "ways of the center"]
+    assert legend(axes) == ["start", "end, 2.5 and 97.5 % of θ", "median end", "paths of the center"]
     np.testing.assert_allclose(axes.collections[0].get_segments(), MM * ways[..., :2])
     order = np.argsort(ways[:, -1, 2])
-    drawn = [line for line in axes.lines if line.get_color() == plot.END]
+    drawn = [line for line in axes.lines if line.get_color() == plot.RED]
     for line, place in zip(drawn, (1, 20, 38), strict=True):
         np.testing.assert_allclose(line.get_xydata(), in_world(ways[order[place], -1]), atol=1e-9)
     assert [line.get_linestyle() for line in drawn] == [":", "-", ":"]
@@ -73,7 +73,7 @@ def test_capture_figure(block):
     x, y = np.meshgrid(np.linspace(-0.01, 0.01, 6), np.linspace(0, 0.02, 6))
     density = ((x, y), np.exp(-((x / 0.005) ** 2)))
     runs = {"few": (ways, wanted), "more": (ways, ~wanted)}
-    figure = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, runs, density, ways=10)
+    figure = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, runs, density, max_paths=10)
     figure.canvas.draw()
     few, more, heat, bar = figure.axes
     assert [axes.get_title() for axes in (few, more, heat)] == ["few", "more", "start centers, more"]
@@ -84,7 +84,7 @@ def test_capture_figure(block):
     np.testing.assert_allclose(caught.get_segments(), MM * ways[:10][wanted[:10], :, :2])
     np.testing.assert_allclose(missed.get_segments(), MM * ways[:10][~wanted[:10], :, :2])
     assert len(few.patches) == 4  # two fingers at both ends
-    (outside,) = ends_of(heat, plot.START)
+    (outside,) = ends_of(heat, plot.BLACK)
     np.testing.assert_allclose(outside, MM * ways[wanted, 0, :2])
     alone = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, {"none": (ways, np.zeros(40, bool))})
     assert len(alone.axes) == 1
@@ -122,13 +122,15 @@ def test_speed_figure():
 def test_no_more_curves_than_can_be_told_apart():
     with pytest.raises(ValueError, match="at most 6 curves can be told apart; got 7: a, b"):
         speed_figure({name: [(1e-6, 0.1)] for name in "abcdefg"}, 0.1)
-    seen = [tuple(map(str, look.values())) for _, _, look in looks(dict.fromkeys("abcdef", 0))]
+    seen = [tuple(map(str, look.values())) for _, _, look in curve_styles(dict.fromkeys("abcdef", 0))]
     for column in zip(*seen, strict=True):
         assert len(set(column)) == 6
 
 
 def test_a_model_looks_the_same_in_every_picture():
-    one, other = looks({"quartic": 0, "ellipsoid": 0}), looks({"ellipsoid": 0, "quartic": 0})
+    one, other = curve_styles({"quartic": 0, "ellipsoid": 0}), curve_styles({"ellipsoid": 0, "quartic": 0})
     assert one == other[::-1]
-    assert looks({"ellipsoid": 0})[0][2] == one[1][2]
-    assert looks({"a": 0})[0][2] == looks({"ellipsoid": 0, "a": 0})[0][2] == one[0][2]  # other names: in order
+    assert curve_styles({"ellipsoid": 0})[0][2] == one[1][2]
+    assert (
+        curve_styles({"a": 0})[0][2] == curve_styles({"ellipsoid": 0, "a": 0})[0][2] == one[0][2]
+    )  # other names: in order

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from pushjax.datasets._archive import Arrays, check_shapes, floats, read_archive
-from pushjax.datasets.clocks import Stream, aligned
 from pushjax.datasets.pushes import Floats, LogError
-from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recordings, gathered
+from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recordings, collect
+from pushjax.datasets.resampling import Stream, align_streams
 
 STREAMS = ("tip_pose", "object_pose", "ft_wrench")
 COLUMNS = 4
@@ -181,4 +181,4 @@ def _one_push(path: Path, tables: list[Floats]) -> Recordings:
     hand = Stream(STREAMS[0], HAND[:2], tip[:, 0], tip[:, 1:3])
     pose = Stream(STREAMS[1], OBJECT, body[:, 0], body[:, 1:])
     force = Stream(STREAMS[2], FORCE, wrench[:, 0], -wrench[:, 1:3])
-    return gathered(path, [aligned(path, hand, pose, force)])
+    return collect(path, [align_streams(path, hand, pose, force)])

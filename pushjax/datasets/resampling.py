@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pushjax.datasets.pushes import Floats, LogError
-from pushjax.datasets.recordings import Recording, bad_number, checked, interpolated
+from pushjax.datasets.recordings import Recording, check_recording, find_bad_number, interpolated
 
 # If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
-LONGEST_GAP = 0.5
+MAX_GAP = 0.5
 # If the object's time stamps go back by more than this (s), the cause is not jitter of the tracker but another clock.
 # The largest jitter seen is 0.007 s.
-MOST_JITTER = 0.05
+MAX_JITTER = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +37,12 @@ class Stream:
         return Stream(self.name, self.columns, self.time[which], self.values[which])
 
 
-def aligned(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording | LogError:
+def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording | LogError:
     """Combine three streams with time stamps of one clock into the one push of a file.
 
     The result has the hand's samples from the first to the last one at which the object is seen. The object's pose and
     the force on it are interpolated at these samples; the angle of the pose takes the short way. The object counts as
-    unseen within gaps of its stream that are longer than LONGEST_GAP. Rows of its stream that are all NaN are ignored.
+    unseen within gaps of its stream that are longer than MAX_GAP. Rows of its stream that are all NaN are ignored.
     Time starts at the first sample of the hand's stream.
 
     Args:
@@ -54,7 +54,7 @@ def aligned(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording 
     Returns:
         The recording, or the error that describes the first fault.
     """
-    for stream, most_back, may_lack in ((hand, 0.0, False), (body, MOST_JITTER, True), (force, 0.0, False)):
+    for stream, most_back, may_lack in ((hand, 0.0, False), (body, MAX_JITTER, True), (force, 0.0, False)):
         fault = _fault(stream, most_back, may_lack)
         if fault is not None:
             return LogError(path, fault, push=0)
@@ -70,10 +70,10 @@ def aligned(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording 
     seen = np.flatnonzero(np.isfinite(pose[:, 0]))
     if len(seen) < 2:
         message = f"expected the object to be seen at two samples of {hand.name} at least, found {len(seen)}"
-        return LogError(path, f"{message} that are not in a gap of {body.name} longer than {LONGEST_GAP:g} s", push=0)
+        return LogError(path, f"{message} that are not in a gap of {body.name} longer than {MAX_GAP:g} s", push=0)
     kept = slice(seen[0], seen[-1] + 1)
     on_object = interpolated(time[kept], force_time, force.values)
-    return checked(path, 0, hand.values[kept], pose[kept], force=on_object, time=time[kept])
+    return check_recording(path, 0, hand.values[kept], pose[kept], force=on_object, time=time[kept])
 
 
 def _fault(stream: Stream, most_back: float, may_lack: bool) -> str | None:
@@ -81,7 +81,7 @@ def _fault(stream: Stream, most_back: float, may_lack: bool) -> str | None:
     if len(stream.time) < 2:
         return f"expected at least two samples in {stream.name}, found {len(stream.time)}"
     for names, values, lacks in ((("time",), stream.time[:, None], False), (stream.columns, stream.values, may_lack)):
-        fault = bad_number(names, values, lacks)
+        fault = find_bad_number(names, values, lacks)
         if fault is not None:
             return f"{fault[0]} in row {fault[1]} of {stream.name}"
     step = np.diff(stream.time)
@@ -114,7 +114,7 @@ def _poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
 
 
 def _within_gap(time: Floats, known: Floats) -> NDArray[np.bool_]:
-    """Return a mask (m,) of the times between two `known` ones that are more than LONGEST_GAP apart."""
+    """Return a mask (m,) of the times between two `known` ones that are more than MAX_GAP apart."""
     before = np.clip(np.searchsorted(known, time, side="right") - 1, 0, None)
     after = np.clip(np.searchsorted(known, time, side="left"), None, len(known) - 1)
-    return known[after] - known[before] > LONGEST_GAP
+    return known[after] - known[before] > MAX_GAP
