@@ -33,7 +33,7 @@ def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> 
         "versions": {"python": platform.python_version(), "pushjax": pushjax.__version__}
         | {name: version(name) for name in PACKAGES},
         "machine": {
-            "processor": platform.processor() or platform.machine(),
+            "processor": _processor(),
             "cores": os.cpu_count(),
             "devices": [str(device) for device in jax.devices()],
             "x64": bool(jax.config.jax_enable_x64),  # pyright: ignore[reportAttributeAccessIssue]
@@ -41,6 +41,14 @@ def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> 
         "date": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "settings": settings,
     } | figures
+
+
+def _processor() -> str:
+    """Return the name of the processor's model, or its architecture where the system does not tell."""
+    listed = Path("/proc/cpuinfo")
+    lines = listed.read_text().splitlines() if listed.exists() else []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
 
 
 def write_json(record: dict[str, Any], path: Path) -> None:
