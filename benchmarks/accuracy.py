@@ -1,26 +1,23 @@
 """Error and penetration depth of pushes as functions of the step.
 
-    python -m benchmarks accuracy
-
 A 90 mm square is pushed 221 times by 50 mm. The pushes start every 5 mm across a side and go every 10 degrees up to 60
 degrees from its normal; mu is 0.25. Some slide off a corner. All is computed in float64; the reference has 6400 steps.
 """
 
-import argparse
+from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-jax.config.update("jax_enable_x64", True)
-
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-
-import pushjax as pj  # noqa: E402
-from benchmarks._measure import header  # noqa: E402
-from pushjax.geometry import se2  # noqa: E402
+import pushjax as pj
+from benchmarks.timing import both_dtypes
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.geometry import se2
 
 LENGTH, FRICTION, GAP, REFERENCE = 0.05, 0.25, 0.0005, 6400
+RADII, STEPS = (0.00475, 0.001, 0.0), (10, 25, 50, 100, 200)
 
 
 def fan(slider: pj.Slider, radius: float, steps: int) -> tuple[np.ndarray, float]:
@@ -48,23 +45,40 @@ def fan(slider: pj.Slider, radius: float, steps: int) -> tuple[np.ndarray, float
     return np.asarray(pose), max(0.0, -float(jnp.min(gap)))
 
 
-def main() -> None:
-    square = pj.Polygon.rectangle(0.09, 0.09)
-    surface = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
-    slider = pj.Slider(square, surface)
-    print(header())
-    for radius in (0.00475, 0.001, 0.0):
-        exact, _ = fan(slider, radius, REFERENCE)
-        print(f"finger of {1e3 * radius:g} mm:  step    worst (mm, deg)      median (mm)   penetration (um)")
-        for steps in (10, 25, 50, 100, 200):
-            pose, depth = fan(slider, radius, steps)
-            off = np.linalg.norm(pose[:, :2] - exact[:, :2], axis=1)
-            turn = np.degrees(np.abs(pose[:, 2] - exact[:, 2]).max())
-            print(
-                f"  {1e3 * LENGTH / steps:20.2f} mm   {1e3 * off.max():8.4f} {turn:8.4f}   "
-                f"{1e3 * np.median(off):10.6f}   {1e6 * depth:10.4f}"
-            )
+def run(progress: ProgressCallback = no_progress) -> dict[str, Any]:
+    """Compare pushes in large steps with pushes in small ones.
+
+    Args:
+        progress: Called with the number of rows done and their total.
+
+    Returns:
+        The record, with one row for each radius of the finger and step, all in mm: the worst and the median distance of
+        the final positions from the reference, the worst angle (degrees), and the largest penetration depth.
+    """
+    rows: list[dict[str, Any]] = []
+    with both_dtypes():
+        square = pj.Polygon.rectangle(0.09, 0.09)
+        surface = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
+        slider = pj.Slider(square, surface)
+        for radius in RADII:
+            exact, _ = fan(slider, radius, REFERENCE)
+            for steps in STEPS:
+                pose, depth = fan(slider, radius, steps)
+                off = 1e3 * np.linalg.norm(pose[:, :2] - exact[:, :2], axis=1)
+                turn = np.degrees(np.abs(pose[:, 2] - exact[:, 2]).max())
+                row = {"radius_mm": 1e3 * radius, "step_mm": 1e3 * LENGTH / steps, "worst_mm": off.max()}
+                row |= {"worst_deg": turn, "median_mm": np.median(off), "penetration_mm": 1e3 * depth}
+                rows.append(row)
+                progress(len(rows), len(RADII) * len(STEPS))
+        return result_record("accuracy", {"steps_of_reference": REFERENCE}, rows=rows)
 
 
-if __name__ == "__main__":
-    main()
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    lines = [f"{'finger':>10}{'step':>10}{'worst (mm, deg)':>20}{'median (mm)':>14}{'penetration (um)':>18}"]
+    for row in record["rows"]:
+        lines.append(
+            f"{row['radius_mm']:7.3g} mm{row['step_mm']:7.3g} mm{row['worst_mm']:11.4f} {row['worst_deg']:8.4f}"
+            f"{row['median_mm']:14.6f}{1e3 * row['penetration_mm']:18.4f}"
+        )
+    return "\n".join(lines)

@@ -1,7 +1,5 @@
 """Cost of the derivatives of pushes and their agreement with finite differences.
 
-    python -m benchmarks derivatives [PART ...] [--quick] [--json FILE] [--picture FILE]
-
 cost       Time of reverse and forward mode beside the push alone: 200 steps, float32, timed in turns in one run.
 memory     Memory that reverse mode needs, as counted by the compiler, and ways to need less.
 agreement  Relative error |derivative - difference| / max(1, |difference|) of random pushes against central differences,
@@ -16,14 +14,14 @@ random     Derivatives of E[f] by `dof` and by the range of friction through `ra
 picture    The final angle and its derivative along three lines: friction, start of a push, start angle in a jaw.
 """
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 import pushjax as pj
 from benchmarks._derivative_cases import (
@@ -38,10 +36,12 @@ from benchmarks._derivative_cases import (
     one_finger,
     two_fingers,
 )
-from benchmarks._measure import alternate, compiled, header
-from pushjax._internal.record import result_record, write_json
+from benchmarks.timing import Program, alternate, compiled
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 
-PARTS = ("cost", "memory", "agreement", "grasps", "random", "picture")
+Part = Literal["cost", "memory", "agreement", "grasps", "random", "picture"]
+Row = dict[str, Any]
 MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
 
 
@@ -99,7 +99,7 @@ def pushes(fingers: int, batch: int, steps: int, stretch: int | None = None) -> 
     return Timed(scalar, (friction, poses, coefficients))
 
 
-def cost(quick: bool) -> list[dict[str, Any]]:
+def cost(quick: bool) -> list[Row]:
     """Time the push, its gradient and its tangent, for one and two fingers."""
     batch, rows = 50 if quick else 2000, []
     for fingers, target in ((1, 4.0), (2, 6.0)):
@@ -110,28 +110,23 @@ def cost(quick: bool) -> list[dict[str, Any]]:
 
         functions = {"push": timed.total, "gradient": jax.grad(timed.total, argnums=(0, 1, 2)), "tangent": tangent}
         ready = {name: compiled(function, *timed.inputs) for name, function in functions.items()}
-        run_s = alternate({name: (program, timed.inputs) for name, (program, _) in ready.items()}, repeats=7 // fingers)
-        for name, seconds in run_s.items():
-            program, compile_s = ready[name]
-            row: dict[str, Any] = {"fingers": fingers, "batch": batch, "steps": 200, "what": name, "run_s": seconds}
-            row |= {"compile_s": compile_s, "ratio": seconds / run_s["push"], "bytes": stored(program)}
-            rows.append(row | {"target": target if name == "gradient" else None})
-            each = (
-                f"{1e9 * seconds / batch / 200:6.0f} ns and {row['bytes'] / batch / 200:6.1f} bytes per push and step"
-            )
-            print(f"  {fingers} finger(s), {name:8}: compile {compile_s:5.1f} s, run {1e3 * seconds:8.1f} ms,")
-            print(f"     {each}, {row['ratio']:.2f} x the push", flush=True)
+        timings = alternate({name: program.run for name, program in ready.items()}, repeats=7 // fingers)
+        for name, program in ready.items():
+            row: Row = {"fingers": fingers, "batch": batch, "steps": 200, "what": name, "run_s": timings[name].median}
+            row |= {"compile_s": program.compile_s, "ratio": timings[name].median / timings["push"].median}
+            rows.append(row | {"bytes": stored(program), "target": target if name == "gradient" else None})
     return rows
 
 
-def stored(program: Any) -> int:
+def stored(program: Program) -> int:
     """Return the bytes that the compiler reserved for the program in addition to its inputs and outputs."""
-    return program.memory_analysis().temp_size_in_bytes
+    call: Any = program.call
+    return call.memory_analysis().temp_size_in_bytes
 
 
-def memory(quick: bool) -> list[dict[str, Any]]:
+def memory(quick: bool) -> list[Row]:
     """Measure memory and time of the gradient, as it is and with three ways to need less memory."""
-    batch, rows = 50 if quick else 2000, []
+    batch = 50 if quick else 2000
     timed, stretched = pushes(1, batch, 200), pushes(1, batch, 200, stretch=20)
     again = Timed(jax.checkpoint(timed.scalar), timed.inputs)
 
@@ -141,32 +136,31 @@ def memory(quick: bool) -> list[dict[str, Any]]:
     ways = {"as it is": timed.total, "jax.checkpoint of the scalar": again.total}
     ways |= {"stretches of 20 steps, each in jax.checkpoint": stretched.total, "lax.map, a tenth at once": chunks}
     ready = {name: compiled(jax.grad(way, argnums=(0, 1, 2)), *timed.inputs) for name, way in ways.items()}
-    run_s = alternate({name: (program, timed.inputs) for name, (program, _) in ready.items()})
-    for name, (program, compile_s) in ready.items():
-        rows.append({"batch": batch, "steps": 200, "way": name, "bytes": stored(program)})
-        rows[-1] |= {"run_s": run_s[name], "compile_s": compile_s}
-        each = f"{rows[-1]['bytes'] / 1e6:7.1f} MB, {rows[-1]['bytes'] / batch / 200:6.1f} bytes per push and step"
-        print(f"  gradient, {name:46}: {each}, {1e3 * run_s[name]:8.1f} ms", flush=True)
-    return rows
+    timings = alternate({name: program.run for name, program in ready.items()})
+    about = {"batch": batch, "steps": 200}
+    return [
+        about | {"way": name, "bytes": stored(each), "run_s": timings[name].median, "compile_s": each.compile_s}
+        for name, each in ready.items()
+    ]
 
 
 # --- agreement ---
 
 
-def agreement(quick: bool) -> list[dict[str, Any]]:
+def agreement(quick: bool) -> list[Row]:
     """Compare the derivatives of random pushes with central differences."""
     few, many = (QUICK, QUICK) if quick else (FEW, MANY)
     return judged({"one finger, pentagons": one_finger(many), "two fingers push": two_fingers(few)})
 
 
-def grasping(quick: bool) -> list[dict[str, Any]]:
+def grasping(quick: bool) -> list[Row]:
     """Compare the derivatives of random grasps with central differences."""
     few, fewer = (QUICK, QUICK) if quick else (GRASPS, JAWS)
     return judged({"two fingers grasp": grasps(False, few), "jaw grasps": grasps(True, fewer)})
 
 
-def judged(cases: dict[str, Case]) -> list[dict[str, Any]]:
-    """Compare each case with central differences, print the errors, and return one row for each case."""
+def judged(cases: dict[str, Case]) -> list[Row]:
+    """Compare each case with central differences, and return one row for each."""
     rows = []
     for name, case in cases.items():
         found = compare(case)
@@ -179,23 +173,13 @@ def judged(cases: dict[str, Case]) -> list[dict[str, Any]]:
         row |= {"above": (error > TOLERANCE).sum(), "above_fine": (found.fine > TOLERANCE).sum()}
         row |= {"largest_fine": np.where(found.error > TOLERANCE, found.fine, found.error).max()}
         rows.append(row)
-        print(
-            f"  {name}: {row['pushes']} pushes x {row['directions']} directions; {row['finite']} with all derivatives"
-        )
-        print(
-            f"     finite; {row['held']} end held, {row['failed']} with failed steps; {row['left_out']} pairs left out"
-        )
-        print("     " + ", ".join(f"{k} {row[k]:.1e}" for k in ("q50", "q99", "q99.9", "largest")), end="; ")
-        print(
-            f"{row['above']} above {TOLERANCE:g}, {row['above_fine']} by finer differences ({row['largest_fine']:.1e})"
-        )
     return rows
 
 
 # --- random friction ---
 
 
-def random(quick: bool) -> list[dict[str, Any]]:
+def random(quick: bool) -> list[Row]:
     """Compare derivatives of three means with differences of means, for pushes of the README's square.
 
     The means are those of x / LENGTH, theta and (theta + 0.4 rad)^2 of the final pose.
@@ -225,10 +209,6 @@ def random(quick: bool) -> list[dict[str, Any]]:
             paired = (slope[:, :, k] - difference).std(axis=0) / np.sqrt(n)
             rows.append({"sampler": sampler, "dof": dof, "by": name, "derivative": mine, "difference": theirs})
             rows[-1] |= {"standard_error": paired, "finite": np.isfinite(slope[:, :, k]).all()}
-            text = [
-                f"{a:.3e} / {b:.3e} ± {e:.0e}" for a, b, e in zip(mine, theirs, rows[-1]["standard_error"], strict=True)
-            ]
-            print(f"  {sampler}, dof {dof:g}, by {name:10}: " + "; ".join(text), flush=True)
     return rows
 
 
@@ -270,7 +250,7 @@ def lines(quick: bool) -> list[tuple[str, str, Callable, np.ndarray]]:
     ]
 
 
-def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
+def draw(quick: bool, to: Path) -> list[Row]:
     """Draw the final angle and its derivative along each of `lines`, and save the figure to the path `to`."""
     import matplotlib.pyplot as plt
 
@@ -282,8 +262,8 @@ def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
             both = jax.jit(jax.vmap(lambda x, angle=angle: jax.jvp(angle, (x,), (jnp.ones_like(x),))))
             value, slope = both(jnp.asarray(at))
             central = np.gradient(np.asarray(value), at)
-            above.plot(at, value, ".", color=plot.START, markersize=1.5)
-            below.plot(at, central, ".", color=plot.BETWEEN, markersize=4, label="difference of neighbors")
+            above.plot(at, value, ".", color=plot.BLACK, markersize=1.5)
+            below.plot(at, central, ".", color=plot.GRAY, markersize=4, label="difference of neighbors")
             below.plot(at, slope, ".", color=plot.ORANGE, markersize=1.5, label="jax.jvp")
             low, high = np.quantile(slope, [0.005, 0.995])
             below.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
@@ -292,36 +272,78 @@ def picture(quick: bool, to: Path) -> list[dict[str, Any]]:
         axes[0, 0].set_ylabel("final angle, deg")
         axes[1, 0].set_ylabel("its derivative")
         plot.legend_below(figure, axes[1, 0], columns=2)
-        print(f"  drew {plot.save(figure, to)}")
-    return [{"picture": to}]
+        return [{"picture": plot.save(figure, to)}]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}; all")
-    parser.add_argument("--quick", action="store_true", help="small batches: does it run")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--picture", type=Path, default=Path("derivatives.png"))
-    arguments = parser.parse_args()
-    for part in arguments.parts:  # argparse's own choices refuse none (until Python 3.12)
-        if part not in PARTS:
-            parser.error(f"parts: expected some of {', '.join(PARTS)}; got {part}")
+# --- the record ---
+
+
+def run(
+    parts: Annotated[tuple[Part, ...], tyro.conf.Positional] = get_args(Part),
+    quick: bool = False,
+    picture: Path = Path("derivatives.png"),
+    progress: ProgressCallback = no_progress,
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> dict[str, Any]:
+    """Measure cost and agreement of derivatives, in float32 the cost and the memory, and in float64 the rest.
+
+    Args:
+        parts: Which parts.
+        quick: Small batches: does it run.
+        picture: File of the picture.
+        progress: Called with the number of parts done and their total.
+        keep: Called with the record so far.
+
+    Returns:
+        The record, with the rows of each part by its name.
+    """
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are measured
-    print(header())
-    made: dict[str, Callable] = {"cost": cost, "memory": memory, "agreement": agreement}
-    made |= {"grasps": grasping, "random": random}
-    made["picture"] = lambda quick: picture(quick, arguments.picture)
-    rows = {}
-    for part in PARTS:
-        if part in (arguments.parts or PARTS):
-            jax.config.update("jax_enable_x64", part not in ("cost", "memory"))
-            print(f"{part}, {'float64' if part not in ('cost', 'memory') else 'float32'}", flush=True)
-            rows[part] = made[part](arguments.quick)
-    if arguments.json is not None:
-        write_json(
-            result_record("derivatives", {"quick": arguments.quick, "parts": list(rows)}, **rows), arguments.json
+    made: dict[str, Callable[[bool], list[Row]]] = {"cost": cost, "memory": memory, "agreement": agreement}
+    made |= {"grasps": grasping, "random": random, "picture": lambda quick: draw(quick, picture)}
+    chosen = [part for part in made if part in parts]
+    rows: dict[str, list[Row]] = {}
+    record = result_record("derivatives", {"quick": quick, "parts": chosen})
+    for part in chosen:
+        jax.config.update("jax_enable_x64", part not in ("cost", "memory"))
+        rows[part] = made[part](quick)
+        keep(record | rows)
+        progress(len(rows), len(chosen))
+    return record | rows
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    lines = []
+    for part in record["settings"]["parts"]:
+        lines.append(f"{part}, {'float64' if part not in ('cost', 'memory') else 'float32'}")
+        lines += [f"  {_line(part, row)}" for row in record[part]]
+    return "\n".join(lines)
+
+
+def _line(part: str, row: Row) -> str:
+    """Return the text of one row."""
+    if part in ("cost", "memory"):
+        each = row["batch"] * row["steps"]
+        bytes_each = f"{row['bytes'] / each:.1f} bytes per push and step"
+        if part == "memory":
+            return (
+                f"gradient, {row['way']:46}: {row['bytes'] / 1e6:7.1f} MB, {bytes_each}, {1e3 * row['run_s']:8.1f} ms"
+            )
+        return (
+            f"{row['fingers']} finger(s), {row['what']:8}: compile {row['compile_s']:5.1f} s, run "
+            f"{1e3 * row['run_s']:8.1f} ms, {1e9 * row['run_s'] / each:.0f} ns and {bytes_each}, {row['ratio']:.2f} x "
+            "the push"
         )
-
-
-if __name__ == "__main__":
-    main()
+    if part in ("agreement", "grasps"):
+        errors = ", ".join(f"{name} {row[name]:.1e}" for name in ("q50", "q99", "q99.9", "largest"))
+        return (
+            f"{row['case']}: {row['pushes']} pushes x {row['directions']} directions; {row['finite']} with all "
+            f"derivatives finite; {row['held']} end held, {row['failed']} with failed steps; {row['left_out']} pairs "
+            f"left out\n     {errors}; {row['above']} above {TOLERANCE:g}, {row['above_fine']} by finer differences "
+            f"({row['largest_fine']:.1e})"
+        )
+    if part == "random":
+        figures = zip(row["derivative"], row["difference"], row["standard_error"], strict=True)
+        text = "; ".join(f"{a:.3e} / {b:.3e} ± {e:.0e}" for a, b, e in figures)
+        return f"{row['sampler']}, dof {row['dof']:g}, by {row['by']:10}: {text}"
+    return f"drew {row['picture']}"

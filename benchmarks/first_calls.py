@@ -1,32 +1,35 @@
 """Time of first calls including tracing and compiling.
 
-    python -m benchmarks first_calls [CASE …] [--rounds 3] [--batch 2000] [--x64] [--option NAME=VALUE …]
-
 The programs are pushes of a square, their gradient, pushes of a T, and grasps by two fingers and by a parallel jaw
 (four contacts). The sessions are the README's example and 1000 random pushes of an L, both timed from after the import
 to the end, and the whole command `pushjax identify` on the log of "Getting started".
 
-Each call runs in a process of its own, without a cache of compiled programs, with the cases in turns. Prints the
-seconds of tracing, lowering and compiling, the equations traced, the kernels and instructions of the compiled program,
-the memory maps that it added to the process (Linux allows 65 530), and the median time of nine runs after the first;
-then the medians of all rounds. `--option` sets an option of XLA, as in `jax.jit(compiler_options=...)`. Run nothing
-else on the machine meanwhile, because compiling uses all cores.
+Each call runs in a process of its own, without a cache of compiled programs, with the cases in turns. The figures are
+the seconds of tracing, lowering and compiling, the equations traced, the kernels and instructions of the compiled
+program, the memory maps that it added to the process (Linux allows 65 530), and the median time of nine runs after the
+first; then the medians of all rounds. Run nothing else on the machine meanwhile, because compiling uses all cores.
 """
 
-import argparse
+import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
+from typing import Annotated, Any, Literal, get_args
+
+import tyro
+
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 
 STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000
-PROGRAMS = ("push", "gradient", "t", "two_fingers", "jaw")
-SESSIONS = ("example", "random_l", "identify")
-CASES = PROGRAMS + SESSIONS
+Program = Literal["push", "gradient", "t", "two_fingers", "jaw"]
+Session = Literal["example", "random_l", "identify"]
 COLUMNS = (
     "trace_s",
     "lower_s",
@@ -39,51 +42,70 @@ COLUMNS = (
     "maps",
     "run_ms",
 )
-LAYOUT = "{:>12}" + " {:>12}" * len(COLUMNS)
 ROOT = Path(__file__).resolve().parent.parent
-
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES), default=CASES)
-parser.add_argument("--rounds", type=int, default=3)
-parser.add_argument("--batch", type=int, default=2000)
-parser.add_argument("--x64", action="store_true", help="with float64 enabled, and used")
-parser.add_argument("--option", action="append", default=[])
-parser.add_argument("--alone", action="store_true", help="one case, in this process")
-arguments = parser.parse_args()
-if wrong := sorted(set(arguments.cases) - set(CASES)):
-    parser.error(f"unknown {', '.join(wrong)}; there are {', '.join(CASES)}")
+Figures = dict[str, float]
 
 
-def main() -> None:
-    if arguments.alone:
-        print(*measured(arguments.cases[0]))
-        return
-    from benchmarks._measure import header
+def run(
+    cases: Annotated[tuple[Program | Session, ...], tyro.conf.Positional] = (*get_args(Program), *get_args(Session)),
+    rounds: int = 3,
+    batch: int = 2000,
+    x64: bool = False,
+    option: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")] = (),
+    progress: ProgressCallback = no_progress,
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> dict[str, Any]:
+    """Measure first calls, each in a process of its own.
 
-    print(header())
-    print(LAYOUT.format("", *COLUMNS))
-    found = {case: [] for case in arguments.cases}
-    for _ in range(arguments.rounds):
-        for case in arguments.cases:
-            found[case].append(in_process_of_its_own(case))
-            print(LAYOUT.format(case, *(f"{x:g}" for x in found[case][-1])), flush=True)
-    print("medians")
-    for case, rows in found.items():
-        print(LAYOUT.format(case, *(f"{median(column):g}" for column in zip(*rows, strict=True))))
+    Args:
+        cases: Names of programs and sessions.
+        rounds: Number of times that each is measured, in turns.
+        batch: Number of pushes or grasps of a program.
+        x64: Whether to compute in float64.
+        option: Options of XLA, as in `jax.jit(compiler_options=...)`.
+        progress: Called with the number of calls done and their total.
+        keep: Called with the record so far.
+
+    Returns:
+        The record, with one row for each call in the order of the calls, and the `medians` of each case. A session has
+        two times only.
+    """
+    settings = {"rounds": rounds, "batch": batch, "x64": x64, "option": list(option)}
+    rows: list[dict[str, Any]] = []
+    record = result_record("first_calls", settings, rows=rows, medians=[])
+    for _ in range(rounds):
+        for case in cases:
+            rows.append({"case": case} | _in_process_of_its_own(case, settings))
+            keep(record)
+            progress(len(rows), rounds * len(cases))
+    for case in cases:
+        mine = [row for row in rows if row["case"] == case]
+        medians = {name: median(row[name] for row in mine) for name in COLUMNS if name in mine[0]}
+        record["medians"].append({"case": case} | medians)
+    return record
 
 
-def in_process_of_its_own(case: str) -> list[float]:
-    """Return `COLUMNS` of one case, measured in a new process."""
-    given = [f"--option={option}" for option in arguments.option] + ["--x64"] * arguments.x64
-    command = [sys.executable, "-m", "benchmarks.first_calls", case, "--alone", "--batch", str(arguments.batch), *given]
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+
+    def line(row: dict[str, Any]) -> str:
+        return f"{row['case']:>12}" + "".join(f" {row[x]:>12g}" if x in row else f" {'':>12}" for x in COLUMNS)
+
+    heads = " " * 12 + "".join(f" {name:>12}" for name in COLUMNS)
+    return "\n".join([heads, *map(line, record["rows"]), "medians", *map(line, record["medians"])])
+
+
+def _in_process_of_its_own(case: str, settings: dict[str, Any]) -> Figures:
+    """Return the figures of one case, measured in a new process."""
+    command = [sys.executable, "-m", "benchmarks.first_calls", case, json.dumps(settings)]
     with tempfile.TemporaryDirectory() as folder:
         if case == "identify":  # writing its log is not timed
             _checked([sys.executable, "-c", log_script()], folder)
             command = [sys.executable, "-m", "pushjax", *identify_arguments(), "--no-cache"]
             begin = perf_counter()
             processor = _checked(command, folder)[1]
-            return session(perf_counter() - begin, processor)
-        return [float(word) for word in _checked(command, folder)[0].split()]
+            return _session(perf_counter() - begin, processor)
+        return json.loads(_checked(command, folder)[0])
 
 
 def _checked(command: list[str], folder: str) -> tuple[str, float]:
@@ -106,15 +128,9 @@ def _checked(command: list[str], folder: str) -> tuple[str, float]:
     return done.stdout, used
 
 
-def session(seconds: float, processor: float) -> list[float]:
-    """Return `COLUMNS` of a whole session, with NaN for all but its two times.
-
-    Args:
-        seconds: Wall time, in s.
-        processor: Processor time, in s.
-    """
-    known = {"first_call_s": round(seconds, 2), "processor_s": round(processor, 2)}
-    return [known.get(column, float("nan")) for column in COLUMNS]
+def _session(seconds: float, processor: float) -> Figures:
+    """Return the figures of a whole session: its wall time and its processor time, in s."""
+    return {"first_call_s": round(seconds, 2), "processor_s": round(processor, 2)}
 
 
 def blocks(page: str, language: str) -> list[str]:
@@ -134,20 +150,19 @@ def identify_arguments() -> list[str]:
     return command.split()[1:]
 
 
-def measured(case: str) -> list[float]:
-    """Return `COLUMNS` of one case, measured in this process."""
-    if case in SESSIONS:
-        return in_session(case)
+def measured(case: str, batch: int, x64: bool, option: list[str], rounds: int = 1) -> Figures:
+    """Return the figures of one case, measured in this process, with the settings of `run`."""
     import jax
 
     from benchmarks.hlo import traffic
 
-    jax.config.update("jax_enable_x64", arguments.x64)
+    jax.config.update("jax_enable_x64", x64)
     jax.config.update("jax_enable_compilation_cache", False)
-    function, args = work(case, "float64" if arguments.x64 else "float32")
+    if case in get_args(Session):
+        return _in_session(case)
+    function, args = work(case, "float64" if x64 else "float32", batch)
     jax.block_until_ready(args)
-    options = dict(option.split("=", 1) for option in arguments.option)
-    program = jax.jit(function, compiler_options=options)
+    program = jax.jit(function, compiler_options=dict(each.split("=", 1) for each in option))
 
     maps, busy = memory_maps(), process_time()
     begin = perf_counter()
@@ -170,7 +185,7 @@ def measured(case: str) -> list[float]:
         runs.append(1e3 * (perf_counter() - begin_run))
     seconds = [round(x, 2) for x in (then - begin, later - then, end - later, first, busy)]
     counts = [equations(traced.jaxpr.jaxpr), traffic(text).kernels, instructions, maps]
-    return [*seconds, *counts, round(median(runs), 2)]
+    return dict(zip(COLUMNS, [*seconds, *counts, round(median(runs), 2)], strict=True))
 
 
 def memory_maps() -> int:
@@ -186,15 +201,13 @@ def equations(jaxpr) -> int:
     return sum(1 + sum(map(equations, jaxprs_in_params(each.params))) for each in jaxpr.eqns)
 
 
-def in_session(case: str) -> list[float]:
-    """Return `COLUMNS` of a session that runs in this process, timed from after the import."""
+def _in_session(case: str) -> Figures:
+    """Return the figures of a session that runs in this process, timed from after the import."""
     import jax
     import jax.numpy as jnp
 
     import pushjax as pj
 
-    jax.config.update("jax_enable_x64", arguments.x64)
-    jax.config.update("jax_enable_compilation_cache", False)
     begin, busy = perf_counter(), process_time()
     if case == "example":
         exec(blocks("README.md", "python")[0], {})
@@ -207,15 +220,16 @@ def in_session(case: str) -> list[float]:
         model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
         hand, key = pj.Hand.finger(0.005), jax.random.key(1)
         pj.monte_carlo(key, RANDOM_PUSHES, slider, hand, path, pose=jnp.zeros(3), model=model).summary()
-    return session(perf_counter() - begin, process_time() - busy)
+    return _session(perf_counter() - begin, process_time() - busy)
 
 
-def work(case: str, dtype: str) -> tuple:
+def work(case: str, dtype: str, batch: int) -> tuple:
     """Return the function of a program and its arguments.
 
     Args:
-        case: One of `PROGRAMS`.
+        case: Name of the program.
         dtype: Floating type.
+        batch: Number of pushes or grasps.
     """
     import jax
     import jax.numpy as jnp
@@ -224,13 +238,13 @@ def work(case: str, dtype: str) -> tuple:
     from benchmarks import cases, grasps, tasks
 
     if case in ("push", "gradient"):
-        one, args = cases.each_push("quartic", dtype, arguments.batch, STEPS)
+        one, args = cases.each_push("quartic", dtype, batch, STEPS)
     elif case == "t":
-        one, (_, path, friction) = cases.each_push("quartic", dtype, arguments.batch, STEPS)
+        one, (_, path, friction) = cases.each_push("quartic", dtype, batch, STEPS)
         one, args = push_of_t(dtype), (path, friction)
     else:
         hand = grasps.hand(dtype) if case == "two_fingers" else tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype)
-        one, args = cases.each_grasp(hand, dtype, arguments.batch, STEPS)
+        one, args = cases.each_grasp(hand, dtype, batch, STEPS)
     final = jax.vmap(lambda *each: one(*each).pose[-1])
     if case == "gradient":
         return jax.grad(lambda *args: jnp.sum(final(*args)), argnums=(0, 1, 2)), args
@@ -248,4 +262,4 @@ def push_of_t(dtype: str):
 
 
 if __name__ == "__main__":
-    main()
+    print(json.dumps(measured(sys.argv[1], **json.loads(sys.argv[2]))))

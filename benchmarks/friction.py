@@ -1,36 +1,27 @@
 """Convexity, mean and repairs of a million random surfaces of each sampler.
 
-    python -m benchmarks friction [--n 1000000] [--certificates 200] [--x64]
-
 Convexity is judged in float64 by a sweep of the Hessian that does not use the sampler's certificate. For a few surfaces
 a semi-definite program also searches for a Gram matrix that proves it (needs cvxpy).
 """
 
-import argparse
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--n", type=int, default=1_000_000)
-parser.add_argument("--certificates", type=int, default=200)
-parser.add_argument("--x64", action="store_true")
-arguments = parser.parse_args()
-if arguments.x64:
-    jax.config.update("jax_enable_x64", True)
-
-import numpy as np  # noqa: E402
-
-import pushjax as pj  # noqa: E402
-from benchmarks._measure import header  # noqa: E402
-from pushjax.friction.quartic import MONOMIALS  # noqa: E402
-from pushjax.testing.convexity import least_curvatures  # noqa: E402
+import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.friction.quartic import MONOMIALS
+from pushjax.testing.convexity import least_curvatures
 
 CHUNK = 50_000
 DOFS = (10, 20, 50, 250)
 # Least curvature of a surface that counts as convex, relative to its largest coefficient. It is below zero by roundoff.
-CONVEX = -1e-8 if arguments.x64 else -3e-7
+CONVEX = {"float64": -1e-8, "float32": -3e-7}
+SAMPLERS = ("gram", "sum_of_squares")
 
 
 @jax.jit
@@ -95,41 +86,86 @@ def _bent(c: np.ndarray, f: np.ndarray, z: np.ndarray) -> float:
     return float(2 * np.polyfit(t, values, 4)[2])
 
 
-def main() -> None:
-    print(header())
+def run(
+    n: int = 1_000_000,
+    certificates: int = 200,
+    x64: bool = False,
+    progress: ProgressCallback = no_progress,
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> dict[str, Any]:
+    """Draw random surfaces around the quartic of a square on 64 points, and around an ellipsoid.
+
+    Args:
+        n: Number of samples with 20 degrees of freedom; a tenth of it, but at least CHUNK, with others.
+        certificates: Number of quartics with 20 degrees of freedom for which a semi-definite program is solved.
+        x64: Whether to compute in float64.
+        progress: Called with the number of rows done and their total.
+        keep: Called with the record so far.
+
+    Returns:
+        The record, with the row of `_quartics` for each sampler and number of degrees of freedom, and `ellipsoid`.
+    """
+    jax.config.update("jax_enable_x64", x64)
     block = pj.Polygon.rectangle(0.09, 0.09)
     surface = pj.fit_limit_surface(*pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(0), 400))
     assert isinstance(surface, pj.Quartic)
+    rows: list[dict[str, Any]] = []
+    settings = {"n": n, "certificates": certificates, "dtype": str(surface.coefficients.dtype)}
+    record = result_record("friction", settings, rows=rows, ellipsoid=_ellipsoids(n))
+    todo = [(sampler, dof) for sampler in SAMPLERS for dof in DOFS]
+    for sampler, dof in todo:
+        count = n if dof == 20 else max(n // 10, CHUNK)
+        rows.append(_quartics(surface, sampler, dof, count, certificates if dof == 20 else 0))
+        keep(record)
+        progress(len(rows), len(todo))
+    return record
+
+
+def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certificates: int) -> dict[str, Any]:
+    """Draw `count` quartics, and compare their moments with those of the distribution.
+
+    Args:
+        surface: Mean of the surfaces.
+        sampler: Name of the sampler.
+        dof: Degrees of freedom.
+        count: Number of samples.
+        certificates: Number of samples, half of them repaired ones, for which a semi-definite program is solved.
+
+    Returns:
+        The row. `mean_off` is the largest deviation of a mean coefficient, in standard errors, before repairs, and
+        `mean_shift` that after them, relative to the largest coefficient. `variance` is the relative variance of H,
+        divided by 2 / dof.
+    """
     mean = np.asarray(surface.coefficients, np.float64)
-    n = arguments.n
-    print(f"quartic of a square on 64 points, {surface.coefficients.dtype}, {n} samples each")
+    c, pull, seconds = draw(pj.FrictionModel(dof=dof, friction=0.3, sampler=sampler), surface, count)
+    raw = (c - pull[:, None] * mean) / (1 - pull[:, None])
+    off = np.abs(raw.mean(axis=0) - mean) / (raw.std(axis=0) / np.sqrt(count))
+    shift = (c.mean(axis=0) - mean) / np.abs(mean).max()
     rays = np.random.default_rng(0).normal(size=(1000, 3))
-    products = np.prod(rays[:, None] ** MONOMIALS, axis=2)
-    for sampler in ("gram", "sum_of_squares"):
-        for dof in DOFS:
-            count = n if dof == 20 else max(n // 10, CHUNK)
-            c, pull, seconds = draw(pj.FrictionModel(dof=dof, friction=0.3, sampler=sampler), surface, count)
-            raw = (c - pull[:, None] * mean) / (1 - pull[:, None])
-            error = raw.std(axis=0) / np.sqrt(count)
-            off = np.abs(raw.mean(axis=0) - mean) / error
-            shift = (c.mean(axis=0) - mean) / np.abs(mean).max()
-            values = raw[:100_000] @ products.T
-            spread = np.mean(values.var(axis=0) / values.mean(axis=0) ** 2) * dof / 2
-            begun = time.perf_counter()
-            curvature = least_curvatures(c)
-            print(
-                f"{sampler:14} dof {dof:3}: {count:8} samples, {1e6 * seconds / count:5.1f} us each; "
-                f"{np.sum(~(curvature >= CONVEX))} not convex (least curvature {curvature.min():.1e}, "
-                f"{time.perf_counter() - begun:.0f} s of sweep); repaired {np.mean(pull > 0):.2%}, mean shrinkage "
-                f"{pull[pull > 0].mean() if (pull > 0).any() else 0:.3f}; mean off {off.max():.1f} standard errors at "
-                f"worst before repair, {np.abs(shift).max():.2e} of the largest coefficient after; relative variance "
-                f"of H {spread:.3f} of 2 / dof",
-                flush=True,
-            )
-            if dof == 20 and arguments.certificates:
-                few = np.concatenate([c[pull > 0][: arguments.certificates // 2], c[pull == 0]])
-                few = few[: arguments.certificates]
-                print(f"       a semi-definite program certifies {certified(few)} of {len(few)}", flush=True)
+    values = raw[:100_000] @ np.prod(rays[:, None] ** MONOMIALS, axis=2).T
+    begun = time.perf_counter()
+    curvature = least_curvatures(c)
+    swept = time.perf_counter() - begun
+    few = np.concatenate([c[pull > 0][: certificates // 2], c[pull == 0]])[:certificates]
+    return {
+        "sampler": sampler,
+        "dof": dof,
+        "samples": count,
+        "us_per_sample": 1e6 * seconds / count,
+        "not_convex": int(np.sum(~(curvature >= CONVEX[str(surface.coefficients.dtype)]))),
+        "least_curvature": curvature.min(),
+        "sweep_s": swept,
+        "repaired": np.mean(pull > 0),
+        "shrinkage": pull[pull > 0].mean() if (pull > 0).any() else 0.0,
+        "mean_off": off.max(),
+        "mean_shift": np.abs(shift).max(),
+        "variance": np.mean(values.var(axis=0) / values.mean(axis=0) ** 2) * dof / 2,
+        "certified": [certified(few), len(few)] if certificates else None,
+    }
+
+
+def _ellipsoids(n: int) -> dict[str, float]:
+    """Draw `n` ellipsoids with 20 degrees of freedom, and compare their moments with the formula's."""
     a = np.array([[1.0, 0.2, -0.1], [0.2, 1.5, 0.3], [-0.1, 0.3, 0.8]])
     around = pj.FrictionModel(dof=20.0, friction=0.3).around(pj.Ellipsoid(a, 0.03))
     ellipsoids: Any = jax.jit(jax.vmap(around.sample))(jax.random.split(jax.random.key(2), n)).surface
@@ -137,11 +173,25 @@ def main() -> None:
     variance = (a**2 + np.outer(np.diag(a), np.diag(a))) / 20
     off = np.abs(drawn_a.mean(axis=0) - a) / np.sqrt(variance / n)
     ratio = drawn_a.var(axis=0) / variance
-    print(
-        f"ellipsoid dof 20: mean off {off.max():.1f} standard errors at worst, variances {ratio.min():.4f} to "
-        f"{ratio.max():.4f} of the formula's"
+    return {"mean_off": off.max(), "lowest_variance": ratio.min(), "highest_variance": ratio.max()}
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    lines = [f"quartic of a square on 64 points, {record['settings']['dtype']}"]
+    for row in record["rows"]:
+        lines.append(
+            f"{row['sampler']:14} dof {row['dof']:3}: {row['samples']:8} samples, {row['us_per_sample']:5.1f} us each; "
+            f"{row['not_convex']} not convex (least curvature {row['least_curvature']:.1e}, {row['sweep_s']:.0f} s of "
+            f"sweep); repaired {row['repaired']:.2%}, mean shrinkage {row['shrinkage']:.3f}; mean off "
+            f"{row['mean_off']:.1f} standard errors at worst before repair, {row['mean_shift']:.2e} of the largest "
+            f"coefficient after; relative variance of H {row['variance']:.3f} of 2 / dof"
+        )
+        if row["certified"]:
+            lines.append("       a semi-definite program certifies {} of {}".format(*row["certified"]))
+    here = record["ellipsoid"]
+    lines.append(
+        f"ellipsoid dof 20: mean off {here['mean_off']:.1f} standard errors at worst, variances "
+        f"{here['lowest_variance']:.4f} to {here['highest_variance']:.4f} of the formula's"
     )
-
-
-if __name__ == "__main__":
-    main()
+    return "\n".join(lines)

@@ -1,14 +1,12 @@
 """Time, memory and bitwise reproducibility of a million pushes.
 
-    python -m benchmarks million_pushes [--n 1000000] [--steps 200] [--same 100000]
-
 Results are compared bit by bit between runs on one, two and eight devices, in two processes, and in a run that is
-killed halfway by SIGKILL and resumed. Each run is a process of its own. `--same` is the number of pushes that are
-compared.
+killed halfway by SIGKILL and resumed. Each run is a process of its own: `python -m benchmarks.million_pushes SETTINGS`,
+with the arguments of `one_run` in JSON.
 """
 
-import argparse
 import hashlib
+import json
 import os
 import resource
 import signal
@@ -18,126 +16,151 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--n", type=int, default=1_000_000)
-parser.add_argument("--steps", type=int, default=200)
-parser.add_argument("--same", type=int, default=100_000)
-parser.add_argument("--run", type=int, help=argparse.SUPPRESS)
-parser.add_argument("--checkpoint", help=argparse.SUPPRESS)
-parser.add_argument("--kill-after", type=int, help=argparse.SUPPRESS)
-parser.add_argument("--process", type=int, default=0, help=argparse.SUPPRESS)
-parser.add_argument("--of", type=int, default=1, help=argparse.SUPPRESS)
-parser.add_argument("--port", type=int, help=argparse.SUPPRESS)
-arguments = parser.parse_args()
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
 
 
-def run() -> None:
+def one_run(
+    n: int,
+    steps: int,
+    checkpoint: str | None = None,
+    kill_after: int | None = None,
+    process: int = 0,
+    processes: int = 1,
+    port: int = 0,
+) -> dict[str, Any]:
     """Do one run in this process.
 
-    Prints the seconds of the run and of 2000 pushes, the peak memory in MB, a digest of every bit of the result, a
-    digest of the friction that was drawn, and the number of pushes that failed.
+    Args:
+        n: Number of pushes.
+        steps: Number of steps of each.
+        checkpoint: Folder in which the run is kept.
+        kill_after: Number of pushes after which the process kills itself.
+        process: Which of the processes this is.
+        processes: Number of processes that share the run.
+        port: Port at which they meet.
+
+    Returns:
+        Seconds of the run, seconds of 2000 pushes (where the run is of one process and not kept), peak memory in MB, a
+        digest of every bit of the result, a digest of the friction that was drawn, and the number of failed pushes.
     """
     import jax
     import jax.numpy as jnp
     import numpy as np
 
-    if arguments.of > 1:
+    if processes > 1:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
-        jax.distributed.initialize(f"127.0.0.1:{arguments.port}", arguments.of, arguments.process)
+        jax.distributed.initialize(f"127.0.0.1:{port}", processes, process)
     import pushjax as pj
     from pushjax.experiments import stochastic_push
 
-    slider, hand, path = stochastic_push.setting(0, arguments.steps)
+    slider, hand, path = stochastic_push.setting(0, steps)
     model = pj.FrictionModel(dof=20.0, friction=(0.15, 0.35))
 
     def progress(done: int, total: int) -> None:
-        if arguments.kill_after is not None and done >= arguments.kill_after:
+        if kill_after is not None and done >= kill_after:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def pushes(n: int, **options):
         return pj.monte_carlo(jax.random.key(1), n, slider, hand, path, pose=jnp.zeros(3), model=model, **options)
 
-    if arguments.kill_after is None:
+    if kill_after is None:
         pushes(2048)  # compiles
-    small = (
-        np.median([pushes(2000).seconds for _ in range(5)]) if arguments.of == 1 and not arguments.checkpoint else 0.0
-    )
-    result = pushes(arguments.run, checkpoint=arguments.checkpoint, progress=progress)
+    small = float(np.median([pushes(2000).seconds for _ in range(5)])) if processes == 1 and not checkpoint else 0.0
+    result = pushes(n, checkpoint=checkpoint, progress=progress)
     found = hashlib.sha256()
     for name, value in sorted(vars(result).items()):
         if isinstance(value, np.ndarray):
             found.update(name.encode() + np.ascontiguousarray(value).tobytes())
-    draws = hashlib.sha256(result.friction.tobytes() + result.shrinkage.tobytes()).hexdigest()[:12]
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(
-        "RESULT",
-        result.seconds,
-        float(small),
-        peak,
-        found.hexdigest()[:12],
-        draws,
-        result.outcomes()["failed"],
-        flush=True,
-    )
+    return {
+        "run_s": result.seconds,
+        "run_s_of_2000": small,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "digest": found.hexdigest()[:12],
+        "draws": hashlib.sha256(result.friction.tobytes() + result.shrinkage.tobytes()).hexdigest()[:12],
+        "failed": int(result.outcomes()["failed"]),
+    }
 
 
-def start(n: int, *options: str, devices: int = 1) -> subprocess.Popen:
-    """Start a run of `n` pushes in a process of its own, on so many devices."""
+def _start(devices: int = 1, **settings: Any) -> subprocess.Popen:
+    """Start `one_run` in a process of its own, on so many devices."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
-    command = [
-        sys.executable,
-        "-m",
-        "benchmarks.million_pushes",
-        "--steps",
-        str(arguments.steps),
-        "--run",
-        str(n),
-        *options,
-    ]
+    command = [sys.executable, "-m", "benchmarks.million_pushes", json.dumps(settings)]
     return subprocess.Popen(command, env=os.environ | {"XLA_FLAGS": flags}, stdout=subprocess.PIPE, text=True)
 
 
-def finished(process: subprocess.Popen) -> list[str]:
-    """Wait for a run, and return the figures that it printed."""
+def _finished(process: subprocess.Popen) -> dict[str, Any]:
+    """Wait for a run, and return what it found."""
     out, _ = process.communicate()
-    return next(line for line in out.splitlines() if line.startswith("RESULT")).split()[1:]
+    return json.loads(out.splitlines()[-1])
 
 
-def main() -> None:
-    from benchmarks._measure import header
+def run(
+    n: int = 1_000_000, steps: int = 200, same: int = 100_000, progress: ProgressCallback = no_progress
+) -> dict[str, Any]:
+    """Run a million pushes, and fewer in several ways that have to give the same bits.
 
-    print(header())
-    seconds, small, peak, _, _, failed = finished(start(arguments.n))
-    each, few = float(seconds) / arguments.n, float(small) / 2000
-    print(
-        f"{arguments.n} pushes of {arguments.steps} steps, float32, one device: {float(seconds):.1f} s, "
-        f"{1e6 * each:.0f} us a push, {each / few:.2f} times that of 2000 at once ({1e6 * few:.0f} us); peak "
-        f"{float(peak):.0f} MB; {failed} failed",
-        flush=True,
-    )
-    n = arguments.same
-    rows = {f"{devices} devices": finished(start(n, devices=devices)) for devices in (1, 2, 8)}
+    Args:
+        n: Number of pushes of the first run.
+        steps: Number of steps of each push.
+        same: Number of pushes of the runs that are compared.
+        progress: Called with the number of runs done and their total.
+
+    Returns:
+        The record. `alone` is the first run; each row is one of the others, with whether its bits and draws are those
+        of one device; `resumed_s` is the time of the resumed process, imports and compiling included.
+    """
+    alone = _finished(_start(n=n, steps=steps))
+    progress(1, 7)
+    few = {"n": same, "steps": steps}
+    found = {}
+    for devices in (1, 2, 8):
+        found[f"{devices} devices"] = _finished(_start(devices, **few))
+        progress(1 + len(found), 7)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    both = [start(n, "--process", str(i), "--of", "2", "--port", port) for i in range(2)]
-    rows |= {f"process {i} of 2": finished(process) for i, process in enumerate(both)}
+        port = free.getsockname()[1]
+    both = [_start(**few, process=i, processes=2, port=port) for i in range(2)]
+    found |= {f"process {i} of 2": _finished(process) for i, process in enumerate(both)}
+    progress(6, 7)
     with tempfile.TemporaryDirectory() as folder:
         kept = str(Path(folder) / "kept")
-        killed = start(n, "--checkpoint", kept, "--kill-after", str(n // 2))
+        killed = _start(**few, checkpoint=kept, kill_after=same // 2)
         killed.communicate()
         assert killed.returncode == -signal.SIGKILL
         begun = time.perf_counter()
-        rows["killed halfway, resumed"] = finished(start(n, "--checkpoint", kept))
-        print(f"resumed and finished in {time.perf_counter() - begun:.1f} s, imports and compiling included")
-    _, _, _, bits, draws, _ = rows["1 devices"]
-    for name, row in rows.items():
-        print(
-            f"{n} pushes, {name:24} {float(row[0]):6.1f} s, peak {float(row[2]):5.0f} MB; poses and all: "
-            f"{'the same bits' if row[3] == bits else 'OTHER BITS'}; draws: {'same' if row[4] == draws else 'OTHER'}"
+        found["killed halfway, resumed"] = _finished(_start(**few, checkpoint=kept))
+        resumed_s = time.perf_counter() - begun
+    progress(7, 7)
+    one = found["1 devices"]
+    rows = [
+        {"run": name} | each | {f"same_{part}": each[part] == one[part] for part in ("digest", "draws")}
+        for name, each in found.items()
+    ]
+    settings = {"n": n, "steps": steps, "same": same}
+    return result_record("million_pushes", settings, alone=alone, rows=rows, resumed_s=resumed_s)
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    alone, settings = record["alone"], record["settings"]
+    each, few = alone["run_s"] / settings["n"], alone["run_s_of_2000"] / 2000
+    lines = [
+        f"{settings['n']} pushes of {settings['steps']} steps, float32, one device: {alone['run_s']:.1f} s, "
+        f"{1e6 * each:.0f} us a push, {each / few:.2f} times that of 2000 at once ({1e6 * few:.0f} us); peak "
+        f"{alone['peak_mb']:.0f} MB; {alone['failed']} failed",
+        f"resumed and finished in {record['resumed_s']:.1f} s, imports and compiling included",
+    ]
+    for row in record["rows"]:
+        lines.append(
+            f"{settings['same']} pushes, {row['run']:24} {row['run_s']:6.1f} s, peak {row['peak_mb']:5.0f} MB; poses "
+            f"and all: {'the same bits' if row['same_digest'] else 'OTHER BITS'}; draws: "
+            f"{'same' if row['same_draws'] else 'OTHER'}"
         )
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    run() if arguments.run is not None else main()
+    print(json.dumps(one_run(**json.loads(sys.argv[1]))))

@@ -24,7 +24,7 @@ def run(scale: float = 1.0, seed: int = 0, progress: ProgressCallback = no_progr
     surface and number of steps.
 
     Args:
-        scale: Factor of the number of pushes.
+        scale: Factor of the number of pushes, 100 000.
         seed: Seed of the pushes.
         progress: Called after every row with the number of rows done and their total.
 

@@ -9,7 +9,7 @@ import pytest
 
 import pushjax as pj
 from benchmarks import cases, contacts, grasps, numerics, outlines, speed, tasks, timing
-from benchmarks.__main__ import SCRIPTS, listing, main
+from benchmarks.__main__ import MODULES, SCRIPTS, listing, main
 from benchmarks.hlo import traffic
 from benchmarks.peers import rows
 from benchmarks.peers.figure import speed_figure
@@ -251,8 +251,18 @@ def test_every_case_is_listed_with_a_line(capsys):
     main([])
     lines = capsys.readouterr().out.splitlines()
     assert lines == listing().splitlines()
-    assert {"push", "contacts", "table1_causes", *SCRIPTS} <= {line.split()[0] for line in lines}
+    assert {"push", "contacts", "table1_causes", *MODULES} <= {line.split()[0] for line in lines}
     assert all(len(line.split()) > 2 for line in lines)
+
+
+@pytest.mark.parametrize("case", ["", *sorted(set(MODULES) - set(SCRIPTS))])
+def test_every_case_describes_its_options_and_writes_a_record(case, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*case.split(), "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    assert "--json FILE" in text
+    assert "--progress" not in text
 
 
 def test_picture():

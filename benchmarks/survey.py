@@ -1,0 +1,202 @@
+"""Random pushes and grasps of many outlines by four hands, for the survey `overlaps`."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import shapely
+
+import pushjax as pj
+from pushjax.simulation.hand import Pad, RoundFinger
+
+MM = 1e-3
+# Vertices of the polygon that replaces a smooth outline. Its chords are within 0.2 um of the outline.
+FINE = 4000
+
+
+def _around(radius, count: int = 16) -> np.ndarray:
+    """Return `count` points (m) of the outline whose radius in mm is given as a function of the polar angle."""
+    angle = 2 * np.pi * np.arange(count) / count
+    return MM * radius(angle)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _comb() -> list[tuple[float, float]]:
+    """Return the vertices, in mm, of a comb with three teeth of 18 mm and gaps of 24 mm."""
+    tops = [(x + a, y) for x in (84, 42, 0) for a, y in ((18, 50), (0, 50), (0, 15), (-24, 15))][:-2]
+    return [(0, 0), (102, 0), *tops]
+
+
+def _star() -> np.ndarray:
+    """Return the vertices, in mm, of a star with five points."""
+    angle = np.pi * np.arange(10) / 5
+    return np.where(np.arange(10) % 2, 28, 60)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+POLYGONS = {
+    "L": [(0, 0), (120, 0), (120, 40), (40, 40), (40, 80), (0, 80)],
+    "T": [(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)],
+    "U": [(0, 0), (120, 0), (120, 80), (80, 80), (80, 30), (40, 30), (40, 80), (0, 80)],
+    "plus": [(-20, -60), (20, -60), (20, -20), (60, -20), (60, 20), (20, 20), (20, 60), (-20, 60), (-20, 20),
+             (-60, 20), (-60, -20), (-20, -20)],
+    "Z": [(0, 0), (80, 0), (80, 40), (120, 40), (120, 80), (40, 80), (40, 40), (0, 40)],
+    "arrow": [(-40, -50), (70, 0), (-40, 50), (-10, 0)],
+    "comb": _comb(),
+    "star": _star(),
+    "rectangle": [(-45, -30), (45, -30), (45, 30), (-45, 30)],
+    "hexagon": [(50 * np.cos(np.pi * k / 3), 50 * np.sin(np.pi * k / 3)) for k in range(6)],
+}  # fmt: skip
+SMOOTH = {
+    "bean": lambda: pj.Curve.through(_around(lambda a: 45 + 14 * np.cos(2 * a) - 12 * np.sin(a))),
+    "clover": lambda: pj.Curve.through(_around(lambda a: 45 + 11 * np.cos(3 * a), 24)),
+    "peanut": lambda: pj.Curve.through(_around(lambda a: 42 + 18 * np.cos(2 * a), 20)),
+    "ellipse": lambda: pj.Ellipse(0.06, 0.035),
+    "disk": lambda: pj.Disk(0.045),
+}
+SHAPES = (*POLYGONS, *SMOOTH)
+HANDS = ("one", "two", "three", "jaw")
+FINGER = 8 * MM
+PAD = (50 * MM, 10 * MM)
+
+
+def shape_of(name: str) -> pj.Polygon | pj.Curve | pj.Ellipse | pj.Disk:
+    """Return the outline of that name, one of `SHAPES`; polygons have their centroid at the origin."""
+    if name in SMOOTH:
+        return SMOOTH[name]()
+    vertices = MM * np.asarray(POLYGONS[name], float)
+    middle = np.asarray(shapely.Polygon(vertices).centroid.coords[0])
+    return pj.Polygon(vertices - middle)
+
+
+def outline_of(shape) -> shapely.Polygon:
+    """Return the outline as a polygon of shapely, which judges overlaps."""
+    points = shape.vertices if isinstance(shape, pj.Polygon) else shape.boundary(FINE)
+    return shapely.Polygon(np.asarray(points, float))
+
+
+def hand_of(name: str) -> pj.Hand:
+    """Return the hand of that name, one of `HANDS`."""
+    return {
+        "one": lambda: pj.Hand.finger(FINGER),
+        "two": lambda: pj.Hand.two_fingers(FINGER),
+        "three": lambda: pj.Hand.three_fingers(FINGER),
+        "jaw": lambda: pj.Hand.parallel_jaw(*PAD),
+    }[name]()
+
+
+def ends_of(name: str, rng: np.random.Generator, starts: int) -> np.ndarray:
+    """Return the first and the last configuration of each push.
+
+    Args:
+        name: Name of the hand.
+        rng: Generator of the pushes.
+        starts: Number of pushes.
+
+    Returns:
+        Configurations, (starts, 2, dof).
+    """
+    if name == "one":
+        angle, aside = rng.uniform(-np.pi, np.pi, starts), rng.uniform(-0.04, 0.04, starts)
+        along, across = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)
+        begin = -0.16 * along + aside[:, None] * across
+        return np.stack([begin, begin + 0.3 * along], axis=1)
+    first, last = {"two": (0.32, 0.02), "three": (0.17, 0.012), "jaw": (0.32, 0.02)}[name]
+    still = np.zeros((starts, 2, 3))
+    return np.concatenate([still, np.broadcast_to([[first], [last]], (starts, 2, 1))], axis=2)
+
+
+class Survey(NamedTuple):
+    """The pushes of one outline by one hand, and their trajectories.
+
+    Attributes:
+        hand: The hand.
+        slider: The slider.
+        path: Configurations of the hand, (starts, steps + 1, dof).
+        pose: Start poses of the slider, (starts, 3).
+        friction: Friction coefficients, (starts,).
+        push: Trajectories, with a leading axis (starts,).
+    """
+
+    hand: pj.Hand
+    slider: pj.Slider
+    path: np.ndarray
+    pose: np.ndarray
+    friction: np.ndarray
+    push: pj.Trajectory
+
+    @property
+    def shape(self):
+        """The outline of the slider."""
+        return self.slider.shape
+
+
+def surface_of(shape, key) -> pj.LimitSurface:
+    """Return the quartic of uniform pressure on 64 points of the outline."""
+    support = pj.Support.uniform(shape, points=64, load=1.0)
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(key, 400), degree=4)
+
+
+def simulate(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: int = 0) -> Survey:
+    """Simulate random pushes of one outline by one hand.
+
+    Args:
+        shape_name: One of `SHAPES`.
+        hand_name: One of `HANDS`.
+        starts: Number of pushes.
+        steps: Number of steps of each push.
+        dtype: Floating type.
+        seed: Seed of the pushes.
+    """
+    shape, hand = shape_of(shape_name), hand_of(hand_name)
+    seeds = (seed, SHAPES.index(shape_name), HANDS.index(hand_name))
+    rng = np.random.default_rng(seeds)
+    surface = surface_of(shape, jax.random.key(seed))
+    slider, hand = (jax.tree.map(lambda leaf: leaf.astype(dtype), tree) for tree in (pj.Slider(shape, surface), hand))
+    ends = ends_of(hand_name, rng, starts)
+    pose = np.concatenate([rng.uniform(-0.02, 0.02, (starts, 2)), rng.uniform(-np.pi, np.pi, (starts, 1))], axis=1)
+    friction = rng.uniform(0.05, 0.6, starts)
+    t = np.linspace(0, 1, steps + 1)[:, None]
+    path = (ends[:, :1] * (1 - t) + ends[:, 1:] * t).astype(dtype)
+    pose, friction = pose.astype(dtype), friction.astype(dtype)
+    push = jax.jit(jax.vmap(rollout, (None, None, 0, 0, 0)))(slider, hand, path, pose, friction)
+    return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push))
+
+
+# The slider is an argument so that polygons with the same number of vertices share a program in the compilation cache.
+def rollout(slider, hand, path, pose, friction) -> pj.Trajectory:
+    """Simulate one push."""
+    return pj.rollout(slider, hand, path, pose=pose, friction=friction)
+
+
+def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
+    """Return the place of each finger in the body frame of the slider.
+
+    Args:
+        hand: The hand.
+        poses: Poses of the slider, (..., 3).
+        configurations: Configurations of the hand, (..., dof).
+
+    Returns:
+        For each finger its center, (..., 1, 2), or the corners of a pad, (..., corners, 2), m.
+
+    Raises:
+        TypeError: If a finger is neither a `RoundFinger` nor a `Pad`.
+    """
+    where = np.asarray(hand.poses(jnp.asarray(configurations)), float)
+    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    found = []
+    for k, finger in enumerate(hand.fingers):
+        away = where[..., k, :2] - poses[..., :2]
+        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
+        placed = local[..., None, :]
+        if isinstance(finger, Pad):
+            turn = where[..., k, 2] - poses[..., 2]
+            corners = np.asarray(finger.shape.vertices, float)
+            cs, sn = np.cos(turn)[..., None], np.sin(turn)[..., None]
+            placed = placed + np.stack(
+                [cs * corners[:, 0] - sn * corners[:, 1], sn * corners[:, 0] + cs * corners[:, 1]], axis=-1
+            )
+        elif not isinstance(finger, RoundFinger):
+            raise TypeError(f"not a finger: {finger!r}")
+        found.append(placed)
+    return found
