@@ -80,7 +80,7 @@ def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[st
 
 
 def one_finger(n: int, steps: int = 60) -> Case:
-    """Return pushes of random pentagons by one finger: 60 mm, from any side towards any place in the pentagon.
+    """Return pushes of random pentagons by one finger: 60 mm, from any side toward any place in the pentagon.
 
     Some fingers slip off, some miss.
 

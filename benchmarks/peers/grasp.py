@@ -15,7 +15,7 @@ within 0.1 mm of the converged answer.
 - The corners slide at up to 0.1 m/s, ten times as fast as in a push. On supports as stiff as in a push, the square hops
   and poses scatter by 0.2 mm at any timestep. On softer ones (40 ms, 0.5; 0.15 s of sliding) errors fall with the
   timestep.
-- Twice the speed needs half the timestep. Slowing down towards the end, in eight pieces, gains nothing.
+- Twice the speed needs half the timestep. Slowing down toward the end, in eight pieces, gains nothing.
 - "Newton" (tolerance 1e-6) and "CG" (1e-8) do about equally well; so do values of impratio from 50 to 170.
 """
 

@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from pushjax.plot.style import BETWEEN, BLUE, GREEN, ORANGE, PURPLE, STYLE, bars
+from pushjax.plot.style import BLUE, GRAY, GREEN, ORANGE, PURPLE, STYLE, bars
 
 Change = Mapping[str, float]
 
@@ -45,7 +45,7 @@ def causes_figure(
         left.set(xlabel="change of the mean deviation / mm (left is better)", title="What each cause explains")
         left.legend(loc="upper center", bbox_to_anchor=(0.4, -0.16), ncols=2)
         kinds = (
-            ("nothing", "no cause", bars(BETWEEN)),
+            ("nothing", "no cause", bars(GRAY)),
             ("calibration", "calibrated", bars(BLUE)),
             ("noise", "repetitions", bars(ORANGE, True)),
         )

@@ -63,7 +63,7 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
 
     Reference: Mason 1986; Zhou et al. 2017, section IV.A.
     """
-    contact = _checked_contact(point, normal, friction, common_dtype(surface, point, normal))
+    contact = _checked_contact(point, normal, friction, common_dtype(surface, point, normal, friction))
     curve = LimitCurve.of(surface.form(), contact)
     edges = []
     for s in (contact.friction, -contact.friction):

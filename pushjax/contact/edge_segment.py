@@ -89,9 +89,9 @@ def monotone_intervals(c: Cubic, low: Scalar, high: Scalar) -> tuple[tuple[Monot
         For each of the three pieces, the piece and whether it has a root.
     """
     # turning points: the roots of c1 + 2 c2 u + 3 c3 u^2 = 0, in a form without cancellation
-    disc = c[2] * c[2] - 3 * c[3] * c[1]
-    turns = disc > 0
-    q = -(c[2] + jnp.where(c[2] < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(turns, disc, 1.0)))
+    discriminant = c[2] * c[2] - 3 * c[3] * c[1]
+    turns = discriminant > 0
+    q = -(c[2] + jnp.where(c[2] < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(turns, discriminant, 1.0)))
     t1 = jnp.where(turns & (c[3] != 0), q / jnp.where(c[3] != 0, 3 * c[3], 1.0), low)
     t2 = jnp.where(turns & (q != 0), c[1] / jnp.where(q != 0, q, 1.0), low)
     t1, t2 = jnp.clip(jnp.minimum(t1, t2), low, high), jnp.clip(jnp.maximum(t1, t2), low, high)

@@ -66,7 +66,7 @@ def distribute_force(
     kept = tuple(tree_where(s, g, Vec3(zero, zero, zero)) for g, s in zip(generators, suitable, strict=True))
     # Three coplanar edges may be all that suit and still be one too many. With three independent ones both ways agree.
     several = decide((count > used) | (count > 2), size)
-    y, curvature = without_derivatives(_minimised, kept, chosen, alpha.scale(1 / unit), target, several)
+    y, curvature = without_derivatives(_minimized, kept, chosen, alpha.scale(1 / unit), target, several)
     # Differentiated iterations: each makes one more order of derivative exact, with the curvature held fixed.
     y = compute_once(y + _solve(curvature, target - linear_combination(kept, _weights_of_dual(kept, y))), size)
     weights = compute_once(_weights_of_dual(kept, y), size)
@@ -83,7 +83,7 @@ def distribute_force(
     return tuple(jnp.where(indeterminate, s * unit, o) for s, o in zip(shared, own, strict=True))
 
 
-def _minimised(
+def _minimized(
     kept: tuple[Vec3, ...], chosen: tuple, alpha: Vec3, target: Vec3, several: Bool[Array, ""]
 ) -> tuple[Vec3, Symmetric3]:
     """Minimize phi.

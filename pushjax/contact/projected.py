@@ -84,7 +84,7 @@ def _forces(problem: ScaledProblem, rounds: int, sweeps: int) -> tuple[Vec2, ...
         wrench = _wrench(problem, forces)
         some = decide(wrench.dot(wrench) > 0, problem.speed)
         wrench = tree_where(some, wrench, Vec3(zero + 1, zero, zero))
-        linear = compute_once(_linearised(problem, wrench), problem.speed)
+        linear = compute_once(_linearized(problem, wrench), problem.speed)
         return jax.lax.fori_loop(0, sweeps, lambda _, f: _sweep(problem, linear, f), forces)
 
     return jax.lax.fori_loop(0, rounds, round_, start)
@@ -96,7 +96,7 @@ def _wrench(problem: ScaledProblem, forces: tuple[Vec2, ...]) -> Vec3:
     return linear_combination(rows, [component for force in forces for component in force])
 
 
-def _linearised(problem: ScaledProblem, wrench: Vec3) -> _Linear:
+def _linearized(problem: ScaledProblem, wrench: Vec3) -> _Linear:
     """Linearize grad H at a wrench."""
     hessian = problem.form.hessian(wrench)
     along_n = tuple(hessian.times(n) for n in problem.normal)

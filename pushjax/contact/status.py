@@ -6,7 +6,7 @@ from enum import IntEnum
 class ContactMode(IntEnum):
     """How the pusher and the slider move relative to each other at a contact.
 
-    LEFT and RIGHT name the pusher's slip relative to the slider, seen along the inward normal. Left is towards the
+    LEFT and RIGHT name the pusher's slip relative to the slider, seen along the inward normal. Left is toward the
     tangent t = (-n_y, n_x). When the pusher slides left, the friction on the slider is +mu f_n.
 
     Attributes:

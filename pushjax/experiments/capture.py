@@ -134,7 +134,7 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: d
     }
     pushes, settled = list(shown.values())[-1]
     figure = plot.capture_figure(
-        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[settled, :2]), ways=DRAWN
+        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[settled, :2]), max_paths=DRAWN
     )
     return [str(plot.save(figure, out / "capture.png"))]
 

@@ -12,7 +12,7 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.support import Support
 from pushjax.geometry.shape import Shape
 from pushjax.plot.parts import arrow, center_of_rotation, outline
-from pushjax.plot.style import BETWEEN, BLUE, GREEN, MM, ORANGE, PURPLE, START, STYLE, legend_below, row
+from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, PURPLE, STYLE, legend_below, panel_row
 
 
 def motion_cone_figure(
@@ -31,8 +31,8 @@ def motion_cone_figure(
     """
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(5.6, 4.9), layout="constrained")
-        outline(axes, shape, np.zeros(3), START, 1.4)
-        axes.plot(*(MM * np.asarray(support.point)).T, ".", color=BETWEEN, ms=3, label="support points")
+        outline(axes, shape, np.zeros(3), BLACK, 1.4)
+        axes.plot(*(MM * np.asarray(support.point)).T, ".", color=GRAY, ms=3, label="support points")
         point, normal = np.asarray(contacts.point[0]), np.asarray(contacts.normal[0])
         mu = float(contacts.friction[0])
         reach = 0.45 * float(np.max(np.asarray(shape.bounds[1] - shape.bounds[0])))
@@ -69,7 +69,7 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
         panels: For each panel the two contacts, in the body frame, and their solution.
     """
     with plt.rc_context(STYLE):
-        figure, all_axes = row(len(panels), 5.0, 4.6)
+        figure, all_axes = panel_row(len(panels), 5.0, 4.6)
         low, high = (MM * np.asarray(b) for b in shape.bounds)
         reach = 0.55 * (high - low).max()
         box = low - 0.4 * reach, high + 0.4 * reach
@@ -77,9 +77,9 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
             point, normal = MM * np.asarray(contacts.point), np.asarray(contacts.normal)
             mu = np.asarray(contacts.friction)
             _allowed_centers(axes, point, normal, box)
-            outline(axes, shape, np.zeros(3), START, 1.4)
+            outline(axes, shape, np.zeros(3), BLACK, 1.4)
             for name, p, n, m in zip("AC", point, normal, mu, strict=False):
-                _labelled_contact(axes, name, p, n, m, reach)
+                _labeled_contact(axes, name, p, n, m, reach)
             axes.plot(*point.T, ":", color="0.2", lw=1.3)
             center_of_rotation(axes, np.asarray(motion.twist))
             axes.plot([], [], color=GREEN, label="friction cone")
@@ -106,7 +106,7 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
             axes.fill([], [], color=color, alpha=0.16, label=label)
 
 
-def _labelled_contact(axes: Axes, name: str, p: np.ndarray, n: np.ndarray, mu: float, reach: float) -> None:
+def _labeled_contact(axes: Axes, name: str, p: np.ndarray, n: np.ndarray, mu: float, reach: float) -> None:
     """Draw the normal, the friction cone and the closing finger of a contact at p (2,), mm."""
     axes.plot(*np.array([p - 2 * reach * n, p + 2 * reach * n]).T, "--", color=BLUE, lw=0.9)
     tangent = np.array([-n[1], n[0]])

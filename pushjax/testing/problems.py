@@ -167,7 +167,7 @@ def random_contacts_problem(
     The pushers move in one of four ways, with equal probability:
 
     - as one rigid hand, in half of these problems without rotation;
-    - towards the middle of the slider, in half of these problems exactly and equally fast, in the others unevenly and
+    - toward the middle of the slider, in half of these problems exactly and equally fast, in the others unevenly and
       with some drift;
     - independently, three quarters of them into the slider;
     - such that one of them slides along the slider and moves it alone, often while it recedes, and the others stay

@@ -204,7 +204,7 @@ class _Equations:
         return _interleave(normal, np.clip(force[1::2], -limit, limit))
 
     def follow_modes(self, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Move most starts a few Newton steps towards a random choice of contact modes.
+        """Move most starts a few Newton steps toward a random choice of contact modes.
 
         The choice need not have a solution. It consists of one to three edges of friction cones, which are enough for
         a solution because wrenches have three dimensions. A contact sticks if both of its edges are chosen.

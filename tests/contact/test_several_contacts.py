@@ -35,12 +35,12 @@ def test_flat_push_sticks_without_slip_and_shares_the_force(degree):
 
 def test_pinched_disc_moves_to_the_middle():
     """With two opposite fingers, one faster, the slider moves with the difference; at equal speed it is jammed."""
-    disc = pj.Ellipsoid(np.eye(3), 0.02)
+    disk = pj.Ellipsoid(np.eye(3), 0.02)
     point, normal = jnp.array([[-0.03, 0.0], [0.03, 0.0]]), jnp.array([[1.0, 0.0], [-1.0, 0.0]])
-    jam = solve(disc, pj.Contacts(point, normal, jnp.array([[0.001, 0.0], [-0.001, 0.0]]), 0.3))
+    jam = solve(disk, pj.Contacts(point, normal, jnp.array([[0.001, 0.0], [-0.001, 0.0]]), 0.3))
     assert jam.status == pj.Status.JAMMED
     np.testing.assert_allclose(jam.margin, -0.001, rtol=1e-6)
-    gap = solve(disc, pj.Contacts(point, normal, jnp.array([[0.001, 0.0], [-0.001, 0.0]]), 0.3, jnp.array([0, 0.003])))
+    gap = solve(disk, pj.Contacts(point, normal, jnp.array([[0.001, 0.0], [-0.001, 0.0]]), 0.3, jnp.array([0, 0.003])))
     assert gap.status == pj.Status.MOVING
     np.testing.assert_allclose(gap.twist, [0.001, 0, 0], atol=1e-15)
     assert gap.mode[1] == pj.ContactMode.SEPARATED

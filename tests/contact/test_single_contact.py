@@ -551,3 +551,13 @@ def test_motion_cone_refuses_bad_input():
     ):
         with pytest.raises(ValueError, match=message):
             motion_cone(surface, *arguments)
+
+
+@pytest.mark.parametrize("wide", range(4))
+def test_motion_cone_computes_in_the_widest_type_given(wide):
+    """One argument in float64, also the friction, makes the result float64."""
+    types = [jnp.float64 if k == wide else jnp.float32 for k in range(4)]
+    surface = Ellipsoid(jnp.eye(3, dtype=types[0]), jnp.asarray(0.03, types[0]))
+    values = ((0.02, -0.04), (0.0, 1.0), 0.25)
+    arguments = [jnp.asarray(value, dtype) for value, dtype in zip(values, types[1:], strict=True)]
+    assert motion_cone(surface, *arguments).dtype == jnp.float64

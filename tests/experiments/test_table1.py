@@ -54,7 +54,7 @@ def written(folder, data):
 def test_loader_matches_rows(tmp_path):
     log = load_mit_pushes_npz(written(tmp_path, archive()))
     assert (len(log.whole), len(log.middle), len(log.fast)) == (5, 3, 2)
-    assert log.learned.tolist() == [True, False, False, True, False]
+    assert log.is_training.tolist() == [True, False, False, True, False]
     assert log.middle_of.tolist() == [1, 4, 2]
     assert log.repeats.tolist() == [[0, 3]]  # the other action is not in `whole`
     assert log.whole.valid.tolist() == [True, False, True, True, True]
@@ -99,7 +99,7 @@ def test_real_archives(logs):
     for log in logs.values():
         travel = np.linalg.norm(log.middle.tip_end - log.middle.tip_start, axis=1)
         assert np.all((travel > 0.04) & (travel < 0.047))
-        assert not log.learned[log.middle_of].any()
+        assert not log.is_training[log.middle_of].any()
         assert np.all(np.abs(log.whole.end[:, 2] - log.whole.start[:, 2]) <= np.pi)
     for surface, expected in TOOLBOX_MM.items():
         means = [
@@ -167,7 +167,7 @@ def test_noise_floor(logs):
 
 def test_filled_up(logs):
     log = logs["abs", "tri1"]
-    rows = np.flatnonzero(log.learned)
+    rows = np.flatnonzero(log.is_training)
     pushes = conditions.straight(log, log.whole, rows, 10, 128)
     assert pushes.path.shape == (128, 11, 2)
     assert float(pushes.weight.sum()) == len(rows)

@@ -10,7 +10,7 @@ import pushjax as pj
 from pushjax import plot
 from pushjax.experiments.grasps.sliders import Setting
 
-COLORS = {"grasped": plot.END, "jammed": plot.ORANGE, "free": plot.BETWEEN, "failed": plot.PURPLE}
+COLORS = {"grasped": plot.RED, "jammed": plot.ORANGE, "free": plot.GRAY, "failed": plot.PURPLE}
 NUMBERS = ((plot.MM, "x / mm"), (plot.MM, "y / mm"), (180 / np.pi, "θ / °"))
 BINS = 60
 
@@ -36,7 +36,7 @@ def draw(
         rows = len(shown) + 1
         figure, axes = plt.subplots(rows, 4, figsize=(14.0, 3.4 * rows), layout="constrained")
         first = axes[0]
-        plot.pose_panel(first[0], starts, plot.START)
+        plot.pose_panel(first[0], starts, plot.BLACK)
         plot.outline(first[0], setting.shape, np.zeros(3), plot.BLUE, 1.0)
         plot.hand_at(first[0], hand, np.asarray(hand.poses(path[0])), plot.BLUE, 1.0)
         first[0].set_title(f"{len(starts)} start poses")

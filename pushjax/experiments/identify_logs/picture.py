@@ -31,8 +31,8 @@ def _pushes(findings: Findings, out: Path) -> Path:
         push = order[round(share * (len(order) - 1))]
         shape, hand = findings.slider.shape, findings.hand
         for pose, color, dash, label in (
-            (start[push], plot.BETWEEN, "-", "start"),
-            (end[push], plot.START, "-", "measured end"),
+            (start[push], plot.GRAY, "-", "start"),
+            (end[push], plot.BLACK, "-", "measured end"),
             (final[push], plot.BLUE, "--", "predicted end"),
         ):
             plot.outline(panel, shape, pose, color, 1.5, linestyle=dash, label=label)
@@ -59,14 +59,14 @@ def _residuals(findings: Findings, out: Path) -> Path:
         panel.plot(residual[:, a], residual[:, b], "o", color=plot.BLUE, ms=4, alpha=0.7)
         turn = np.linspace(0, 2 * np.pi, 100)
         for many, dash in ((1, "-"), (2, "--")):
-            panel.plot(many * sigma * np.cos(turn), many * sigma * np.sin(turn), dash, color=plot.BETWEEN, zorder=0)
+            panel.plot(many * sigma * np.cos(turn), many * sigma * np.sin(turn), dash, color=plot.GRAY, zorder=0)
         panel.set(xlabel=f"predicted less measured {names[0]}", ylabel=f"predicted less measured {names[1]}")
         panel.set_aspect("equal", adjustable="datalim")
     axes[0].set_title(f"rings: one and two sigma, {sigma:.2g} mm")
     still = findings.deviation_mm(findings.rows(findings.pushes.start))
     for values, color, dash, label in (
         (findings.deviation_mm(findings.final), plot.BLUE, "-", "predicted"),
-        (still, plot.BETWEEN, "--", "no motion"),
+        (still, plot.GRAY, "--", "no motion"),
     ):
         order = np.sort(values)
         share = 100 * np.arange(1, len(order) + 1) / len(order)
@@ -92,7 +92,7 @@ def _profiles(findings: Findings, out: Path) -> Path:
         panel.plot(value, rise, "-", color=plot.BLUE, label="all else at its best")
         panel.plot(scale * each.value, each.rise, "o", color=plot.BLUE, ms=3)
         panel.plot(value, dense**2 / 2, "--", color=plot.ORANGE, label="normal")
-        panel.axhline(RISE_OF_90, color=plot.BETWEEN, lw=0.8, label="where a 90 % interval ends")
+        panel.axhline(RISE_OF_90, color=plot.GRAY, lw=0.8, label="where a 90 % interval ends")
         panel.set(xlabel=each.label + (f" / {name}" if name else ""), ylim=(0, 5))
     axes[0, 0].set_ylabel("rise of the negative log posterior")
     plot.legend_below(figure, axes[0, 0], columns=3)

@@ -13,7 +13,7 @@ prediction and measurement.
 
 The error that the model leaves is not the tracker's: starts shifted by 0.5 mm and 0.3 degrees move the predictions by
 about 1 mm. The error comes from the pushes that slip past a finger at another moment than predicted. This happens
-above all under the face that touches everywhere, where the pressure is not known. A pressure that grows towards the rim
+above all under the face that touches everywhere, where the pressure is not known. A pressure that grows toward the rim
 would fit slightly better there (6.3 against 6.9 mm, everything chosen on all pushes), but no measurement supports it.
 """
 

@@ -52,7 +52,7 @@ def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> 
     """
     for values, color, dash, label in (
         (predicted, plot.BLUE, "-", "predicted"),
-        (still, plot.BETWEEN, "--", "no motion"),
+        (still, plot.GRAY, "--", "no motion"),
     ):
         order = np.sort(values)
         axes.step(order, 100 * np.arange(1, len(order) + 1) / len(order), dash, color=color, where="post", label=label)
@@ -65,14 +65,14 @@ def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
     """Draw the start, the measured end and the predicted end of one push, with the fingers."""
     shape = pj.Polygon(log.vertices)
     drawn = (
-        (log.pose_start[push], plot.BETWEEN, "-", "start"),
-        (log.pose_end[push], plot.START, "-", "measured end"),
+        (log.pose_start[push], plot.GRAY, "-", "start"),
+        (log.pose_end[push], plot.BLACK, "-", "measured end"),
         (final, plot.BLUE, "--", "predicted end"),
     )
     for pose, color, dash, label in drawn:
         plot.outline(axes, shape, pose, color, 1.5, linestyle=dash, label=label)
     for hand, color, label in (
-        (log.hand_start[push], plot.BETWEEN, "fingers, start"),
+        (log.hand_start[push], plot.GRAY, "fingers, start"),
         (log.hand_end[push], plot.ORANGE, "fingers, end"),
     ):
         aside = log.spacing / 2 * np.array([-np.sin(hand[2]), np.cos(hand[2])])
