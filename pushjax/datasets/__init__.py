@@ -1,6 +1,7 @@
 """Loaders of published push logs. They use NumPy only and return SI units."""
 
 from pushjax.datasets.data_folder import find_data as find_data
+from pushjax.datasets.download import fetch_triangle as fetch_triangle
 from pushjax.datasets.load import load_recordings as load_recordings
 from pushjax.datasets.mit_folder import find_mit_pushes as find_mit_pushes
 from pushjax.datasets.mit_folder import load_mit_folder as load_mit_folder
@@ -21,3 +22,6 @@ from pushjax.datasets.pushes import force_filter as force_filter
 from pushjax.datasets.recordings import Recordings as Recordings
 from pushjax.datasets.triangle import load_triangle_log as load_triangle_log
 from pushjax.datasets.triangle_archive import load_push_npz as load_push_npz
+from pushjax.datasets.two_finger import TwoFingerLog as TwoFingerLog
+from pushjax.datasets.two_finger import load_two_finger_npz as load_two_finger_npz
+from pushjax.datasets.two_finger_logs import load_two_finger_logs as load_two_finger_logs

@@ -217,7 +217,7 @@ def _edge_distances(pose: Floats, point: Floats) -> Floats:
 
 def _push(record: Record) -> Push:
     """Convert a checked record to a push."""
-    start, end = (_body_pose(row) for row in record.poses)
+    start, end = (body_pose(row) for row in record.poses)
     end[2] = start[2] + wrap_angle(end[2] - start[2])
     # Unix times in s use most digits of a float64, so the clock of the push starts at its first force sample.
     force_time = record.force[:, 0] - record.force[0, 0]
@@ -240,7 +240,7 @@ def _push(record: Record) -> Push:
     )
 
 
-def _body_pose(row: Floats) -> Floats:
+def body_pose(row: Floats) -> Floats:
     """Convert a logged pose (7,) of the corner to the world pose (3,) of the body frame: x, y (m), theta (rad)."""
     w, x, y, z = row[3:] / np.linalg.norm(row[3:])
     # First two rows of the rotation matrix. The plate's small tilt shortens the distance to its center in the plane.

@@ -21,11 +21,12 @@ from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.random import FrictionModel
 from pushjax.friction.table import Table
+from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
 from pushjax.simulation.monte_carlo_tiles import Devices, Outcome, Setup, fetch, placed, submit
-from pushjax.simulation.rollout import Slider, checked_rollout_arguments, checked_table
+from pushjax.simulation.slider import Slider
 
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
 ACCELERATOR_TILE = 1 << 18  # the same for an accelerator, whose kernels take long to start but compute many at once

@@ -44,6 +44,53 @@ def _line(xp: Any, start: Array, end: Array, *, steps: int) -> Array:
     return start[None] * (1 - t) + end[None] * t  # exact at both ends
 
 
+def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
+    """Circular path of equal steps: the hand turns about a point like a rigid body.
+
+    Args:
+        start: First configuration, (dof,): x and y (m), then, if there are more than two numbers, the angle of the hand
+            (rad), which turns with it, and numbers that stay, such as an opening.
+        center: Point about which the hand turns, (2,), world, m.
+        angle: Angle by which it turns, rad, counterclockwise.
+        steps: Number of steps.
+
+    Returns:
+        The path, (steps + 1, dof).
+
+    Raises:
+        ValueError: For fewer than one step, for a configuration of fewer than two numbers, or for values that are not
+            finite.
+
+    Examples:
+        >>> import numpy as np
+        >>> arc((0.1, 0.0, 0.0), (0.0, 0.0), np.pi / 2, steps=2).round(4).tolist()
+        [[0.1, 0.0, 0.0], [0.0707, 0.0707, 0.7854], [0.0, 0.1, 1.5708]]
+    """
+    _check_steps(steps)
+    dtype = common_dtype(start, center, angle)
+    first, about, turn = (as_float(value, dtype) for value in (start, center, angle))
+    check_shape("start", first, ("dof",))
+    if first.shape[0] < 2:
+        raise ValueError(f"start must hold at least x and y; got shape {first.shape}")
+    check_shape("center", about, (2,))
+    check_shape("angle", turn, ())
+    for name, value in (("start", first), ("center", about), ("angle", turn)):
+        check_finite(name, value)
+    return _arc(first, about, turn, steps=steps)
+
+
+@in_numpy
+def _arc(xp: Any, start: Array, center: Array, angle: Array, *, steps: int) -> Array:
+    turned = xp.arange(steps + 1, dtype=start.dtype) / steps * angle
+    cos, sin = xp.cos(turned), xp.sin(turned)
+    x, y = start[0] - center[0], start[1] - center[1]
+    columns = [center[0] + cos * x - sin * y, center[1] + sin * x + cos * y]
+    if start.shape[0] > 2:
+        columns.append(start[2] + turned)
+    columns += [xp.full_like(turned, 1) * start[k] for k in range(3, start.shape[0])]
+    return xp.stack(columns, axis=-1)
+
+
 def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Array, "points dof"]:
     """Path that goes straight from each way point to the next and meets all of them exactly.
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pushjax import Hand, line, resample, through
+from pushjax.simulation.path import arc
 
 ROUNDING = 1e-15  # of numbers of order 0.1
 
@@ -153,3 +154,31 @@ def test_finger():
 def test_finger_refuses_bad_input(radius, message):
     with pytest.raises(ValueError, match=message):
         Hand.finger(radius)
+
+
+def test_an_arc_turns_the_hand_like_a_rigid_body():
+    path = np.asarray(arc((0.3, 0.1, 0.2, 0.05), (0.1, 0.1), -np.pi / 2, 4))
+    assert path.shape == (5, 4)
+    np.testing.assert_allclose(path[0], (0.3, 0.1, 0.2, 0.05), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(path[-1], (0.1, -0.1, 0.2 - np.pi / 2, 0.05), rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(np.hypot(*(path[:, :2] - 0.1).T), 0.2, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(np.diff(path[:, 2]), -np.pi / 8, rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(arc((0.3, 0.1), (0.1, 0.1), -np.pi / 2, 4), path[:, :2], rtol=0, atol=ROUNDING)
+    traced = jax.jit(arc, static_argnums=3)(path[0], np.array([0.1, 0.1]), -np.pi / 2, 4)
+    np.testing.assert_allclose(traced, path, rtol=0, atol=ROUNDING)
+    slope = jax.jacfwd(lambda angle: arc(path[0], (0.1, 0.1), angle, 4))(-np.pi / 2)
+    np.testing.assert_allclose(slope[-1], (0.2, 0, 1, 0), rtol=0, atol=10 * ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (((0.1,), (0, 0), 1.0, 2), "start must hold at least x and y"),
+        (((0.1, 0.0), (0, 0, 0), 1.0, 2), "center"),
+        (((0.1, 0.0), (0, 0), np.nan, 2), "angle"),
+        (((0.1, 0.0), (0, 0), 1.0, 0), "steps"),
+    ],
+)
+def test_arc_refuses_bad_input(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        arc(*arguments)

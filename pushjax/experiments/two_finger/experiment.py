@@ -25,7 +25,9 @@ import numpy as np
 
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
-from pushjax.datasets.two_finger import load_two_finger_npz
+from pushjax.datasets import LogError
+from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz
+from pushjax.datasets.two_finger_logs import load_two_finger_logs
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
 from pushjax.experiments.two_finger.scores import STUCK, days, figures
@@ -44,7 +46,7 @@ def run(
     """Compute one cell for each object.
 
     Args:
-        folder: Folder of the data, which contains `two_finger_push/`.
+        folder: Folder of the data, which contains `two_finger_push/` with archives or with folders of published logs.
         seed: Seed of the wrench-twist pairs, the splits and the bootstrap.
         out: Folder for the pictures. None: no pictures.
         steps: Steps of each push.
@@ -60,7 +62,7 @@ def run(
     """
     if model not in MODELS:
         raise ValueError(f"model must be one of {', '.join(MODELS)}; got {model!r}")
-    logs = {name: load_two_finger_npz(folder / "two_finger_push" / f"{name}.npz") for name in OBJECTS}
+    logs = {name: load(folder / "two_finger_push", name) for name in OBJECTS}
     batch = max(len(log) for log in logs.values())
     cells, by_day, shown = [], [], []
     for index, (name, log) in enumerate(logs.items()):
@@ -84,6 +86,25 @@ def run(
         "train_share": TRAIN_SHARE,
     }
     return result_record("two-finger", settings, cells=cells, days=by_day, pictures=pictures)
+
+
+def load(folder: Path, name: str) -> TwoFingerLog:
+    """Load the pushes of an arrangement from its curated archive, or else from a folder of original logs.
+
+    Args:
+        folder: Folder of the archives, or of the folders of logs.
+        name: Name of the arrangement, and of the archive or the folder.
+
+    Raises:
+        LogError: If there is neither, or what is there is damaged.
+    """
+    archive, originals = folder / f"{name}.npz", folder / name
+    if archive.exists():
+        return load_two_finger_npz(archive)
+    if originals.is_dir():
+        return load_two_finger_logs(originals)
+    fetched = "`pushjax data triangle` fetches them"
+    raise LogError(folder, f"expected {name}.npz, or a folder {name} of published logs; {fetched}")
 
 
 def summary(record: dict[str, Any]) -> str:

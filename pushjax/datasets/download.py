@@ -1,0 +1,105 @@
+"""Fetch the triangle's recorded pushes from the repository in which their authors published them.
+
+`triangle_files.csv` lists the files: name here, SHA-256, size in bytes, and path at a fixed commit of the repository
+(github.com/robinzhoucmu/MLab_EXP, Apache-2.0).
+"""
+
+import csv
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax.datasets.data_folder import default_folder
+
+SOURCE = "https://raw.githubusercontent.com/robinzhoucmu/MLab_EXP/4d86db9438203f51c4368e5b886def5c402955f3/"
+TIMEOUT = 30  # s without an answer
+
+
+class RemoteFile(NamedTuple):
+    """A published file.
+
+    Attributes:
+        file: Its path in the folder of recorded pushes.
+        sha256: Its SHA-256.
+        bytes: Its size.
+        source: Its path in the repository.
+    """
+
+    file: str
+    sha256: str
+    bytes: int
+    source: str
+
+
+def triangle_files() -> list[RemoteFile]:
+    """Return the files that `fetch_triangle` fetches: ten logs of one finger, 54 pairs of two fingers."""
+    with open(Path(__file__).with_name("triangle_files.csv"), newline="") as table:
+        rows = list(csv.DictReader(table))
+    return [RemoteFile(row["file"], row["sha256"], int(row["bytes"]), row["source"]) for row in rows]
+
+
+def fetch_triangle(to: str | PathLike[str] | None = None, *, progress: ProgressCallback = no_progress) -> Path:
+    """Fetch the logs of the triangle, pushed by one finger and by two: 118 files, 34 MB.
+
+    Args:
+        to: Folder in which `three_point_push` and `two_finger_push` are created. Default: the one in which `find_data`
+            looks if no environment variable names another.
+        progress: Called with the number of bytes that are there and their total.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OSError: As in `fetch`.
+    """
+    folder = default_folder() if to is None else Path(to)
+    fetch(triangle_files(), SOURCE, folder, progress=progress)
+    return folder
+
+
+def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: ProgressCallback = no_progress) -> None:
+    """Fetch files and check their content.
+
+    A file that is there and has the right content is not fetched again, so an interrupted call can be repeated. A file
+    that arrives incomplete or changed is not kept.
+
+    Args:
+        files: The files.
+        source: Address that their paths continue.
+        folder: Folder of the files here.
+        progress: Called with the number of bytes that are there and their total.
+
+    Raises:
+        OSError: If a file cannot be fetched or written, or arrives with other content. The files that were fetched
+            before it stay.
+    """
+    import pooch  # imported here, because only those who fetch need it
+    import requests
+
+    total, done = sum(each.bytes for each in files), 0
+    pooch.get_logger().setLevel("WARNING")  # it prints a line for each file
+    get = pooch.HTTPDownloader(timeout=TIMEOUT)
+    progress(done, total)
+    for each in files:
+        target, address = folder / each.file, source + quote(each.source)
+        try:
+            pooch.retrieve(address, f"sha256:{each.sha256}", target.name, target.parent, downloader=get)
+        except requests.RequestException as error:
+            raise OSError(f"cannot fetch {address}: {_reason(error)}") from error
+        except ValueError as error:  # a wrong checksum
+            raise OSError(
+                f"cannot use {address}: it is not the file of {each.bytes} bytes that was published"
+            ) from error
+        done += each.bytes
+        progress(done, total)
+
+
+def _reason(error: Exception) -> str:
+    """Return one line on what went wrong with a request."""
+    response = getattr(error, "response", None)
+    if response is not None:
+        return f"the server answers {response.status_code} {response.reason}"
+    return " ".join(str(error).split()) or type(error).__name__
