@@ -48,9 +48,9 @@ from pushjax.simulation.path import line as line
 from pushjax.simulation.path import resample as resample
 from pushjax.simulation.path import through as through
 from pushjax.simulation.random_rollout import random_rollout as random_rollout
-from pushjax.simulation.rollout import Slider as Slider
-from pushjax.simulation.rollout import Step as Step
-from pushjax.simulation.rollout import Trajectory as Trajectory
+from pushjax.simulation.slider import Slider as Slider
+from pushjax.simulation.trajectory import Step as Step
+from pushjax.simulation.trajectory import Trajectory as Trajectory
 from pushjax.simulation.rollout import rollout as rollout
 from pushjax.simulation.rollout import step as step
 

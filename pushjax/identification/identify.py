@@ -20,8 +20,9 @@ from pushjax.identification.model import Problem
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified
 from pushjax.identification.unknowns import Prior, Unknowns
+from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.simulation.rollout import Slider, check_slider_and_hand
+from pushjax.simulation.slider import Slider
 
 ROBUST = 2.0  # sigma: where the pseudo-Huber loss turns from quadratic to linear
 SIGMA = 0.002  # m, initial value if sigma is estimated

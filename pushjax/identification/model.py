@@ -20,7 +20,9 @@ from pushjax.identification.pushes import Pushes, PushInput
 from pushjax.identification.unknowns import TABLE, Parameters, Prior
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.path import arc_length, interpolate_arc_length
-from pushjax.simulation.rollout import Slider, Trajectory, rollout
+from pushjax.simulation.rollout import rollout
+from pushjax.simulation.slider import Slider
+from pushjax.simulation.trajectory import Trajectory
 
 STRAIGHT = 5  # beyond its end, a path goes on in the direction of this part (a fifth) of it
 

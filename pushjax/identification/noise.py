@@ -47,7 +47,7 @@ from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified, from_record, to_record
 from pushjax.metrics import energy_score
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Slider
+from pushjax.simulation.slider import Slider
 
 Score = Literal["energy", "density"]
 FORMAT, VERSION = "pushjax noise", 1

@@ -21,7 +21,7 @@ from pushjax.identification.pushes import Pushes, PushInput
 from pushjax.identification.result import Identified
 from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Slider
+from pushjax.simulation.slider import Slider
 
 ANY_DOF = 60.0  # placeholder: every sample sets its own dof
 

@@ -18,7 +18,8 @@ from pushjax.identification.model import Scene, apply_inset, correct_path, surfa
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.unknowns import SPREADS, Layout, Parameters, Prior, PriorSurface, Unknowns
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Slider, Trajectory
+from pushjax.simulation.slider import Slider
+from pushjax.simulation.trajectory import Trajectory
 
 FORMAT, VERSION = "pushjax identified", 1
 ARRAYS = ("z", "precision", "sigma", "direction", "gap", "residual", "information", "loss", "length")

@@ -14,7 +14,7 @@ from pushjax.identification.model import Problem, surfaces
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Slider
+from pushjax.simulation.slider import Slider
 
 if TYPE_CHECKING:
     from pushjax.identification.result import Identified

@@ -15,8 +15,11 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
+from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import Slider, Trajectory, checked_rollout_arguments, checked_table, on_table, simulate
+from pushjax.simulation.rollout import on_table, simulate
+from pushjax.simulation.slider import Slider
+from pushjax.simulation.trajectory import Trajectory
 
 
 class Draws(NamedTuple):

@@ -25,15 +25,14 @@ angles of the outline's corners. Whether the result is valid is judged afterward
 slider (`max_penetration`), which is computed from the whole outline. `substeps` divides a step that is too long.
 """
 
-import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import compute_once, decide, map_items, tree_where
-from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
+from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.problem import solve_in_scalars
 from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution
@@ -41,33 +40,21 @@ from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
+from pushjax.simulation.contact_selection import select_contacts, selected_candidates, track_contacts
 from pushjax.simulation.detection import (
     MAX_PENETRATION,
     OUT_OF_REACH,
     Candidate,
-    FingerPose,
     contact_candidates,
     num_contacts,
-    penetration_depth,
-    select_contacts,
-    selected_candidates,
     time_of_impact,
-    track_contacts,
 )
-from pushjax.simulation.hand import Finger, Hand, Pad
+from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
 from pushjax.simulation.working_set import Urgency, WorkingSet, together, violated
 
 # rad. If a step, or a part of one, turns the slider farther than this, its result is rejected: contacts are detected at
 # the start of the step, and nothing checks what the slider passes on the way.
 MAX_ROTATION_PER_STEP = 0.5
-# A jam is a grasp if every finger is nearer to the slider than this, in units of the length, or than four times the
-# hand's displacement in the step. The margin is needed because a jam is detected before the last gap is closed, and
-# because the slider swings faster than the fingers close.
-GRASP_GAP = 1e-4
-# After a step a finger may be this deep in the slider, as a fraction of the largest displacement of the fingers in the
-# step, if it was not deeper before: the midpoint rule leaves that much at a corner. The floor is in units of the length
-# and allows for roundoff.
-TOLERATED, FLOOR = 0.1, 1e-5
 
 
 class ScalarStep(NamedTuple):
@@ -78,6 +65,8 @@ class ScalarStep(NamedTuple):
         twist: Twist of the slider over the step, body frame.
         wrench: Wrench on the slider, normalized, body frame.
         force: Force of each contact along normal and tangent, N.
+        contact_point: Point of each contact, body frame, m; an array, because nothing computes with it.
+        contact_normal: Inward unit normal of each contact, body frame; an array, too.
         mode: `ContactMode` of each contact.
         status: `Status` of the step.
         overlap: Depth of the deepest finger at the end of the step, m; zero until it has been judged.
@@ -87,102 +76,122 @@ class ScalarStep(NamedTuple):
     twist: Vec3
     wrench: Vec3
     force: tuple[Vec2, ...]
+    contact_point: Float[Array, "contacts 2"]
+    contact_normal: Float[Array, "contacts 2"]
     mode: tuple[Int[Array, ""], ...]
     status: Int[Array, ""]
     overlap: Scalar
 
 
-class BodyFrame(NamedTuple):
-    """A pose with the unit vector of its angle, which is kept because sines cost as much as a contact.
+class Stage(NamedTuple):
+    """What the predictor passes to the corrector, and what the corrector leaves.
 
     Attributes:
-        pose: Pose of the slider, world.
-        angle: The unit vector (cos, sin) of the pose's angle.
+        twist: Twist of the slider over the step.
+        point: Point of the slider that moves in a straight line, body frame, m.
+        angle: Unit vector of the angle of the frame in which the twist is given.
+        status: `Status` so far.
+        begun: For each finger, its contacts as they were at the start of the step.
+        chosen: For each finger, the index of each of its contacts among the places where it may touch.
+        holds: Whether every finger is near enough to hold a jammed slider.
     """
 
-    pose: Vec3
+    twist: Vec3
+    point: Vec2
     angle: Vec2
+    status: Int[Array, ""]
+    begun: tuple[tuple[Candidate, ...], ...]
+    chosen: tuple[tuple[Int[Array, ""] | int, ...], ...]
+    holds: Bool[Array, ""]
 
     @staticmethod
-    def at(pose: Vec3) -> "BodyFrame":
-        """A pose, with the unit vector computed."""
-        return BodyFrame(pose, compute_once(cos_sin(pose.z), pose.x))
-
-    def local(self, world: Vec2) -> Vec2:
-        """A world point in the body frame."""
-        return (world - self.pose.xy).unrotate(self.angle)
-
-    def moved(self, contact: Vec2, motion: Vec3, seen: Vec2) -> "BodyFrame":
-        """The pose after a body twist that moves a point of the slider in a straight line.
+    def before(start: BodyFrame, counts: list[int]) -> "Stage":
+        """What the predictor starts from: no motion yet, and no contacts selected.
 
         Args:
-            contact: The point, body frame, m.
-            motion: The twist.
-            seen: Unit vector of the angle of the frame in which the twist is given; it rotates the twist to the world.
+            start: Pose of the slider at the start.
+            counts: Number of contacts of each finger.
         """
-        straight = (motion.xy + contact.perp().scale(motion.z)).rotate(seen)
-        theta = self.pose.z + motion.z
-        angle = compute_once(cos_sin(theta), self.pose.x)
-        swing = contact.rotate(angle) - contact.rotate(self.angle)
-        return BodyFrame(Vec3(self.pose.x + straight.x - swing.x, self.pose.y + straight.y - swing.y, theta), angle)
+        zero = jnp.zeros_like(start.pose.x)
+        still, nowhere = Vec3(zero, zero, zero), Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
+        none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
+        begun = tuple((nowhere,) * n for n in counts)
+        return Stage(still, Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8), begun, none, jnp.zeros((), bool))
 
 
-class FingerMotion(NamedTuple):
-    """Motion of one finger over a step, and its friction.
+class FingerContacts(NamedTuple):
+    """The contacts of one finger in a stage.
 
     Attributes:
-        finger: The finger.
-        friction: Coefficient of friction mu between finger and slider.
-        center: Center of the finger at the start, world, m.
-        path: Displacement of the center, world, m.
-        angle: Angle at the start, world, rad; None if the finger never turns.
-        turning: Change of the angle, rad; None if the finger never turns.
+        contacts: The contacts as they are now, with the gaps of the start of the step.
+        chosen: Index of each among the places where the finger may touch.
+        begun: Each as it was at the start of the step.
+        near: Whether one of them is near enough to hold a jammed slider.
     """
 
-    finger: Finger
-    friction: Scalar
-    center: Vec2
-    path: Vec2
-    angle: Scalar | None
-    turning: Scalar | None
+    contacts: tuple[Contact, ...]
+    chosen: tuple[Int[Array, ""], ...]
+    begun: tuple[Candidate, ...]
+    near: Bool[Array, ""]
 
-    def seen(self, slider: BodyFrame, share: Scalar) -> FingerPose:
-        """Pose of the finger in the slider's frame after the fraction `share` of the step."""
-        center = slider.local(self.center + self.path.scale(share))
-        if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
-            return FingerPose(center, None)
-        if self.angle is None or self.turning is None:
-            raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
-        return FingerPose(
-            center, compute_once(cos_sin(self.angle + share * self.turning), center.x).unrotate(slider.angle)
-        )
 
-    def part(self, begin: Scalar, size: Scalar) -> "FingerMotion":
-        """The part of the step that starts at the fraction `begin` and has the size `size`."""
-        angle, turning = self.angle, self.turning
-        if angle is not None and turning is not None:
-            angle, turning = angle + begin * turning, size * turning
-        center = self.center + self.path.scale(begin)
-        return FingerMotion(self.finger, self.friction, center, self.path.scale(size), angle, turning)
+class PushingPart(NamedTuple):
+    """The part of a step in which the fingers push, after the free motion.
 
-    def motion(self, slider: BodyFrame, point: Vec2, center: Vec2, rest: Scalar, first: Bool[Array, ""]) -> Vec2:
-        """Displacement of the finger's material at a point of the slider, slider's frame, m.
+    Attributes:
+        outline: The slider's outline.
+        length: Characteristic length of the limit surface, m.
+        start: Pose of the slider at the start.
+        begin: Fraction of the step after which a finger first touches.
+        rest: Fraction of the step that is left then.
+        reach: Distance within which a finger holds a jammed slider, m.
+    """
+
+    outline: Outline
+    length: Scalar
+    start: BodyFrame
+    begin: Scalar
+    rest: Scalar
+    reach: Scalar
+
+    def contacts_of(
+        self,
+        there: BodyFrame,
+        share: Scalar,
+        first: Bool[Array, ""],
+        grip: FingerMotion,
+        chosen: tuple[Int[Array, ""] | int, ...],
+        begun: tuple[Candidate, ...],
+    ) -> FingerContacts:
+        """Contacts of one finger in a stage.
 
         Args:
-            slider: Pose of the slider.
-            point: The point of the slider, slider's frame, m.
-            center: Center of the finger, slider's frame, m.
-            rest: Fraction of the step that is left; the displacement is the one in that last fraction.
-            first: True in the predictor stage, which is evaluated at the start of that fraction and not halfway. A
-                turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
-                toward each other on what they hold, and cause a jam.
+            there: Pose of the slider in this stage.
+            share: Fraction of the pushing part that is done in this stage.
+            first: True in the predictor.
+            grip: Motion of the finger over the step.
+            chosen: Index of each contact among the places where the finger may touch; not used in the predictor.
+            begun: The contacts as they were at the start of the step; not used in the predictor.
         """
-        straight = self.path.scale(rest).unrotate(slider.angle)
-        if self.turning is None:
-            return straight
-        straight = straight.unrotate(cos_sin(jnp.where(first, rest * self.turning / 2, 0.0)))
-        # the chord of a rotation about the center; seen from halfway through the turn it is exact
-        return straight + (point - center).perp().scale(2 * jnp.sin(rest * self.turning / 2))
+        x = self.start.pose.x
+        at = compute_once(grip.seen(there, self.begin + self.rest * share), x)
+        path = grip.path.unrotate(there.angle)
+        touches = compute_once(contact_candidates(grip.finger, self.outline, at, path, self.length), x)
+        nearest = select_contacts(touches, self.length, self.outline, path.scale(self.rest))
+        same = track_contacts(touches, chosen, begun, grip.finger, self.outline)
+        mine = tuple(jnp.where(first, new, old) for new, old in zip(nearest, same, strict=True))
+        each, fresh, near = [], [], jnp.zeros((), bool)
+        for touch, before in zip(selected_candidates(touches, mine), begun, strict=True):
+            before = tree_where(first, touch, before)
+            # a corner that has passed the end of an edge by now keeps its contact from the start of the step
+            touch = tree_where(decide(touch.distance > OUT_OF_REACH / 2, x), before, touch)
+            # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
+            gap = before.distance
+            motion = grip.motion(there, touch.point, at.center, self.rest, first)
+            each.append(compute_once(Contact(touch.point, touch.normal, motion, grip.friction, gap), x))
+            near |= gap <= self.reach
+            fresh.append(before)
+        return FingerContacts(tuple(each), mine, tuple(fresh), near)
 
 
 def step_in_scalars(
@@ -213,76 +222,74 @@ def step_in_scalars(
         The record of the step, and the urgency of each contact after it (None if `urgency` is None).
     """
     start = BodyFrame.at(pose)
-    begin = jnp.ones_like(pose.x)
-
-    def first_contact(grip: FingerMotion) -> Scalar:
-        at, path = compute_once((grip.seen(start, jnp.zeros_like(pose.x)), grip.path.unrotate(start.angle)), pose.x)
-        return time_of_impact(grip.finger, outline, at, path, form.length)
-
-    for met in map_items(first_contact, grips):
-        begin = jnp.minimum(begin, met)
-    begin = compute_once(begin, pose.x)
-    rest = 1 - begin
+    begin = _first_contact(grips, outline, start, form.length)
+    part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
     counts = [num_contacts(grip.finger, outline) for grip in grips]
-    zero = jnp.zeros_like(pose.x)
     working = WorkingSet.most_urgent(urgency, together(counts))
     on = (jnp.asarray(ongoing),) * together(counts)
 
-    def stage(carry, share):
+    def stage(carry: Stage, share: Scalar):
         """Solve the contacts as they are after the fraction `share` of the previous stage's motion."""
-        twist, point, angle, status, begun, chosen, _ = carry
-        there = start.moved(point, twist.scale(share), angle)
+        there = start.moved(carry.point, carry.twist.scale(share), carry.angle)
         first = share == 0
-
-        def contacts_of(gripped: tuple[FingerMotion, tuple[Int[Array, ""], ...], tuple[Candidate, ...]]):
-            grip, chosen, begun = gripped
-            at = compute_once(grip.seen(there, begin + rest * share), pose.x)
-            path = grip.path.unrotate(there.angle)
-            touches = compute_once(contact_candidates(grip.finger, outline, at, path, form.length), pose.x)
-            nearest = select_contacts(touches, form.length, outline, path.scale(rest))
-            same = track_contacts(touches, chosen, begun, grip.finger, outline)
-            mine = tuple(jnp.where(first, new, old) for new, old in zip(nearest, same, strict=True))
-            each, fresh, near = [], [], jnp.zeros((), bool)
-            for touch, before in zip(selected_candidates(touches, mine), begun, strict=True):
-                before = tree_where(first, touch, before)
-                # a corner that has passed the end of an edge by now keeps its contact from the start of the step
-                touch = tree_where(decide(touch.distance > OUT_OF_REACH / 2, pose.x), before, touch)
-                # both stages use the gap from the start of the step, so that position errors of the rule do not
-                # accumulate
-                gap = before.distance
-                motion = grip.motion(there, touch.point, at.center, rest, first)
-                each.append(compute_once(Contact(touch.point, touch.normal, motion, grip.friction, gap), pose.x))
-                near |= gap <= reach
-                fresh.append(before)
-            return tuple(each), mine, tuple(fresh), near
-
-        found = map_items(contacts_of, tuple(zip(grips, chosen, begun, strict=True)))
-        made, picked, fresh, near = zip(*found, strict=True)
-        each, holds = sum(made, ()), jnp.ones((), bool)
+        found = map_items(
+            lambda gripped: part.contacts_of(there, share, first, *gripped),
+            tuple(zip(grips, carry.chosen, carry.begun, strict=True)),
+        )
+        contacts, chosen, begun, near = zip(*found, strict=True)
+        each, holds = sum(contacts, ()), jnp.ones((), bool)
         for one in near:
             holds &= one
         motion = solve_in_scalars(form, working.of(each), on, solver, margin=False)
         motion = working.spread(motion, len(each))
         missed = None if urgency is None else violated(each, motion.twist, motion.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
-        status = jnp.where(status == Status.MOVING, motion.status, jnp.maximum(status, motion.status))
+        status = jnp.where(carry.status == Status.MOVING, motion.status, jnp.maximum(carry.status, motion.status))
         where = _force_weighted_point(each, motion.force)
-        return (motion.twist, where, there.angle, status, fresh, picked, holds), (motion, missed)
+        following = Stage(motion.twist, where, there.angle, status, begun, chosen, holds)
+        return following, (motion, _points_and_normals(each), missed)
 
-    unmoved = (Vec3(zero, zero, zero), Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8))
-    none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
-    nowhere = Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
-    carry = (*unmoved, tuple((nowhere,) * n for n in counts), none, jnp.zeros((), bool))
-    carry, answers = jax.lax.scan(stage, carry, jnp.array([0.0, 0.5], zero.dtype))
-    twist, point, angle, status, _, _, holds = carry
-    motion, missed = jax.tree.map(lambda leaf: leaf[-1], answers)
-    moved = start.moved(point, twist, angle).pose
-    status = jnp.where((status == Status.JAMMED) & holds, Status.GRASPED, status)
-    too_far = (status == Status.MOVING) & (jnp.abs(twist.z) > MAX_ROTATION_PER_STEP)
+    carry, answers = jax.lax.scan(stage, Stage.before(start, counts), jnp.array([0.0, 0.5], pose.x.dtype))
+    motion, places, missed = jax.tree.map(lambda leaf: leaf[-1], answers)
+    moved = start.moved(carry.point, carry.twist, carry.angle).pose
+    return _keep_pose_unless_moving(motion, places, moved, pose, _status(carry, before, form.length)), missed
+
+
+def _status(after: Stage, before: Scalar, length: Scalar) -> Int[Array, ""]:
+    """Status of a step.
+
+    Args:
+        after: What the corrector left.
+        before: Depth of the deepest finger at the start of the step, m.
+        length: Characteristic length of the limit surface, m.
+    """
+    status = jnp.where((after.status == Status.JAMMED) & after.holds, Status.GRASPED, after.status)
+    too_far = (status == Status.MOVING) & (jnp.abs(after.twist.z) > MAX_ROTATION_PER_STEP)
     status = jnp.where(too_far, Status.NOT_CONVERGED, status)
-    overlapping = (before > MAX_PENETRATION * form.length) & (status != Status.INVALID)
-    status = jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
-    return _keep_pose_unless_moving(motion, moved, pose, status), missed
+    overlapping = (before > MAX_PENETRATION * length) & (status != Status.INVALID)
+    return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
+
+
+def _first_contact(grips: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
+    """Fraction of the step after which a finger first touches a slider at rest, or one if none does."""
+    begin = jnp.ones_like(start.pose.x)
+
+    def of(grip: FingerMotion) -> Scalar:
+        at, path = compute_once(
+            (grip.seen(start, jnp.zeros_like(start.pose.x)), grip.path.unrotate(start.angle)), start.pose.x
+        )
+        return time_of_impact(grip.finger, outline, at, path, length)
+
+    for met in map_items(of, grips):
+        begin = jnp.minimum(begin, met)
+    return compute_once(begin, start.pose.x)
+
+
+def _points_and_normals(contacts: tuple[Contact, ...]) -> tuple[Array, Array]:
+    """Points and inward normals of contacts, both (contacts, 2), body frame. Not differentiated."""
+    point = jnp.stack([contact.point.array() for contact in contacts])
+    normal = jnp.stack([contact.normal.array() for contact in contacts])
+    return jax.lax.stop_gradient((point, normal))
 
 
 def _force_weighted_point(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...]) -> Vec2:
@@ -295,23 +302,9 @@ def _force_weighted_point(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...
     return middle.scale(1 / jnp.where(total > 0, total, 1.0))
 
 
-def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[FingerMotion, ...]:
-    """Motion of each finger over a step, from its poses before and after (see `unstack_finger_poses`)."""
-    grips = []
-    for k, finger in enumerate(hand.fingers):
-        a, b = before[k], after[k]
-        angle, turning = (a[2], _wrap_to_pi(b[2] - a[2])) if len(a) == 3 else (None, None)
-        center = Vec2(a[0], a[1])
-        grips.append(FingerMotion(finger, friction[k], center, Vec2(b[0], b[1]) - center, angle, turning))
-    return tuple(grips)
-
-
-def _wrap_to_pi(angle: Scalar) -> Scalar:
-    """The same turn, reduced to at most half a revolution, because recorded angles may jump from pi to -pi."""
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
-
-
-def _keep_pose_unless_moving(motion: ScalarSolution, moved: Vec3, pose: Vec3, status: Int[Array, ""]) -> ScalarStep:
+def _keep_pose_unless_moving(
+    motion: ScalarSolution, places: tuple[Array, Array], moved: Vec3, pose: Vec3, status: Int[Array, ""]
+) -> ScalarStep:
     """The record of a step, where a slider that does not move keeps its pose bit for bit.
 
     Without motion the pose is not touched by arithmetic that might have failed.
@@ -328,54 +321,9 @@ def _keep_pose_unless_moving(motion: ScalarSolution, moved: Vec3, pose: Vec3, st
         kept(motion.twist),
         kept(motion.wrench),
         kept(motion.force),
+        kept(places[0]),
+        kept(places[1]),
         tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in motion.mode),
         status,
         jnp.zeros_like(pose.x),
     )
-
-
-def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
-    """Numbers of each finger's pose, as a tuple for each finger.
-
-    Args:
-        poses: Poses or centers, (fingers, width), or with an axis of steps in front.
-    """
-    return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
-
-
-def max_penetration(outline: Outline, grips: tuple[FingerMotion, ...], pose: Vec3, share: float) -> Scalar:
-    """Depth of the deepest finger in the slider after a fraction of the step, m; negative where all are apart.
-
-    Not differentiated.
-
-    Args:
-        outline: The slider's outline.
-        grips: Motion of each finger over the step.
-        pose: Pose of the slider, world.
-        share: Fraction of the step that the fingers have done.
-    """
-    outline, grips, pose = jax.lax.stop_gradient((outline, grips, pose))
-    there = BodyFrame.at(pose)
-
-    def of(grip: FingerMotion) -> Scalar:
-        return penetration_depth(
-            grip.finger, outline, compute_once(grip.seen(there, jnp.full_like(pose.x, share)), pose.x)
-        )
-
-    return functools.reduce(jnp.maximum, map_items(of, grips))
-
-
-def max_displacement(grips: tuple[FingerMotion, ...]) -> Scalar:
-    """Largest displacement of a finger's center in the step, m, along a straight line. Not differentiated."""
-    paths = jax.lax.stop_gradient([grip.path for grip in grips])
-    return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
-
-
-def holding_distance(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
-    """Distance within which a finger holds a jammed slider, m."""
-    return jnp.maximum(GRASP_GAP * length, 4 * max_displacement(grips))
-
-
-def allowed_penetration(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
-    """Largest depth of a finger in the slider after a step, m, unless it was deeper before."""
-    return jnp.maximum(FLOOR * length, TOLERATED * max_displacement(grips))

@@ -34,14 +34,8 @@ from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.detection import num_contacts
-from pushjax.simulation.step import (
-    FingerMotion,
-    ScalarStep,
-    allowed_penetration,
-    holding_distance,
-    max_penetration,
-    step_in_scalars,
-)
+from pushjax.simulation.finger_motion import FingerMotion, allowed_penetration, holding_distance, max_penetration
+from pushjax.simulation.step import ScalarStep, step_in_scalars
 from pushjax.simulation.working_set import LOADED, Urgency, likeliest
 
 SMALLEST = 1 / 256  # of a step
@@ -148,11 +142,32 @@ def divided(
     # computes to memory and reading it back took twice as long.
     round_ = jax.checkpoint(round_, prevent_cse=False, policy=keep_found)
     last, (records, ends, step) = jax.lax.scan(round_, begin, length=most)
-    # For each step, the round that ended it. A step that no round ended has the record that the last round left.
+    return _records_of_steps(records, ends, step, steps, last, nothing), last.done
+
+
+def _records_of_steps(
+    records: ScalarStep,
+    ends: Bool[Array, " rounds"],
+    step: Int[Array, " rounds"],
+    steps: int,
+    last: Trial,
+    nothing: ScalarStep,
+) -> ScalarStep:
+    """For each step, the record of the round that ended it, or what the last round left if no round ended it.
+
+    Args:
+        records: Record of each round.
+        ends: Whether each round ended its step.
+        step: Index of the step of each round.
+        steps: Number of steps.
+        last: State after the last round.
+        nothing: Record of a step in which nothing pushes.
+    """
+    most = len(ends)
     at = jnp.full(steps, most).at[jnp.where(ends, step, steps)].set(jnp.arange(most), mode="drop")
     status = jnp.where(last.stopped != 0, last.stopped, Status.NOT_CONVERGED).astype(jnp.int8)
     rest = nothing._replace(pose=last.pose, status=status, overlap=last.overlap)
-    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[at], records, rest), last.done
+    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[at], records, rest)
 
 
 class Outcome(NamedTuple):

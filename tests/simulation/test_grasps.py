@@ -11,7 +11,7 @@ import pytest
 import pushjax as pj
 from pushjax.experiments import squeeze
 from pushjax.friction.sum_of_squares import squared_quadratics
-from pushjax.simulation.rollout import overlaps
+from pushjax.simulation.slider import overlaps
 from pushjax.testing import ProblemBatch, violations
 
 DISTANCE, ANGLE = 1e-4, np.radians(0.1)  # of a final pose from a recorded one

@@ -15,7 +15,7 @@ from pushjax._math.vec import Vec2, Vec3, cos_sin
 from pushjax.plot.style import END
 from pushjax.simulation.detection import OUT_OF_REACH, FingerPose, contact_candidates, penetration_depth
 from pushjax.simulation.hand import Pad, RoundFinger
-from pushjax.simulation.step import finger_motions, max_penetration
+from pushjax.simulation.finger_motion import finger_motions, max_penetration
 
 shapely = pytest.importorskip("shapely")
 from benchmarks import overlaps as survey  # noqa: E402

@@ -90,7 +90,7 @@ def start_poses(
     Returns:
         The poses (n, 3), and how many were sampled again.
     """
-    from pushjax.simulation.rollout import overlaps
+    from pushjax.simulation.slider import overlaps
 
     rng = np.random.default_rng(seed)
     kept, again = np.zeros((0, 3)), 0

@@ -1,0 +1,132 @@
+"""Checks of the arguments of steps and rollouts, and their conversion to one floating dtype."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    check_type,
+    common_dtype,
+    concrete,
+    traced,
+)
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.table import Table
+from pushjax.geometry.shape import Shape
+from pushjax.simulation.detection import MAX_PENETRATION
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.path import checked_path
+from pushjax.simulation.slider import Slider, overlaps
+
+OVERLAPS = 4096  # poses whose overlaps are computed together
+
+
+def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
+    """Raise TypeError unless `slider` and `hand` are of their types."""
+    check_type("slider", slider, Slider)
+    check_type("slider.shape", slider.shape, Shape)
+    check_type("slider.surface", slider.surface, LimitSurface)
+    check_type("hand", hand, Hand)
+
+
+def checked_arguments(
+    slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike, *paths: ArrayLike, pushes: int | None = None
+):
+    """Cast everything to one floating dtype, and check it as far as its values are known.
+
+    Args:
+        slider: The slider.
+        hand: The hand.
+        pose: Pose of the slider, (3,), world.
+        friction: Coefficient of friction mu, a scalar or (fingers,).
+        *paths: Configurations, which only help to decide the dtype.
+        pushes: If given, `pose` may also be (pushes, 3).
+
+    Returns:
+        Slider, hand, pose, friction (fingers,), and the dtype.
+    """
+    check_slider_and_hand(slider, hand)
+    dtype = common_dtype(slider, hand, pose, friction, *paths)
+    start, mu = as_float(pose, dtype), as_float(friction, dtype)
+    if pushes is None or start.ndim == 1:
+        check_shape("pose", start, (3,))
+    elif start.shape != (pushes, 3):
+        raise ValueError(f"pose has shape {start.shape}; expected (3,) or ({pushes}, 3)")
+    check_finite("pose", start)
+    fingers = len(hand.fingers)
+    if mu.shape not in ((), (fingers,)):
+        raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
+    check_finite("friction", mu)
+    check_non_negative("friction", mu)
+    cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
+    return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
+
+
+def checked_rollout_arguments(
+    slider: Slider, hand: Hand, path: ArrayLike, pose: ArrayLike, friction: ArrayLike, pushes: int | None = None
+):
+    """Prepare the arguments of a rollout: slider, hand, path, start and friction, in one dtype and checked.
+
+    `path` is as in `rollout`; the other arguments are as in `checked_arguments`.
+    """
+    slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
+    p = checked_path(path, hand.dof, dtype)
+    check_opening(hand, p)
+    check_start(slider, hand, start, p[0])
+    return slider, hand, p, start, mu
+
+
+def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:
+    """Raise ValueError if a finger starts too deep in the slider, unless values are traced.
+
+    Args:
+        slider: The slider.
+        hand: The hand.
+        poses: Poses of the slider, (3,) or (pushes, 3), world.
+        configuration: First configuration of the hand, (dof,).
+    """
+    if traced((slider, hand, poses, configuration)):
+        return
+    many = np.atleast_2d(poses)
+    some, found = min(len(many), OVERLAPS), []
+    for first in range(0, len(many), some):  # parts of equal size; the last one is padded
+        part = many[np.minimum(np.arange(first, first + some), len(many) - 1)]
+        found.append(np.asarray(overlaps(slider, hand, jnp.asarray(part), configuration)))
+    overlap = np.concatenate(found)
+    worst = int(np.argmax(overlap))
+    allowed = MAX_PENETRATION * float(slider.surface.length)
+    if overlap[worst] > allowed:
+        where = "" if poses.ndim == 1 else f" at pose {worst}"
+        raise ValueError(
+            f"path starts with the hand inside the slider{where}: a finger overlaps it by {1e3 * overlap[worst]:.3g} "
+            f"mm; at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
+        )
+
+
+def check_opening(hand: Hand, path: Array) -> None:
+    """Raise ValueError if a path closes the hand on itself, unless values are traced."""
+    least, known = hand.least, concrete(path)
+    if least is None or known is None or traced(least):
+        return
+    narrow = np.flatnonzero(np.atleast_2d(known)[:, -1] < float(least))
+    if narrow.size:
+        raise ValueError(
+            f"path closes the hand on itself: d is {np.atleast_2d(known)[narrow[0], -1]:.6g} m at index {narrow[0]}; "
+            f"with these fingers it must be at least {float(least):.6g} m"
+        )
+
+
+def checked_table(table: Table | None, dtype: Any) -> Table | None:
+    """Return the table in a floating dtype. Raises TypeError for anything else than a table or None."""
+    if table is None:
+        return None
+    check_type("table", table, Table)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), table)

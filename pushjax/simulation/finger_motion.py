@@ -1,0 +1,179 @@
+"""Motion of fingers over a step, seen from the slider, and how deep the fingers are in the slider."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._internal.xla import compute_once, map_items
+from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
+from pushjax.geometry.shape import Outline
+from pushjax.simulation.detection import FingerPose, penetration_depth
+from pushjax.simulation.hand import Finger, Hand, Pad
+
+# A jam is a grasp if every finger is nearer to the slider than this, in units of the length, or than four times the
+# hand's displacement in the step. The margin is needed because a jam is detected before the last gap is closed, and
+# because the slider swings faster than the fingers close.
+GRASP_GAP = 1e-4
+# After a step a finger may be this deep in the slider, as a fraction of the largest displacement of the fingers in the
+# step, if it was not deeper before: the midpoint rule leaves that much at a corner. The floor is in units of the length
+# and allows for roundoff.
+TOLERATED, FLOOR = 0.1, 1e-5
+
+
+class BodyFrame(NamedTuple):
+    """A pose with the unit vector of its angle, which is kept because sines cost as much as a contact.
+
+    Attributes:
+        pose: Pose of the slider, world.
+        angle: The unit vector (cos, sin) of the pose's angle.
+    """
+
+    pose: Vec3
+    angle: Vec2
+
+    @staticmethod
+    def at(pose: Vec3) -> "BodyFrame":
+        """A pose, with the unit vector computed."""
+        return BodyFrame(pose, compute_once(cos_sin(pose.z), pose.x))
+
+    def local(self, world: Vec2) -> Vec2:
+        """A world point in the body frame."""
+        return (world - self.pose.xy).unrotate(self.angle)
+
+    def moved(self, contact: Vec2, motion: Vec3, seen: Vec2) -> "BodyFrame":
+        """The pose after a body twist that moves a point of the slider in a straight line.
+
+        Args:
+            contact: The point, body frame, m.
+            motion: The twist.
+            seen: Unit vector of the angle of the frame in which the twist is given; it rotates the twist to the world.
+        """
+        straight = (motion.xy + contact.perp().scale(motion.z)).rotate(seen)
+        theta = self.pose.z + motion.z
+        angle = compute_once(cos_sin(theta), self.pose.x)
+        swing = contact.rotate(angle) - contact.rotate(self.angle)
+        return BodyFrame(Vec3(self.pose.x + straight.x - swing.x, self.pose.y + straight.y - swing.y, theta), angle)
+
+
+class FingerMotion(NamedTuple):
+    """Motion of one finger over a step, and its friction.
+
+    Attributes:
+        finger: The finger.
+        friction: Coefficient of friction mu between finger and slider.
+        center: Center of the finger at the start, world, m.
+        path: Displacement of the center, world, m.
+        angle: Angle at the start, world, rad; None if the finger never turns.
+        turning: Change of the angle, rad; None if the finger never turns.
+    """
+
+    finger: Finger
+    friction: Scalar
+    center: Vec2
+    path: Vec2
+    angle: Scalar | None
+    turning: Scalar | None
+
+    def seen(self, slider: BodyFrame, share: Scalar) -> FingerPose:
+        """Pose of the finger in the slider's frame after the fraction `share` of the step."""
+        center = slider.local(self.center + self.path.scale(share))
+        if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
+            return FingerPose(center, None)
+        if self.angle is None or self.turning is None:
+            raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
+        return FingerPose(
+            center, compute_once(cos_sin(self.angle + share * self.turning), center.x).unrotate(slider.angle)
+        )
+
+    def part(self, begin: Scalar, size: Scalar) -> "FingerMotion":
+        """The part of the step that starts at the fraction `begin` and has the size `size`."""
+        angle, turning = self.angle, self.turning
+        if angle is not None and turning is not None:
+            angle, turning = angle + begin * turning, size * turning
+        center = self.center + self.path.scale(begin)
+        return FingerMotion(self.finger, self.friction, center, self.path.scale(size), angle, turning)
+
+    def motion(self, slider: BodyFrame, point: Vec2, center: Vec2, rest: Scalar, first: Bool[Array, ""]) -> Vec2:
+        """Displacement of the finger's material at a point of the slider, slider's frame, m.
+
+        Args:
+            slider: Pose of the slider.
+            point: The point of the slider, slider's frame, m.
+            center: Center of the finger, slider's frame, m.
+            rest: Fraction of the step that is left; the displacement is the one in that last fraction.
+            first: True in the predictor stage, which is evaluated at the start of that fraction and not halfway. A
+                turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
+                toward each other on what they hold, and cause a jam.
+        """
+        straight = self.path.scale(rest).unrotate(slider.angle)
+        if self.turning is None:
+            return straight
+        straight = straight.unrotate(cos_sin(jnp.where(first, rest * self.turning / 2, 0.0)))
+        # the chord of a rotation about the center; seen from halfway through the turn it is exact
+        return straight + (point - center).perp().scale(2 * jnp.sin(rest * self.turning / 2))
+
+
+def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[FingerMotion, ...]:
+    """Motion of each finger over a step, from its poses before and after (see `unstack_finger_poses`)."""
+    grips = []
+    for k, finger in enumerate(hand.fingers):
+        a, b = before[k], after[k]
+        angle, turning = (a[2], _wrap_to_pi(b[2] - a[2])) if len(a) == 3 else (None, None)
+        center = Vec2(a[0], a[1])
+        grips.append(FingerMotion(finger, friction[k], center, Vec2(b[0], b[1]) - center, angle, turning))
+    return tuple(grips)
+
+
+def _wrap_to_pi(angle: Scalar) -> Scalar:
+    """The same turn, reduced to at most half a revolution, because recorded angles may jump from pi to -pi."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
+    """Numbers of each finger's pose, as a tuple for each finger.
+
+    Args:
+        poses: Poses or centers, (fingers, width), or with an axis of steps in front.
+    """
+    return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
+
+
+def max_penetration(outline: Outline, grips: tuple[FingerMotion, ...], pose: Vec3, share: float) -> Scalar:
+    """Depth of the deepest finger in the slider after a fraction of the step, m; negative where all are apart.
+
+    Not differentiated.
+
+    Args:
+        outline: The slider's outline.
+        grips: Motion of each finger over the step.
+        pose: Pose of the slider, world.
+        share: Fraction of the step that the fingers have done.
+    """
+    outline, grips, pose = jax.lax.stop_gradient((outline, grips, pose))
+    there = BodyFrame.at(pose)
+
+    def of(grip: FingerMotion) -> Scalar:
+        return penetration_depth(
+            grip.finger, outline, compute_once(grip.seen(there, jnp.full_like(pose.x, share)), pose.x)
+        )
+
+    return functools.reduce(jnp.maximum, map_items(of, grips))
+
+
+def max_displacement(grips: tuple[FingerMotion, ...]) -> Scalar:
+    """Largest displacement of a finger's center in the step, m, along a straight line. Not differentiated."""
+    paths = jax.lax.stop_gradient([grip.path for grip in grips])
+    return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
+
+
+def holding_distance(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
+    """Distance within which a finger holds a jammed slider, m."""
+    return jnp.maximum(GRASP_GAP * length, 4 * max_displacement(grips))
+
+
+def allowed_penetration(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
+    """Largest depth of a finger in the slider after a step, m, unless it was deeper before."""
+    return jnp.maximum(FLOOR * length, TOLERATED * max_displacement(grips))
