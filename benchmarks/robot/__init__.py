@@ -1,1 +1,11 @@
-"""Studies of the robot's pushes of table 1: causes of the prediction error, and predicted distributions."""
+"""Studies of the robot's pushes of table 1, and the types of their options."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pushjax._internal.options import cli_option
+
+DataFolder = Annotated[Path | None, cli_option("FOLDER")]
+Surfaces = Annotated[Sequence[str] | None, cli_option("{abs,plywood,delrin} …")]
+Objects = Annotated[Sequence[str], cli_option("OBJECT …")]

@@ -8,17 +8,19 @@ the overlap.
 All runs use one compiled program: a cause that is switched off has a prior of almost zero width (`NO_ROOM`).
 """
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import pushjax as pj
+from benchmarks.robot import DataFolder, Objects, Surfaces
 from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
+from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments.table1.conditions import APART, OBJECTS, SIDES, chosen, load
 from pushjax.experiments.table1.experiment import deviation_mm
@@ -51,12 +53,12 @@ def runs() -> dict[str, tuple[str, ...]]:
 
 
 def run(
-    folder: Path,
+    data: DataFolder = None,
     seed: int = 0,
     out: Path | None = None,
     steps: int = STEPS,
-    surface: Sequence[str] | None = None,
-    object: Sequence[str] = OBJECTS,
+    surface: Surfaces = None,
+    object: Objects = OBJECTS,
     progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
     """Run the study: one cell for each surface, object and run, and the change by each cause over all objects.
@@ -66,12 +68,12 @@ def run(
     to the calibration: against the calibration alone), and `ci95_mm`, half the width of its 95 % confidence interval.
 
     Args:
-        folder: Folder of the data, as for table 1.
+        data: Folder of the recorded pushes, as for table 1. Default: the environment variable PUSHJAX_DATA.
         seed: Seed of the choice of training pushes, where the data do not have one.
         out: Folder for the picture. Each cell is also kept there as soon as it is computed.
         steps: Number of steps of a push.
-        surface: Names of the surfaces, as for table 1.
-        object: Names of the objects, as for table 1.
+        surface: Names of the surfaces, as for table 1. Default: abs, plywood.
+        object: Names of the objects, as for table 1. Default: all.
         progress: Function called with the number of cells done and their total number.
 
     Returns:
@@ -80,22 +82,16 @@ def run(
     Raises:
         ValueError: As table 1 does.
     """
+    folder = data_folder(data)
     surface = chosen(folder, surface, object)
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
-    kept = CellCache("table1-causes", out, settings)
-    cells, total = [], len(surface) * len(object) * len(runs())
+    todo = []
     for log in (load(folder, on, target, seed) for on in surface for target in object):
-        floor, setting = noise_floor_mm(log), None
+        setting = cache(partial(Setting.of, log, "quartic", steps))  # made only if a cell is missing
         for name, causes in runs().items():
             labels = {"surface": log.surface, "object": log.shape, "run": name}
-            cell = kept.find(labels)
-            if cell is None:
-                begin = time.perf_counter()
-                setting = Setting.of(log, "quartic", steps) if setting is None else setting
-                found = _cell(log, setting, causes) | {"noise_floor_mm": floor}
-                cell = kept.add(labels | found | {"run_s": time.perf_counter() - begin})
-            cells.append(cell)
-            progress(len(cells), total)
+            todo.append((labels, partial(_cell, log, setting, causes)))
+    cells = CellCache("table1-causes", out, settings).find_or_compute(todo, progress)
     shares = {name: _share(cells, name) for name in runs()}
     surfaces = {name: _deviations([cell for cell in cells if cell["surface"] == name]) for name in surface}
     pictures = [] if out is None else [_draw(shares, surfaces, out)]
@@ -103,8 +99,9 @@ def run(
     return result_record("table1-causes", settings, cells=cells, shares=shares, surfaces=surfaces, pictures=pictures)
 
 
-def _cell(log: MitPushes, setting: Setting, causes: tuple[str, ...]) -> dict[str, Any]:
+def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) -> dict[str, Any]:
     """Identify with these causes and predict the test pushes of one object on one surface."""
+    setting = made()
     found = identified(setting, causes)
     predicted = found.predict(setting.tested, setting.slider, setting.hand)
     off = deviation_mm(log, own(predicted.pose[:, -1], setting.tested))
@@ -116,6 +113,7 @@ def _cell(log: MitPushes, setting: Setting, causes: tuple[str, ...]) -> dict[str
         "sigma_mm": 1e3 * float(found.sigma),
         "found": {name: np.asarray(physical[name], float) for cause in causes for name in CAUSES[cause]},
         "failed_steps": int(own(predicted.failed, setting.tested).sum()),
+        "noise_floor_mm": noise_floor_mm(log),
     }
 
 

@@ -15,8 +15,7 @@ process     A Gaussian process fitted to the same pushes. It does not know how f
 `curve` shows how many pushes are needed, for point predictions and for one normal distribution about them.
 """
 
-import time
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from jaxtyping import PRNGKeyArray
 from scipy.stats import multivariate_normal
 
 import pushjax as pj
-from benchmarks.robot import gaussian_process
+from benchmarks.robot import DataFolder, Objects, Surfaces, gaussian_process
 from benchmarks.robot.predicted import (
     LEVELS,
     Scored,
@@ -40,6 +39,7 @@ from benchmarks.robot.predicted import (
 from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
+from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments.table1.conditions import APART, OBJECTS, chosen, load, straight
 from pushjax.experiments.table1.methods import LEARNED, TESTED, UNKNOWNS, Setting, fitted, own
@@ -58,12 +58,12 @@ FORMAT = 2  # format of kept cells; those of another format come from another me
 
 
 def run(
-    folder: Path,
+    data: DataFolder = None,
     seed: int = 0,
     out: Path | None = None,
     steps: int = STEPS,
-    surface: Sequence[str] | None = None,
-    object: Sequence[str] = OBJECTS,
+    surface: Surfaces = None,
+    object: Objects = OBJECTS,
     progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
     """Run the study: one cell for each surface and object, and results pooled over the paper's objects.
@@ -73,12 +73,12 @@ def run(
     table 1; `whole` are the same pushes from beginning to end.
 
     Args:
-        folder: Folder of the data, as for table 1.
+        data: Folder of the recorded pushes, as for table 1. Default: the environment variable PUSHJAX_DATA.
         seed: Seed of all sampling, and of the choice of training pushes where the data do not have one.
         out: Folder for the picture. Each cell is also kept there as soon as it is computed.
         steps: Number of steps of a push.
-        surface: Names of the surfaces, as for table 1.
-        object: Names of the objects, as for table 1.
+        surface: Names of the surfaces, as for table 1. Default: abs, plywood.
+        object: Names of the objects, as for table 1. Default: all.
         progress: Function called with the number of cells done and their total number.
 
     Returns:
@@ -87,22 +87,19 @@ def run(
     Raises:
         ValueError: As table 1 does, and if scikit-learn is not installed.
     """
+    folder = data_folder(data)
     surface = chosen(folder, surface, object)
     settings = {"seed": seed, "steps": steps, "version": pj.__version__, "format": FORMAT}
     kept = CellCache("table1-spread", out, settings)
-    cells, total, computed = [], len(surface) * len(object), 0
-    for log in (load(folder, on, target, seed) for on in surface for target in object):
-        labels = {"surface": log.surface, "object": log.shape}
-        cell = kept.find(labels)
-        if cell is None:
-            begin = time.perf_counter()
-            found = _cell(log, Setting.of(log, "quartic", steps), steps, seed)
-            cell = kept.add(labels | found | {"run_s": time.perf_counter() - begin})
-            computed += 1
-            if computed % TOGETHER == 0:
-                jax.clear_caches()
-        cells.append(cell)
-        progress(len(cells), total)
+
+    def cell_of(log: MitPushes) -> dict[str, Any]:
+        if len(kept.cells) % TOGETHER == 0:
+            jax.clear_caches()
+        return _cell(log, Setting.of(log, "quartic", steps), steps, seed)
+
+    logs = [load(folder, on, target, seed) for on in surface for target in object]
+    todo = [({"surface": log.surface, "object": log.shape}, partial(cell_of, log)) for log in logs]
+    cells = kept.find_or_compute(todo, progress)
     paper = [cell for cell in cells if cell["object"] not in APART]
     pooled = {
         group: _pooled([cell[group] for cell in paper], [cell["levels_of"][group] for cell in paper])

@@ -1,10 +1,15 @@
 """Cells of a long run, kept in a file until its results are written, so that an interrupted run can continue."""
 
 import json
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import write_json
+
+Labels = dict[str, str]
 
 
 class CellCache:
@@ -33,9 +38,30 @@ class CellCache:
                 raise ValueError(f"{self.path} is of a run with other settings, {other}: remove it, or use those")
             self.cells = record["cells"]
 
-    def find(self, labels: dict[str, str]) -> dict[str, Any] | None:
-        """Return the first cell with these labels, or None."""
-        return next((cell for cell in self.cells if labels.items() <= cell.items()), None)
+    def find_or_compute(
+        self,
+        todo: Sequence[tuple[Labels, Callable[[], dict[str, Any]]]],
+        progress: ProgressCallback = no_progress,
+    ) -> list[dict[str, Any]]:
+        """Return the cells of a run: those with the labels that are known, and the others computed and saved.
+
+        Args:
+            todo: Labels of each cell, and the function that computes the rest of it.
+            progress: Called with the number of cells done and their total.
+
+        Returns:
+            The cells, in the order of `todo`. A computed one ends with `run_s`, the time that it took in s.
+        """
+        cells = []
+        for labels, compute in todo:
+            cell = next((cell for cell in self.cells if labels.items() <= cell.items()), None)
+            if cell is None:
+                begin = time.perf_counter()
+                found = compute()
+                cell = self.add(labels | found | {"run_s": time.perf_counter() - begin})
+            cells.append(cell)
+            progress(len(cells), len(todo))
+        return cells
 
     def add(self, cell: dict[str, Any]) -> dict[str, Any]:
         """Append a cell, save all cells, and return the cell."""

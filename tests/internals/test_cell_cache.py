@@ -1,5 +1,6 @@
 """Cells of a long run are deleted only when its results are on the disk."""
 
+import functools
 import json
 
 import numpy as np
@@ -24,6 +25,7 @@ def test_cells_are_deleted_after_the_results_are_written(name, figure, tmp_path,
     study, main, command = RUNS[name]
     about = {"settings": {}, "versions": {}, "machine": {}}
 
+    @functools.wraps(study.run)
     def run(*given, out=tmp_path, **options):
         CellCache(name, tmp_path, {}).add({"figure": 1.0})
         return {"experiment": name, "figure": figure} | about

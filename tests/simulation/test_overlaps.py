@@ -18,7 +18,7 @@ from pushjax.simulation.hand import Pad, RoundFinger
 from pushjax.simulation.finger_motion import finger_motions, max_penetration
 
 shapely = pytest.importorskip("shapely")
-from benchmarks import overlaps as survey  # noqa: E402
+from benchmarks import overlaps, survey  # noqa: E402
 
 STARTS = 60
 
@@ -33,13 +33,13 @@ STARTS = 60
     ],
 )
 def test_no_finger_is_inside(hand, shape, steps, dtype):
-    pushes = survey.run(shape, hand, STARTS, steps, dtype)
-    found = survey.judged(pushes, steps)
+    pushes = survey.simulate(shape, hand, STARTS, steps, dtype)
+    found = overlaps.judged(pushes, steps)
     assert found["wrong"] == 0, found["steps_wrong"]
     assert found["failed"] == 0, found["failures"]
     assert found["unconfirmed"] == []
     # the recorded depth is the one that the judge computes
-    depth, own = survey.overlaps(pushes)[:, 1:], pushes.push.overlap
+    depth, own = overlaps.penetration_depths(pushes)[:, 1:], pushes.push.overlap
     deep = np.maximum(depth, own) > 1e-6
     assert deep.any()
     np.testing.assert_allclose(own[deep], depth[deep], atol=1e-6 if dtype == np.float64 else 2e-5, rtol=0.05)
@@ -214,7 +214,7 @@ def test_a_rake_of_five_fingers_touches_in_ten_places():
     path = np.asarray(pj.line((0.0, 0.09), (0.0, 0.0), 90))
     push = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, rake, path, pose=pose, friction=0.3)))(starts)
     assert push.force.shape == (40, 90, 10, 2)
-    depth = survey.overlaps(survey.Survey(rake, slider, path, starts, None, jax.tree.map(np.asarray, push)))
+    depth = overlaps.penetration_depths(survey.Survey(rake, slider, path, starts, None, jax.tree.map(np.asarray, push)))
     fine = ~np.asarray(push.failed)
     assert np.mean(fine) > 0.999
     assert np.max(depth[:, 1:][fine]) < 1e-4 + 1e-9
@@ -345,7 +345,7 @@ def test_hands_of_ones_own_and_smooth_sliders():
         assert body.is_valid
         assert int(push.first_failure) == -1
         assert pj.Status.MOVING in np.asarray(push.status)
-        assert np.max(survey.overlaps(pushes)) < 0.1 * 0.0022
+        assert np.max(overlaps.penetration_depths(pushes)) < 0.1 * 0.0022
 
 
 def test_a_jam_is_confirmed_in_a_part_of_the_step():

@@ -7,8 +7,8 @@ Deviations from the paper: there is one split, where the paper has ten. Pushes t
 in the paper. The curated archives have no pushes on delrin, the paper's third surface; the published folders do.
 """
 
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -62,31 +62,25 @@ def run(
         raise ValueError(f"method must be one or more of {', '.join(METHODS)}; got {unknown or 'none'}")
     logs = [load(folder, on, target, seed) for on in surface for target in object]
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
-    kept = CellCache("table1", out, settings)
-    cells, total = [], len(logs) * len(MODELS) * len(method)
+    todo = []
     for log in logs:
-        floor = noise_floor_mm(log)
         for model in MODELS:
-            setting = None  # shared by all methods, and made only if a cell is missing
+            setting = cache(partial(Setting.of, log, model, steps))  # made only if a cell is missing
             for name in method:
                 labels = {"surface": log.surface, "object": log.shape, "model": model, "method": name}
-                cell = kept.find(labels)
-                if cell is None:
-                    begin = time.perf_counter()
-                    setting = Setting.of(log, model, steps) if setting is None else setting
-                    found = _cell(log, model, METHODS[name](setting), seed)
-                    taken = {"noise_floor_mm": floor, "run_s": time.perf_counter() - begin}
-                    cell = kept.add(labels | found | taken)
-                cells.append(cell)
-                progress(len(cells), total)
+                todo.append((labels, partial(_cell, log, model, METHODS[name], setting, seed)))
+    cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
     means = {name: {model: _means(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
     settings |= {"method": list(method), "surfaces": list(surface), "objects": list(object)}
     return result_record("table1", settings, cells=cells, means=means, pictures=pictures)
 
 
-def _cell(log: MitPushes, model: str, predicted: Predicted, seed: int) -> dict[str, Any]:
-    """Compute the figures of one cell, apart from its labels, noise floor and run time."""
+def _cell(
+    log: MitPushes, model: str, method: Callable[[Setting], Predicted], setting: Callable[[], Setting], seed: int
+) -> dict[str, Any]:
+    """Compute the figures of one cell, apart from its labels and run time."""
+    predicted = method(setting())
     off = deviation_mm(log, predicted.final)
     toolbox = log.middle.toolbox.get(model)
     return {
@@ -103,6 +97,7 @@ def _cell(log: MitPushes, model: str, predicted: Predicted, seed: int) -> dict[s
         "tested": len(off),
         "failed_steps": predicted.failed,
         **_calibration(predicted),
+        "noise_floor_mm": noise_floor_mm(log),
     }
 
 
