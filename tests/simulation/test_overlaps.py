@@ -12,10 +12,10 @@ import pytest
 import pushjax as pj
 from pushjax import plot
 from pushjax._math.vec import Vec2, Vec3, cos_sin
-from pushjax.plot.style import END
+from pushjax.plot.style import RED
 from pushjax.simulation.detection import OUT_OF_REACH, FingerPose, contact_candidates, penetration_depth
-from pushjax.simulation.hand import Pad, RoundFinger
 from pushjax.simulation.finger_motion import finger_motions, max_penetration
+from pushjax.simulation.hand import Pad, RoundFinger
 
 shapely = pytest.importorskip("shapely")
 from benchmarks import overlaps, survey  # noqa: E402
@@ -387,6 +387,6 @@ def test_pictures_name_the_step_that_failed():
     moving.draw(2)
     words = [axes.texts[0] for axes in moving.figure.axes]
     assert words[0].get_text() == f"not converged at step {int(failing.first_failure)}"
-    assert words[0].get_color() == END
+    assert words[0].get_color() == RED
     assert words[1].get_text().startswith("grasped")
     plt.close("all")
