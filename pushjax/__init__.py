@@ -1,57 +1,11 @@
-"""Quasi-static planar pushing and grasping in JAX."""
+"""Quasi-static planar pushing and grasping in JAX.
 
-from pushjax._internal.compilation_cache import enable_compilation_cache as enable_compilation_cache
-from pushjax.contact.cones import friction_cone as friction_cone
-from pushjax.contact.cones import motion_cone as motion_cone
-from pushjax.contact.exhaustive import Exhaustive as Exhaustive
-from pushjax.contact.problem import Contacts as Contacts
-from pushjax.contact.problem import Motion as Motion
-from pushjax.contact.problem import solve_contacts as solve_contacts
-from pushjax.contact.projected import Projected as Projected
-from pushjax.contact.scaled_problem import ContactSolver as ContactSolver
-from pushjax.contact.status import ContactMode as ContactMode
-from pushjax.contact.status import Status as Status
-from pushjax.contact.sticking import HessianIteration as HessianIteration
-from pushjax.contact.sticking import ScalarRoot as ScalarRoot
-from pushjax.friction.ellipsoid import Ellipsoid as Ellipsoid
-from pushjax.friction.fit import FitReport as FitReport
-from pushjax.friction.fit import fit_limit_surface as fit_limit_surface
-from pushjax.friction.fit import mean_twist_angle as mean_twist_angle
-from pushjax.friction.limit_surface import InverseMap as InverseMap
-from pushjax.friction.limit_surface import LimitSurface as LimitSurface
-from pushjax.friction.quartic import Quartic as Quartic
-from pushjax.friction.random import FrictionModel as FrictionModel
-from pushjax.friction.support import Support as Support
-from pushjax.friction.support import WrenchTwistPairs as WrenchTwistPairs
-from pushjax.friction.table import Table as Table
-from pushjax.geometry import se2 as se2
-from pushjax.geometry.curve import Curve as Curve
-from pushjax.geometry.disk import Disk as Disk
-from pushjax.geometry.ellipse import Ellipse as Ellipse
-from pushjax.geometry.polygon import Polygon as Polygon
-from pushjax.geometry.shape import Shape as Shape
-from pushjax.identification.identify import identify as identify
-from pushjax.identification.noise import Noise as Noise
-from pushjax.identification.noise import identify_noise as identify_noise
-from pushjax.identification.pushes import Pushes as Pushes
-from pushjax.identification.result import Identified as Identified
-from pushjax.identification.unknowns import Unknowns as Unknowns
-from pushjax.metrics import coverage as coverage
-from pushjax.metrics import deviation as deviation
-from pushjax.metrics import energy_score as energy_score
-from pushjax.metrics import log_density as log_density
-from pushjax.metrics import total_variation as total_variation
-from pushjax.simulation.hand import Hand as Hand
-from pushjax.simulation.monte_carlo import monte_carlo as monte_carlo
-from pushjax.simulation.monte_carlo_result import MonteCarlo as MonteCarlo
-from pushjax.simulation.path import line as line
-from pushjax.simulation.path import resample as resample
-from pushjax.simulation.path import through as through
-from pushjax.simulation.random_rollout import random_rollout as random_rollout
-from pushjax.simulation.slider import Slider as Slider
-from pushjax.simulation.trajectory import Step as Step
-from pushjax.simulation.trajectory import Trajectory as Trajectory
-from pushjax.simulation.rollout import rollout as rollout
-from pushjax.simulation.rollout import step as step
+The public names are listed in `__init__.pyi`. A name's module is imported when the name is first used, so that
+`import pushjax` and `pushjax --help` take no time.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 __version__ = "0.1.0"

@@ -42,7 +42,7 @@ def test_a_circle_is_found(architecture):
 
 def test_only_four_files_stand_outside_of_the_rooms(architecture):
     at_root = {path.name for path in architecture.PACKAGE.iterdir() if path.is_file()}
-    assert at_root == {"__init__.py", "__main__.py", "metrics.py", "py.typed"}
+    assert at_root == {"__init__.py", "__init__.pyi", "__main__.py", "metrics.py", "py.typed"}
 
 
 def test_the_picture_is_that_of_the_imports(architecture):

@@ -43,9 +43,9 @@ def modules() -> dict[str, set[str]]:
         Names of the imported modules, by the name of the module.
     """
     public = {
-        name.name: node.module
-        for node in ast.parse((PACKAGE / "__init__.py").read_text()).body
-        if isinstance(node, ast.ImportFrom) and node.module and "." in node.module
+        name.name: f"pushjax.{node.module}"
+        for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body
+        if isinstance(node, ast.ImportFrom)
         for name in node.names
     }
     found = {}

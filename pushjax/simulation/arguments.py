@@ -75,12 +75,20 @@ def checked_rollout_arguments(
 ):
     """Prepare the arguments of a rollout: slider, hand, path, start and friction, in one dtype and checked.
 
-    `path` is as in `rollout`; the other arguments are as in `checked_arguments`.
+    `path` is as in `rollout`, and may also be (pushes, steps + 1, dof) where the number of pushes is given. The other
+    arguments are as in `checked_arguments`.
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
-    p = checked_path(path, hand.dof, dtype)
+    if pushes is not None and np.ndim(path) == 3:
+        p = as_float(path, dtype)
+        check_shape("path", p, (pushes, "steps + 1", hand.dof))
+        check_finite("path", p)
+        if p.shape[1] < 2:
+            raise ValueError(f"path must have at least two configurations; got shape {p.shape}")
+    else:
+        p = checked_path(path, hand.dof, dtype)
     check_opening(hand, p)
-    check_start(slider, hand, start, p[0])
+    check_start(slider, hand, start, p[..., 0, :])
     return slider, hand, p, start, mu
 
 
@@ -91,20 +99,22 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
         slider: The slider.
         hand: The hand.
         poses: Poses of the slider, (3,) or (pushes, 3), world.
-        configuration: First configuration of the hand, (dof,).
+        configuration: First configuration of the hand, (dof,) or (pushes, dof).
     """
     if traced((slider, hand, poses, configuration)):
         return
-    many = np.atleast_2d(poses)
-    some, found = min(len(many), OVERLAPS), []
-    for first in range(0, len(many), some):  # parts of equal size; the last one is padded
-        part = many[np.minimum(np.arange(first, first + some), len(many) - 1)]
-        found.append(np.asarray(overlaps(slider, hand, jnp.asarray(part), configuration)))
+    count = max(np.atleast_2d(poses).shape[0], np.atleast_2d(configuration).shape[0])
+    many = np.broadcast_to(poses, (count, 3))
+    begun = np.broadcast_to(configuration, (count, hand.dof))
+    some, found = min(count, OVERLAPS), []
+    for first in range(0, count, some):  # parts of equal size; the last one is padded
+        part = np.minimum(np.arange(first, first + some), count - 1)
+        found.append(np.asarray(overlaps(slider, hand, jnp.asarray(many[part]), jnp.asarray(begun[part]))))
     overlap = np.concatenate(found)
     worst = int(np.argmax(overlap))
     allowed = MAX_PENETRATION * float(slider.surface.length)
     if overlap[worst] > allowed:
-        where = "" if poses.ndim == 1 else f" at pose {worst}"
+        where = "" if poses.ndim == configuration.ndim == 1 else f" in push {worst}"
         raise ValueError(
             f"path starts with the hand inside the slider{where}: a finger overlaps it by {1e3 * overlap[worst]:.3g} "
             f"mm; at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
@@ -116,10 +126,12 @@ def check_opening(hand: Hand, path: Array) -> None:
     least, known = hand.least, concrete(path)
     if least is None or known is None or traced(least):
         return
-    narrow = np.flatnonzero(np.atleast_2d(known)[:, -1] < float(least))
+    opening = np.atleast_2d(known)[..., -1]
+    narrow = np.argwhere(opening < float(least))
     if narrow.size:
+        at = tuple(narrow[0].tolist())
         raise ValueError(
-            f"path closes the hand on itself: d is {np.atleast_2d(known)[narrow[0], -1]:.6g} m at index {narrow[0]}; "
+            f"path closes the hand on itself: d is {opening[at]:.6g} m at index {', '.join(map(str, at))}; "
             f"with these fingers it must be at least {float(least):.6g} m"
         )
 

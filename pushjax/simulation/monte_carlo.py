@@ -65,7 +65,8 @@ def monte_carlo(
         n: Number of pushes.
         slider: The slider; its surface is the mean of the sampled surfaces.
         hand: The hand.
-        path: Configurations of the hand, as in `rollout`.
+        path: Configurations of the hand, as in `rollout`: (steps + 1, dof), or (n, steps + 1, dof) for a path of each
+            push.
         pose: Pose of the slider at the start, world, m and rad: (3,), or (n, 3) for a start of each push.
         model: Distribution from which friction is drawn around `slider.surface`.
         solver: Solver of contact problems, as in `rollout`.
@@ -107,8 +108,8 @@ def monte_carlo(
     if on.several:
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         multihost_utils.sync_global_devices("pushjax monte_carlo")
-    shared = raw, model.around(slider.surface), model, slider.shape, hand, p, solver, checked_table(table, start.dtype)
-    run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), trajectories)
+    shared = raw, model.around(slider.surface), model, slider.shape, hand, solver, checked_table(table, start.dtype)
+    run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), np.asarray(p), trajectories)
     kept: Checkpoint | None = None
     if checkpoint is not None:
         parts = {"n": n, "batch_size": width, "trajectories": trajectories, "key": digest(raw, impl)}
@@ -152,8 +153,19 @@ def _raw(key: Any) -> tuple[Any, Any]:
 class _Run:
     """A run, and its state."""
 
-    def __init__(self, n: int, tile: int, setup: Setup, impl: Any, devices: Devices, start: np.ndarray, keep: bool):
-        self.n, self.tile, self.impl, self.devices, self.start, self.keep = n, tile, impl, devices, start, keep
+    def __init__(
+        self,
+        n: int,
+        tile: int,
+        setup: Setup,
+        impl: Any,
+        devices: Devices,
+        start: np.ndarray,
+        path: np.ndarray,
+        keep: bool,
+    ):
+        self.n, self.tile, self.impl, self.devices, self.keep = n, tile, impl, devices, keep
+        self.start, self.path = start, path
         self.setups, self.round = placed(setup, devices), tile * devices.count
 
     def together(self, action: Callable[[], Any]) -> Any:
@@ -207,7 +219,9 @@ class _Run:
         last = min(first + self.round, self.n)
         indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
         poses = np.broadcast_to(self.start, (self.n, 3))[indices]
-        return first, last, submit(self.setups, self.impl, self.devices, indices, poses, self.keep, pool)
+        # a path that all pushes share is sent once
+        paths = self.path if self.path.ndim == 2 else self.path[indices]
+        return first, last, submit(self.setups, self.impl, self.devices, indices, poses, paths, self.keep, pool)
 
     def _resumed(self, kept: Checkpoint | None) -> tuple[list[Outcome], int]:
         """Pushes that the checkpoint holds, in blocks, and their number."""

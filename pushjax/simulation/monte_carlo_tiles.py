@@ -38,7 +38,6 @@ class Setup(NamedTuple):
         model: Distribution of friction.
         shape: Outline of the slider.
         hand: The hand.
-        path: Configurations of the hand, (steps + 1, dof).
         solver: Solver of contact problems; None for the default.
         table: A table whose friction depends on direction or place; None for uniform friction.
     """
@@ -48,7 +47,6 @@ class Setup(NamedTuple):
     model: FrictionModel
     shape: Shape
     hand: Hand
-    path: Array
     solver: ContactSolver | StickingSolver | None
     table: Table | None
 
@@ -115,7 +113,14 @@ def placed(setup: Setup, devices: Devices) -> list[Setup]:
 
 
 def submit(
-    setups: list[Setup], impl: Any, devices: Devices, indices: np.ndarray, poses: np.ndarray, keep: bool, pool: Executor
+    setups: list[Setup],
+    impl: Any,
+    devices: Devices,
+    indices: np.ndarray,
+    poses: np.ndarray,
+    paths: np.ndarray,
+    keep: bool,
+    pool: Executor,
 ) -> list[Outcome]:
     """Start one round without waiting for it; reading its numbers waits.
 
@@ -125,17 +130,18 @@ def submit(
         devices: Devices of the run.
         indices: Indices of the pushes, (devices, tile), for the devices of all processes.
         poses: Poses of the slider at the start, (devices, tile, 3), for the devices of all processes.
+        paths: Configurations of the hand, (steps + 1, dof) for all pushes, or (devices, tile, steps + 1, dof).
         keep: Whether to keep trajectories.
         pool: Threads, one for each device of this process.
     """
 
     def start(k: int) -> Outcome:
         setup, there = setups[k], devices.first + k
-        index, pose = jax.device_put((indices[there], poses[there]), devices.mine[k])
-        steps = len(setup.path) - 1
-        draws = _draw(impl, steps, setup.key, setup.around, setup.model, index)
-        rest = setup.shape, setup.hand, setup.path, setup.solver, setup.table
-        return _push(setup.model.resample_every, keep, draws, rest, pose)
+        path = paths if paths.ndim == 2 else paths[there]
+        index, pose, path = jax.device_put((indices[there], poses[there], path), devices.mine[k])
+        draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.around, setup.model, index)
+        rest = setup.shape, setup.hand, setup.solver, setup.table
+        return _push(setup.model.resample_every, keep, draws, rest, path, pose)
 
     # in parallel, because each device compiles its own program, once
     return list(pool.map(start, range(len(setups))))
@@ -158,12 +164,13 @@ def _draw(impl: Any, steps: int, key: Array, around: SurfaceDistribution, model:
 
 @without_gc
 @partial(jax.jit, static_argnums=(0, 1))
-def _push(every: int | None, keep: bool, draws, rest: tuple, poses: Array) -> Outcome:
-    return jax.vmap(lambda draws, pose: _outcome(draws, rest, pose, every, keep))(draws, poses)
+def _push(every: int | None, keep: bool, draws, rest: tuple, paths: Array, poses: Array) -> Outcome:
+    each = (0, None if paths.ndim == 2 else 0, 0)
+    return jax.vmap(lambda draws, path, pose: _outcome(draws, rest, path, pose, every, keep), each)(draws, paths, poses)
 
 
-def _outcome(draws, rest: tuple, pose, every, keep) -> Outcome:
-    shape, hand, path, solver, table = rest
+def _outcome(draws, rest: tuple, path, pose, every, keep) -> Outcome:
+    shape, hand, solver, table = rest
     push = push_under(draws, shape, hand, path, pose, solver, every, table)
     mode = push.mode
     return Outcome(

@@ -5,13 +5,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from pushjax._internal.checks import check_type
+from pushjax._internal.checks import ArrayLike, check_type
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
+from pushjax.friction.fit import fit_limit_surface
 from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.support import Support
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.finger_motion import finger_motions, max_penetration, unstack_finger_poses
 from pushjax.simulation.hand import Hand
+
+PAIRS = 400  # wrench-twist pairs of a fit; more change the fit by less than its own error
 
 
 class Slider(eqx.Module):
@@ -29,10 +33,57 @@ class Slider(eqx.Module):
         check_type("shape", self.shape, Shape)
         check_type("surface", self.surface, LimitSurface)
 
+    @staticmethod
+    def uniform(shape: Shape, *, degree: int = 4, load: ArrayLike = 1.0) -> "Slider":
+        """Slider that presses evenly on the table: the usual assumption if the pressure is not known.
+
+        Args:
+            shape: Outline, in the body frame. It must not be traced.
+            degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
+            load: Total friction limit mu m g, N.
+
+        Returns:
+            The slider. Its limit surface is fitted to wrench-twist pairs of `Support.uniform(shape)`.
+
+        Raises:
+            ValueError: As in `Support.uniform` and `fit_limit_surface`.
+
+        Examples:
+            >>> import pushjax as pj
+            >>> slider = Slider.uniform(pj.Polygon.rectangle(0.09, 0.06))
+            >>> slider.surface.degree
+            4
+        """
+        check_type("shape", shape, Shape)
+        return Slider.on(shape, Support.uniform(shape, load=load), degree=degree)
+
+    @staticmethod
+    def on(shape: Shape, support: Support, *, degree: int = 4) -> "Slider":
+        """Slider with a known distribution of pressure.
+
+        Args:
+            shape: Outline, in the body frame.
+            support: Pressure under the slider, in the same frame.
+            degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
+
+        Returns:
+            The slider. Its limit surface is fitted to `PAIRS` wrench-twist pairs of the support. The pairs are drawn
+            with the key 0, so the same arguments give the same bits.
+
+        Raises:
+            ValueError: As in `Support.wrench_twist_pairs` and `fit_limit_surface`.
+        """
+        pairs = support.wrench_twist_pairs(jax.random.key(0), PAIRS)
+        return Slider(shape, fit_limit_surface(*pairs, degree=degree))
+
 
 @quick_jit
-def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
-    """Depth of the deepest finger in the slider, m, for each pose."""
-    where = unstack_finger_poses(hand.poses(configuration))
-    grips = finger_motions(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)
-    return jax.vmap(lambda pose: max_penetration(slider.shape.outline(), grips, Vec3.of(pose), 0.0))(poses)
+def overlaps(slider: Slider, hand: Hand, poses: Array, configurations: Array) -> Array:
+    """Depth of the deepest finger in the slider, m, for each of as many poses and configurations."""
+
+    def one(pose: Array, configuration: Array) -> Array:
+        where = unstack_finger_poses(hand.poses(configuration))
+        grips = finger_motions(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)
+        return max_penetration(slider.shape.outline(), grips, Vec3.of(pose), 0.0)
+
+    return jax.vmap(one)(poses, configurations)

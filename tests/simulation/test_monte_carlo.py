@@ -121,6 +121,23 @@ def test_every_push_from_its_own_start(whole):
     assert np.all(np.diff(result.delta[:, 0]) != 0)
 
 
+def test_every_push_along_its_own_path(whole):
+    """Pushes that share a path go as with a path each; another path of one push changes that push only."""
+    shared = np.asarray(setting()["path"])
+    paths = np.repeat(shared[None], N, axis=0)
+    same = run(path=paths)
+    np.testing.assert_array_equal(same.friction, whole.friction)
+    np.testing.assert_allclose(same.pose, whole.pose, atol=1e-6)
+    paths[7, :, 1] += 0.002
+    other = run(path=paths)
+    changed = np.flatnonzero(np.any(other.pose != same.pose, axis=1))
+    assert changed.tolist() == [7]
+    drawn = jax.random.fold_in(jax.random.key(KEY), 7)
+    given = {name: value for name, value in setting().items() if name != "batch_size"}
+    alone = pj.random_rollout(drawn, **given | {"path": paths[7]})
+    np.testing.assert_allclose(other.pose[7], alone.push.pose[-1], atol=1e-6)
+
+
 def test_friction_drawn_every_few_steps(whole):
     """Ten steps with a new sample every four steps have three samples, each with its own key."""
     given = setting()
@@ -263,10 +280,13 @@ def test_bad_input():
         ({"pose": np.zeros((3, 3))}, r"pose has shape \(3, 3\); expected \(3,\) or \(500, 3\)"),
         ({"pose": np.full(3, np.nan)}, "pose must be finite"),
         ({"path": np.zeros((4, 3))}, "path has shape"),
+        ({"path": np.zeros((3, 4, 2))}, r"path has shape \(3, 4, 2\); expected \(500, steps \+ 1, 2\)"),
+        ({"path": np.full((N, 4, 2), np.nan)}, "path must be finite"),
+        ({"path": np.zeros((N, 1, 2))}, "at least two configurations"),
         ({"path": np.zeros((4, 2))}, "inside the slider"),
         (
             {"pose": jnp.zeros((N, 3)).at[7, 0].set(-0.02)},
-            r"path starts with the hand inside the slider at pose 7: a finger",
+            r"path starts with the hand inside the slider in push 7: a finger",
         ),
     ):
         with pytest.raises(ValueError, match=message):
