@@ -1,1 +1,1 @@
-"""Vectors, small matrices and random matrices, shared by geometry, friction and contact."""
+"""Vectors, small matrices, random matrices and root finding, shared by geometry, friction and contact."""

@@ -183,14 +183,14 @@ class Cholesky(NamedTuple):
         return tuple(tuple(_dot(columns[i], columns[j][i - j :]) for j in range(i + 1)) for i in range(size))
 
 
-def product(a: Lower, b: Lower) -> Lower:
+def multiply_lower(a: Lower, b: Lower) -> Lower:
     """Return the product a b of two lower triangular matrices."""
     return tuple(
         tuple(_dot(a[i][j : i + 1], [b[k][j] for k in range(j, i + 1)]) for j in range(i + 1)) for i in range(len(a))
     )
 
 
-def squared(lower: Lower) -> Lower:
+def times_transpose(lower: Lower) -> Lower:
     """Return L L', which is symmetric."""
     return tuple(tuple(_dot(lower[i][: j + 1], lower[j]) for j in range(i + 1)) for i in range(len(lower)))
 

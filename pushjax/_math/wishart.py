@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
-from pushjax._math.linalg import Lower, product, squared
+from pushjax._math.linalg import Lower, multiply_lower, times_transpose
 from pushjax._math.vec import Scalar, unstack
 
 
@@ -16,20 +16,20 @@ def sample_wishart(key: PRNGKeyArray, factor: Lower, dof: Scalar) -> Lower:
     Args:
         key: PRNG key.
         factor: L, lower triangular with n rows.
-        dof: Degrees of freedom, above n - 1, which is not checked. Otherwise the result is meaningless, and can be
-            finite or NaN.
+        dof: Degrees of freedom, above n - 1.
 
     Returns:
-        The lower triangle of the symmetric matrix.
+        The lower triangle of the symmetric matrix. All entries are NaN if `dof` is not above n - 1.
     """
-    return squared(product(factor, bartlett(key, len(factor), dof)))
+    return times_transpose(multiply_lower(factor, bartlett(key, len(factor), dof)))
 
 
 def bartlett(key: PRNGKeyArray, size: int, dof: Scalar) -> Lower:
-    """Sample a lower triangular T with T T' ~ W(I, dof) / dof."""
+    """Sample a lower triangular T with T T' ~ W(I, dof) / dof; NaN unless `dof` is above `size` - 1."""
     below, diagonal = jax.random.split(key)
     off = jax.random.normal(below, (size * (size - 1) // 2,), dof.dtype)
     squares = 2 * jax.random.gamma(diagonal, (dof - jnp.arange(size, dtype=dof.dtype)) / 2, dtype=dof.dtype)
+    squares = jnp.where(dof > size - 1, squares, jnp.nan)  # every entry of T T' has one of these as a factor
     scale = jax.lax.rsqrt(dof)
     normals, chis = iter(unstack(off * scale)), unstack(jnp.sqrt(squares) * scale)
     return tuple((*(next(normals) for _ in range(i)), chis[i]) for i in range(size))

@@ -30,7 +30,7 @@ from pushjax._math.vec import Scalar
 # The six products v are x², y², z², xy, xz, yz.
 # The matrix of <N, adj S> in their basis. For each entry of N (xx, yy, zz, xy, xz, yz): the places in the lower
 # triangle to which it contributes, and the factors.
-ADJUGATE = (
+ADJUGATE_PLACES = (
     {(2, 1): 0.5, (5, 5): -1.0},
     {(2, 0): 0.5, (4, 4): -1.0},
     {(1, 0): 0.5, (3, 3): -1.0},
@@ -39,9 +39,9 @@ ADJUGATE = (
     {(4, 3): 1.0, (5, 0): -1.0},
 )
 # The same for the matrix N.
-ITSELF = ({(0, 0): 1.0}, {(1, 1): 1.0}, {(2, 2): 1.0}, {(1, 0): 1.0}, {(2, 0): 1.0}, {(2, 1): 1.0})
+ANTISYMMETRIC_PLACES = ({(0, 0): 1.0}, {(1, 1): 1.0}, {(2, 2): 1.0}, {(1, 0): 1.0}, {(2, 0): 1.0}, {(2, 1): 1.0})
 # The same for the matrix of T(S, S), for each of the 15 coefficients.
-SPREAD = (
+COEFFICIENT_PLACES = (
     {(0, 0): 1.0},
     {(1, 1): 1.0},
     {(2, 2): 1.0},
@@ -58,12 +58,13 @@ SPREAD = (
     {(4, 1): 1 / 6, (5, 3): 1 / 3},
     {(3, 2): 1 / 6, (5, 4): 1 / 3},
 )
-BLOCKS = 9  # rows of both blocks together: the parameter of the logarithmic barrier
-MOST_ROUNDS = 60
-WEIGHTS = (4.0, 16.0)  # weight of the share relative to the barrier: initial value, and factor after each centering
-STRIDES = (1.0, 0.7, 0.4)  # step lengths that each Newton round tries
-# Candidates of the initial share, in ascending order
-FIRST = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
+BARRIER_PARAMETER = 9  # of the logarithmic barrier: the number of rows of both blocks together
+MAX_ROUNDS = 60
+# Weight of the scale relative to the barrier: initial value, and factor after each centering
+BARRIER_WEIGHTS = (4.0, 16.0)
+STEP_LENGTHS = (1.0, 0.7, 0.4)  # step lengths that each Newton round tries
+# Candidates for the initial scale, in ascending order
+INITIAL_SCALES = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
 
 
 class Gram(NamedTuple):
@@ -85,8 +86,8 @@ class Gram(NamedTuple):
             coefficients: The 15 coefficients, in the order of `Quartic`.
             n: The entries (xx, yy, zz, xy, xz, yz) of N.
         """
-        parts = (*zip(SPREAD, coefficients, strict=True), *zip(ADJUGATE, n, strict=True))
-        return Gram(_assembled(6, parts), _assembled(3, tuple(zip(ITSELF, n, strict=True))))
+        parts = (*zip(COEFFICIENT_PLACES, coefficients, strict=True), *zip(ADJUGATE_PLACES, n, strict=True))
+        return Gram(_weighted_sum(6, parts), _weighted_sum(3, tuple(zip(ANTISYMMETRIC_PLACES, n, strict=True))))
 
     @staticmethod
     def identity(like: Scalar) -> "Gram":
@@ -103,14 +104,15 @@ class Gram(NamedTuple):
 def coefficients_of(symmetric: Lower) -> Column:
     """Return the 15 coefficients of the quartic v' G v, for the 6 x 6 block G."""
     return tuple(
-        sum(((1 if i == j else 2) * symmetric[i][j] for (i, j) in places), 0 * symmetric[0][0]) for places in SPREAD
+        sum(((1 if i == j else 2) * symmetric[i][j] for (i, j) in places), 0 * symmetric[0][0])
+        for places in COEFFICIENT_PLACES
     )
 
 
 def antisymmetric_of(symmetric: Lower) -> Column:
     """Return the N for which `symmetric` is the 6 x 6 block of the Gram matrix of its quartic."""
     found = []
-    for places in ADJUGATE:
+    for places in ADJUGATE_PLACES:
         (above, a), (below, b) = ((symmetric[i][j], value) for (i, j), value in places.items())
         found.append((4 * above - below) / 3 if b == -1.0 and a == 0.5 else (above - 2 * below) / 3)
     return tuple(found)
@@ -120,21 +122,21 @@ class Certificate(NamedTuple):
     """The result of `max_feasible_scale`.
 
     Attributes:
-        share: The share s that was found. Gram(N) - s * reference is positive definite. Unless the search stopped at
-            `enough`, hardly any larger share is possible.
+        scale: The scale s that was found. Gram(N) - s * reference is positive definite. Unless the search stopped at
+            `enough`, no scale is larger by more than the tolerance.
         n: The entries (xx, yy, zz, xy, xz, yz) of the N that attains it.
-        settled: Whether the search ended within `MOST_ROUNDS`.
+        converged: Whether the search ended within `MAX_ROUNDS`.
     """
 
-    share: Scalar
+    scale: Scalar
     n: Column
-    settled: Bool[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def max_feasible_scale(
     coefficients: Column, n: Column, reference: Gram, *, enough: float, tolerance: float
 ) -> Certificate:
-    """Find the largest share s for which Gram(N) - s * reference is positive semi-definite for some N.
+    """Find the largest scale s for which Gram(N) - s * reference is positive semi-definite for some N.
 
     If the quartic is convex, the largest s is not below zero. The search follows the central path of this problem: it
     applies Newton's method to the logarithmic barrier, and each round takes the best of a few step lengths. The result
@@ -148,11 +150,11 @@ def max_feasible_scale(
         tolerance: The search stops once s is known to be within this of the largest.
 
     Returns:
-        The share, its N, and whether the search ended.
+        The scale, its N, and whether the search ended.
     """
-    start = _begin(coefficients, n, reference)
+    start = _initial_scale(coefficients, n, reference)
     zero = 0 * start
-    state = (start, n, zero + WEIGHTS[0], jnp.zeros((), jnp.int32), start >= enough)
+    state = (start, n, zero + BARRIER_WEIGHTS[0], jnp.zeros((), jnp.int32), start >= enough)
 
     def body(state):
         s, n, weight, rounds, done = state
@@ -160,8 +162,8 @@ def max_feasible_scale(
         centered = moved < 1
         # Close to the border roundoff may make the result of a round not finite. Then keep the previous one.
         lost = ~jnp.isfinite(s_new + sum(n_new))
-        done_now = lost | (s_new >= enough) | (centered & (BLOCKS / weight < tolerance))
-        weight_new = jnp.where(centered, WEIGHTS[1] * weight, weight)
+        done_now = lost | (s_new >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
+        weight_new = jnp.where(centered, BARRIER_WEIGHTS[1] * weight, weight)
 
         def kept(new, old, held):
             return jax.tree.map(lambda a, b: jnp.where(held, b, a), new, old)
@@ -169,21 +171,21 @@ def max_feasible_scale(
         s_new, n_new = kept((s_new, n_new), (s, n), lost)
         return kept((s_new, n_new, weight_new, rounds + 1, done_now), state, done)
 
-    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MOST_ROUNDS), body, state)
+    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MAX_ROUNDS), body, state)
     return Certificate(s, n, done)
 
 
-def _begin(coefficients: Column, n: Column, reference: Gram) -> Scalar:
-    """Return the largest share in `FIRST` for which Gram(n) - share * reference is positive definite.
+def _initial_scale(coefficients: Column, n: Column, reference: Gram) -> Scalar:
+    """Return the largest scale in `INITIAL_SCALES` for which Gram(n) - scale * reference is positive definite.
 
     It is zero if zero is possible.
     """
     gram = Gram.of(coefficients, n)
 
-    def nearer(start, share):
-        return jnp.where(_barrier(gram.plus(-share, reference)).positive, share, start), None
+    def nearer(start, scale):
+        return jnp.where(_barrier(gram.plus(-scale, reference)).positive, scale, start), None
 
-    return jax.lax.scan(nearer, 0 * n[0] + FIRST[0], jnp.asarray(FIRST, n[0].dtype))[0]
+    return jax.lax.scan(nearer, 0 * n[0] + INITIAL_SCALES[0], jnp.asarray(INITIAL_SCALES, n[0].dtype))[0]
 
 
 class _Barrier(NamedTuple):
@@ -214,7 +216,7 @@ def _newton(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight:
     slopes = [0 * s] * 6 + [weight]
     bends = [[0 * s] * (i + 1) for i in range(7)]
     value = weight * s
-    for block, ref, table in zip(gram, reference, (ADJUGATE, ITSELF), strict=True):
+    for block, ref, table in zip(gram, reference, (ADJUGATE_PLACES, ANTISYMMETRIC_PLACES), strict=True):
         factor = Cholesky.of(block)
         value = value + factor.logdet()
         x = compute_once(factor.inverse(), s)
@@ -222,7 +224,7 @@ def _newton(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight:
         for i, mine in enumerate(table):
             slopes[i] = slopes[i] + _trace(x, mine)
             for j in range(i + 1):
-                bends[i][j] = bends[i][j] + _twice(x, mine, table[j])
+                bends[i][j] = bends[i][j] + _double_trace(x, mine, table[j])
             bends[6][i] = bends[6][i] - _trace(across, mine)
         slopes[6] = slopes[6] - _product_trace(x, ref)
         bends[6][6] = bends[6][6] + _product_trace(across, ref)
@@ -230,33 +232,33 @@ def _newton(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight:
     step = compute_once(Cholesky.of(bends).solve(slopes), s)
     squared = sum((a * b for a, b in zip(slopes, step, strict=True)), 0 * s)
     decrement = jnp.sqrt(jnp.maximum(squared, 0))
-    strides = jnp.stack([*(0 * s + stride for stride in STRIDES), 1 / (1 + decrement)])
+    step_lengths = jnp.stack([*(0 * s + step_length for step_length in STEP_LENGTHS), 1 / (1 + decrement)])
 
-    def longer(state, stride):
+    def longer(state, step_length):
         best, most = state
-        at_s, at_n = _along(s, n, step, stride)
+        at_s, at_n = _after_step(s, n, step, step_length)
         reached = _barrier(Gram.of(coefficients, at_n).plus(-at_s, reference))
         value = weight * at_s + reached.logdet
         better = decide(reached.positive & (value > most), s)
-        return (jnp.where(better, stride, best), jnp.where(better, value, most)), None
+        return (jnp.where(better, step_length, best), jnp.where(better, value, most)), None
 
-    best = jax.lax.scan(longer, (0 * s, value), strides)[0][0]
-    s, n = compute_once(_along(s, n, step, best), weight)
+    best = jax.lax.scan(longer, (0 * s, value), step_lengths)[0][0]
+    s, n = compute_once(_after_step(s, n, step, best), weight)
     return s, n, decrement
 
 
-def _along(s: Scalar, n: Column, step: Column, stride):
-    """Return s and N after a step of length `stride`. The step holds six entries for N, then one for s."""
-    return s + stride * step[6], tuple(a + stride * b for a, b in zip(n, step, strict=False))
+def _after_step(s: Scalar, n: Column, step: Column, step_length):
+    """Return s and N after a step of length `step_length`. The step holds six entries for N, then one for s."""
+    return s + step_length * step[6], tuple(a + step_length * b for a, b in zip(n, step, strict=False))
 
 
-def _assembled(size: int, parts) -> Lower:
-    """Return the lower triangle of a sum of matrices, given as pairs of (factors by place, scale)."""
+def _weighted_sum(size: int, parts) -> Lower:
+    """Return the lower triangle of a weighted sum of matrices, given as pairs of (entries by place, weight)."""
     rows = [[None] * (i + 1) for i in range(size)]
     zero = 0 * parts[0][1]
-    for places, scale in parts:
+    for places, weight in parts:
         for (i, j), value in places.items():
-            term = scale if value == 1.0 else value * scale
+            term = weight if value == 1.0 else value * weight
             rows[i][j] = term if rows[i][j] is None else rows[i][j] + term
     return tuple(tuple(zero if e is None else e for e in row) for row in rows)
 
@@ -274,7 +276,7 @@ def _trace(x: Lower, places) -> Scalar:
     return sum((value * entry(x, i, j) for i, j, value in _both(places)), 0 * x[0][0])
 
 
-def _twice(x: Lower, first, second) -> Scalar:
+def _double_trace(x: Lower, first, second) -> Scalar:
     """Return trace(x E x E') for the symmetric matrices E and E' whose lower triangles are `first` and `second`."""
     total = 0 * x[0][0]
     for i, j, a in _both(first):

@@ -42,7 +42,7 @@ from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface, angle_between
 from pushjax.friction.quartic import MONOMIALS, Quartic
-from pushjax.friction.sum_of_squares import TERMS, initial_factors, of_lower, squared_quadratics
+from pushjax.friction.sum_of_squares import TERMS, initial_factors, quadratic_forms, squared_quadratics
 
 VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
@@ -257,7 +257,7 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
 
     def solve(state):
         parameters, along, steps, _, rounds = state
-        parameters, taken, solved = _minimise(_loss(pairs, along, value_weight, ridge), parameters, degree)
+        parameters, taken, solved = _minimize(_loss(pairs, along, value_weight, ridge), parameters, degree)
         after = (pairs.along @ _coefficients(parameters, degree) > 0) | ~counts
         return parameters, after, steps + taken, solved & jnp.all(after == along), rounds + 1
 
@@ -311,7 +311,7 @@ def _loss(pairs: _Pairs, along: Bool[Array, "pairs"], value_weight: Array, ridge
 
 def _coefficients(parameters: Float[Array, "terms 6"], degree: int) -> Float[Array, "m"]:
     """Return the coefficients of H, given the lower triangles of its L_k."""
-    p = of_lower(parameters)
+    p = quadratic_forms(parameters)
     if degree == 4:
         return squared_quadratics(p)
     a = p[0]
@@ -324,7 +324,7 @@ def _symmetric(a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     return jnp.stack([jnp.stack([a[0], xy, xz]), jnp.stack([xy, a[1], yz]), jnp.stack([xz, yz, a[2]])])
 
 
-def _minimise(loss: _Quadratic, parameters: Array, degree: int) -> tuple[Array, Array, Array]:
+def _minimize(loss: _Quadratic, parameters: Array, degree: int) -> tuple[Array, Array, Array]:
     """Minimize the loss over the factors of the terms, by BFGS.
 
     The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each

@@ -37,47 +37,48 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
     d = form.degree
     squared = twist.dot(twist)
     v = compute_once(twist.scale(jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0))), squared)
-    search, plain = (0, 2) if d == 2 else (5, 1 if jnp.finfo(squared.dtype).bits <= 32 else 3)
+    max_searches, full_steps = (0, 2) if d == 2 else (5, 1 if jnp.finfo(squared.dtype).bits <= 32 else 3)
 
-    def newton(f: Vec3):
+    def newton_step(f: Vec3):
         g = form.gradient(f)
         power = f.dot(v)
         dh = f.dot(g)
         c = dh / jnp.where(power > 0, power, 1.0)
-        rest = v.scale(c) - g
-        return g, power, dh / d, form.hessian(f).solve(rest)
+        residual = v.scale(c) - g
+        return g, power, dh / d, form.hessian(f).solve(residual)
 
-    def searched(state):
+    def line_search_round(state):
         count, f, _ = state
-        g, power, h, step = compute_once(newton(f), squared)
+        g, power, h, step = compute_once(newton_step(f), squared)
         c1, c2 = g.dot(step), form.hessian(f).times(step).dot(step) / 2
         g_step = form.gradient(step)
         c3, c4 = f.dot(g_step), step.dot(g_step) / 4
-        c1, c2, c3, c4, gain = compute_once((c1, c2, c3, c4, step.dot(v)), squared)  # compute once, not in each merit
+        # Computed once, and not again for each step length.
+        c1, c2, c3, c4, power_slope = compute_once((c1, c2, c3, c4, step.dot(v)), squared)
 
         def merit(t: float) -> Scalar:
-            p = power + t * gain
+            p = power + t * power_slope
             value = h + t * (c1 + t * (c2 + t * (c3 + t * c4)))
             return jnp.where((value > 0) & (p > 0), (p * p) * (p * p) / jnp.where(value > 0, value, 1.0), 0.0)
 
-        best, top = jnp.ones_like(power), merit(1.0)
+        best_length, best_merit = jnp.ones_like(power), merit(1.0)
         for t in (0.5, 0.2, 0.06, 0.02, 0.005, 2.0):
-            this = merit(t)
-            best, top = jnp.where(this > top, t, best), jnp.maximum(this, top)
-        best = compute_once(best, squared)
-        far = (best != 1) | (step.dot(step) > CLOSE**2 * f.dot(f)) | (power <= 0)
-        return count + 1, compute_once(f + step.scale(best), squared), far & (count + 1 < search)
+            found = merit(t)
+            best_length, best_merit = jnp.where(found > best_merit, t, best_length), jnp.maximum(found, best_merit)
+        best_length = compute_once(best_length, squared)
+        far = (best_length != 1) | (step.dot(step) > CLOSE**2 * f.dot(f)) | (power <= 0)
+        return count + 1, compute_once(f + step.scale(best_length), squared), far & (count + 1 < max_searches)
 
-    def plainly(_, f: Vec3) -> Vec3:
-        return compute_once(f + newton(f)[3], squared)
+    def full_step_round(_, f: Vec3) -> Vec3:
+        return compute_once(f + newton_step(f)[3], squared)
 
     f = v
-    if search:
-        _, f, _ = jax.lax.while_loop(lambda state: state[2], searched, (jnp.zeros((), jnp.int32), v, wanted))
-    f = jax.lax.fori_loop(0, plain, plainly, f)
+    if max_searches:
+        _, f, _ = jax.lax.while_loop(lambda state: state[2], line_search_round, (jnp.zeros((), jnp.int32), v, wanted))
+    f = jax.lax.fori_loop(0, full_steps, full_step_round, f)
     g = form.gradient(f)
     power = f.dot(v)
     c = f.dot(g) / jnp.where(power > 0, power, 1.0)
-    rest = v.scale(c) - g
-    aligned = (power > 0) & (rest.dot(rest) <= (tolerance * c) ** 2) & (squared > 0)
+    residual = v.scale(c) - g
+    aligned = (power > 0) & (residual.dot(residual) <= (tolerance * c) ** 2) & (squared > 0)
     return f, aligned

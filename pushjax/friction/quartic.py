@@ -276,6 +276,6 @@ def _curvature_tensor(coefficients: np.ndarray) -> np.ndarray:
     for index in np.ndindex(3, 3, 3, 3):
         exponent = np.bincount(index, minlength=3)
         k = int(np.argmax((MONOMIALS == exponent).all(axis=1)))
-        ways = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
-        tensor[index] = 12 * coefficients[k] / ways
+        count = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
+        tensor[index] = 12 * coefficients[k] / count
     return tensor

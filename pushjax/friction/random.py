@@ -5,11 +5,14 @@ There are three distributions of limit surfaces, for n degrees of freedom:
 Ellipsoid         A ~ W(A_mean, n) / n, the Wishart distribution: mean A_mean, variance (A_ij^2 + A_ii A_jj) / n.
 Quartic, "gram"   The Gram matrix ~ W(G, n) / n, where G is the Gram matrix of the mean. Along every ray H varies as for
                   an ellipsoid of the same n: its relative variance is 2 / n. Not all samples are convex. Each is
-                  certified (`convexity`); one that is not convex is pulled towards the mean, by as little as the
+                  certified (`convexity`); one that is not convex is pulled toward the mean, by as little as the
                   certificate allows.
 Quartic, "sum_of_squares"
                   H = sum_k (F' P_k F)^2, each P_k ~ W(P_k, m) / m over sqrt(1 + 2 / m). The mean of H is exact, and all
                   samples are convex. m is chosen such that the relative variance of H, averaged over rays, is 2 / n.
+
+A traced `dof` (under `jit`, `grad` or `vmap`) is not checked. If it is so small that the Wishart distribution does not
+exist, the sampled surface is NaN, and every step of a rollout with it has the status INVALID.
 
 All samples are smooth functions of standard draws (Bartlett's decomposition). So they can be differentiated by `dof`,
 by the range of the contact friction and by the mean. The shrinkage of a repaired sample is held fixed, and so are the N
@@ -57,8 +60,8 @@ from pushjax.friction.sum_of_squares import decompose, squared_quadratics
 
 Sampler = Literal["gram", "sum_of_squares"]
 LOADING = 0.01  # relative to the least eigenvalue of the mean's Gram matrix
-SPLIT_TOLERANCE = 1e-3  # largest error of a sum of squares, relative to the largest coefficient
-RAYS = 200
+DECOMPOSITION_TOLERANCE = 1e-3  # largest error of a sum of squares, relative to the largest coefficient
+NUM_RAYS = 200
 
 
 class SurfaceSample(NamedTuple):
@@ -66,7 +69,7 @@ class SurfaceSample(NamedTuple):
 
     Attributes:
         surface: The limit surface.
-        shrinkage: How far the sample was moved towards the mean to be convex, as a fraction of the distance to the
+        shrinkage: How far the sample was moved toward the mean to be convex, as a fraction of the distance to the
             mean. Zero if it was convex.
     """
 
@@ -98,7 +101,8 @@ class FrictionModel(eqx.Module):
     Args:
         dof: Degrees of freedom n of the Wishart distribution, at least 3 for an `Ellipsoid` and at least 9 for a
             `Quartic` (the size of the sampled matrix). It need not be an integer. The relative variance of H along a
-            ray is 2 / n. None if the limit surface is known exactly.
+            ray is 2 / n. None if the limit surface is known exactly. Not checked if traced; see the header of this
+            module.
         friction: Coefficient of contact friction mu, or the range (lowest, highest), shape (2,), on which it is
             uniformly distributed.
         sampler: Distribution of a `Quartic`, see the header of this module. "gram" is the paper's and takes every
@@ -164,7 +168,7 @@ class FrictionModel(eqx.Module):
         """
         dtype = surface.length.dtype
         if self.dof is None:
-            return _Certain(surface)
+            return _Deterministic(surface)
         dof = self.dof.astype(dtype)
         if isinstance(surface, Ellipsoid):
             return _WishartEllipsoid.of(surface, dof)
@@ -212,7 +216,7 @@ def _at_least(dof: Array, least: int, what: str) -> None:
         raise ValueError(f"dof must be at least {least}, the size of {what}; got {known:g}")
 
 
-class _Certain(SurfaceDistribution):
+class _Deterministic(SurfaceDistribution):
     """The distribution of a surface that is known exactly."""
 
     mean: LimitSurface
@@ -220,7 +224,7 @@ class _Certain(SurfaceDistribution):
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
         return SurfaceSample(self.mean, jnp.zeros_like(self.mean.length))
 
-    def with_dof(self, dof: Array) -> "_Certain":
+    def with_dof(self, dof: Array) -> "_Deterministic":
         return self
 
 
@@ -279,7 +283,7 @@ class _GramQuartic(SurfaceDistribution):
         scaled = tuple(c / size for c in form.c)
         canonical = without_derivatives(_canonical, scaled)
         gram = Gram.of(form.c, tuple(size * n for n in canonical.n))
-        least = canonical.share
+        least = canonical.scale
         # For a mean on the border of convexity the least eigenvalue is zero, up to the tolerance of the search.
         loading = size * jnp.where(least > 0, LOADING * least, least)
         within = gram.plus(-loading, Gram.identity(loading)).symmetric
@@ -292,19 +296,19 @@ class _GramQuartic(SurfaceDistribution):
         identity = Gram.identity(self.loading)
         drawn = add_scaled(sample_wishart(key, self.factor, self.dof), self.loading, identity.symmetric)
         coefficients = coefficients_of(drawn)
-        # The Gram matrix of a mean on the border of convexity is not positive definite, so pulling a sample towards it
+        # The Gram matrix of a mean on the border of convexity is not positive definite, so pulling a sample toward it
         # does not help in every direction. Add a very small multiple of the identity to it.
         reference = self.gram.plus(jnp.maximum(-2 * self.loading, 0), identity)
         mean = coefficients_of(reference.symmetric)
         found = without_derivatives(_certified, coefficients, antisymmetric_of(drawn), reference)
-        shrinkage = jnp.where(found.share < 0, -found.share / (1 - found.share), 0.0)
-        shrinkage = jnp.where(jnp.isfinite(found.share), shrinkage, 1.0)  # never observed: samples that are not finite
+        shrinkage = jnp.where(found.scale < 0, -found.scale / (1 - found.scale), 0.0)
+        shrinkage = jnp.where(jnp.isfinite(found.scale), shrinkage, 1.0)  # never observed: samples that are not finite
         moved = [c + shrinkage * (m - c) for c, m in zip(coefficients, mean, strict=True)]
         return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, jnp.stack(moved)), shrinkage)
 
 
 def _canonical(coefficients):
-    """Find the Gram matrix of a quartic whose least eigenvalue is largest; `share` is that eigenvalue."""
+    """Find the Gram matrix of a quartic whose least eigenvalue is as large as possible; `scale` is that eigenvalue."""
     one = jnp.ones_like(coefficients[0])
     ball = (0.2 * one,) * 3 + (0 * one,) * 3
     tolerance = 1e-6 if one.dtype == jnp.float64 else 1e-4
@@ -312,7 +316,7 @@ def _canonical(coefficients):
 
 
 def _certified(coefficients, n, reference):
-    """Certify that a quartic is convex (`share` >= 0), or find how much of the reference makes it so (-`share`)."""
+    """Certify that a quartic is convex (`scale` >= 0), or find how much of the reference makes it so (-`scale`)."""
     return max_feasible_scale(coefficients, n, reference, enough=0.0, tolerance=1e-3)
 
 
@@ -333,7 +337,7 @@ class SumOfSquaresQuartic(SurfaceDistribution):
     def of(mean: Quartic, dof: Array) -> "SumOfSquaresQuartic":
         terms = quick_jit(decompose)(mean.coefficients)
         error = concrete(terms.error)
-        if error is not None and not error < SPLIT_TOLERANCE:
+        if error is not None and not error < DECOMPOSITION_TOLERANCE:
             raise ValueError(
                 f"surface: the nearest sum of five squared quadratic forms is {error:.1g} of its coefficients away; "
                 "the sampler 'gram' takes every convex quartic"
@@ -376,7 +380,7 @@ def dof_of_terms(lower: Array, dof: Array) -> Array:
         dof: Degrees of freedom n.
     """
     forms = lower @ jnp.swapaxes(lower, 1, 2)
-    rays = jnp.asarray(fibonacci_hemisphere(RAYS), dof.dtype)
+    rays = jnp.asarray(fibonacci_hemisphere(NUM_RAYS), dof.dtype)
     each = jnp.einsum("fi,kij,fj->fk", rays, forms, rays) ** 2
     share = each / jnp.sum(each, axis=1, keepdims=True)
     b = 4 * jnp.mean(jnp.sum(share**2, axis=1)) * dof - 2

@@ -28,13 +28,13 @@ def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
     return jnp.asarray(_COLLECT, p.dtype) @ products.reshape(81)
 
 
-def of_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+def quadratic_forms(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
     """Return P_k = L_k L_k', given the lower triangles of L_k, row by row."""
-    full = triangles(lower)
+    full = unpack_lower(lower)
     return full @ jnp.swapaxes(full, 1, 2)
 
 
-def triangles(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+def unpack_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
     """Return the matrices L_k, given their lower triangles, row by row."""
     return jnp.zeros((lower.shape[0], 3, 3), lower.dtype).at[:, *_LOWER].set(lower)
 
@@ -52,7 +52,7 @@ def initial_factors(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 
     return jnp.asarray(size * lower[:, *_LOWER], dtype)
 
 
-class Terms(NamedTuple):
+class SumOfSquares(NamedTuple):
     """A quartic as a sum of squares.
 
     Attributes:
@@ -64,7 +64,7 @@ class Terms(NamedTuple):
     error: Float[Array, ""]
 
 
-def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> Terms:
+def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> SumOfSquares:
     """Write a quartic as a sum of squares of quadratic forms.
 
     The terms are not unique. These are the ones that the Levenberg-Marquardt method reaches from `initial_factors`.
@@ -82,24 +82,24 @@ def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> Terms:
     """
     size = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
     target = coefficients / size
-    found = without_derivatives(_search, target, initial_factors(4, terms, coefficients.dtype))
-    slope = jax.lax.stop_gradient(jax.jacobian(_sum)(found).reshape(len(MONOMIALS), -1))
+    found = without_derivatives(_search_factors, target, initial_factors(4, terms, coefficients.dtype))
+    slope = jax.lax.stop_gradient(jax.jacobian(_coefficients)(found).reshape(len(MONOMIALS), -1))
     off = target - jax.lax.stop_gradient(target)
     found = found + (jnp.linalg.pinv(slope) @ off).reshape(found.shape)
-    return Terms(triangles(found) * size**0.25, jnp.max(jnp.abs(_sum(found) - target)))
+    return SumOfSquares(unpack_lower(found) * size**0.25, jnp.max(jnp.abs(_coefficients(found) - target)))
 
 
-def _sum(lower: Float[Array, "terms 6"]) -> Float[Array, "15"]:
-    return squared_quadratics(of_lower(lower))
+def _coefficients(lower: Float[Array, "terms 6"]) -> Float[Array, "15"]:
+    return squared_quadratics(quadratic_forms(lower))
 
 
-def _search(target: Float[Array, "15"], start: Float[Array, "terms 6"]) -> Float[Array, "terms 6"]:
+def _search_factors(target: Float[Array, "15"], start: Float[Array, "terms 6"]) -> Float[Array, "terms 6"]:
     # The solver keeps its own numbers in the widest float type that is enabled, and it does not mix two types.
     wide = jnp.result_type(float)
     tolerance = 1e-12 if wide == jnp.float64 else 1e-6
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     target, first = target.astype(wide), start.astype(wide)
-    found = optx.least_squares(lambda x, _: _sum(x) - target, solver, first, max_steps=MAX_STEPS, throw=False)
+    found = optx.least_squares(lambda x, _: _coefficients(x) - target, solver, first, max_steps=MAX_STEPS, throw=False)
     return found.value.astype(start.dtype)
 
 

@@ -35,7 +35,7 @@ from pushjax._internal.checks import (
 from pushjax._internal.jit import quick_jit
 from pushjax.geometry.shape import Shape
 
-FACET_SHARE = 0.1  # fraction of the wrench-twist pairs that lie on a facet
+FACET_FRACTION = 0.1  # fraction of the wrench-twist pairs that lie on a facet
 
 
 class WrenchTwistPairs(NamedTuple):
@@ -101,7 +101,7 @@ class Support(eqx.Module):
         check_shape("load", total, ())
         check_finite("load", total)
         check_positive("load", total)
-        return Support(array, in_numpy(_shares)(total, share))
+        return Support(array, in_numpy(_distributed)(total, share))
 
     @staticmethod
     def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
@@ -215,7 +215,7 @@ class Support(eqx.Module):
     @property
     def radius_of_gyration(self) -> Float[Array, ""]:
         """Root mean square distance of the pressure from its center, m."""
-        return in_numpy(_gyration)(self.point, self.limit)
+        return in_numpy(_radius_of_gyration)(self.point, self.limit)
 
     def wrench(self, twist: ArrayLike, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
         """Return the wrench with which a hand balances friction while the slider moves with `twist`.
@@ -246,7 +246,7 @@ class Support(eqx.Module):
         still = speed2 <= (8 * jnp.finfo(speed2.dtype).eps * reach) ** 2
         force = jnp.where(still[:, None], 0.0, velocity / jnp.sqrt(jnp.where(still, 1.0, speed2))[:, None])
         if key is not None:
-            force = jnp.where((still & moved)[:, None], _in_unit_disc(key, len(self.point), v.dtype), force)
+            force = jnp.where((still & moved)[:, None], _in_unit_disk(key, len(self.point), v.dtype), force)
         f = self.limit[:, None] * force
         torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
         return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
@@ -273,14 +273,18 @@ class Support(eqx.Module):
         """
         if pairs < 1:
             raise ValueError(f"pairs must be at least 1; got {pairs}")
-        rho = in_numpy(_length)(self.point, self.limit) if length is None else as_float(length, self.point.dtype)
+        rho = (
+            in_numpy(_characteristic_length)(self.point, self.limit)
+            if length is None
+            else as_float(length, self.point.dtype)
+        )
         check_shape("length", rho, ())
         check_finite("length", rho)
         check_positive("length", rho)
         return _pairs(self, key, pairs, rho)
 
 
-def _shares(xp, total, weights):
+def _distributed(xp, total, weights):
     return total * weights / xp.sum(weights)
 
 
@@ -288,14 +292,14 @@ def _center(xp, point, limit):
     return xp.sum(limit[:, None] * point, axis=0) / xp.sum(limit)
 
 
-def _gyration(xp, point, limit):
+def _radius_of_gyration(xp, point, limit):
     squared = xp.sum((point - _center(xp, point, limit)[None]) ** 2, axis=1)
     return xp.sqrt(xp.sum(limit * squared) / xp.sum(limit))
 
 
-def _length(xp, point, limit):
+def _characteristic_length(xp, point, limit):
     """Return the radius of gyration, or 1 m if it is only roundoff."""
-    gyration = _gyration(xp, point, limit)
+    gyration = _radius_of_gyration(xp, point, limit)
     rounding = 16 * xp.finfo(gyration.dtype).eps * xp.max(xp.abs(point))
     return xp.where(gyration > rounding, gyration, 1.0)
 
@@ -310,7 +314,7 @@ def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, 
     # A rotation about r moves the origin with (r_y, -r_x) omega.
     spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
     pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
-    facets = round(FACET_SHARE * pairs)
+    facets = round(FACET_FRACTION * pairs)
     on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facets)
     normalized = jnp.where(on_facet[:, None], pivot, free)
     normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
@@ -362,7 +366,7 @@ def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "poi
     return jax.lax.map(share, points, batch_size=4096)  # in parts, because points times edges may be many
 
 
-def _in_unit_disc(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
+def _in_unit_disk(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
     """Draw points uniformly from the unit disk."""
     k_r, k_angle = jax.random.split(key)
     radius = jnp.sqrt(jax.random.uniform(k_r, (count, 1), dtype))

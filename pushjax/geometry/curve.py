@@ -15,16 +15,16 @@ from pushjax.geometry.spline_segment import spline_segments
 
 # Nodes per segment for the arc length. The speed is smooth between two nodes.
 ARC_NODES = 8
-# Rounds of a fit. Each one fits the curve and moves every parameter towards the closest point on the curve.
-FIT_ROUNDS = 20
+# Iterations of a fit. Each one fits the curve and moves every parameter toward the closest point on the curve.
+FIT_ITERATIONS = 20
 
 
 class Curve(Shape):
     """A smooth closed curve in the body frame: a uniform cubic B-spline, with continuous curvature.
 
     The curve runs near its control points, not through them. `Curve.through` interpolates points, and `Curve.fit`
-    approximates a dense outline. The control points are stored counter-clockwise, as for `Polygon`. While they are
-    traced (under `jit`, `grad` or `vmap`), they are taken as they are and must be counter-clockwise already.
+    approximates a dense outline. The control points are stored counterclockwise, as for `Polygon`. While they are
+    traced (under `jit`, `grad` or `vmap`), they are taken as they are and must be counterclockwise already.
 
     A query costs the same for all query points, in proportion to the number of control points.
 
@@ -43,7 +43,7 @@ class Curve(Shape):
     convex: bool = eqx.field(static=True)
 
     def __init__(self, control: ArrayLike, *, convex: bool | None = None):
-        array = _checked("control", control, least=4)
+        array = _check_points("control", control, least=4)
         known = concrete(array)
         if known is not None:
             if _check_curve(known.astype(np.float64)) < 0:
@@ -66,7 +66,7 @@ class Curve(Shape):
         Raises:
             ValueError: As for `Curve`.
         """
-        array = _checked("points", points, least=4)
+        array = _check_points("points", points, least=4)
         one = jnp.eye(len(array), dtype=array.dtype)
         at_points = (4 * one + jnp.roll(one, 1, axis=0) + jnp.roll(one, -1, axis=0)) / 6
         return Curve(jnp.linalg.solve(at_points, array), convex=convex)
@@ -90,26 +90,26 @@ class Curve(Shape):
         Raises:
             ValueError: If the points are traced, `controls` is out of range, or as for `Curve`.
         """
-        array = _checked("points", points, least=4)
+        array = _check_points("points", points, least=4)
         known = concrete(array)
         if known is None:
             raise ValueError("points are traced; a curve is fitted only to known points, outside jit, grad and vmap")
         if not 4 <= controls <= len(known) // 2:
             raise ValueError(f"controls must be from 4 to half the number of points, {len(known) // 2}; got {controls}")
-        return Curve(jnp.asarray(_fitted(known.astype(np.float64), controls), array.dtype), convex=convex)
+        return Curve(jnp.asarray(_fit_control_points(known.astype(np.float64), controls), array.dtype), convex=convex)
 
     @property
     def area(self) -> Float[Array, ""]:
-        x, y, dx, dy, weight = self._by_gauss()
+        x, y, dx, dy, weight = self._quadrature()
         return jnp.sum(weight * (x * dy - y * dx)) / 2
 
     @property
     def centroid(self) -> Float[Array, "2"]:
-        x, y, dx, dy, weight = self._by_gauss()
+        x, y, dx, dy, weight = self._quadrature()
         moment = jnp.stack([jnp.sum(weight * x * x * dy), -jnp.sum(weight * y * y * dx)]) / 2
         return self.control[0] + moment / (jnp.sum(weight * (x * dy - y * dx)) / 2)
 
-    def _by_gauss(self) -> tuple[Array, ...]:
+    def _quadrature(self) -> tuple[Array, ...]:
         """Return points, derivatives and weights of Gauss-Legendre quadrature along the curve.
 
         The five points per segment are exact for integrands up to degree nine.
@@ -123,7 +123,7 @@ class Curve(Shape):
     @property
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         pieces = spline_segments(self.control)
-        low, high = zip(*(_range(*fields) for fields in zip(*pieces[:4], strict=True)), strict=True)
+        low, high = zip(*(_coordinate_range(*fields) for fields in zip(*pieces[:4], strict=True)), strict=True)
         return jnp.stack(low), jnp.stack(high)
 
     @property
@@ -158,7 +158,7 @@ class Curve(Shape):
         return compute_once(outline, self.control[0, 0])
 
 
-def _range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
+def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
     """Return the least and largest value of one coordinate over all segments.
 
     The candidates are the ends of the segments and the stationary points between them.
@@ -171,7 +171,7 @@ def _range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
     return jnp.min(values), jnp.max(values)
 
 
-def _checked(name: str, points: ArrayLike, least: int) -> Array:
+def _check_points(name: str, points: ArrayLike, least: int) -> Array:
     """Return the argument `name` as an array; raise unless it holds at least `least` finite, distinct points."""
     array = as_float(points)
     check_shape(name, array, (name, 2))
@@ -194,7 +194,7 @@ def _checked(name: str, points: ArrayLike, least: int) -> Array:
 _BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 
 
-def _known_at(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
+def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
     """Evaluate points and first and second derivatives of a known curve.
 
     This repeats `spline_segments` and `SplineSegment.at` in NumPy, to compute in float64 whatever precision JAX runs
@@ -210,7 +210,7 @@ def _known_at(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, .
 def _check_curve(control: np.ndarray) -> float:
     """Return the approximate signed area, m^2; raise if the curve encloses no area, has a cusp or crosses itself."""
     samples = max(4, min(16, 1200 // len(control)))  # per segment; all pairs of samples are compared
-    points, velocity, _ = _known_at(control, np.arange(len(control) * samples) / samples)
+    points, velocity, _ = _evaluate_in_numpy(control, np.arange(len(control) * samples) / samples)
     size, area = float(np.max(np.ptp(points, axis=0))), signed_area(points)
     if abs(area) <= 1e-9 * size**2:
         raise ValueError(f"control: the curve encloses no area ({abs(area):.3g} m^2)")
@@ -232,7 +232,7 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     if known is None:
         return bool(claimed)
     count = len(known)
-    points, velocity, second = _known_at(known.astype(np.float64), np.arange(32 * count) / 32)
+    points, velocity, second = _evaluate_in_numpy(known.astype(np.float64), np.arange(32 * count) / 32)
     curvature = velocity[:, 0] * second[:, 1] - velocity[:, 1] * second[:, 0]
     curvature /= np.linalg.norm(velocity, axis=1) ** 3
     # Error of the curvature from roundoff in the second differences of the control points.
@@ -250,12 +250,12 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     return convex if claimed is None else bool(claimed)
 
 
-def _fitted(points: np.ndarray, controls: int) -> np.ndarray:
+def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
     """Fit control points by alternating least squares.
 
-    Each round solves for the control points at fixed parameters, then moves the parameter of every point towards the
-    closest point of the curve. A point's parameter starts at its fraction of the outline's length. The first rounds
-    minimize the whole distance between a point and the curve's point at its parameter. The later rounds weight mostly
+    Each iteration solves for the control points at fixed parameters, then moves the parameter of every point toward the
+    closest point of the curve. A point's parameter starts at its fraction of the outline's length. The first iterations
+    minimize the whole distance between a point and the curve's point at its parameter. The later ones weight mostly
     the distance across the curve, because the parameter can compensate for the distance along it.
     """
     before, after = (np.linalg.norm(points - np.roll(points, k, axis=0), axis=1) for k in (1, -1))
@@ -263,22 +263,22 @@ def _fitted(points: np.ndarray, controls: int) -> np.ndarray:
     arc = np.concatenate([[0], np.cumsum(after)])
     parameter = arc[:-1] / arc[-1] * controls
     across, along = np.broadcast_to(np.eye(2)[:, None], (2, len(points), 2))
-    for turn in range(FIT_ROUNDS):
+    for iteration in range(FIT_ITERATIONS):
         index = np.floor(parameter).astype(int)
-        share = (parameter - index)[:, None] ** np.arange(4)[None] @ _BASIS
+        basis = (parameter - index)[:, None] ** np.arange(4)[None] @ _BASIS
         design = np.zeros((len(points), controls))
         for k in range(4):
-            design[np.arange(len(points)), (index + k - 1) % controls] += share[:, k]
-        slack = 1.0 if turn < FIT_ROUNDS // 4 else 0.1
-        ways = [weight * scale * way for scale, way in ((1.0, across), (slack, along))]
-        matrix = np.concatenate([(way[:, :, None] * design[:, None]).reshape(len(points), -1) for way in ways])
-        value = np.concatenate([np.sum(way * points, axis=1) for way in ways])
+            design[np.arange(len(points)), (index + k - 1) % controls] += basis[:, k]
+        slack = 1.0 if iteration < FIT_ITERATIONS // 4 else 0.1
+        rows = [weight * scale * direction for scale, direction in ((1.0, across), (slack, along))]
+        matrix = np.concatenate([(row[:, :, None] * design[:, None]).reshape(len(points), -1) for row in rows])
+        value = np.concatenate([np.sum(row * points, axis=1) for row in rows])
         control = np.linalg.lstsq(matrix, value, rcond=None)[0].reshape(2, controls).T
-        at, first, second = _known_at(control, parameter)
+        at, first, second = _evaluate_in_numpy(control, parameter)
         squared = np.sum(first**2, axis=1)
         stiff = np.maximum(squared - np.sum((points - at) * second, axis=1), 0.5 * squared)
         parameter = parameter + np.clip(np.sum((points - at) * first, axis=1) / stiff, -0.25, 0.25)
-        along = _known_at(control, parameter)[1]
+        along = _evaluate_in_numpy(control, parameter)[1]
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         across = np.stack([along[:, 1], -along[:, 0]], axis=1)
     return control

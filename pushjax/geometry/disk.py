@@ -1,12 +1,13 @@
 """Disks: closest point and sweep in closed form."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, Outline, Shape, ray_circle_intersection
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, ray_circle_intersection
 
 
 class DiskOutline(Outline):
@@ -30,6 +31,10 @@ class DiskOutline(Outline):
         normal = tree_where(at_center, aside, rel.scale(1 / length))
         distance = jnp.where(at_center, normal.dot(rel), length) - self.radius
         return ClosestPoint(distance, self.center + normal.scale(self.radius), normal)
+
+    def facing(self, direction: Vec2) -> FacingPoints:
+        point = self.center + direction.scale(self.radius)
+        return FacingPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         return ray_circle_intersection(x - self.center, path, self.radius + radius)

@@ -1,13 +1,14 @@
 """Ellipses: closest point and sweep, each by one root on the outline.
 
 The outline is parameterized by a unit vector q = (c, s). The point at q is p = (a c, b s), and the outward normal n is
-(b c, a s), normalized. Each query is one root in q. A fixed number of bracketed rounds finds the root outside the
-derivative. One more, differentiable round then gives the root its derivatives. Angles appear only as small turns of q.
+(b c, a s), normalized. Each query is one root in q. A fixed number of bracketed iterations finds the root outside the
+derivative. One more, differentiable iteration then gives the root its derivatives. Angles appear only as small turns of
+q.
 
 Closest point to x: q is a critical point of the distance where f(q) = (a^2 - b^2) s c - a |x| s + b |y| c = 0. In the
-quadrant of (|x|, |y|), f falls through zero at exactly one q, and this is the closest point. The rounds use Halley's
-method for two reasons. It is of third order, so that second derivatives are also right after one round. And it is fast
-at the cusps of the evolute, where the root is threefold.
+quadrant of (|x|, |y|), f falls through zero at exactly one q, and this is the closest point. The iterations use
+Halley's method for two reasons. It is of third order, so that second derivatives are also right after one iteration.
+And it is fast at the cusps of the evolute, where the root is threefold.
 
 Sweep: a disk of radius r touches the outline at q where x + t path = p(q) + r n(q), so g(q) = cross(path, p + r n - x)
 = 0. On the half of the outline that faces the path, g falls monotonically. So the values of g at the ends of this half
@@ -23,12 +24,12 @@ from jaxtyping import Array, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, Outline, Shape, SupportPoints, equally_spaced, roundoff
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, equally_spaced, roundoff
 
-# Most points reach roundoff in 6 rounds. Near the cusps of the evolute each round gains only one digit, also in
+# Most points reach roundoff in 6 iterations. Near the cusps of the evolute each iteration gains only one digit, also in
 # float32.
-CLOSEST_ROUNDS = {False: 8, True: 16}  # key: whether the type is float64
-SWEEP_ROUNDS = 8
+CLOSEST_ITERATIONS = {False: 8, True: 16}  # key: whether the type is float64
+SWEEP_ITERATIONS = 8
 # Number of intervals for the arc length. Its integrand is smooth between two nodes, down to axes of 1 : 100.
 ARC_NODES = 512
 
@@ -52,24 +53,24 @@ class EllipseOutline(Outline):
 
     def closest(self, x: Vec2) -> ClosestPoint:
         rel = x - self.center
-        q = _foot(self.semi, rel)
+        q = _closest_parameter(self.semi, rel)
         foot, normal, _ = self._at(q)
         return ClosestPoint(normal.dot(rel - foot), self.center + foot, normal)
 
-    def facing(self, direction: Vec2) -> SupportPoints:
+    def facing(self, direction: Vec2) -> FacingPoints:
         across = Vec2(self.semi.x * direction.x, self.semi.y * direction.y)
         reach = jnp.sqrt(across.dot(across))
         point = self.center + Vec2(self.semi.x * across.x, self.semi.y * across.y).scale(1 / reach)
-        return SupportPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
+        return FacingPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         rel = x - self.center
-        rounded = jax.lax.stop_gradient((self.semi, rel, path, radius))
-        q, crosses = _meeting(*rounded)
-        height, slope, *_ = _height(self.semi, rel, path, radius, q)
+        fixed = jax.lax.stop_gradient((self.semi, rel, path, radius))
+        q, crosses = _contact_parameter(*fixed)
+        height, slope, *_ = _center_height(self.semi, rel, path, radius, q)
         # This step makes q exact to first order. Below, q only selects the tangent line that is hit, so the fraction is
         # exact to third order.
-        q = _turned(q, -height / jnp.where(slope < 0, slope, -jnp.inf))
+        q = _rotated(q, -height / jnp.where(slope < 0, slope, -jnp.inf))
         foot, normal, _ = self._at(q)
         gap = normal.dot(rel - foot) - radius
         approach = -normal.dot(path)
@@ -84,51 +85,51 @@ def _unit(v: Vec2) -> Vec2:
     return v.scale(1 / jnp.sqrt(v.dot(v)))
 
 
-def _turned(q: Vec2, angle: Scalar) -> Vec2:
+def _rotated(q: Vec2, angle: Scalar) -> Vec2:
     """Rotate `q` by a small angle. The angle is right to second order; the length is always one."""
     return _unit(q + q.perp().scale(angle))
 
 
-def _between(q: Vec2, low: Vec2, high: Vec2) -> Array:
-    """Whether `q` lies on the counter-clockwise arc from `low` to `high`, up to roundoff."""
+def _is_on_arc(q: Vec2, low: Vec2, high: Vec2) -> Array:
+    """Whether `q` lies on the counterclockwise arc from `low` to `high`, up to roundoff."""
     slack = -4 * jnp.finfo(q.x.dtype).eps
     return (low.cross(q) >= slack) & (q.cross(high) >= slack)
 
 
-def _middle(low: Vec2, high: Vec2) -> Vec2:
-    """Return the midpoint of the counter-clockwise arc from `low` to `high`, also if they are opposite."""
+def _arc_midpoint(low: Vec2, high: Vec2) -> Vec2:
+    """Return the midpoint of the counterclockwise arc from `low` to `high`, also if they are opposite."""
     return _unit(low + high + low.perp().scale(float(jnp.finfo(low.x.dtype).eps)))
 
 
-def _falling_root(function, q: Vec2, low: Vec2, high: Vec2, small: Scalar, rounds: int, like: Scalar) -> Vec2:
+def _falling_root(function, q: Vec2, low: Vec2, high: Vec2, small: Scalar, iterations: int, like: Scalar) -> Vec2:
     """Find where a function of q falls through zero in a bracket; not differentiated.
 
     Args:
         function: Function of q that returns its value, its slope by the angle of q, and the step (an angle) to take.
         q: Initial guess.
         low: Start of the bracket; the function is positive after it.
-        high: End of the bracket, counter-clockwise from `low`; the function is negative before it.
+        high: End of the bracket, counterclockwise from `low`; the function is negative before it.
         small: Magnitude up to which a value is zero up to roundoff.
-        rounds: Number of rounds.
+        iterations: Number of iterations.
         like: As in `compute_once`.
 
     Returns:
         The root.
     """
 
-    def round_(_, carry):
+    def iterate(_, carry):
         q, low, high = carry
         value, slope, step = function(q)
-        there = _turned(q, step)
+        proposal = _rotated(q, step)
         above, done = decide((value > 0, jnp.abs(value) <= small), like)
         low, high = tree_where(above, q, low), tree_where(above, high, q)
-        (inside,) = decide((_between(there, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
-        return tree_where(done, q, tree_where(inside, there, _middle(low, high))), low, high
+        (inside,) = decide((_is_on_arc(proposal, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
+        return tree_where(done, q, tree_where(inside, proposal, _arc_midpoint(low, high))), low, high
 
-    return jax.lax.fori_loop(0, rounds, round_, (q, low, high))[0]
+    return jax.lax.fori_loop(0, iterations, iterate, (q, low, high))[0]
 
 
-def _imbalance(excess: Scalar, a: Scalar, b: Scalar, q: Vec2, flat: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+def _closest_residual(excess: Scalar, a: Scalar, b: Scalar, q: Vec2, flat: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     """Return f(q) = excess s c - a s + b c, its slope, and Halley's step to its root.
 
     In the step, a slope whose magnitude is at most `flat` is replaced by -flat.
@@ -142,22 +143,25 @@ def _imbalance(excess: Scalar, a: Scalar, b: Scalar, q: Vec2, flat: Scalar) -> t
     return value, slope, newton / (1 - jnp.clip(-newton * bend / (2 * steep), -1.0, 0.5))
 
 
-def _foot(semi: Vec2, rel: Vec2) -> Vec2:
+def _closest_parameter(semi: Vec2, rel: Vec2) -> Vec2:
     """Find q of the outline's point closest to `rel`, a point relative to the center; differentiable."""
     x, y = jnp.where(rel.x < 0, -1.0, 1.0), jnp.where(rel.y < 0, -1.0, 1.0)
     excess = (semi.x + semi.y) * (semi.x - semi.y)
     a, b = semi.x * x * rel.x, semi.y * y * rel.y
     fixed, fixed_semi = jax.lax.stop_gradient(((excess, a, b), semi))
-    q = _nearest_quadrant(*fixed, fixed_semi)
+    q = _closest_in_first_quadrant(*fixed, fixed_semi)
     # The closest point has no derivative on the evolute. Close to the evolute the step would only magnify roundoff.
     flat = jnp.sqrt(jnp.finfo(a.dtype).eps) * (jnp.abs(fixed[0]) + fixed[1] + fixed[2] + fixed_semi.dot(fixed_semi))
-    *_, step = _imbalance(excess, a, b, q, flat)
-    q = _turned(q, step)
+    *_, step = _closest_residual(excess, a, b, q, flat)
+    q = _rotated(q, step)
     return Vec2(x * q.x, y * q.y)
 
 
-def _nearest_quadrant(excess: Scalar, a: Scalar, b: Scalar, semi: Vec2) -> Vec2:
-    """Find the root of f in the first quadrant; the arguments are as in `_imbalance`, with a and b not negative."""
+def _closest_in_first_quadrant(excess: Scalar, a: Scalar, b: Scalar, semi: Vec2) -> Vec2:
+    """Find the root of f in the first quadrant.
+
+    The arguments are those of `_closest_residual`. Neither a nor b is negative.
+    """
     one, zero = jnp.ones_like(a), jnp.zeros_like(a)
     # Halley's method can overshoot a root at an end of the quadrant. Where f has the right sign beyond that end, the
     # bracket extends past it. Where it does not, a root at that end is a critical point that is not the closest point,
@@ -176,11 +180,11 @@ def _nearest_quadrant(excess: Scalar, a: Scalar, b: Scalar, semi: Vec2) -> Vec2:
     q = _unit(tree_where(undirected, Vec2(one, one), guess))
     small = 2 * jnp.finfo(a.dtype).eps * (jnp.abs(excess) + a + b)
     tiny = jnp.full_like(a, jnp.finfo(a.dtype).tiny)
-    rounds = CLOSEST_ROUNDS[a.dtype == jnp.float64]
-    return _falling_root(lambda q: _imbalance(excess, a, b, q, tiny), q, low, high, small, rounds, a)
+    iterations = CLOSEST_ITERATIONS[a.dtype == jnp.float64]
+    return _falling_root(lambda q: _closest_residual(excess, a, b, q, tiny), q, low, high, small, iterations, a)
 
 
-def _height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
+def _center_height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
     """Return g(q), its slope by the angle of q, and Newton's step.
 
     g is the height, over the line of the path, of the center of a disk that touches at `q` (times the path's length).
@@ -195,21 +199,21 @@ def _height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple
     return value, slope, -value / jnp.where(slope < 0, slope, -jnp.inf)
 
 
-def _meeting(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar) -> tuple[Vec2, Array]:
+def _contact_parameter(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar) -> tuple[Vec2, Array]:
     """Find q where a disk first touches on its path, and whether it touches anywhere on the line of the path."""
     moves = path.dot(path) > 0
     along = tree_where(moves, path, Vec2(jnp.ones_like(path.x), jnp.zeros_like(path.x)))
     end = _unit(Vec2(semi.x * along.y, -semi.y * along.x))  # where the tangent is parallel to the path
-    first, last = (_height(semi, rel, along, radius, side)[0] for side in (-end, end))
+    first, last = (_center_height(semi, rel, along, radius, side)[0] for side in (-end, end))
     (crosses,) = decide((moves & (first > 0) & (last < 0),), rel.x)
     # Initial guess: between its ends, g is a cosine if the radius is zero. Else it is nearly a cosine, most closely at
     # the ends.
-    share = jnp.clip((first + last) / jnp.where(crosses, first - last, 1.0), -1.0, 1.0)
-    begin = _unit(end.scale(share) - end.perp().scale(jnp.sqrt((1 - share) * (1 + share))))
+    cosine = jnp.clip((first + last) / jnp.where(crosses, first - last, 1.0), -1.0, 1.0)
+    begin = _unit(end.scale(cosine) - end.perp().scale(jnp.sqrt((1 - cosine) * (1 + cosine))))
     size = jnp.abs(rel.x) + jnp.abs(rel.y) + semi.x + semi.y + radius
     small = 0.5 * jnp.finfo(size.dtype).eps * size * jnp.sqrt(along.dot(along))
-    height = partial(_height, semi, rel, along, radius)
-    return _falling_root(height, begin, -end, end, small, SWEEP_ROUNDS, rel.x), crosses
+    height = partial(_center_height, semi, rel, along, radius)
+    return _falling_root(height, begin, -end, end, small, SWEEP_ITERATIONS, rel.x), crosses
 
 
 class Ellipse(Shape):

@@ -16,7 +16,7 @@ from pushjax._math.vec import Scalar, Vec2
 class ClosestPoint(NamedTuple):
     """Signed distance, closest boundary point and outward normal for one query point.
 
-    If the closest point is a corner, the normal lies along the line from the corner to the query point: towards the
+    If the closest point is a corner, the normal lies along the line from the corner to the query point: toward the
     query point if that is outside, away from it if that is inside. If the query point lies on the boundary, the normal
     is that of the edge, or at a corner the bisector.
 
@@ -31,20 +31,23 @@ class ClosestPoint(NamedTuple):
     normal: Vec2
 
 
-class SupportPoints(NamedTuple):
-    """Points of an outline that face a given direction, as arrays of static length with a mask.
+class FacingPoints(NamedTuple):
+    """Points of an outline whose outward normal is a given direction, as arrays of static length with a mask.
 
     Attributes:
-        point: Points on the outline, m, body frame; its coordinates have shape (places,).
-        real: Which of the entries exist, shape (places,).
+        point: Points on the outline, m, body frame; its coordinates have shape (points,).
+        valid: Which of the entries are such points, shape (points,). The other entries are padding.
     """
 
     point: Vec2
-    real: Bool[Array, "places"]
+    valid: Bool[Array, "points"]
 
 
 class Outline(eqx.Module):
-    """A shape prepared for queries: all that does not depend on the query point is computed once."""
+    """The boundary of a shape as contact detection uses it: in scalars (see `pushjax._math.vec`), for distance queries.
+
+    Whatever does not depend on the query point is computed once, when `Shape.outline` creates the outline.
+    """
 
     @abstractmethod
     def closest(self, x: Vec2) -> ClosestPoint:
@@ -57,20 +60,20 @@ class Outline(eqx.Module):
             Signed distance, closest point and outward normal.
         """
 
-    def touches(self, x: Vec2) -> tuple[ClosestPoint, ...]:
-        """Find all places where a round finger centered at `x` can touch the outline at the same time.
+    def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
+        """Find all points at which a round finger centered at `x` can touch the outline at the same time.
 
-        The first place is `closest(x)`. An outline that may not be convex returns a second place, for a finger wedged
-        in a concave corner. It is the nearest of the other boundary points that face `x` and are local minima of the
-        distance to `x`. Its distance is negative if `x` is behind the edge on which the place lies. If there is no such
-        point, the second place has the point and normal of the first. Its distance is then the first distance plus the
-        perimeter, which is out of reach of any finger.
+        The first is `closest(x)`. An outline that may not be convex returns a second one, for a finger wedged in a
+        concave corner. It is the nearest of the other boundary points that face `x` and are local minima of the
+        distance to `x`. Its distance is negative if `x` is behind the edge on which the point lies. If there is no such
+        point, the second candidate has the point and normal of the first. Its distance is then the first distance plus
+        the perimeter, which is out of reach of any finger.
 
         Args:
             x: Center of the finger, m, body frame.
 
         Returns:
-            The places, nearest first. Their number is static.
+            The candidates, nearest first. Their number is static.
         """
         return (self.closest(x),)
 
@@ -90,7 +93,7 @@ class Outline(eqx.Module):
             infinite if the disk does not touch within the path.
         """
 
-    def facing(self, direction: Vec2) -> SupportPoints:
+    def facing(self, direction: Vec2) -> FacingPoints:
         """Find the points of a smooth outline where the outward normal is `direction` and the curvature is convex.
 
         A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
@@ -99,12 +102,12 @@ class Outline(eqx.Module):
             direction: Unit vector, body frame.
 
         Returns:
-            The points, and a mask of those that exist.
+            The points, and a mask of those that are valid.
 
         Raises:
-            NotImplementedError: If the outline has corners (its class does not define this query).
+            NotImplementedError: If the outline has corners.
         """
-        raise NotImplementedError(f"{type(self).__name__} has corners")
+        raise NotImplementedError(f"{type(self).__name__} has corners, at which the outward normal is not unique")
 
 
 class Shape(eqx.Module):
@@ -137,7 +140,7 @@ class Shape(eqx.Module):
             points: Number of points.
 
         Returns:
-            The points in counter-clockwise order, shape (points, 2), m, body frame.
+            The points in counterclockwise order, shape (points, 2), m, body frame.
         """
 
     def closest(self, point: ArrayLike) -> tuple[Float[Array, ""], Float[Array, "2"], Float[Array, "2"]]:
@@ -210,12 +213,12 @@ def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
     b = x.dot(path)
     squared = x.dot(x)
     c = squared - reach * reach
-    # disc is the discriminant b^2 - a c. In that form it would be a small difference of large numbers for a distant
+    # The discriminant is b^2 - a c. In that form it would be a small difference of large numbers for a distant
     # start. So it is computed as a reach^2 - (x cross path)^2, which is equal.
     side = x.cross(path)
-    disc = a * reach * reach - side * side
-    hits = (b < 0) & (c >= -roundoff(16 * squared)) & (disc > 0)
-    root = jnp.sqrt(jnp.where(hits, disc, 1.0))
+    discriminant = a * reach * reach - side * side
+    hits = (b < 0) & (c >= -roundoff(16 * squared)) & (discriminant > 0)
+    root = jnp.sqrt(jnp.where(hits, discriminant, 1.0))
     fraction = jnp.maximum(c / jnp.where(hits, root - b, 1.0), 0)
     return jnp.where(hits & (fraction <= 1), fraction, jnp.inf)
 
@@ -258,7 +261,7 @@ def equally_spaced(
 
 
 def signed_area(v: np.ndarray) -> float:
-    """Compute the signed area of a closed polyline, m^2, positive if it runs counter-clockwise.
+    """Compute the signed area of a closed polyline, m^2, positive if it runs counterclockwise.
 
     Args:
         v: Vertices, shape (vertices, 2), m.
@@ -315,7 +318,7 @@ def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] |
 
     p, q, r, s = a[:, None], b[:, None], a[None], b[None]
     crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
-    on_edge = _touches(p, q, r, tolerance)  # a vertex on an edge; its own edges are excluded below
+    on_edge = _is_near_segment(p, q, r, tolerance)  # a vertex on an edge; its own edges are excluded below
     index = np.arange(n)
     own = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
     bad = crossing | (on_edge & ~own)
@@ -325,7 +328,7 @@ def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] |
     return int(i), int(j)
 
 
-def _touches(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
+def _is_near_segment(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether the point `r` lies within `tolerance` of the segment from `p` to `q`."""
     edge = q - p
     s = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)

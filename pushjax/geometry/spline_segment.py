@@ -82,7 +82,7 @@ def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
 
 
 def outward_normal(velocity: Vec2) -> tuple[Vec2, Scalar]:
-    """Return the outward unit normal and the speed of a counter-clockwise outline.
+    """Return the outward unit normal and the speed of a counterclockwise outline.
 
     Args:
         velocity: Derivative of the outline's point with respect to its parameter.

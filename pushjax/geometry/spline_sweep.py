@@ -17,14 +17,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._math.roots import Proposal, bracketed_root
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import roundoff
 from pushjax.geometry.spline_segment import SplineSegment, outward_normal
 
-SWEEP_ROUNDS = 10
+SWEEP_ITERATIONS = 10
 # How many of the places where the line of the path enters the outline are solved for, nearest first. More than one is
 # needed because their order is known only approximately beforehand.
-ENTRIES = 3
+MAX_ENTRIES = 3
 # Intervals per segment; at their ends it is checked whether the disk fits into the curvature of the hollow.
 HOLLOW_SAMPLES = 16
 
@@ -33,7 +34,7 @@ def first_contact(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *,
     """Find the fraction of a path after which a disk first touches a closed spline; see `Outline.sweep`.
 
     Args:
-        pieces: All segments of the outline, counter-clockwise.
+        pieces: All segments of the outline, counterclockwise.
         x: Center of the disk at the start, m, body frame.
         path: Displacement of the disk, m, body frame.
         radius: Radius of the disk, m.
@@ -45,7 +46,7 @@ def first_contact(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *,
     fixed = jax.lax.stop_gradient((pieces, x, path, radius))
     index, t, fraction = _first_root(*fixed, convex=convex)
     # Evaluated again with the differentiable arguments, to give the fraction its derivatives.
-    return jnp.where(fraction <= 1, _met(pieces.chosen(index), t, x, path, radius), jnp.inf)
+    return jnp.where(fraction <= 1, _contact_fraction(pieces.chosen(index), t, x, path, radius), jnp.inf)
 
 
 class Offset(NamedTuple):
@@ -65,10 +66,10 @@ class Offset(NamedTuple):
         point, first, second = piece.at(t)
         normal, speed = outward_normal(first)
         # 1 + r kappa; negative where the hollow is too tight for the disk
-        room = 1 + radius * first.cross(second) / (speed * speed * speed)
-        return Offset(point + normal.scale(radius), first.scale(room))
+        stretch = 1 + radius * first.cross(second) / (speed * speed * speed)
+        return Offset(point + normal.scale(radius), first.scale(stretch))
 
-    def over(self, x: Vec2, path: Vec2) -> tuple[Scalar, Scalar, Scalar]:
+    def relative_to_path(self, x: Vec2, path: Vec2) -> tuple[Scalar, Scalar, Scalar]:
         """Return g, its derivative by the segment's parameter, and the position along the path.
 
         g is the height over the line of the path that starts at `x`. All three are multiplied by the path's length.
@@ -77,7 +78,7 @@ class Offset(NamedTuple):
         return path.cross(rel), path.cross(self.velocity), path.dot(rel)
 
 
-def _met(piece: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
+def _contact_fraction(piece: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
     """Return the fraction of the path at which a disk touches at the root `t` of g; infinite if not on the path.
 
     The value is the projection of the touching disk's center on the path. It is well-conditioned even for a path that
@@ -85,21 +86,21 @@ def _met(piece: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -
     `t`, which is the same fraction. One Newton step for `t` makes these derivatives exact to third order. The value of
     that step is removed by `stop_gradient`, because for a grazing path it is magnified roundoff.
     """
-    height, slope, along = Offset.of(piece, t, radius).over(x, path)
+    height, slope, along = Offset.of(piece, t, radius).relative_to_path(x, path)
     step = -height / jnp.where(slope < 0, slope, -jnp.inf)
     t = t + step - jax.lax.stop_gradient(step)
     point, first, _ = piece.at(t)
     normal, _ = outward_normal(first)
     rel, squared, approach = x - point, path.dot(path), -normal.dot(path)
     fraction = jax.lax.stop_gradient(along / jnp.where(squared > 0, squared, 1.0))
-    loose = roundoff(jnp.abs(x.x) + jnp.abs(x.y) + jnp.abs(point.x) + jnp.abs(point.y) + radius)
-    hits = (approach > 0) & (fraction * approach >= -loose) & (fraction <= 1)
+    tolerance = roundoff(jnp.abs(x.x) + jnp.abs(x.y) + jnp.abs(point.x) + jnp.abs(point.y) + radius)
+    hits = (approach > 0) & (fraction * approach >= -tolerance) & (fraction <= 1)
     by_tangent = (normal.dot(rel) - radius) / jnp.where(hits, approach, 1.0)
     fraction = jnp.maximum(fraction, 0) + by_tangent - jax.lax.stop_gradient(by_tangent)
     return jnp.where(hits, fraction, jnp.inf)
 
 
-class Slot(NamedTuple):
+class MonotoneInterval(NamedTuple):
     """An interval of a segment on which g is monotone, or arrays of such intervals.
 
     Attributes:
@@ -122,7 +123,7 @@ class Slot(NamedTuple):
     flat_start: Bool[Array, ""]
     flat_end: Bool[Array, ""]
 
-    def begin(self) -> tuple[Array, Array, Array]:
+    def initial_guess(self) -> tuple[Array, Array, Array]:
         """Estimate where g falls through zero in the interval.
 
         g is taken to be linear, or parabolic about an end where it is flat.
@@ -132,15 +133,15 @@ class Slot(NamedTuple):
             it is parabolic about the end.
         """
         fall = self.height_start - self.height_end
-        share = jnp.clip(self.height_start / jnp.where(fall > 0, fall, 1.0), 0, 1)
+        fraction = jnp.clip(self.height_start / jnp.where(fall > 0, fall, 1.0), 0, 1)
         both = self.flat_start & self.flat_end
-        rooted, rest = (jnp.sqrt(part / jnp.where(both, 2, 1)) for part in (share, 1 - share))
-        early = self.flat_start & (~both | (share < 0.5))
+        rooted, rest = (jnp.sqrt(part / jnp.where(both, 2, 1)) for part in (fraction, 1 - fraction))
+        early = self.flat_start & (~both | (fraction < 0.5))
         late = self.flat_end & ~early
-        return jnp.where(early, rooted, jnp.where(late, 1 - rest, share)), early, late
+        return jnp.where(early, rooted, jnp.where(late, 1 - rest, fraction)), early, late
 
 
-class Room(NamedTuple):
+class FreeInterval(NamedTuple):
     """An interval of a segment that a disk can touch from outside, or arrays of such intervals.
 
     Attributes:
@@ -156,7 +157,9 @@ class Room(NamedTuple):
     at_high: Offset
 
 
-def _slots(piece: SplineSegment, rooms: list[Room], x: Vec2, path: Vec2, radius: Scalar) -> list[Slot]:
+def _monotone_intervals(
+    piece: SplineSegment, free_intervals: list[FreeInterval], x: Vec2, path: Vec2, radius: Scalar
+) -> list[MonotoneInterval]:
     """Return the intervals of a segment, or of an array of segments, on which g is monotone; some can be empty."""
     # The two parameters at which the outline is parallel to the path: roots of a quadratic.
     constant, linear, square = (path.cross(c.scale(k)) for k, c in enumerate((piece.c1, piece.c2, piece.c3), start=1))
@@ -164,24 +167,24 @@ def _slots(piece: SplineSegment, rooms: list[Room], x: Vec2, path: Vec2, radius:
     half = -(linear + jnp.where(linear < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(inside, 0))) / 2
     one, other = half / jnp.where(square == 0, jnp.inf, square), constant / jnp.where(half == 0, jnp.inf, half)
     turning = [jnp.where(inside > 0, jnp.clip(f(one, other), 0, 1), 0) for f in (jnp.minimum, jnp.maximum)]
-    turned = [Offset.of(piece, t, radius).over(x, path) for t in turning]
-    slots = []
-    for low, high, *ends in rooms:
-        first, last = (end.over(x, path) for end in ends)
+    turned = [Offset.of(piece, t, radius).relative_to_path(x, path) for t in turning]
+    intervals = []
+    for low, high, *ends in free_intervals:
+        first, last = (end.relative_to_path(x, path) for end in ends)
 
-        def within(t, there, low=low, high=high, first=first, last=last):
+        def within(t, turning_point, low=low, high=high, first=first, last=last):
             before, after = t <= low, t >= high
-            height, _, along = tree_where(before, first, tree_where(after, last, there))
+            height, _, along = tree_where(before, first, tree_where(after, last, turning_point))
             return jnp.clip(t, low, high), height, along, ~before & ~after
 
-        stops = [within(t, there) for t, there in zip(turning, turned, strict=True)]
+        stops = [within(t, turning_point) for t, turning_point in zip(turning, turned, strict=True)]
         stops = [(low, first[0], first[2], low > 0), *stops, (high, last[0], last[2], high < 1)]
-        # The fields of `Slot` alternate between the start and the end.
-        slots += [Slot(*(end[k] for k in range(4) for end in ends)) for ends in pairwise(stops)]
-    return slots
+        # The fields of `MonotoneInterval` alternate between the start and the end.
+        intervals += [MonotoneInterval(*(end[k] for k in range(4) for end in ends)) for ends in pairwise(stops)]
+    return intervals
 
 
-def _roomy(pieces: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
+def _free_intervals(pieces: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
     """Find the intervals of each segment that a disk can touch from outside: where it fits into the curvature.
 
     At most two intervals are kept, the first and the last. An interval is empty, with equal ends, if there is none.
@@ -192,24 +195,24 @@ def _roomy(pieces: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Ar
     grid = jnp.linspace(0, 1, HOLLOW_SAMPLES + 1, dtype=zero.dtype)
     spread = jax.tree.map(lambda field: field[:, None], pieces)
 
-    def room(pieces, t):
+    def clearance(pieces, t):
         _, first, second = pieces.at(t)
         _, speed = outward_normal(first)
         return speed * speed * speed + radius * first.cross(second)
 
-    inside = room(spread, jnp.broadcast_to(grid[None], (zero.size, grid.size))) > 0
+    inside = clearance(spread, jnp.broadcast_to(grid[None], (zero.size, grid.size))) > 0
     closed = jnp.pad(inside, ((0, 0), (1, 1)))
     rises, falls = inside & ~closed[:, :-2], inside & ~closed[:, 2:]
 
     def edge(at, outward):
         """Locate the end of an interval between its last node, where the disk fits, and the next, where it does not."""
         within, beyond = grid[at], jnp.clip(grid[at] + outward / HOLLOW_SAMPLES, 0, 1)
-        values = room(pieces, within), room(pieces, beyond)
+        values = clearance(pieces, within), clearance(pieces, beyond)
         for _ in range(6):  # false position; the value at the end that stays is halved
             t = within + (beyond - within) * values[0] / jnp.where(
                 values[0] == values[1], jnp.inf, values[0] - values[1]
             )
-            value = room(pieces, t)
+            value = clearance(pieces, t)
             kept = value > 0
             within, beyond = jnp.where(kept, t, within), jnp.where(kept, beyond, t)
             values = jnp.where(kept, value, values[0] / 2), jnp.where(kept, values[1] / 2, value)
@@ -225,15 +228,15 @@ def _roomy(pieces: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Ar
     return [(jnp.where(some, low, 0), jnp.where(some, high, 0)), (jnp.where(two, low_2, 1), jnp.where(two, high_2, 1))]
 
 
-def _order(slot: Slot, squared: Scalar, loose: Scalar) -> Scalar:
+def _entry_estimate(interval: MonotoneInterval, squared: Scalar, tolerance: Scalar) -> Scalar:
     """Estimate how far along the path the disk enters the outline in an interval; infinite if it does not."""
-    fall = slot.height_start - slot.height_end
-    enters = (slot.height_start >= -loose) & (slot.height_end <= loose) & (fall > 0)
-    begin, *_ = slot.begin()
-    along = slot.along_start + begin * (slot.along_end - slot.along_start)
+    fall = interval.height_start - interval.height_end
+    enters = (interval.height_start >= -tolerance) & (interval.height_end <= tolerance) & (fall > 0)
+    begin, *_ = interval.initial_guess()
+    along = interval.along_start + begin * (interval.along_end - interval.along_start)
     # In a hollow, the positions in the interval lie at most this far beyond those of its ends.
-    spread = fall + jnp.abs(slot.along_end - slot.along_start)
-    on_path = (along + spread >= -loose) & (along - spread <= squared + loose)
+    spread = fall + jnp.abs(interval.along_end - interval.along_start)
+    on_path = (along + spread >= -tolerance) & (along - spread <= squared + tolerance)
     return jnp.where(enters & on_path, along, jnp.inf)
 
 
@@ -241,56 +244,53 @@ def _first_root(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, c
     """Find the first root of g on the path: its segment's index, the segment's parameter, the fraction of the path."""
     # These do not depend on the path, so they are computed once for a batch of paths and not for each path.
     known = pieces.c0.x[0]
-    rooms = [
-        Room(low, high, Offset.of(pieces, low, radius), Offset.of(pieces, high, radius))
-        for low, high in compute_once(_roomy(pieces, radius, convex), known)
+    free_intervals = [
+        FreeInterval(low, high, Offset.of(pieces, low, radius), Offset.of(pieces, high, radius))
+        for low, high in compute_once(_free_intervals(pieces, radius, convex), known)
     ]
-    rooms, extent = compute_once((rooms, jnp.max(jnp.abs(pieces.c0.x)) + jnp.max(jnp.abs(pieces.c0.y))), known)
+    extent = jnp.max(jnp.abs(pieces.c0.x)) + jnp.max(jnp.abs(pieces.c0.y))
+    free_intervals, extent = compute_once((free_intervals, extent), known)
     squared = path.dot(path)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-    loose = roundoff(extent + jnp.abs(x.x) + jnp.abs(x.y) + radius) * length
-    order = jnp.concatenate([_order(slot, squared, loose) for slot in _slots(pieces, rooms, x, path, radius)])
+    tolerance = roundoff(extent + jnp.abs(x.x) + jnp.abs(x.y) + radius) * length
+    intervals = _monotone_intervals(pieces, free_intervals, x, path, radius)
+    order = jnp.concatenate([_entry_estimate(interval, squared, tolerance) for interval in intervals])
 
     def entry(_, carry):
         order, best = carry
         chosen = jnp.argmin(order)
         part, index = jnp.divmod(chosen, pieces.c0.x.size)
-        piece, around = jax.tree.map(lambda field: field[index], (pieces, rooms))
-        slots = _slots(piece, around, x, path, radius)
-        slot = slots[0]
-        for k, candidate in enumerate(slots[1:], start=1):
-            slot = tree_where(part == k, candidate, slot)
-        t = _root(piece, slot, x, path, radius)
-        fraction = _met(piece, t, x, path, radius)
+        piece, free = jax.tree.map(lambda field: field[index], (pieces, free_intervals))
+        intervals = _monotone_intervals(piece, free, x, path, radius)
+        interval = intervals[0]
+        for k, candidate in enumerate(intervals[1:], start=1):
+            interval = tree_where(part == k, candidate, interval)
+        t = _root_in_interval(piece, interval, x, path, radius)
+        fraction = _contact_fraction(piece, t, x, path, radius)
         (sooner,) = decide(((order[chosen] < jnp.inf) & (fraction < best[2]),), x.x)
         order = jnp.where(jnp.arange(order.size) == chosen, jnp.inf, order)
         return order, tree_where(sooner, (index, t, fraction), best)
 
-    none = jnp.zeros_like(jnp.argmin(order)), jnp.zeros_like(loose), jnp.full_like(loose, jnp.inf)
-    return jax.lax.fori_loop(0, ENTRIES, entry, (order, none))[1]
+    none = jnp.zeros_like(jnp.argmin(order)), jnp.zeros_like(tolerance), jnp.full_like(tolerance, jnp.inf)
+    return jax.lax.fori_loop(0, MAX_ENTRIES, entry, (order, none))[1]
 
 
-def _root(piece: SplineSegment, slot: Slot, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
+def _root_in_interval(piece: SplineSegment, interval: MonotoneInterval, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
     """Find where g falls through zero in an interval, by Newton's method with bisection if it leaves the bracket.
 
     If g is nearly parabolic about an end, Newton's method solves for the squared distance from that end.
     """
-    begin, early, late = slot.begin()
-    flat, parabolic = jnp.where(early, slot.start, slot.end), early | late
+    begin, early, late = interval.initial_guess()
+    flat, parabolic = jnp.where(early, interval.start, interval.end), early | late
 
-    def round_(_, carry):
-        t, low, high = carry
-        height, slope, _ = Offset.of(piece, t, radius).over(x, path)
-        low, high = jnp.where(height > 0, t, low), jnp.where(height > 0, high, t)
+    def propose(t: Scalar) -> Proposal:
+        height, slope, _ = Offset.of(piece, t, radius).relative_to_path(x, path)
         step = -height / jnp.where(slope < 0, slope, -jnp.inf)
         arm = t - flat
         squared = arm * (arm + 2 * step)
         root = flat + jnp.where(arm < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(squared, 0))
-        there = jnp.where(parabolic & (squared >= 0), root, t + step)
-        # After convergence, a step can leave the bracket by roundoff.
-        inside = (slope < 0) & (((there >= low) & (there <= high)) | (jnp.abs(there - t) < 1e-6))
-        return jnp.where(inside, there, (low + high) / 2), low, high
+        proposal = jnp.where(parabolic & (squared >= 0), root, t + step)
+        return Proposal(height > 0, proposal, usable=slope < 0, is_tiny=jnp.abs(proposal - t) < 1e-6)
 
-    start = slot.start + begin * (slot.end - slot.start)
-    t, *_ = jax.lax.fori_loop(0, SWEEP_ROUNDS, round_, (start, slot.start, slot.end))
-    return compute_once(t, x.x)
+    start = interval.start + begin * (interval.end - interval.start)
+    return compute_once(bracketed_root(propose, start, interval.start, interval.end, SWEEP_ITERATIONS), x.x)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool
 from pushjax._internal.xla import compute_once, decide, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
-from pushjax.geometry.polygon import Edge, PolygonOutline
+from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline, roundoff
 from pushjax.simulation import pad_on_curve
 from pushjax.simulation.hand import Finger, RoundFinger
@@ -94,7 +94,7 @@ def contact_candidates(
     """
     if isinstance(finger, RoundFinger):
         return tuple(
-            Candidate(s.distance - finger.radius, s.point, -s.normal) for s in outline.touches(at.center)
+            Candidate(s.distance - finger.radius, s.point, -s.normal) for s in outline.contact_candidates(at.center)
         )
     pad, angle = finger.shape.outline(), _angle(at)
     if isinstance(outline, DiskOutline):
@@ -222,7 +222,7 @@ def _smooth_candidates(
     points = (corner.onward.dot(near.normal) >= -BLUNT) & (corner.back.dot(near.normal) >= -BLUNT)
     points &= near.distance > deep
     loose = LOOSE[seen.length.dtype.itemsize] * seen.length
-    beside = seen.real & (seen.along >= -loose) & (seen.along <= seen.length + loose) & (seen.height > deep)
+    beside = seen.valid & (seen.along >= -loose) & (seen.along <= seen.length + loose) & (seen.height > deep)
     at_corners = Candidate(jnp.where(points, near.distance, OUT_OF_REACH), near.point, -near.normal)
     at_edges = Candidate(jnp.where(beside, seen.height, OUT_OF_REACH), seen.point, seen.normal)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), at_corners, at_edges)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.polygon import Edge, PolygonOutline
+from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline
 
 
@@ -20,7 +20,7 @@ class EdgeSupport(NamedTuple):
     """Places of an outline that face the edges of a pad, as arrays over the places of all edges.
 
     Attributes:
-        real: Whether the place exists.
+        valid: Whether the place exists.
         point: Point of the outline, in the outline's frame, m.
         normal: Outward unit normal of the pad's edge, in the outline's frame.
         local: The point in the pad's frame, m.
@@ -29,7 +29,7 @@ class EdgeSupport(NamedTuple):
         height: Height of the point above the edge, m.
     """
 
-    real: Bool[Array, "places"]
+    valid: Bool[Array, "places"]
     point: Vec2
     normal: Vec2
     local: Vec2
@@ -55,7 +55,7 @@ def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2,
         rel = local - edge.start
         height = edge.normal.dot(rel)
         normal, length = jax.tree.map(lambda entry: jnp.full_like(height, entry), (normal, edge.length))
-        return EdgeSupport(facing.real, facing.point, normal, local, rel.dot(edge.along), length, height)
+        return EdgeSupport(facing.valid, facing.point, normal, local, rel.dot(edge.along), length, height)
 
     # All edges at once: unrolled edge by edge, the program for a jaw took much longer to trace and to compile.
     stacked = jax.tree.map(lambda *entries: jnp.stack(entries), *edges)
@@ -76,11 +76,11 @@ def sweep(pad: PolygonOutline, seen: EdgeSupport, outline: Outline, corners: Vec
     zero = jnp.zeros_like(path.x)
     first = jnp.min(jax.vmap(lambda corner: outline.sweep(corner, path, zero))(corners))
     met = pad.sweep(seen.local, back, zero)
-    return jnp.minimum(first, jnp.min(jnp.where(seen.real, met, jnp.inf)))
+    return jnp.minimum(first, jnp.min(jnp.where(seen.valid, met, jnp.inf)))
 
 
 def overlap(pad: PolygonOutline, seen: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
     """Depth of the deepest corner in the outline, or of the deepest facing place in the pad, m; negative if apart."""
     deepest = jnp.max(-jax.vmap(lambda corner: outline.closest(corner).distance)(corners))
     depth = -pad.closest(seen.local).distance
-    return jnp.maximum(deepest, jnp.max(jnp.where(seen.real, depth, -jnp.inf)))
+    return jnp.maximum(deepest, jnp.max(jnp.where(seen.valid, depth, -jnp.inf)))

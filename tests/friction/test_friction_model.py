@@ -8,6 +8,7 @@ import scipy.stats
 
 import pushjax as pj
 from pushjax._math.vec import Vec3
+from pushjax._math.wishart import sample_wishart
 from pushjax.friction.convexity import Gram, antisymmetric_of, coefficients_of, max_feasible_scale
 from pushjax.friction.quartic import MONOMIALS, least_curvature
 from pushjax.friction.random import FrictionModel
@@ -252,7 +253,34 @@ def test_largest_share_of_itself(quartic):
     c = tuple(map(jnp.asarray, np.asarray(quartic.coefficients) / float(quartic.coefficients[0])))
     ball = (jnp.asarray(0.2),) * 3 + (jnp.asarray(0.0),) * 3
     one = max_feasible_scale(c, ball, Gram.identity(c[0]), enough=np.inf, tolerance=1e-6)
-    assert one.settled
-    assert one.share > 0
+    assert one.converged
+    assert one.scale > 0
     again = max_feasible_scale(c, ball, Gram.of(c, one.n), enough=np.inf, tolerance=1e-6)
-    assert float(again.share) == pytest.approx(1.0, abs=1e-5)
+    assert float(again.scale) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize(("size", "few", "enough"), [(3, [-3.0, 0.0, 1.0, 2.0], [2.1, 20.0]), (6, [4.0, 5.0], [5.1])])
+def test_a_wishart_matrix_of_too_few_degrees_of_freedom_is_nan(size, few, enough):
+    factor = tuple(tuple(float(i == j) for j in range(i + 1)) for i in range(size))
+    drawn = jax.jit(jax.vmap(lambda dof: sample_wishart(jax.random.key(3), factor, dof)))
+    for row in drawn(jnp.array(few)):
+        assert np.isnan(row).all()
+    for row in drawn(jnp.array(enough)):
+        assert np.isfinite(row).all()
+
+
+def test_traced_degrees_of_freedom_that_are_too_few_give_invalid_steps():
+    """They cannot be checked. Each push of a batch says so itself, and its pose stays where it was."""
+    block, surface = pj.Polygon.rectangle(0.09, 0.09), pj.Ellipsoid(np.eye(3), 0.03)
+    slider, hand, path = pj.Slider(block, surface), pj.Hand.finger(0.005), pj.line((-0.06, 0.012), (-0.04, 0.012), 4)
+
+    def push(dof):
+        model = FrictionModel(dof, 0.3)
+        return pj.random_rollout(jax.random.key(0), slider, hand, path, pose=jnp.zeros(3), model=model).push
+
+    both = jax.jit(jax.vmap(push))(jnp.array([1.0, 20.0]))
+    few, enough = (jax.tree.map(lambda leaf, k=k: leaf[k], both) for k in (0, 1))
+    assert np.all(few.status == pj.Status.INVALID)
+    np.testing.assert_array_equal(few.pose, np.zeros((5, 3)))
+    assert not np.any(enough.status == pj.Status.INVALID)
+    assert np.any(enough.pose[-1] != 0)

@@ -485,7 +485,7 @@ def test_bad_input_is_named(make, message):
         make()
 
 
-def test_rounding_in_a_is_symmetrised():
+def test_rounding_in_a_is_symmetrized():
     a = np.eye(3)
     a[0, 1] = 1e-6
     np.testing.assert_array_equal(Ellipsoid(a, 1).A, (a + a.T) / 2)

@@ -279,7 +279,7 @@ def test_traced_values_do_not_raise():
     assert float(load) == -0.5
 
 
-def test_uniform_pressure_is_centred_on_the_centroid():
+def test_uniform_pressure_is_centered_on_the_centroid():
     """Cells that slanted edges cut carry their share: without it, the center was off by 1.5 mm, and not symmetric."""
     triangle = Polygon([[0.0, 0.0], [0.15, 0.0], [0.0, 0.15]])
     for points in (64, 100, 400):
@@ -291,7 +291,7 @@ def test_uniform_pressure_is_centred_on_the_centroid():
         assert abs(len(support.point) - points) <= 0.1 * points
 
 
-def test_one_support_point_has_a_length_of_one_metre():
+def test_one_support_point_has_a_length_of_one_meter():
     for load in (0.7, 1.3, 14.9):
         pairs = Support.points([[0.031, 0.0237]], load=load).wrench_twist_pairs(jax.random.key(0), 20)
         assert pairs.length == 1

@@ -239,7 +239,7 @@ def test_deviation_takes_the_smaller_angle():
     close(deviation(poses, np.zeros(3), 0.5), 0.5 * smaller)
 
 
-def test_deviation_adds_metres():
+def test_deviation_adds_meters():
     close(deviation([0.3, 0.4, 0.2], [0, 0, 0], 0.1), 0.5 + 0.1 * 0.2)
     close(deviation([300.0, 400.0, 0.2], [0, 0, 0], 100.0), 500 + 100 * 0.2)  # the same in mm
 

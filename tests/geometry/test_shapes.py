@@ -26,7 +26,7 @@ DTYPES = [np.float32, np.float64]
 
 
 def star(vertices: int, seed: int) -> np.ndarray:
-    """Return a star-shaped outline about the origin, counter-clockwise, mostly not convex."""
+    """Return a star-shaped outline about the origin, counterclockwise, mostly not convex."""
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * (np.arange(vertices) + rng.uniform(-0.3, 0.3, vertices)) / vertices
     radius = rng.uniform(0.03, 0.08, vertices)
@@ -169,7 +169,7 @@ def test_on_the_vertices(vertices, dtype):
 
 
 def sector_points(v: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Return points whose nearest point is a convex vertex of counter-clockwise `v`: vertex, direction, distance."""
+    """Return points whose nearest point is a convex vertex of counterclockwise `v`: vertex, direction, distance."""
     rng = np.random.default_rng(seed)
     edge = np.roll(v, -1, axis=0) - v
     before = np.roll(edge, 1, axis=0)
@@ -278,14 +278,14 @@ def test_gradient_by_the_vertices(name):
     assert wrong.mean() < 0.01
 
 
-# --- all places that a finger touches ---
+# --- all points that a finger can touch ---
 
-touches = jax.jit(jax.vmap(lambda shape, x: shape.outline().touches(Vec2.of(x)), (None, 0)))
+candidates_at = jax.jit(jax.vmap(lambda shape, x: shape.outline().contact_candidates(Vec2.of(x)), (None, 0)))
 REFLEX = ["arrow", "L", "star of 14"]
 
 
 def reflex_corners(v: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the reflex vertices of counter-clockwise `v`, and the outward normals of the edges before and after."""
+    """Return the reflex vertices of counterclockwise `v`, and the outward normals of the edges before and after."""
     edge = np.roll(v, -1, axis=0) - v
     normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     before = np.roll(edge, 1, axis=0)
@@ -306,7 +306,7 @@ def test_both_walls_of_a_reflex_corner_are_touched(name, heights, dtype):
     polygon = Polygon(POLYGONS[name].astype(dtype))
     vertex, *walls = reflex_corners(np.asarray(polygon.vertices, np.float64))
     points = against(vertex, *walls, heights)
-    first, second = touches(polygon, points.astype(dtype))
+    first, second = candidates_at(polygon, points.astype(dtype))
     alone = closest(polygon, points.astype(dtype))
     same = (alone[0], *alone[1].T, *alone[2].T) if heights[0] != heights[1] else alone[:1]  # either, if equally near
     for a, b in zip(jax.tree.leaves(first), same, strict=False):
@@ -330,7 +330,7 @@ def test_a_point_pressed_into_a_reflex_corner_is_stopped_by_the_other_wall(name,
     polygon = Polygon(POLYGONS[name])
     vertex, *walls = reflex_corners(np.asarray(polygon.vertices, np.float64))
     points = against(vertex, *walls, heights)
-    first, second = touches(polygon, points)
+    first, second = candidates_at(polygon, points)
     assert (first.distance < 0).all()
     normal = np.stack(second.normal, axis=1)
     at = np.argmin([np.abs(normal - wall).max(axis=1) for wall in walls], axis=0)
@@ -345,7 +345,7 @@ def test_the_second_touch_is_the_next_local_minimum(vertices):
     polygon, points = Polygon(vertices, convex=False), scattered(12, 150)
     outline = complex_of(polygon.boundary(4000))
     perimeter = float(polygon.perimeter)
-    first, second = touches(polygon, points)
+    first, second = candidates_at(polygon, points)
     found = np.asarray(second.distance) < np.asarray(first.distance) + 0.99 * perimeter
     np.testing.assert_allclose(second.distance[~found], first.distance[~found] + perimeter, rtol=1e-12)
     for k in np.flatnonzero(brute_closest(vertices, points)[0] > 0):
@@ -363,17 +363,17 @@ def test_the_second_touch_is_the_next_local_minimum(vertices):
 @pytest.mark.parametrize("name", ["triangle", "square", "needle"])
 def test_convex_outlines_are_touched_once(name):
     shape = Polygon(POLYGONS[name])
-    (only,) = touches(shape, scattered(13))
+    (only,) = candidates_at(shape, scattered(13))
     np.testing.assert_array_equal(only.distance, distances(shape, scattered(13)))
-    # Even if two touches are asked for, there is no second one at a vertex, where two edges share the closest point,
+    # Even if two candidates are asked for, there is no second one at a vertex, where two edges share the closest point,
     # nor through material.
     vertex, direction, height = sector_points(POLYGONS[name], 200)
     inside = 0.4 * vertex
     for points in (scattered(13), vertex + direction * height[:, None], vertex, inside):
-        first, second = touches(Polygon(POLYGONS[name], convex=False), points)
+        first, second = candidates_at(Polygon(POLYGONS[name], convex=False), points)
         np.testing.assert_allclose(second.distance - first.distance, shape.perimeter, rtol=1e-9)
         np.testing.assert_allclose(np.hypot(*second.normal), 1, rtol=1e-9)
-    assert len(touches(Disk(0.05), scattered(13))) == 1
+    assert len(candidates_at(Disk(0.05), scattered(13))) == 1
 
 
 @pytest.mark.parametrize("name", ["L", "star of 14"])
@@ -382,11 +382,11 @@ def test_gradients_of_the_second_touch_are_finite(name):
     points = np.concatenate([scattered(14, 100), np.asarray(polygon.vertices), [polygon.centroid]])
 
     def second(shape, x):
-        return jnp.stack(jax.tree.leaves(shape.outline().touches(Vec2.of(x))[1]))
+        return jnp.stack(jax.tree.leaves(shape.outline().contact_candidates(Vec2.of(x))[1]))
 
     slope = jax.jit(jax.vmap(jax.jacfwd(second, argnums=(0, 1)), (None, 0)))(polygon, points)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
-    seen = touches(polygon, points)
+    seen = candidates_at(polygon, points)
     own = np.asarray(seen[1].distance) < np.asarray(seen[0].distance) + 0.99 * float(polygon.perimeter)
     np.testing.assert_allclose(slope[1][own, 0], np.stack(seen[1].normal, axis=1)[own], atol=1e-9)
 
@@ -566,6 +566,12 @@ def test_first_hit_far_away():
         assert bool(np.isfinite(found)) == hits
 
 
+def test_outlines_with_corners_have_no_facing_points():
+    outline = Polygon(POLYGONS[next(iter(POLYGONS))]).outline()
+    with pytest.raises(NotImplementedError, match="PolygonOutline has corners, at which the outward normal is not"):
+        outline.facing(Vec2(jnp.ones(()), jnp.zeros(())))
+
+
 def test_no_path_touches_nothing():
     start = np.array([(0.2, 0.0), (0.045, 0.0), (0.045, 0.045)])
     for shape in (Polygon(POLYGONS["square"]), Disk(0.045)):
@@ -641,7 +647,7 @@ def test_perimeter_and_boundary(vertices):
     assert gaps.max() <= perimeter / 500 * (1 + 1e-9)
     assert np.isclose(gaps, perimeter / 500).sum() >= 500 - len(vertices)  # all except those across a corner
     about = complex_of(points) - complex_of(polygon.centroid)
-    assert np.imag(about.conj() * np.roll(about, -1)).sum() > 0  # counter-clockwise
+    assert np.imag(about.conj() * np.roll(about, -1)).sum() > 0  # counterclockwise
 
 
 def test_boundary_of_a_disk():

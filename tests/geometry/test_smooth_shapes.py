@@ -44,7 +44,7 @@ def batched(function, shared: int = 1, size: int = 500):
 
 closest = batched(lambda shape, x: shape.closest(x))
 distances = batched(lambda shape, x: shape.signed_distance(x), size=4000)
-touches = batched(lambda shape, x: shape.outline().touches(Vec2.of(x)))
+candidates_at = batched(lambda shape, x: shape.outline().contact_candidates(Vec2.of(x)))
 sweep = batched(lambda shape, x, path, r: shape.outline().sweep(Vec2.of(x), Vec2.of(path), r))
 boundary = jax.jit(lambda shape: shape.boundary(2000))
 
@@ -54,7 +54,7 @@ def lengths(dtype) -> float:
 
 
 def wavy(controls: int, seed: int) -> np.ndarray:
-    """Return control points about the origin, counter-clockwise, at random radii."""
+    """Return control points about the origin, counterclockwise, at random radii."""
     angle = 2 * np.pi * np.arange(controls) / controls
     radius = np.random.default_rng(seed).uniform(0.03, 0.08, controls)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -298,14 +298,14 @@ def test_derivatives_are_finite_where_they_are_singular(shape):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(every))
 
 
-# --- all places that a finger touches ---
+# --- all points that a finger can touch ---
 
 
 @pytest.mark.parametrize("name", ["waisted", "wavy"])
 def test_the_second_touch_is_the_next_local_minimum_that_faces(name):
     shape = SHAPES[name]
     points = np.random.default_rng(6).uniform(-0.1, 0.1, (300, 2))
-    first, second = touches(shape, points)
+    first, second = candidates_at(shape, points)
     np.testing.assert_allclose(first.distance, distances(shape, points), atol=1e-15)
     brute, outline = Outline(shape), []
     for k, (gap, u) in enumerate(brute.minima(points)):
@@ -324,13 +324,13 @@ def test_the_second_touch_is_the_next_local_minimum_that_faces(name):
 
 def test_a_finger_in_the_waist_touches_both_flanks():
     """A finger too wide for the waist touches both sides; half a millimeter to one side it still finds the other."""
-    first, second = touches(SHAPES["waisted"], np.array([(0.075, 0.0), (0.075, 5e-4), (0.075, -5e-4)]))
+    first, second = candidates_at(SHAPES["waisted"], np.array([(0.075, 0.0), (0.075, 5e-4), (0.075, -5e-4)]))
     assert (np.abs(first.distance - second.distance) < 2e-3).all()
     assert (first.normal.y * second.normal.y < 0).all()
     assert (first.point.y * second.point.y < 0).all()
     assert (np.minimum(first.normal.x, second.normal.x) > 0).all()
     for convex in (SHAPES["oval"], SHAPES["ellipse"]):
-        assert len(touches(convex, np.array([(0.075, 0.0)]))) == 1
+        assert len(candidates_at(convex, np.array([(0.075, 0.0)]))) == 1
 
 
 # --- sweep ---
@@ -476,7 +476,7 @@ def test_the_boundary_is_equally_spaced(shape):
     arc = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(dense, axis=0), axis=1))])
     np.testing.assert_allclose(np.diff(arc[::400]), float(shape.perimeter) / 20, rtol=1e-4)
     after = np.roll(points, -1, axis=0)
-    assert np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]) > 0  # counter-clockwise
+    assert np.sum(points[:, 0] * after[:, 1] - points[:, 1] * after[:, 0]) > 0  # counterclockwise
 
 
 def test_perimeter_of_an_ellipse():
@@ -548,7 +548,7 @@ def test_convexity_is_found_out():
     # a convex curve has no second touch, even if two are asked for
     points = scattered(Curve(CURVES["oval"]), 12, 100)
     outside = points[np.asarray(distances(Curve(CURVES["oval"]), points)) > 1e-5]
-    first, second = touches(Curve(CURVES["oval"], convex=False), outside)
+    first, second = candidates_at(Curve(CURVES["oval"], convex=False), outside)
     np.testing.assert_allclose(second.distance - first.distance, Curve(CURVES["oval"]).perimeter, rtol=1e-9)
 
 
@@ -582,7 +582,7 @@ def test_dtype_is_the_input_s():
             sizes,
             shape.closest([0.3, 0.2]),
             shape.closest(point),
-            outline.touches(x),
+            outline.contact_candidates(x),
             outline.sweep(x, x, x.x),
         )
 

@@ -30,10 +30,10 @@ def dense(shape, count=40_000) -> np.ndarray:
     return np.asarray(shape.boundary(count))
 
 
-@pytest.mark.parametrize("name", ["ellipse", "curve", "butterfly"])
+@pytest.mark.parametrize("name", ["ellipse", "curve", "butterfly", "disk"])
 def test_facing_is_every_place_that_stands_out(name):
     """`facing` finds all local maxima of the height over a direction where a dense outline is convex, and no others."""
-    shape = shapes()[name]
+    shape = (shapes() | {"disk": pj.Disk(0.02, center=(0.002, -0.001))})[name]
     points, found = dense(shape), jax.jit(lambda d: shape.outline().facing(d))
     # the axes of the ellipse and of the butterfly are where their pieces join
     for angle in (*np.linspace(0.01, 6.2, 12), *(k * np.pi / 2 for k in range(4))):
@@ -44,7 +44,7 @@ def test_facing_is_every_place_that_stands_out(name):
         outward = velocity[:, 1] * d[0] - velocity[:, 0] * d[1] > 0
         peaks = (height > np.roll(height, 1)) & (height >= np.roll(height, -1)) & outward
         facing = found(Vec2.of(jnp.asarray(d)))
-        mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.real)]
+        mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.valid)]
         assert len(np.unique(np.round(mine / 1e-5), axis=0)) >= peaks.sum() > 0
         apart = np.linalg.norm(mine[:, None] - points[peaks][None], axis=-1)
         assert np.all(apart.min(axis=1) < 1e-5)
@@ -56,7 +56,7 @@ def test_derivatives_of_facing():
 
     def point(angle):
         facing = outline.facing(Vec2(jnp.cos(angle), jnp.sin(angle)))
-        return jnp.stack([jnp.where(facing.real, facing.point.x, 0.0), jnp.where(facing.real, facing.point.y, 0.0)])
+        return jnp.stack([jnp.where(facing.valid, facing.point.x, 0.0), jnp.where(facing.valid, facing.point.y, 0.0)])
 
     angle, h = 0.7, 1e-6
     slope = jax.jit(jax.jacfwd(point))(angle)

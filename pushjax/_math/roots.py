@@ -1,0 +1,53 @@
+"""The root of a function of one variable, in a bracket."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._math.vec import Scalar
+
+
+class Proposal(NamedTuple):
+    """The next point of a search for a root, as the function at the current point proposes it.
+
+    Attributes:
+        is_above: Whether the root lies above the current point.
+        next: The next point, by Newton's method for example.
+        usable: Whether `next` may be taken. If not, the bracket is halved.
+        is_tiny: Whether the step to `next` is so small that it may leave the bracket, as it can by roundoff after
+            convergence.
+    """
+
+    is_above: Bool[Array, ""]
+    next: Scalar
+    usable: Bool[Array, ""] | bool
+    is_tiny: Bool[Array, ""]
+
+
+def bracketed_root(
+    propose: Callable[[Scalar], Proposal], start: Scalar, low: Scalar, high: Scalar, iterations: int
+) -> Scalar:
+    """Find a root in a bracket by a fixed number of iterations: the proposed steps, with bisection as the safeguard.
+
+    Args:
+        propose: Function of the current point.
+        start: Initial point.
+        low: Lower end of the bracket.
+        high: Upper end of the bracket.
+        iterations: Number of iterations.
+
+    Returns:
+        The last point. Reverse mode cannot differentiate it.
+    """
+
+    def iterate(_, carry):
+        t, low, high = carry
+        found = propose(t)
+        low, high = jnp.where(found.is_above, t, low), jnp.where(found.is_above, high, t)
+        inside = found.usable & (((found.next >= low) & (found.next <= high)) | found.is_tiny)
+        return jnp.where(inside, found.next, (low + high) / 2), low, high
+
+    return jax.lax.fori_loop(0, iterations, iterate, (start, low, high))[0]
