@@ -18,14 +18,14 @@ import numpy as np
 
 import pushjax as pj
 from benchmarks._measure import header
-from pushjax.identification.model import Scene, trajectories
-from pushjax.identification.unknowns import Prior
+from pushjax.identification.model import Scene, predict_pushes
+from pushjax.identification.prior import Prior
 
 HALF, RADIUS, TRAVEL, STEPS = 0.045, 0.005, 0.03, 30
-UNKNOWNS = pj.Unknowns((0.0, 1.0), dof=50, center=0.003, inset=0.001)
+UNKNOWNS = pj.Unknowns((0.0, 1.0), surface_dof=50, pressure_center=0.003, inset=0.001)
 
 
-def planned(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
+def random_pushes(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
     """Draw random pushes of the square.
 
     Args:
@@ -57,20 +57,20 @@ def main() -> None:
     rng = np.random.default_rng(1)
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
-    several = jax.tree.map(lambda leaf: leaf[None], mean)
-    prior = Prior.of(UNKNOWNS, several, jnp.asarray([0.25]), jnp.zeros(2))
+    surfaces = jax.tree.map(lambda leaf: leaf[None], mean)
+    prior = Prior.of(UNKNOWNS, surfaces, jnp.asarray([0.25]), jnp.zeros(2))
     layout, count = prior.layout, arguments.repetitions
-    starts, paths = planned(rng, (count, arguments.pushes))
+    starts, paths = random_pushes(rng, (count, arguments.pushes))
     truth, mu = rng.normal(size=(count, layout.size)), rng.uniform(0.1, 0.5, count)
-    own = int(layout.index[0, layout.local["friction"]][0])
-    truth[:, own] = np.log(mu / (1 - mu))
+    position = int(layout.positions[0, layout.slices["friction"]][0])
+    truth[:, position] = np.log(mu / (1 - mu))
     truth = jnp.asarray(truth, jnp.float32)
 
     @jax.jit
     @jax.vmap
     def ends(z, start, path):
         pushes = pj.Pushes(start[None], path[None], start[None])
-        return trajectories(prior.physical(z), several, Scene(square, hand, prior.origin), pushes).pose[0, :, -1]
+        return predict_pushes(prior.parameters(z), surfaces, Scene(square, hand, prior.origin), pushes).pose[0, :, -1]
 
     noise = 1e-3 * arguments.noise * rng.normal(size=starts.shape) / [1, 1, float(mean.length)]
     seen = ends(truth, starts, paths) + jnp.asarray(noise, jnp.float32)
@@ -88,10 +88,10 @@ def main() -> None:
     print(f"{count} x {arguments.pushes} pushes: compiled in {middle - begin:.0f} s, run in {took:.0f} s")
     print(f"not converged: {int(np.sum(~np.asarray(found.converged)))}; sigma {1e3 * np.median(found.sigma):.3f} mm")
     deviation = np.sqrt(np.diagonal(np.linalg.inv(np.asarray(found.precision, float)), axis1=1, axis2=2))
-    off = np.abs(np.asarray(found.z) - np.asarray(truth)) / deviation
-    for level, reach in ((0.5, 0.6745), (0.9, 1.6449)):
-        held = (off < reach).mean(axis=0)
-        parts = {name: held[layout.index[0, layout.local[name]]] for name in layout.names}
+    error = np.abs(np.asarray(found.z) - np.asarray(truth)) / deviation
+    for level, quantile in ((0.5, 0.6745), (0.9, 1.6449)):
+        inside = (error < quantile).mean(axis=0)
+        parts = {name: inside[layout.positions[0, layout.slices[name]]] for name in layout.names}
         print(
             f"intervals of {100 * level:.0f} % hold", {name: f"{100 * np.mean(v):.1f} %" for name, v in parts.items()}
         )

@@ -25,16 +25,16 @@ import numpy as np
 
 import pushjax as pj
 from benchmarks._measure import header
-from benchmarks.identification import HALF, RADIUS, planned
+from benchmarks.identification import HALF, RADIUS, random_pushes
 
 PATH_STEPS, GRID, TEST = 20, np.linspace(0.05, 0.65, 21), 10
 POSE_NOISE, ANGLE_NOISE = 3e-4, np.radians(3.0)
-UNKNOWNS = pj.Unknowns((0.0, 1.0), dof=30)
+UNKNOWNS = pj.Unknowns((0.0, 1.0), surface_dof=30)
 Arrays = tuple[jax.Array, ...]
 
 
 @jax.jit
-def pushed(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
+def simulate(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
     """Simulate the pushes of all objects.
 
     Args:
@@ -54,13 +54,13 @@ def pushed(surface: pj.LimitSurface, friction, starts, paths) -> pj.Trajectory:
     return jax.vmap(jax.vmap(one, in_axes=(None, None, 0, 0)))(surface, friction, starts, paths)
 
 
-def objects(rng: np.random.Generator, mean: pj.LimitSurface, count: int) -> tuple[pj.LimitSurface, jax.Array]:
+def random_objects(rng: np.random.Generator, mean: pj.LimitSurface, count: int) -> tuple[pj.LimitSurface, jax.Array]:
     """Draw the limit surfaces and the friction of `count` objects around the surface `mean`."""
     model = pj.FrictionModel(30, (0.1, 0.5))
     return jax.vmap(lambda key: model.sample(key, mean))(jax.random.split(jax.random.key(int(rng.integers(99))), count))
 
 
-def recorded(rng: np.random.Generator, surface, friction, length: float, count: int, pushes: int) -> pj.Pushes:
+def measured_pushes(rng: np.random.Generator, surface, friction, length: float, count: int, pushes: int) -> pj.Pushes:
     """Simulate the measured pushes of all objects, with noise.
 
     Args:
@@ -74,15 +74,15 @@ def recorded(rng: np.random.Generator, surface, friction, length: float, count: 
     Returns:
         The pushes, with a leading axis (count,). Each has two wrench-twist pairs.
     """
-    starts, paths = short(rng, count, pushes)
-    done = pushed(surface, friction, starts, paths)
+    starts, paths = coarse_random_pushes(rng, count, pushes)
+    done = simulate(surface, friction, starts, paths)
     noise = rng.normal(size=(count, pushes, 3)) * POSE_NOISE / [1, 1, length]
     metric = np.array([1, 1, length])
     middle = PATH_STEPS // 2
     wrench, twist = [], []
     for part in (slice(1, middle), slice(middle, None)):
-        wrench.append(_astray(rng, np.asarray(done.wrench)[:, :, part].mean(axis=2) / metric) * metric)
-        twist.append(_astray(rng, np.asarray(done.twist)[:, :, part].sum(axis=2) * metric) / metric)
+        wrench.append(_with_direction_noise(rng, np.asarray(done.wrench)[:, :, part].mean(axis=2) / metric) * metric)
+        twist.append(_with_direction_noise(rng, np.asarray(done.twist)[:, :, part].sum(axis=2) * metric) / metric)
     pairs = (jnp.asarray(np.stack(each, axis=2), jnp.float32) for each in (wrench, twist))
     wrench, twist = pairs
     return jax.vmap(lambda s, p, e, w, v: pj.Pushes(s, p, e, wrench=w, twist=v))(
@@ -90,19 +90,19 @@ def recorded(rng: np.random.Generator, surface, friction, length: float, count: 
     )
 
 
-def short(rng: np.random.Generator, count: int, pushes: int) -> Arrays:
+def coarse_random_pushes(rng: np.random.Generator, count: int, pushes: int) -> Arrays:
     """Draw start poses, (count, pushes, 3), and paths of PATH_STEPS steps, (count, pushes, PATH_STEPS + 1, 2)."""
-    starts, paths = planned(rng, (count, pushes))
+    starts, paths = random_pushes(rng, (count, pushes))
     return starts, jax.vmap(jax.vmap(lambda path: pj.line(path[0], path[-1], PATH_STEPS)))(paths)
 
 
-def _astray(rng: np.random.Generator, vectors: np.ndarray) -> np.ndarray:
+def _with_direction_noise(rng: np.random.Generator, vectors: np.ndarray) -> np.ndarray:
     """Return vectors (..., 3) with noise that turns their directions by ANGLE_NOISE, as a root mean square."""
     size = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors + ANGLE_NOISE / np.sqrt(2) * size * rng.normal(size=vectors.shape)
 
 
-def programmed(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
+def ellipsoid_by_sdp(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
     """Fit an ellipsoid by a semi-definite program, with the loss of `fit_limit_surface`.
 
     Args:
@@ -114,20 +114,20 @@ def programmed(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarr
         The matrix of the ellipsoid, (3, 3).
     """
     metric = np.array([1, 1, length])
-    there = np.any(wrench != 0, axis=1) & np.any(twist != 0, axis=1)
-    force, motion = wrench[there] / metric, twist[there] * metric
+    valid = np.any(wrench != 0, axis=1) & np.any(twist != 0, axis=1)
+    force, motion = wrench[valid] / metric, twist[valid] * metric
     force = force / np.linalg.norm(force, axis=1).mean()
     motion = motion / np.linalg.norm(motion, axis=1, keepdims=True)
     a, s = cp.Variable((3, 3), PSD=True), cp.Variable(len(force), nonneg=True)
-    astray = cp.sum_squares(2 * force @ a - cp.multiply(cp.reshape(s, (len(force), 1), order="C"), motion))
+    misfit = cp.sum_squares(2 * force @ a - cp.multiply(cp.reshape(s, (len(force), 1), order="C"), motion))
     values = cp.sum(cp.multiply(force @ a, force), axis=1)
-    loss = (astray + 2 * cp.sum_squares(values - 1)) / len(force) + 1e-3 * cp.sum_squares(a)
+    loss = (misfit + 2 * cp.sum_squares(values - 1)) / len(force) + 1e-3 * cp.sum_squares(a)
     cp.Problem(cp.Minimize(loss)).solve(solver=cp.CLARABEL)
     return np.asarray(a.value)
 
 
 @jax.jit
-def on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
+def friction_on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
     """Find the friction on the grid for which the final poses of each object deviate least.
 
     Args:
@@ -140,7 +140,7 @@ def on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
     """
 
     def off(mu):
-        done = pushed(surface, jnp.full(len(pushes.weight), mu), pushes.start, pushes.path)
+        done = simulate(surface, jnp.full(len(pushes.weight), mu), pushes.start, pushes.path)
         return jnp.mean(pj.deviation(done.pose[:, :, -1], pushes.end, length), axis=1)
 
     losses = jax.lax.map(off, jnp.asarray(GRID, jnp.float32))
@@ -159,9 +159,9 @@ def report(name: str, surface, friction, truth, tested: Arrays, length: float) -
         length: Characteristic length, m.
     """
     real, mu, ends = truth
-    done = pushed(surface, friction, *tested)
+    done = simulate(surface, friction, *tested)
     off = 1e3 * np.asarray(pj.deviation(done.pose[:, :, -1], ends, length)).mean(axis=1)
-    angles = np.degrees(np.asarray(angle(surface, real)))
+    angles = np.degrees(np.asarray(wrench_angle(surface, real)))
     wrong = np.abs(np.asarray(friction - mu))
     print(
         f"{name}: final poses off by {off.mean():.3f} mm in the mean over objects, {np.quantile(off, 0.95):.3f} in one "
@@ -171,7 +171,7 @@ def report(name: str, surface, friction, truth, tested: Arrays, length: float) -
 
 
 @jax.jit
-def angle(one, other) -> jax.Array:
+def wrench_angle(one, other) -> jax.Array:
     """Return the mean angle between the wrenches of two surfaces over 100 random twists, rad, for each object."""
     twist = jax.random.normal(jax.random.key(5), (100, 3))
 
@@ -199,13 +199,13 @@ def main() -> None:
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400), degree=2)
     length = float(mean.length)
-    real, mu = objects(rng, mean, given.objects)
-    pushes = recorded(rng, real, mu, length, given.objects, given.pushes)
-    tested = short(rng, given.objects, TEST)
-    truth = (real, mu, pushed(real, mu, *tested).pose[:, :, -1])
-    size = jnp.full(given.objects, 0.25)
+    real, mu = random_objects(rng, mean, given.objects)
+    pushes = measured_pushes(rng, real, mu, length, given.objects, given.pushes)
+    tested = coarse_random_pushes(rng, given.objects, TEST)
+    truth = (real, mu, simulate(real, mu, *tested).pose[:, :, -1])
+    middle_friction = jnp.full(given.objects, 0.25)
     same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (given.objects, *leaf.shape)), mean)
-    report("expected, friction 0.25", same, size, truth, tested, length)
+    report("expected, friction 0.25", same, middle_friction, truth, tested, length)
 
     def identified(pushes):
         return pj.identify(pushes, pj.Slider(square, mean), hand, UNKNOWNS, robust=None)
@@ -225,10 +225,10 @@ def main() -> None:
     part = jax.tree.map(lambda leaf: leaf[:count], (pushes, truth, tested))
     wrench, twist = (np.asarray(x, float).reshape(count, -1, 3) for x in (part[0].wrench, part[0].twist))
     begin = time.perf_counter()
-    matrices = np.stack([programmed(w, v, length) for w, v in zip(wrench, twist, strict=True)])
+    matrices = np.stack([ellipsoid_by_sdp(w, v, length) for w, v in zip(wrench, twist, strict=True)])
     middle = time.perf_counter()
     convex = jax.vmap(pj.Ellipsoid, in_axes=(0, None))(jnp.asarray(matrices, jnp.float32), mean.length)
-    grid = on_grid.lower(convex, part[0], length).compile()
+    grid = friction_on_grid.lower(convex, part[0], length).compile()
     start = time.perf_counter()
     friction = jax.block_until_ready(grid(convex, part[0], length))
     took = time.perf_counter() - start

@@ -24,21 +24,31 @@ from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments.table1.conditions import APART, OBJECTS, SIDES, chosen, load
 from pushjax.experiments.table1.experiment import deviation_mm
-from pushjax.experiments.table1.methods import CENTER, DOF, INSET, MARKER, NO_ROOM, OFFSET, Setting, fitted, own
+from pushjax.experiments.table1.methods import (
+    FRAME_OFFSET,
+    HAND_OFFSET,
+    INSET,
+    NO_ROOM,
+    PRESSURE_CENTER,
+    SURFACE_DOF,
+    Setting,
+    fitted,
+    own,
+)
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
 STEPS = 50
 # Unknowns of each cause, with their prior standard deviations as in `Unknowns`.
 CAUSES: dict[str, dict[str, float]] = {
-    "tip offset": {"offset": OFFSET},
-    "object frame": {"marker": MARKER},
+    "tip offset": {"hand_offset": HAND_OFFSET},
+    "object frame": {"frame_offset": FRAME_OFFSET},
     "outline": {"inset": INSET},
-    "stream lag": {"lag": 0.001},
+    "stream lag": {"lag_distance": 0.001},
     "initial overlap": {"overlap": 1.0},
-    "anisotropic friction": {"grain": 0.1},
-    "friction over the table": {"slope": 1.0, "curvature": 10.0},
-    "drift": {"drift": 0.3},
-    "friction by side": {"side": 0.3},
+    "anisotropic friction": {"anisotropy": 0.1},
+    "friction over the table": {"log_gradient": 1.0, "log_hessian": 10.0},
+    "drift": {"friction_drift": 0.3},
+    "friction by side": {"friction_by_side": 0.3},
 }
 CALIBRATION = ("tip offset", "object frame", "outline")
 NOTHING, CALIBRATED = "nothing", "calibration"
@@ -105,13 +115,13 @@ def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) 
     found = identified(setting, causes)
     predicted = found.predict(setting.tested, setting.slider, setting.hand)
     off = deviation_mm(log, own(predicted.pose[:, -1], setting.tested))
-    physical = found.physical._asdict()
+    parameters = found.parameters._asdict()
     return {
         "mean_mm": float(off.mean()),
         "each_mm": off,
         "friction": float(found.friction),
         "sigma_mm": 1e3 * float(found.sigma),
-        "found": {name: np.asarray(physical[name], float) for cause in causes for name in CAUSES[cause]},
+        "found": {name: np.asarray(parameters[name], float) for cause in causes for name in CAUSES[cause]},
         "failed_steps": int(own(predicted.failed, setting.tested).sum()),
         "noise_floor_mm": noise_floor_mm(log),
     }
@@ -127,7 +137,7 @@ def identified(setting: Setting, causes: tuple[str, ...]) -> pj.Identified:
     spreads: dict[str, Any] = {name: NO_ROOM for each in CAUSES.values() for name in each}
     spreads |= {name: value for cause in causes for name, value in CAUSES[cause].items()}
     spreads["overlap"] = NO_ROOM  # imposed, not identified
-    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, center=CENTER, sides=SIDES, **spreads)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, pressure_center=PRESSURE_CENTER, sides=SIDES, **spreads)
     return fitted(setting.coarse, setting, unknowns, overlap=0.0 if "initial overlap" in causes else 1.0)
 
 

@@ -116,22 +116,23 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     """Identify, predict and score with every method, for one object on one surface."""
     rng = np.random.default_rng(seed)
     slider, hand, length = setting.slider, setting.hand, setting.length
-    rows = rng.permutation(np.flatnonzero(log.learned & log.whole.valid))
+    rows = rng.permutation(np.flatnonzero(log.is_training & log.whole.valid))
     of_rest, held = _crossed(log, setting, rows, steps, FOLDS, FOLD)
     first, *keys = jax.random.split(jax.random.key(seed), 6)
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
     every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
     found = fitted(setting.coarse, setting, every)
     off = own(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
-    predicted = noise.about(found)
+    predicted = noise.transferred_to(found)
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
     levels, far = _held(first, log, setting, noise, rows, steps)
     groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
-    numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in ("dof", "offset", "sigma", "tails")}
+    scalars = ("surface_dof", "hand_offset", "sigma", "student_dof")
+    numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in scalars}
     spread = float(predicted.friction[1] - found.friction)
-    cell["noise"] = numbers | {"relative": np.asarray(noise.relative), "spread": spread}
+    cell["noise"] = numbers | {"relative_error": np.asarray(noise.relative_error), "spread": spread}
     cell |= {"held_level": levels, "levels_of": {}}
     for k, (group, pushes) in enumerate(groups.items()):
         ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
@@ -164,7 +165,7 @@ def _held(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict each training push from nearly all others; return the levels and the predicted `reach`."""
     of_rest, held = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
-    draws = own(noise.about(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
+    draws = own(noise.transferred_to(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
     there = scored(draws, own(held.end, held), setting.length)
     return there.level, reach(draws, own(held.start, held), setting.length)
 

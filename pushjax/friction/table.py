@@ -15,7 +15,7 @@ from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3, cos_sin, unstack
 from pushjax.friction.limit_surface import Form
 
-SIZES = {"grain": 2, "slope": 2, "curvature": 3, "origin": 2}
+SIZES = {"anisotropy": 2, "log_gradient": 2, "log_hessian": 3, "origin": 2}
 NEAR_ZERO = 1e-3  # value of r^2 below which cosh(r) and sinh(r) / r are computed by their series
 
 
@@ -53,17 +53,17 @@ class WrenchTransform(NamedTuple):
         )
 
 
-class _WarpedFields(NamedTuple):
+class _TransformedFields(NamedTuple):
     base: Form
-    warp: WrenchTransform
+    transform: WrenchTransform
 
 
-class TransformedForm(_WarpedFields):
+class TransformedForm(_TransformedFields):
     """H(T F) in scalars.
 
     Attributes:
         base: The form H.
-        warp: The map T.
+        transform: The map T.
     """
 
     @property
@@ -75,26 +75,26 @@ class TransformedForm(_WarpedFields):
         return self.base.length
 
     def scaled(self, factor: Scalar) -> "TransformedForm":
-        return TransformedForm(self.base.scaled(factor), self.warp)
+        return TransformedForm(self.base.scaled(factor), self.transform)
 
     def value(self, f: Vec3) -> Scalar:
-        return self.base.value(self.warp.times(f))
+        return self.base.value(self.transform.times(f))
 
     def gradient(self, f: Vec3) -> Vec3:
-        return self.warp.transposed(self.base.gradient(self.warp.times(f)))
+        return self.transform.transposed(self.base.gradient(self.transform.times(f)))
 
     def spin(self, f: Vec3) -> Scalar:
-        return self.base.spin(self.warp.times(f))
+        return self.base.spin(self.transform.times(f))
 
     def hessian(self, f: Vec3) -> Symmetric3:
-        base, t = self.base.hessian(self.warp.times(f)), self.warp
+        base, t = self.base.hessian(self.transform.times(f)), self.transform
         zero, one = 0 * t.xx, 0 * t.xx + 1
         x, y, z = Vec3(t.xx, t.xy, t.cy), Vec3(t.xy, t.yy, -t.cx), Vec3(zero, zero, one)
         bx, by, bz = base.times(x), base.times(y), base.times(z)
         return Symmetric3(x.dot(bx), y.dot(by), z.dot(bz), x.dot(by), x.dot(bz), y.dot(bz))
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        return self.base.restrict(self.warp.times(a), self.warp.times(b))
+        return self.base.restrict(self.transform.times(a), self.transform.times(b))
 
 
 class Table(eqx.Module):
@@ -102,18 +102,18 @@ class Table(eqx.Module):
 
     If all attributes are zero, friction is uniform. Only ratios of friction matter, not its magnitude.
 
-    Friction that rises to one side moves the center of pressure to that side, by length^2 / 2 times the slope at the
+    Friction that rises to one side moves the center of pressure to that side, by length^2 / 2 times the gradient at the
     slider's origin, where length is that of the limit surface. This is exact to first order for pressure on a ring
     whose radius is that length. For other pressure distributions it differs by a factor. Friction that depends on
     direction stretches the forces of the limit surface. This is exact for translations.
 
     Attributes:
-        grain: Anisotropy, shape (2,). Friction along x is exp(2 grain[0]) times that along y. Friction along the
-            diagonal is exp(2 grain[1]) times that across it.
-        slope: Relative increase of friction per meter along x and y at `origin`, shape (2,), 1/m.
-        curvature: Change of the slope with position, shape (3,), 1/m^2: the second derivatives xx, yy, xy of the
-            logarithm of friction.
-        origin: Point of the table at which `slope` is given, shape (2,), m.
+        anisotropy: Dependence of friction on direction, shape (2,). Friction along x is exp(2 anisotropy[0]) times that
+            along y. Friction along the diagonal is exp(2 anisotropy[1]) times that across it.
+        log_gradient: Gradient of the logarithm of friction along x and y at `origin`, shape (2,), 1/m: the relative
+            increase of friction per meter.
+        log_hessian: Second derivatives xx, yy, xy of the logarithm of friction, shape (3,), 1/m^2.
+        origin: Point of the table at which `log_gradient` is given, shape (2,), m.
 
     Raises:
         ValueError: If an array has the wrong shape or is not finite.
@@ -121,19 +121,19 @@ class Table(eqx.Module):
     Reference: Extends Zhou et al. 2017, where the table is uniform.
     """
 
-    grain: Float[Array, "2"]
-    slope: Float[Array, "2"]
-    curvature: Float[Array, "3"]
+    anisotropy: Float[Array, "2"]
+    log_gradient: Float[Array, "2"]
+    log_hessian: Float[Array, "3"]
     origin: Float[Array, "2"]
 
     def __init__(
         self,
-        grain: ArrayLike = (0.0, 0.0),
-        slope: ArrayLike = (0.0, 0.0),
-        curvature: ArrayLike = (0.0, 0.0, 0.0),
+        anisotropy: ArrayLike = (0.0, 0.0),
+        log_gradient: ArrayLike = (0.0, 0.0),
+        log_hessian: ArrayLike = (0.0, 0.0, 0.0),
         origin: ArrayLike = (0.0, 0.0),
     ):
-        given = {"grain": grain, "slope": slope, "curvature": curvature, "origin": origin}
+        given = {"anisotropy": anisotropy, "log_gradient": log_gradient, "log_hessian": log_hessian, "origin": origin}
         dtype = common_dtype(*given.values())
         for name, value in given.items():
             array = as_float(value, dtype)
@@ -141,7 +141,7 @@ class Table(eqx.Module):
             check_finite(name, array)
             setattr(self, name, array)
 
-    def warp(self, pose: Vec3, length: Scalar) -> WrenchTransform:
+    def wrench_transform(self, pose: Vec3, length: Scalar) -> WrenchTransform:
         """Return the map T of the wrenches of a slider, in its body frame.
 
         Args:
@@ -153,7 +153,7 @@ class Table(eqx.Module):
         """
         angle = cos_sin(pose.z)
         # The entries of a symmetric matrix of trace zero rotate by twice the angle.
-        a, b = unstack(self.grain)
+        a, b = unstack(self.anisotropy)
         cos, sin = angle.x * angle.x - angle.y * angle.y, 2 * angle.x * angle.y
         a, b = cos * a + sin * b, cos * b - sin * a
         squared = a * a + b * b
@@ -161,12 +161,12 @@ class Table(eqx.Module):
         r = jnp.sqrt(jnp.where(small, 1.0, squared))
         even = jnp.where(small, 1 + squared / 2 * (1 + squared / 12 * (1 + squared / 30)), jnp.cosh(r))
         odd = jnp.where(small, 1 + squared / 6 * (1 + squared / 20 * (1 + squared / 42)), jnp.sinh(r) / r)
-        sx, sy = unstack(self.slope)
-        xx, yy, xy = unstack(self.curvature)
+        sx, sy = unstack(self.log_gradient)
+        xx, yy, xy = unstack(self.log_hessian)
         ox, oy = unstack(self.origin)
         x, y = pose.x - ox, pose.y - oy
         rise_x, rise_y = sx + xx * x + xy * y, sy + xy * x + yy * y
         half = length / 2  # length^2 / 2, divided by the length, because c is normalized
         cx, cy = half * (angle.x * rise_x + angle.y * rise_y), half * (angle.x * rise_y - angle.y * rise_x)
-        # S = exp(-grain): where friction is higher along x, S shrinks forces along x.
+        # S = exp(-anisotropy): where friction is higher along x, S shrinks forces along x.
         return WrenchTransform(even - odd * a, even + odd * a, -odd * b, cx, cy)

@@ -14,13 +14,28 @@ from pushjax.identification.model import Problem
 from pushjax.identification.pushes import Pushes
 
 MAX_STEPS = 60
-EARLY = 0.01  # tolerance in all rounds but the last, while sigma is still being estimated
-TINY = 1e-6  # prior precision of a friction: makes the precision matrix invertible if no push depends on it
-ROUNDS = 6
-LEAST = 1e-6  # m, lower bound of sigma: no measurement is more exact
-KINDS = (3, 3, 1)  # measured numbers per push: of its poses, of its pairs, of its contact
-CONTACT = 2  # index of the contact in KINDS
-LOST = 3.0  # sigma: beyond this residual of a gap, the finger counts as having lost the slider and has little weight
+LOOSE_TOLERANCE = 0.01  # tolerance in all rounds but the last, while sigma is still being estimated
+FRICTION_RIDGE = 1e-6  # prior precision of a friction: makes the precision matrix invertible if no push depends on it
+SIGMA_ROUNDS = 6
+MIN_SIGMA = 1e-6  # m, lower bound of sigma: no measurement is more exact
+GAP_SCALE = 3.0  # sigma: beyond this residual of a gap, the finger counts as having lost the slider
+
+
+class Kinds(NamedTuple):
+    """A quantity that exists once for each kind of residual.
+
+    Attributes:
+        poses: That of the poses.
+        directions: That of the directions of motion under measured wrenches.
+        gap: That of the gap between finger and slider at the end.
+    """
+
+    poses: Any
+    directions: Any
+    gap: Any
+
+
+NUMBERS = Kinds(poses=3, directions=3, gap=1)  # measured numbers per push
 
 
 class Fit(NamedTuple):
@@ -51,67 +66,64 @@ class FixedEntries(NamedTuple):
     """Entries of z that are held fixed.
 
     Attributes:
-        which: (size,) True for entries that are held.
+        mask: (size,) True for entries that are fixed.
         value: (size,) their values.
     """
 
-    which: Bool[Array, "size"]
+    mask: Bool[Array, "size"]
     value: Float[Array, "size"]
 
     @staticmethod
     def none(start: Array) -> "FixedEntries":
-        """Hold no entry."""
+        """Fix no entry."""
         return FixedEntries(jnp.zeros(start.shape, bool), start)
 
-    def on(self, z: Array) -> Array:
-        """Return z with the held entries at their values."""
-        return jnp.where(self.which, self.value, z)
+    def apply(self, z: Array) -> Array:
+        """Return z with the fixed entries at their values."""
+        return jnp.where(self.mask, self.value, z)
 
 
-class Counts(NamedTuple):
-    """Weights of each push's poses, pairs and contact in the loss."""
+def push_weights(pushes: Pushes) -> Kinds:
+    """Return the weight (conditions, pushes) of each push for each kind of residual.
 
-    poses: Float[Array, "conditions pushes"]
-    pairs: Float[Array, "conditions pushes"]
-    contact: Float[Array, "conditions pushes"]
-
-    @staticmethod
-    def of(pushes: Pushes) -> "Counts":
-        """Return the weights of `pushes`; pairs have weight zero in pushes that recorded none."""
-        pairs = jnp.where(jnp.any(pushes.paired, axis=-1), pushes.weight, 0.0)
-        return Counts(pushes.weight, pairs, pushes.weight)
+    Directions have weight zero in pushes that have no pair of wrench and motion.
+    """
+    directions = jnp.where(jnp.any(pushes.has_pair, axis=-1), pushes.weight, 0.0)
+    return Kinds(pushes.weight, directions, pushes.weight)
 
 
-def _parts(residual: Array, pushes: Pushes) -> tuple[Array, Array, Array]:
-    """Split the last axis of residuals into poses, pairs and contacts."""
-    poses = 3 * len(pushes.rows)
-    pairs = poses + 3 * pushes.wrench.shape[-2]
-    return residual[..., :poses], residual[..., poses:pairs], residual[..., pairs:]
+def split_kinds(residual: Array, pushes: Pushes) -> Kinds:
+    """Split the last axis of residuals by their kind; a kind that was not measured has no entries."""
+    poses = 3 * len(pushes.observed_steps)
+    directions = poses + 3 * pushes.wrench.shape[-2]
+    return Kinds(residual[..., :poses], residual[..., poses:directions], residual[..., directions:])
 
 
-def whitened(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
+def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
     """Return residuals whose squares add up to the data part of the loss.
 
-    The poses of each push, and its pairs, use the pseudo-Huber loss, which is linear beyond `robust` sigma (None: least
-    squares). Gaps use the bounded Geman-McClure loss, so a push whose finger lost the slider has almost no influence.
+    The poses of each push, and its directions, use the pseudo-Huber loss, which is linear beyond `robust` sigma (None:
+    least squares). Gaps use the bounded Geman-McClure loss, so a push whose finger lost the slider has almost no
+    influence.
     """
-    whole = []
-    for k, (r, weight) in enumerate(zip(_parts(residual, pushes), Counts.of(pushes), strict=True)):
+    weighted = []
+    kinds = zip(Kinds._fields, split_kinds(residual, pushes), push_weights(pushes), strict=True)
+    for k, (kind, r, weight) in enumerate(kinds):
         r = r / sigma[k]
         squared = jnp.sum(r**2, axis=-1, keepdims=True)
-        if k == CONTACT:
-            r = r / jnp.sqrt(1 + squared / LOST**2)
+        if kind == "gap":
+            r = r / jnp.sqrt(1 + squared / GAP_SCALE**2)
         elif robust is not None:
             r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
-        whole.append(r * jnp.sqrt(weight)[..., None])
-    return jnp.concatenate(whole, axis=-1)
+        weighted.append(r * jnp.sqrt(weight)[..., None])
+    return jnp.concatenate(weighted, axis=-1)
 
 
-def _trust(k: int, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
-    """Return the effective weight of each push in the information, given its residual of kind `k`."""
+def _final_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
+    """Return the effective weight of each push in the information, given its residual of one kind."""
     squared = jnp.sum((residual / sigma) ** 2, axis=-1)
-    if k == CONTACT:
-        return weight / (1 + squared / LOST**2) ** 2
+    if kind == "gap":
+        return weight / (1 + squared / GAP_SCALE**2) ** 2
     return weight if robust is None else weight / jnp.sqrt(1 + squared / robust**2)
 
 
@@ -128,100 +140,141 @@ class Schedule(NamedTuple):
 
     @staticmethod
     def of(dtype, rounds: int, tolerance: float | None = None) -> "Schedule":
-        """Return the effort for a floating dtype.
+        """Return the schedule for a floating dtype.
 
         Args:
             dtype: Floating dtype of the fit.
             rounds: Number of alternations between z and sigma.
             tolerance: Tolerance of z in the last round. Default: 1e-6 in float64, 1e-4 in float32.
         """
-        least = 1e-6 if dtype == jnp.float64 else 1e-4
-        return Schedule(jnp.asarray(rounds), jnp.asarray(least if tolerance is None else tolerance, dtype))
+        default = 1e-6 if dtype == jnp.float64 else 1e-4
+        return Schedule(jnp.asarray(rounds), jnp.asarray(default if tolerance is None else tolerance, dtype))
+
+
+class _Evidence(NamedTuple):
+    """What the residuals at the minimum say about z and about sigma.
+
+    Attributes:
+        precision: (size, size) inverse covariance of z.
+        information: (conditions, pushes, size) contribution of each push to the diagonal of the precision.
+        new_sigma: Standard deviation of each kind of residual; that of a kind that was not measured is not used.
+    """
+
+    precision: Array
+    information: Array
+    new_sigma: list[Array]
+
+
+def _evidence(residual: Array, jacobian: Array, pushes: Pushes, fit: Fit, robust: float | None, normal) -> _Evidence:
+    """Return the precision of z, and sigma as the evidence procedure estimates it.
+
+    Args:
+        residual: (conditions, pushes, rows) residuals at the minimizer.
+        jacobian: (conditions, pushes, rows, size) their derivatives with respect to z.
+        pushes: Pushes with a leading axis of conditions.
+        fit: The fit before, with the sigma with which the minimizer was found.
+        robust: Number of sigma from which a push has less influence. None: least squares.
+        normal: (size,) 1 for entries of z that have a normal prior, else 0.
+    """
+    by_kind, each, counts_and_squares = [], jnp.zeros_like(fit.information), []
+    kinds = zip(
+        Kinds._fields,
+        split_kinds(residual, pushes),
+        split_kinds(jnp.moveaxis(jacobian, 3, 0), pushes),
+        push_weights(pushes),
+        strict=True,
+    )
+    for k, (kind, r, slopes, weight) in enumerate(kinds):
+        count = _final_weights(kind, r, weight, fit.sigma[k], robust)
+        scaled = slopes * (jnp.sqrt(count) / fit.sigma[k])[None, ..., None]
+        by_kind.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
+        each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
+        counts_and_squares.append((jnp.sum(count), jnp.sum(count[..., None] * r**2)))
+    precision = sum(by_kind) + jnp.diag(jnp.maximum(normal, FRICTION_RIDGE))
+    # The trace of a share is the number of parameters that a kind of residual determines; it reduces the degrees of
+    # freedom of the variance. One solve serves all kinds: two batched solves of jaxlib that run at once deadlock
+    # (0.10.1, two cores).
+    shares = jnp.split(jnp.linalg.solve(precision, jnp.concatenate(by_kind, axis=1)), len(NUMBERS), axis=1)
+    new_sigma = [
+        jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(share), 3.0))
+        for numbers, share, (count, squares) in zip(NUMBERS, shares, counts_and_squares, strict=True)
+    ]
+    return _Evidence(precision, each, new_sigma)
 
 
 def fit(
-    setup: Problem,
+    problem: Problem,
     pushes: Pushes,
     start: Array,
     sigma: Array,
     robust: float | None,
-    known: Array,
-    held: FixedEntries,
-    effort,
+    sigma_is_given: Array,
+    fixed: FixedEntries,
+    schedule: Schedule,
 ) -> Fit:
     """Find the most probable z and the standard deviations of the residuals, in alternation.
 
     Args:
-        setup: Everything that stays constant.
+        problem: Everything that stays constant.
         pushes: Pushes with a leading axis of conditions.
         start: (size,) initial z.
         sigma: (3,) initial or known standard deviations of poses (m), of directions of motion, and of gaps (m).
         robust: Number of sigma from which a push has less influence. None: least squares.
-        known: (3,) whether each entry of `sigma` is known.
-        held: Entries of z that are not optimized.
-        effort: A `Schedule`; may be traced.
+        sigma_is_given: (3,) whether each entry of `sigma` is known.
+        fixed: Entries of z that are not optimized.
+        schedule: How long to fit; may be traced.
 
     Returns:
         The result of the last round.
     """
-    flat = jnp.asarray(setup.prior.layout.flat_prior, start.dtype)
-    rounds, last = effort
+    normal = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
+    rounds, last_tolerance = schedule
 
-    def round_(index, before: Fit) -> Fit:
+    def one_round(index, before: Fit) -> Fit:
         sigma = before.sigma
 
         def loss(z):
-            z = held.on(z)
-            local = setup.local(z, pushes)
-            return (whitened(setup.expanded(z, local), pushes, sigma, robust), flat * z), local
+            z = fixed.apply(z)
+            at = problem.linearize(z, pushes)
+            linear = problem.linear_residuals(z, at)
+            return (weighted_residuals(linear, pushes, sigma, robust), normal * z), at
 
-        tolerance = jnp.where(index < rounds - 1, EARLY, last).astype(start.dtype)
+        tolerance = jnp.where(index < rounds - 1, LOOSE_TOLERANCE, last_tolerance).astype(start.dtype)
         found = least_squares(loss, before.z, MAX_STEPS, tolerance)
-        z, residual = held.on(found.z), found.beside.value
-        slopes = setup.slopes(z, found.beside)
-        information, each, left = [], jnp.zeros_like(before.information), []
-        parts = zip(
-            _parts(residual, pushes), _parts(jnp.moveaxis(slopes, 3, 0), pushes), Counts.of(pushes), strict=True
-        )
-        for k, (r, slope, weight) in enumerate(parts):
-            count = _trust(k, r, weight, sigma[k], robust)
-            scaled = slope * (jnp.sqrt(count) / sigma[k])[None, ..., None]
-            information.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
-            each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
-            left.append((jnp.sum(count), jnp.sum(count[..., None] * r**2)))
-        precision = sum(information) + jnp.diag(jnp.maximum(flat, TINY))
-        # The trace of `share` is the number of parameters that a kind of residual determines; it reduces the degrees of
-        # freedom of the variance. One solve serves all kinds: two batched solves of jaxlib that run at once deadlock
-        # (0.10.1, two cores).
-        shares = jnp.linalg.solve(precision, jnp.concatenate(information, axis=1))
-        again = [
-            jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(share), 3.0))
-            for numbers, share, (count, squares) in zip(KINDS, jnp.split(shares, len(KINDS), axis=1), left, strict=True)
-        ]
-        total = jnp.sum(whitened(residual, pushes, sigma, robust) ** 2) + jnp.sum((flat * z) ** 2)
+        z, residual = fixed.apply(found.z), found.auxiliary.value
+        evidence = _evidence(residual, problem.jacobian(z, found.auxiliary), pushes, before, robust, normal)
+        total = jnp.sum(weighted_residuals(residual, pushes, sigma, robust) ** 2) + jnp.sum((normal * z) ** 2)
         steps = before.steps + found.steps
-        measured = jnp.where(known, sigma, jnp.maximum(jnp.stack(again), LEAST))
+        measured = jnp.where(sigma_is_given, sigma, jnp.maximum(jnp.stack(evidence.new_sigma), MIN_SIGMA))
         # the last round keeps the sigma with which it fitted
         sigma = jnp.where(index < rounds - 1, measured, sigma)
-        return Fit(z, sigma, precision, residual, each, total, steps, found.converged)
+        return Fit(z, sigma, evidence.precision, residual, evidence.information, total, steps, found.converged)
 
     many = pushes.weight.shape
-    rows = 3 * len(pushes.rows) + 3 * pushes.wrench.shape[-2] + setup.touching
+    rows = 3 * len(pushes.observed_steps) + 3 * pushes.wrench.shape[-2] + problem.contact_at_end
     size = len(start)
-    precision, residual, information, loss = (
+    precision, residual, information, total = (
         jnp.zeros(shape, start.dtype) for shape in ((size, size), (*many, rows), (*many, size), ())
     )
-    nothing, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    first = Fit(held.on(start), sigma, precision, residual, information, loss, nothing, no)
-    return jax.lax.fori_loop(0, rounds, round_, first)
+    no_steps, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    first = Fit(fixed.apply(start), sigma, precision, residual, information, total, no_steps, no)
+    return jax.lax.fori_loop(0, rounds, one_round, first)
 
 
 @quick_jit
 def compiled_fit(
-    setup: Problem, pushes: Pushes, start, sigma, known, held: FixedEntries, effort: Schedule, *, robust: float | None
+    problem: Problem,
+    pushes: Pushes,
+    start,
+    sigma,
+    sigma_is_given,
+    fixed: FixedEntries,
+    schedule: Schedule,
+    *,
+    robust: float | None,
 ) -> Fit:
     """Run `fit` as the one compiled program that all callers share."""
-    return fit(setup, pushes, start, sigma, robust, known, held, effort)
+    return fit(problem, pushes, start, sigma, robust, sigma_is_given, fixed, schedule)
 
 
 class Minimum(NamedTuple):
@@ -229,13 +282,13 @@ class Minimum(NamedTuple):
 
     Attributes:
         z: Minimizer.
-        beside: Auxiliary output of the residual function at z.
+        auxiliary: Auxiliary output of the residual function at z.
         steps: Number of steps.
         converged: Whether the method converged.
     """
 
     z: Float[Array, "size"]
-    beside: Any
+    auxiliary: Any
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 

@@ -16,8 +16,9 @@ from pushjax.friction.table import Table
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2 import compose, inverse, transform
 from pushjax.geometry.shape import Shape
+from pushjax.identification.prior import Prior
 from pushjax.identification.pushes import Pushes, PushInput
-from pushjax.identification.unknowns import TABLE, Parameters, Prior
+from pushjax.identification.unknowns import TABLE, Parameters
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.path import arc_length, interpolate_arc_length
 from pushjax.simulation.rollout import rollout
@@ -36,7 +37,7 @@ class Problem(eqx.Module):
         surface: Limit surface of each condition, with a leading axis of conditions. The fit replaces its coefficients.
         prior: Prior of the unknowns.
         length: Length of the metric, m.
-        touching: Whether the gap at the end of every push is a residual.
+        contact_at_end: Whether the gap at the end of every push is a residual.
     """
 
     shape: Shape
@@ -44,19 +45,20 @@ class Problem(eqx.Module):
     surface: LimitSurface
     prior: Prior
     length: Float[Array, ""]
-    touching: bool = eqx.field(static=True, default=False)
+    contact_at_end: bool = eqx.field(static=True, default=False)
 
     def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes rows"]:
         """Return the residuals of all pushes, predicted less measured.
 
         The rows are, in this order: the poses (x, y, length * theta, in m), divided by the root of the number of poses;
-        the directions of motion under the wrenches, divided by the root of the number of pairs; and, with `touching`,
-        the gap in m between the finger and the slider as it was measured at the end.
+        the directions of motion under the wrenches, divided by the root of the number of pairs; and, with
+        `contact_at_end`, the gap in m between the finger and the slider as it was measured at the end.
         """
-        varied, rest = self._split(z)
-        return jnp.concatenate([each[0] for each in self._kinds(lambda f: f, varied, rest, pushes)], axis=-1)
+        free, parameters = self._free(z)
+        blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
+        return jnp.concatenate([block[0] for block in blocks], axis=-1)
 
-    def local(self, z: Float[Array, "size"], pushes: Pushes) -> "Local":
+    def linearize(self, z: Float[Array, "size"], pushes: Pushes) -> "Linearized":
         """Return residuals and their Jacobian with respect to the parameters of each push's own condition.
 
         These are some twenty numbers, whatever the size of z. The result is constant in every derivative: gradients do
@@ -65,78 +67,82 @@ class Problem(eqx.Module):
         The Jacobian uses forward mode, also for the fifteen coefficients of a quartic. This takes half the run time and
         half the compilation time of three reverse sweeps.
         """
-        varied, rest = self._split(jax.lax.stop_gradient(z))
-        kinds = self._kinds(lambda f: jax.jacfwd(f, has_aux=True), varied, rest, pushes)
-        slopes, value = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=2), *kinds)
-        return Local(value, slopes, varied)
+        free, parameters = self._free(jax.lax.stop_gradient(z))
+        blocks = self._residual_blocks(lambda f: jax.jacfwd(f, has_aux=True), free, parameters, pushes)
+        jacobian, value = jax.tree.map(lambda *kinds: jnp.concatenate(kinds, axis=2), *blocks)
+        return Linearized(value, jacobian, free)
 
-    def _kinds(self, of: Callable, varied: dict[str, Array], rest: Parameters, pushes: Pushes) -> list:
+    def _residual_blocks(
+        self, transform: Callable, free: dict[str, Array], parameters: Parameters, pushes: Pushes
+    ) -> list:
         """Evaluate each kind of residual over all conditions and pushes.
 
         Args:
-            of: Transformation (the identity or `jacfwd`) applied to functions that return the pair (residual,
+            transform: Transformation (the identity or `jacfwd`) applied to functions that return the pair (residual,
                 residual).
-            varied: Parameters to differentiate with respect to, with a leading axis of conditions.
-            rest: All parameters; `varied` replaces some of them.
+            free: Parameters to differentiate with respect to, with a leading axis of conditions.
+            parameters: All parameters; `free` replaces some of them.
             pushes: Pushes with a leading axis of conditions.
         """
-        rows = tuple(pushes.rows.tolist())
-        fixed = (Scene(self.shape, self.hand, self.prior.origin), self.length)
-        own = _Own(self.surface, pushes.given, pushes.poses)
+        steps = tuple(pushes.observed_steps.tolist())
+        constants = (Scene(self.shape, self.hand, self.prior.origin), self.length)
+        data = _PushData(self.surface, pushes.inputs, pushes.poses)
 
-        def off(varied, rest, own, fixed):
-            return _off(varied, rest, own, fixed, rows)
+        def pose_residual(free, parameters, data, constants):
+            return _pose_residual(free, parameters, data, constants, steps)
 
-        kinds = [_each(of(off), varied, rest, own, fixed)]
+        blocks = [_over_pushes(transform(pose_residual), free, parameters, data, constants)]
         if pushes.wrench.shape[-2]:
-            pairs = _Pairs(self.surface, pushes.wrench, pushes.twist, pushes.paired)
-            kinds.append(_each(of(_astray), varied, rest, pairs, ()))
-        if self.touching:
-            kinds.append(_each(of(_gap), varied, rest, own, fixed))
-        return kinds
+            pairs = _WrenchMotionPairs(self.surface, pushes.wrench, pushes.twist, pushes.has_pair)
+            blocks.append(_over_pushes(transform(_direction_residual), free, parameters, pairs, ()))
+        if self.contact_at_end:
+            blocks.append(_over_pushes(transform(_gap_residual), free, parameters, data, constants))
+        return blocks
 
-    def expanded(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes rows"]:
-        """Return the residuals to first order about the point where `local` was evaluated.
+    def linear_residuals(self, z: Float[Array, "size"], at: "Linearized") -> Float[Array, "conditions pushes rows"]:
+        """Return the residuals to first order about the point where `at` was evaluated.
 
         At that point the values and the derivatives with respect to z are exact, and they cost matrix products only.
         """
-        varied, _ = self._split(z)
+        free, _ = self._free(z)
 
-        def along(name: str) -> Array:
+        def change(name: str) -> Array:
             """Return the change due to `name`.
 
-            It is the product of slopes (conditions, pushes, rows, *own shape) and differences (conditions, *own shape).
+            It is the product of the Jacobian (conditions, pushes, rows, ...) and the difference (conditions, ...).
             """
-            off = varied[name] - local.varied[name]
+            difference = free[name] - at.free[name]
             return jnp.einsum(
-                "cnri,ci->cnr", local.slopes[name].reshape(*local.value.shape, -1), off.reshape(len(off), -1)
+                "cnri,ci->cnr",
+                at.jacobian[name].reshape(*at.value.shape, -1),
+                difference.reshape(len(difference), -1),
             )
 
-        return local.value + jnp.sum(jnp.stack([along(name) for name in varied]), axis=0)
+        return at.value + jnp.sum(jnp.stack([change(name) for name in free]), axis=0)
 
-    def slopes(self, z: Float[Array, "size"], local: "Local") -> Float[Array, "conditions pushes rows size"]:
+    def jacobian(self, z: Float[Array, "size"], at: "Linearized") -> Float[Array, "conditions pushes rows size"]:
         """Return the Jacobian of the residuals with respect to z."""
-        return jax.jacfwd(lambda z: self.expanded(z, local))(z)
+        return jax.jacfwd(lambda z: self.linear_residuals(z, at))(z)
 
-    def _split(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
-        """Return the parameters that are varied, by name, and all parameters that pushes depend on."""
-        theta = self.prior.physical(z)
-        free = {"surface" if name == "center" else name for name in self.prior.layout.names}
-        return {name: value for name, value in theta._asdict().items() if name in free}, theta
+    def _free(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
+        """Return the parameters that are estimated, by name, and all parameters that pushes depend on."""
+        parameters = self.prior.parameters(z)
+        free = {"surface" if name == "pressure_center" else name for name in self.prior.layout.names}
+        return {name: value for name, value in parameters._asdict().items() if name in free}, parameters
 
 
-class Local(NamedTuple):
+class Linearized(NamedTuple):
     """Residuals and their Jacobian at one point.
 
     Attributes:
         value: (conditions, pushes, rows) residuals.
-        slopes: Derivatives (conditions, pushes, rows, ...) with respect to each entry of `varied`.
-        varied: Parameters (conditions, ...) by name, at that point.
+        jacobian: Derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`.
+        free: Parameters (conditions, ...) by name, at that point.
     """
 
     value: Float[Array, "conditions pushes rows"]
-    slopes: dict[str, Array]
-    varied: dict[str, Array]
+    jacobian: dict[str, Array]
+    free: dict[str, Array]
 
 
 class Scene(NamedTuple):
@@ -153,88 +159,104 @@ class Scene(NamedTuple):
     origin: Float[Array, "2"]
 
 
-def trajectories(theta: Parameters, surface: LimitSurface, body: Scene, pushes: Pushes) -> Trajectory:
+def predict_pushes(parameters: Parameters, surface: LimitSurface, scene: Scene, pushes: Pushes) -> Trajectory:
     """Predict pushes.
 
     Args:
-        theta: Parameters, with a leading axis of conditions.
+        parameters: Parameters, with a leading axis of conditions.
         surface: Limit surfaces, with a leading axis of conditions.
-        body: Slider and hand.
+        scene: Slider and hand.
         pushes: Pushes with a leading axis of conditions.
 
     Returns:
         Trajectories with leading axes (conditions, pushes).
     """
-    over_pushes = jax.vmap(push, in_axes=(None, None, None, 0))
+    over_pushes = jax.vmap(predict_push, in_axes=(None, None, None, 0))
     over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0))
-    return over_all(theta, surface, body, pushes.given)
+    return over_all(parameters, surface, scene, pushes.inputs)
 
 
-class _Own(NamedTuple):
-    """Data of one push; the surface is that of its condition."""
+class _PushData(NamedTuple):
+    """What was recorded of one push; the surface is that of its condition."""
 
     surface: LimitSurface
-    given: PushInput
+    inputs: PushInput
     poses: Array
 
 
-class _Pairs(NamedTuple):
+class _WrenchMotionPairs(NamedTuple):
     """Wrenches and motions of one push, and where they exist; the surface is that of its condition."""
 
     surface: LimitSurface
     wrench: Array
     twist: Array
-    there: Array
+    valid: Array
 
 
-def _off(varied: dict[str, Array], rest: Parameters, own: _Own, fixed: tuple[Scene, Array], rows: tuple[int, ...]):
+def _pose_residual(
+    free: dict[str, Array],
+    parameters: Parameters,
+    data: _PushData,
+    constants: tuple[Scene, Array],
+    steps: tuple[int, ...],
+):
     """Return the pose residuals of one push, twice (value and auxiliary)."""
-    body, length = fixed
-    predicted = push(rest._replace(**varied), own.surface, body, own.given)
-    off = predicted.pose[np.array(rows)] - own.poses
-    residual = off.at[:, 2].mul(length).reshape(-1) / float(np.sqrt(len(rows)))
+    scene, length = constants
+    predicted = predict_push(parameters._replace(**free), data.surface, scene, data.inputs)
+    difference = predicted.pose[np.array(steps)] - data.poses
+    residual = difference.at[:, 2].mul(length).reshape(-1) / float(np.sqrt(len(steps)))
     return residual, residual
 
 
-def _gap(varied: dict[str, Array], rest: Parameters, own: _Own, fixed: tuple[Scene, Array]):
+def _gap_residual(
+    free: dict[str, Array], parameters: Parameters, data: _PushData, constants: tuple[Scene, Array]
+) -> tuple[Array, Array]:
     """Return the gap between the finger and the slider at its measured final pose, twice (value and auxiliary)."""
-    theta, body = rest._replace(**varied), fixed[0]
-    shape, hand = apply_inset(body.shape, body.hand, theta.inset)
-    end = own.poses[-1] if theta.marker is None else compose(own.poses[-1], theta.marker)
-    tip = correct_path(own.given.path, theta.end, theta.lag, theta.offset)[-1]
-    distance, _, radius = nearest(shape, hand, end, tip)
+    parameters, scene = parameters._replace(**free), constants[0]
+    shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
+    offset, end = parameters.frame_offset, data.poses[-1]
+    end = end if offset is None else compose(end, offset)
+    path = correct_path(data.inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
+    distance, _, radius = finger_clearance(shape, hand, end, path[-1])
     residual = (distance - radius)[None]
     return residual, residual
 
 
-def _astray(varied: dict[str, Array], rest: Parameters, own: _Pairs, fixed: tuple[()]):
+def _direction_residual(
+    free: dict[str, Array], parameters: Parameters, pairs: _WrenchMotionPairs, constants: tuple[()]
+) -> tuple[Array, Array]:
     """Return the direction residuals of one push, twice (value and auxiliary).
 
     Directions are unit vectors along (vx, vy, length * omega). So wrenches may have any scale, and motions any size.
     """
-    theta = rest._replace(**varied)
-    surface = with_coefficients(own.surface, theta.surface)
+    parameters = parameters._replace(**free)
+    surface = with_coefficients(pairs.surface, parameters.surface)
     metric = jnp.stack([jnp.ones_like(surface.length)] * 2 + [surface.length])
 
     def direction(v: Array) -> Array:
         squared = jnp.sum(v**2, axis=-1, keepdims=True)
         return jnp.where(squared > 0, v / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
-    there = own.there
-    wrench = jnp.where(there[:, None], direction(own.wrench / metric[None]), 1.0)
+    valid = pairs.valid
+    wrench = jnp.where(valid[:, None], direction(pairs.wrench / metric[None]), 1.0)
     predicted = jax.vmap(surface.twist)(wrench * metric[None])
-    astray = direction(predicted * metric[None]) - direction(own.twist * metric[None])
-    residual = jnp.where(there[:, None], astray, 0.0).reshape(-1)
-    residual = residual / jnp.sqrt(jnp.maximum(jnp.sum(there), 1).astype(residual.dtype))
+    difference = direction(predicted * metric[None]) - direction(pairs.twist * metric[None])
+    residual = jnp.where(valid[:, None], difference, 0.0).reshape(-1)
+    residual = residual / jnp.sqrt(jnp.maximum(jnp.sum(valid), 1).astype(residual.dtype))
     return residual, residual
 
 
-def _each(function: Callable, varied: dict[str, Array], rest: Parameters, own: "_Own | _Pairs", fixed: tuple):
-    # the pushes of a condition share its surface
-    """Map `function` over conditions and pushes."""
-    each: Any = own._replace(**{name: None if name == "surface" else 0 for name in own._fields})
-    over_pushes = jax.vmap(function, in_axes=(None, None, each, None))
-    return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(varied, rest, own, fixed)
+def _over_pushes(
+    function: Callable,
+    free: dict[str, Array],
+    parameters: Parameters,
+    data: "_PushData | _WrenchMotionPairs",
+    constants: tuple,
+):
+    """Map `function` over conditions and pushes. The pushes of a condition share its surface."""
+    axes: Any = data._replace(**{name: None if name == "surface" else 0 for name in data._fields})
+    over_pushes = jax.vmap(function, in_axes=(None, None, axes, None))
+    return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(free, parameters, data, constants)
 
 
 def coefficients_of(surface: LimitSurface) -> Array:
@@ -247,47 +269,46 @@ def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurfac
     return eqx.tree_at(coefficients_of, surface, coefficients)
 
 
-def push(theta: Parameters, surface: LimitSurface, body: Scene, given: PushInput) -> Trajectory:
+def predict_push(parameters: Parameters, surface: LimitSurface, scene: Scene, inputs: PushInput) -> Trajectory:
     """Predict one push, with the poses that the tracker reports.
 
     Args:
-        theta: Parameters of the push's condition.
-        surface: Limit surface; `theta` replaces its coefficients.
-        body: Slider and hand.
-        given: Recorded start, path, age and side of the push.
+        parameters: Parameters of the push's condition.
+        surface: Limit surface; `parameters` replaces its coefficients.
+        scene: Slider and hand.
+        inputs: Recorded start, path, age and side of the push.
 
     Returns:
-        The trajectory. Its poses are those of the tracked frame, also if `theta.marker` is not zero.
+        The trajectory. Its poses are those of the tracked frame, also if `parameters.frame_offset` is not zero.
     """
-    shape, hand = apply_inset(body.shape, body.hand, theta.inset)
-    slider = Slider(shape, with_coefficients(surface, theta.surface))
-    path = correct_path(given.path, theta.end, theta.lag, theta.offset)
-    start = given.start if theta.marker is None else compose(given.start, theta.marker)
-    if theta.overlap is not None:
-        path = path.at[:, :2].add(theta.overlap * apart(slider, hand, start, path[0])[None])
-    mu = theta.friction
-    if theta.drift is not None:
-        mu = mu * jnp.exp(theta.drift * given.age)
-    if theta.side is not None:
-        mu = mu * jnp.exp(theta.side[jnp.clip(given.side.astype(int), 0, len(theta.side) - 1)])
-    table = None
-    if not (theta.grain is None and theta.slope is None and theta.curvature is None):
-        known = {name: getattr(theta, name) for name in TABLE if getattr(theta, name) is not None}
-        table = Table(**known, origin=body.origin)
+    shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
+    slider = Slider(shape, with_coefficients(surface, parameters.surface))
+    path = correct_path(inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
+    offset = parameters.frame_offset
+    start = inputs.start if offset is None else compose(inputs.start, offset)
+    if parameters.overlap is not None:
+        path = path.at[:, :2].add(parameters.overlap * overlap_vector(slider, hand, start, path[0])[None])
+    mu = parameters.friction
+    if parameters.friction_drift is not None:
+        mu = mu * jnp.exp(parameters.friction_drift * inputs.age)
+    by_side = parameters.friction_by_side
+    if by_side is not None:
+        mu = mu * jnp.exp(by_side[jnp.clip(inputs.side.astype(int), 0, len(by_side) - 1)])
+    uneven = {name: getattr(parameters, name) for name in TABLE if getattr(parameters, name) is not None}
+    table = Table(**uneven, origin=scene.origin) if uneven else None
     pushed = rollout(slider, hand, path, pose=start, friction=mu, table=table)
-    if theta.marker is None:
+    if offset is None:
         return pushed
-    seen = compose(pushed.pose, inverse(theta.marker)[None])
-    return eqx.tree_at(lambda p: p.pose, pushed, seen)
+    return eqx.tree_at(lambda p: p.pose, pushed, compose(pushed.pose, inverse(offset)[None]))
 
 
-def apart(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
+def overlap_vector(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
     """Return the shortest displacement (world, m) that separates a round finger from the slider it penetrates."""
-    distance, normal, radius = nearest(slider.shape, hand, start, configuration)
+    distance, normal, radius = finger_clearance(slider.shape, hand, start, configuration)
     return jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)
 
 
-def nearest(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
+def finger_clearance(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
     """Find the place of the outline that is nearest to the center of a single round finger.
 
     Returns:
@@ -314,37 +335,37 @@ def apply_inset(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
     return shape, eqx.tree_at(lambda h: h.fingers, hand, fingers)
 
 
-def correct_path(path: Array, end: Array, lag: Array, offset: Array) -> Array:
+def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset: Array) -> Array:
     """Return the true path of the hand, from the logged one.
 
-    The configurations are those of the logged path at the arc lengths s (1 + end / whole) - lag, shifted by `offset`.
-    Beyond an end of the path it goes straight on. Its direction there is that of a fifth of the path, because local
-    directions of a recording are mostly roundoff.
+    The configurations are those of the logged path at the arc lengths s (1 + overshoot / length) - lag_distance,
+    shifted by `hand_offset`. Beyond an end of the path it goes straight on. Its direction there is that of a fifth of
+    the path, because local directions of a recording are mostly roundoff.
 
     Args:
         path: (steps + 1, dof) logged path.
-        end: Distance in m that the hand went on after the end of its path.
-        lag: Distance in m by which the hand was behind its logged position.
-        offset: (2,) displacement of the hand, world, m.
+        overshoot: Distance in m that the hand went on after the end of its path.
+        lag_distance: Distance in m by which the hand was behind its logged position.
+        hand_offset: (2,) displacement of the hand, world, m.
     """
     arc = arc_length(path[:, :2])
-    whole = arc[-1]
-    at = arc * (1 + end / jnp.where(whole > 0, whole, 1.0)) - lag
-    there = interpolate_arc_length(path, arc, jnp.clip(at, 0, whole))
+    length = arc[-1]
+    at = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
+    corrected = interpolate_arc_length(path, arc, jnp.clip(at, 0, length))
     part = max(len(path) // STRAIGHT, 1)
-    beyond, before = jnp.maximum(at - whole, 0), jnp.minimum(at, 0)
-    there = there + beyond[:, None] * _slope(path, arc, -1 - part, -1)[None]
-    there = there + before[:, None] * _slope(path, arc, 0, part)[None]
-    return there.at[:, :2].add(offset[None])
+    beyond, before = jnp.maximum(at - length, 0), jnp.minimum(at, 0)
+    corrected = corrected + beyond[:, None] * _change_per_length(path, arc, -1 - part, -1)[None]
+    corrected = corrected + before[:, None] * _change_per_length(path, arc, 0, part)[None]
+    return corrected.at[:, :2].add(hand_offset[None])
 
 
-def _slope(path: Array, arc: Array, one: int, other: int) -> Float[Array, "dof"]:
+def _change_per_length(path: Array, arc: Array, first: int, last: int) -> Float[Array, "dof"]:
     """Return the change of configuration per arc length between two rows; zero if their arc lengths are equal."""
-    apart = arc[other] - arc[one]
-    return jnp.where(apart > 0, (path[other] - path[one]) / jnp.where(apart > 0, apart, 1.0), 0.0)
+    length = arc[last] - arc[first]
+    return jnp.where(length > 0, (path[last] - path[first]) / jnp.where(length > 0, length, 1.0), 0.0)
 
 
-def surfaces(prior: Prior, theta: Parameters) -> LimitSurface:
+def limit_surfaces(prior: Prior, parameters: Parameters) -> LimitSurface:
     """Return the limit surfaces of all conditions, with a leading axis of conditions."""
-    kind = Quartic if prior.mean.lower.shape[1] > 1 else Ellipsoid
-    return jax.vmap(kind)(theta.surface, prior.mean.length)
+    kind = Quartic if prior.mean_surface.factors.shape[1] > 1 else Ellipsoid
+    return jax.vmap(kind)(parameters.surface, prior.mean_surface.length)

@@ -1,13 +1,14 @@
 """Identification of noise: how much pushes scatter about their prediction.
 
-In the model of the noise, each push has its own limit surface, sampled about the identified one with `dof` degrees of
-freedom. It has its own friction, uniform about the identified one, up to `spread` away from it. Its hand is displaced
-by `offset` in x and in y. Its final pose has an error in x, y and length * theta, whose scale combines three parts in
-quadrature: the measurement error `sigma`; a fraction `relative[0]` of the distance between the slider's start and end;
-and a fraction `relative[1]` of length times the angle that it turned. So a push that hardly moves the slider is
-predicted far better than one that turns it around. All of these errors are normal except for a common random factor, so
-together they have Student's distribution with `tails` degrees of freedom. The tails describe pushes that slip where no
-model predicts it. These are few, but more than a normal distribution would have.
+In the model of the noise, each push has its own limit surface, sampled about the identified one with `surface_dof`
+degrees of freedom. It has its own friction, uniform about the identified one, up to half the width of `friction` away
+from it. Its hand is displaced by `hand_offset` in x and in y. Its final pose has an error in x, y and length * theta,
+whose scale combines three parts in quadrature: the measurement error `sigma`; a fraction `relative_error[0]` of the
+distance between the slider's start and end; and a fraction `relative_error[1]` of length times the angle that it
+turned. So a push that hardly moves the slider is predicted far better than one that turns it around. All of these
+errors are normal except for a common random factor, so together they have Student's distribution with `student_dof`
+degrees of freedom. Its tails describe pushes that slip where no model predicts it. These are few, but more than a
+normal distribution would have.
 
 The search minimizes the mean score of the recorded final poses. The score is proper: in expectation, no other noise
 scores better than the true one. The expectation of "energy" does not depend on the number of samples of a push, and
@@ -51,59 +52,66 @@ from pushjax.simulation.slider import Slider
 
 Score = Literal["energy", "density"]
 FORMAT, VERSION = "pushjax noise", 1
-ARRAYS = ("dof", "friction", "offset", "sigma", "relative", "tails", "score", "history")
+ARRAYS = ("surface_dof", "friction", "hand_offset", "sigma", "relative_error", "student_dof", "score", "history")
 SAMPLES = 32  # samples of each push in each step of the search
 STEPS = 80
 CHUNK = 10  # steps between two calls of `progress`
-RATE, LAST = 0.1, 0.1  # learning rate of the logarithms, and the fraction of it that is left at the end
+LEARNING_RATE = 0.1  # of the logarithms of the parameters
+FINAL_RATE = 0.1  # fraction of the learning rate that is left at the end
 AVERAGED = 30  # number of last steps whose parameters and scores are averaged
-START = {"dof": 60.0, "spread": 0.1, "offset": 5e-4, "relative": (0.05, 0.05), "tails": 6.0}
-LEAST_DOF, LEAST_TAILS = 9.0, 1.0
+START = {
+    "surface_dof": 60.0,
+    "friction_half_width": 0.1,
+    "hand_offset": 5e-4,
+    "relative_error": (0.05, 0.05),
+    "student_dof": 6.0,
+}
+LOWER_BOUNDS = {"surface_dof": 9.0, "student_dof": 1.0}
 
 
 class Noise(eqx.Module):
     """Distribution of pushes about their prediction.
 
     Attributes:
-        found: What `identify` returned.
-        dof: Degrees of freedom of the limit surface.
+        identified: What `identify` returned.
+        surface_dof: Degrees of freedom of the limit surface.
         friction: (..., 2) range on which mu is uniform, for each condition.
-        offset: Scale in m of the hand's displacement against the slider, in x and in y, which differs from push to
+        hand_offset: Scale in m of the hand's displacement against the slider, in x and in y, which differs from push to
             push.
         sigma: Scale in m of the error of a final pose in x, y and length * theta, however far the slider moved.
-        relative: (2,) scale of the additional error per distance that the slider moved, and per length * angle that it
-            turned.
-        tails: Degrees of freedom of Student's distribution of all of these errors.
+        relative_error: (2,) scale of the additional error per distance that the slider moved, and per length * angle
+            that it turned.
+        student_dof: Degrees of freedom of Student's distribution of all of these errors.
         score: Mean score of the final poses at the end of the search (energy: m).
         history: (steps,) mean score during the search.
         sampler: Sampler of the limit surfaces; see `FrictionModel`.
     """
 
-    found: Identified
-    dof: Float[Array, ""]
+    identified: Identified
+    surface_dof: Float[Array, ""]
     friction: Float[Array, "*conditions 2"]
-    offset: Float[Array, ""]
+    hand_offset: Float[Array, ""]
     sigma: Float[Array, ""]
-    relative: Float[Array, "2"]
-    tails: Float[Array, ""]
+    relative_error: Float[Array, "2"]
+    student_dof: Float[Array, ""]
     score: Float[Array, ""]
     history: Float[Array, "steps"]
     sampler: Sampler = eqx.field(static=True)
 
     @property
     def model(self) -> FrictionModel:
-        """Friction model for rollouts and `monte_carlo` around `found.surface`.
+        """Friction model for rollouts and `monte_carlo` around `identified.surface`.
 
         Raises:
             ValueError: If several conditions were identified.
         """
-        if not self.found.single:
+        if not self.identified.one_condition:
             raise ValueError("model is for what was found of one condition; of several there is `predict`")
-        return FrictionModel(self.dof, self.friction, self.sampler)
+        return FrictionModel(self.surface_dof, self.friction, self.sampler)
 
     def save(self, path: str | Path) -> None:
         """Write everything to a JSON file that `load` reads back to the same bits."""
-        record = {"sampler": self.sampler, "found": to_record(self.found)}
+        record = {"sampler": self.sampler, "identified": to_record(self.identified)}
         record |= {name: to_list(getattr(self, name)) for name in ARRAYS}
         save_json(path, FORMAT, VERSION, self.score.dtype, record)
 
@@ -131,9 +139,9 @@ class Noise(eqx.Module):
         Returns:
             (..., pushes, n, 3) final poses, world, m and rad.
         """
-        predictive = PredictiveModel.of(self.found, pushes, slider, hand, self.sampler)
-        drawn = predict(key, predictive, self._values, n)
-        return drawn[0] if self.found.single else drawn
+        predictive = PredictiveModel.of(self.identified, pushes, slider, hand, self.sampler)
+        drawn = predict(key, predictive, self._parameters, n)
+        return drawn[0] if self.identified.one_condition else drawn
 
     def log_density(
         self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
@@ -153,27 +161,29 @@ class Noise(eqx.Module):
         Returns:
             (..., pushes) log density per cubic meter of (x, y, length * theta).
         """
-        predictive = PredictiveModel.of(self.found, pushes, slider, hand, self.sampler)
-        density = log_density(key, predictive, self._values, n)
-        return density[0] if self.found.single else density
+        predictive = PredictiveModel.of(self.identified, pushes, slider, hand, self.sampler)
+        density = log_density(key, predictive, self._parameters, n)
+        return density[0] if self.identified.one_condition else density
 
-    def about(self, found: Identified) -> "Noise":
+    def transferred_to(self, identified: Identified) -> "Noise":
         """Return the same noise about an estimate from other pushes.
 
         Args:
-            found: The other estimate, of one condition or of several.
+            identified: The other estimate, of one condition or of several.
 
         Returns:
             The noise. If the range of friction differs between conditions, it has the widest range.
         """
-        spread = jnp.max(self.friction[..., 1] - self.found.friction)
-        friction = jnp.stack([jnp.maximum(found.friction - spread, 0), found.friction + spread], axis=-1)
-        return eqx.tree_at(lambda noise: (noise.found, noise.friction), self, (found, friction))
+        center, half_width = identified.friction, jnp.max(self.friction[..., 1] - self.identified.friction)
+        friction = jnp.stack([jnp.maximum(center - half_width, 0), center + half_width], axis=-1)
+        return eqx.tree_at(lambda noise: (noise.identified, noise.friction), self, (identified, friction))
 
     @property
-    def _values(self) -> NoiseParameters:
-        friction = self.friction[None] if self.found.single else self.friction
-        return NoiseParameters(self.dof, friction, self.offset, self.sigma, self.relative, self.tails)
+    def _parameters(self) -> NoiseParameters:
+        friction = self.friction[None] if self.identified.one_condition else self.friction
+        return NoiseParameters(
+            self.surface_dof, friction, self.hand_offset, self.sigma, self.relative_error, self.student_dof
+        )
 
 
 def identify_noise(
@@ -222,110 +232,116 @@ def identify_noise(
         raise ValueError(f"samples must be at least 2; got {samples}")
     check_positive("steps", steps)
     predictive = PredictiveModel.of(found, pushes, slider, hand, sampler)
-    scatter = _first(found)
-    state, values, visited = _rule(steps).init(scatter), [], []
+    log_noise = _first(found)
+    state, scores, visited = _optimizer(steps).init(log_noise), [], []
     keys = jax.random.split(key, steps)
     for begin in range(0, steps, CHUNK):
         part = keys[begin : begin + CHUNK]
-        scatter, state, each, passed = _descend(scatter, state, part, predictive, samples, steps, score)
-        values.append(each)
+        log_noise, state, each, passed = _descend(log_noise, state, part, predictive, samples, steps, score)
+        scores.append(each)
         visited.append(passed)
         progress(begin + len(part), steps)
-    history = jnp.concatenate(values)
+    history = jnp.concatenate(scores)
     passed = jax.tree.map(lambda *parts: jnp.concatenate(parts), *visited)
     last = min(AVERAGED, steps)
-    best = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), passed).values(predictive.theta.friction)
-    if found.single:
+    mean = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), passed)
+    best = mean.parameters(predictive.parameters.friction)
+    if found.one_condition:
         best = best._replace(friction=best.friction[0])
     return Noise(found, score=jnp.mean(history[-last:]), history=history, sampler=sampler, **best._asdict())
 
 
-def _rule(steps: int) -> optax.GradientTransformation:
+def _optimizer(steps: int) -> optax.GradientTransformation:
     """Return the optimizer: Adam with a cosine decay of the learning rate."""
-    return optax.adam(optax.cosine_decay_schedule(RATE, steps, LAST))
+    return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps, FINAL_RATE))
 
 
-class _Scatter(NamedTuple):
+class _LogNoise(NamedTuple):
     """The parameters that are optimized, as unbounded numbers (logarithms of the distance to the lower bound)."""
 
-    dof: Float[Array, ""]
-    spread: Float[Array, ""]
-    offset: Float[Array, ""]
+    surface_dof: Float[Array, ""]
+    friction_half_width: Float[Array, ""]
+    hand_offset: Float[Array, ""]
     sigma: Float[Array, ""]
-    relative: Float[Array, "2"]
-    tails: Float[Array, ""]
+    relative_error: Float[Array, "2"]
+    student_dof: Float[Array, ""]
 
-    def values(self, center: Float[Array, "conditions"]) -> NoiseParameters:
+    def parameters(self, center: Float[Array, "conditions"]) -> NoiseParameters:
         """Return the parameters of the noise; `center` is the identified friction of each condition."""
-        spread = jnp.exp(self.spread)
-        friction = jnp.stack([jnp.maximum(center - spread, 0), center + spread], axis=-1)
-        dof, tails = LEAST_DOF + jnp.exp(self.dof), LEAST_TAILS + jnp.exp(self.tails)
-        return NoiseParameters(dof, friction, jnp.exp(self.offset), jnp.exp(self.sigma), jnp.exp(self.relative), tails)
+        half_width = jnp.exp(self.friction_half_width)
+        values = {
+            name: LOWER_BOUNDS[name] + jnp.exp(value) if name in LOWER_BOUNDS else jnp.exp(value)
+            for name, value in self._asdict().items()
+            if name != "friction_half_width"
+        }
+        return NoiseParameters(
+            friction=jnp.stack([jnp.maximum(center - half_width, 0), center + half_width], axis=-1), **values
+        )
 
 
-def _first(found: Identified) -> _Scatter:
+def _first(found: Identified) -> _LogNoise:
     """Return the initial parameters."""
-    least = {"dof": LEAST_DOF, "tails": LEAST_TAILS}
-    first = {name: jnp.asarray(value, found.z.dtype) - least.get(name, 0.0) for name, value in START.items()}
-    return _Scatter(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
+    first = {name: jnp.asarray(value, found.z.dtype) - LOWER_BOUNDS.get(name, 0.0) for name, value in START.items()}
+    return _LogNoise(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
 
 
 @jit
-def _descend(scatter, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
+def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
     """Take one optimizer step per key; return the state, and the scores and parameters of all steps."""
-    rule = _rule(steps)
+    optimizer = _optimizer(steps)
 
     def step(carry, key):
-        scatter, state = carry
-        value, slope = _score(scatter, key, predictive, samples, score)
-        updates, state = rule.update(slope, state)
-        scatter = optax.apply_updates(scatter, updates)
-        return (scatter, state), (value, scatter)
+        log_noise, state = carry
+        value, gradient = _score(log_noise, key, predictive, samples, score)
+        updates, state = optimizer.update(gradient, state)
+        log_noise = optax.apply_updates(log_noise, updates)
+        return (log_noise, state), (value, log_noise)
 
-    (scatter, state), (values, passed) = jax.lax.scan(step, (scatter, state), keys)
-    return scatter, state, values, passed
+    (log_noise, state), (scores, passed) = jax.lax.scan(step, (log_noise, state), keys)
+    return log_noise, state, scores, passed
 
 
 def _score(
-    scatter: _Scatter, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
-) -> tuple[Array, _Scatter]:
+    log_noise: _LogNoise, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
+) -> tuple[Array, _LogNoise]:
     """Return the mean score and its derivative.
 
     A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
     forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
     """
 
-    def local(
-        drawing: ConditionSampler, key: PRNGKeyArray, values: NoiseParameters
+    def linearize(
+        condition: ConditionSampler, key: PRNGKeyArray, parameters: NoiseParameters
     ) -> tuple[RandomInputs, tuple[Array, PoseJacobian]]:
-        chances = drawing.chances(key, samples)
-        return chances, drawing.slopes(chances, values)
+        inputs = condition.draw_inputs(key, samples)
+        return inputs, condition.linearize(inputs, parameters)
 
-    center, pushes = predictive.theta.friction, predictive.pushes
-    start = scatter.values(center)
-    chances, (poses, slopes) = predictive.over_conditions(local, key, start)
-    before = jax.lax.stop_gradient(start.own(chances))
+    center, pushes = predictive.parameters.friction, predictive.pushes
+    start = log_noise.parameters(center)
+    inputs, (poses, jacobian) = predictive.over_conditions(linearize, key, start)
+    before = jax.lax.stop_gradient(start.per_sample(inputs))
 
-    def mean(scatter: _Scatter) -> Array:
-        values = scatter.values(center)
-        dof, mu = ((now - then)[..., None] for now, then in zip(values.own(chances), before, strict=True))
-        errors = chances.errors(values.tails)
-        there = poses + slopes.dof * dof + slopes.mu * mu
-        aside = values.offset * jnp.einsum("...ij,...j->...i", slopes.aside, errors[..., :2])
+    def mean(log_noise: _LogNoise) -> Array:
+        parameters = log_noise.parameters(center)
+        changes = zip(parameters.per_sample(inputs), before, strict=True)
+        dof, mu = ((now - then)[..., None] for now, then in changes)
+        errors = inputs.errors(parameters.student_dof)
+        unshifted = poses + jacobian.dof * dof + jacobian.mu * mu
+        shift = parameters.hand_offset * jnp.einsum("...ij,...j->...i", jacobian.hand_shift, errors[..., :2])
         if score == "density":
-            each = -predictive.log_density(there + aside, pushes, values)
+            each = -predictive.log_density(unshifted + shift, pushes, parameters)
         else:
-            # `there` does not include the hand's displacement: a relative error of that would be a product of two
+            # `unshifted` does not include the hand's displacement: a relative error of that would be a product of two
             # heavy-tailed variables, whose mean may be infinite
-            error = predictive.error(there, pushes, values)
-            off = predictive.measured(there + aside, error, errors) - pushes.end[..., None, :]
+            error = predictive.error(unshifted, pushes, parameters)
+            off = predictive.measured(unshifted + shift, error, errors) - pushes.end[..., None, :]
             each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
         return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
 
-    return jax.value_and_grad(mean)(scatter)
+    return jax.value_and_grad(mean)(log_noise)
 
 
 def _noise(record: dict[str, Any], dtype: Any) -> Noise:
     """Return the noise of a record, in a floating dtype."""
     arrays = {name: jnp.asarray(record[name], dtype) for name in ARRAYS}
-    return Noise(found=from_record(record["found"], dtype), sampler=record["sampler"], **arrays)
+    return Noise(identified=from_record(record["identified"], dtype), sampler=record["sampler"], **arrays)

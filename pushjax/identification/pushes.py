@@ -24,7 +24,7 @@ from pushjax.geometry.shape import Shape
 from pushjax.identification.recordings import push_arrays
 
 STEPS = 50
-ARRAYS = ("start", "path", "end", "weight", "along", "wrench", "twist", "age", "side")
+ARRAYS = ("start", "path", "end", "weight", "poses_between", "wrench", "twist", "age", "side")
 
 
 class PushInput(NamedTuple):
@@ -47,15 +47,15 @@ class Pushes(eqx.Module):
         end: (pushes, 3) slider's pose after each push, world, m and rad. The angle is the one that the slider really
             turned to (not wrapped).
         weight: (pushes,) weight of each push; zero leaves it out. Default: ones.
-        along: (pushes, k, 3) slider's poses during the push, after the path's steps `rows`: at equal parts of it.
+        poses_between: (pushes, k, 3) slider's poses during the push, after equal parts of it (`observed_steps`).
             Default: none.
         wrench: (pushes, p, 3) wrenches on the slider, in the body frame about its origin, of any scale. Default: none.
         twist: (pushes, p, 3) motion of the slider under each wrench, in the body frame about its origin, of any scale.
             If the wrench or the motion is zero, the pair does not count. Default: none.
         age: (pushes,) time of each push, from 0 (the first) to 1 (the last). The friction may depend on it, if
-            `Unknowns.drift` is given. Default: zeros.
-        side: (pushes,) side of the slider that was pushed, from 0. The friction may depend on it, if `Unknowns.side` is
-            given. A side beyond `Unknowns.sides` counts as the last. Default: zeros.
+            `Unknowns.friction_drift` is given. Default: zeros.
+        side: (pushes,) side of the slider that was pushed, from 0. The friction may depend on it, if
+            `Unknowns.friction_by_side` is given. A side beyond `Unknowns.sides` counts as the last. Default: zeros.
 
     Raises:
         ValueError: If an array has the wrong shape or is not finite, or if a weight or side is negative.
@@ -65,7 +65,7 @@ class Pushes(eqx.Module):
     path: Float[Array, "*conditions pushes steps+1 dof"]
     end: Float[Array, "*conditions pushes 3"]
     weight: Float[Array, "*conditions pushes"]
-    along: Float[Array, "*conditions pushes seen 3"]
+    poses_between: Float[Array, "*conditions pushes seen 3"]
     wrench: Float[Array, "*conditions pushes pairs 3"]
     twist: Float[Array, "*conditions pushes pairs 3"]
     age: Float[Array, "*conditions pushes"]
@@ -78,7 +78,7 @@ class Pushes(eqx.Module):
         end: ArrayLike,
         weight: ArrayLike | None = None,
         *,
-        along: ArrayLike | None = None,
+        poses_between: ArrayLike | None = None,
         wrench: ArrayLike | None = None,
         twist: ArrayLike | None = None,
         age: ArrayLike | None = None,
@@ -91,8 +91,8 @@ class Pushes(eqx.Module):
         many = self.start.shape[:-1]
         none = jnp.zeros((*many, 0, 3), dtype)
         self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
-        self.along, self.wrench, self.twist = (
-            none if value is None else as_float(value, dtype) for value in (along, wrench, twist)
+        self.poses_between, self.wrench, self.twist = (
+            none if value is None else as_float(value, dtype) for value in (poses_between, wrench, twist)
         )
         self.age, self.side = (
             jnp.zeros(many, dtype) if value is None else as_float(value, dtype) for value in (age, side)
@@ -102,37 +102,37 @@ class Pushes(eqx.Module):
         check_shape("weight", self.weight, many)
         check_shape("age", self.age, many)
         check_shape("side", self.side, many)
-        check_shape("along", self.along, (*many, "k", 3))
+        check_shape("poses_between", self.poses_between, (*many, "k", 3))
         check_shape("wrench", self.wrench, (*many, "p", 3))
         check_shape("twist", self.twist, self.wrench.shape)
-        steps, seen = self.path.shape[-2] - 1, self.along.shape[-2]
+        steps, seen = self.path.shape[-2] - 1, self.poses_between.shape[-2]
         if steps < 1:
             raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
         if seen >= steps:
-            raise ValueError(f"along has {seen} poses on the way; between {steps} steps there are {steps - 1}")
+            raise ValueError(f"poses_between has {seen} poses on the way; between {steps} steps there are {steps - 1}")
         for name in ARRAYS:
             check_finite(name, getattr(self, name))
         check_non_negative("weight", self.weight)
         check_non_negative("side", self.side)
 
     @property
-    def rows(self) -> np.ndarray:
+    def observed_steps(self) -> np.ndarray:
         """(k + 1,) steps of the path after which the slider's pose was measured; the last is the end."""
-        parts = self.along.shape[-2] + 1
+        parts = self.poses_between.shape[-2] + 1
         return np.round(np.arange(1, parts + 1) / parts * (self.path.shape[-2] - 1)).astype(int)
 
     @property
     def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
         """All poses measured after the start, including the last."""
-        return jnp.concatenate([self.along, self.end[..., None, :]], axis=-2)
+        return jnp.concatenate([self.poses_between, self.end[..., None, :]], axis=-2)
 
     @property
-    def given(self) -> "PushInput":
+    def inputs(self) -> "PushInput":
         """What is known of every push before it happens."""
         return PushInput(self.start, self.path, self.age, self.side)
 
     @property
-    def paired(self) -> Bool[Array, "*conditions pushes pairs"]:
+    def has_pair(self) -> Bool[Array, "*conditions pushes pairs"]:
         """True where there is a wrench with a motion."""
         return jnp.any(self.wrench != 0, axis=-1) & jnp.any(self.twist != 0, axis=-1)
 

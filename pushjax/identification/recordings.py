@@ -116,7 +116,7 @@ def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | N
             too.
 
     Returns:
-        Arrays `start`, `path`, `end` and `along`, and `wrench` and `twist` if they are used.
+        Arrays `start`, `path`, `end` and `poses_between`, and `wrench` and `twist` if they are used.
 
     Raises:
         ValueError: If `steps` or `parts` is less than one, or if `parts` is not less than `steps`.
@@ -138,7 +138,7 @@ def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | N
         which = [np.clip(np.searchsorted(shares * arc[-1], arc, side="right") - 1, 0, parts - 1) for arc in arcs]
         pairs = _pairs(pushes, poses, which, shape)
     ends = {"start": poses[:, 0], "path": np.stack(path), "end": poses[:, -1]}
-    return ends | {"along": poses[:, 1:-1]} | pairs
+    return ends | {"poses_between": poses[:, 1:-1]} | pairs
 
 
 def observed_often_enough(recordings: Recordings, parts: int) -> bool:

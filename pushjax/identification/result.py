@@ -14,16 +14,18 @@ from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.identification import uncertainty
-from pushjax.identification.model import Scene, apply_inset, correct_path, surfaces, trajectories
+from pushjax.identification.model import Scene, apply_inset, correct_path, limit_surfaces, predict_pushes
+from pushjax.identification.prior import Layout, Prior, PriorSurface
 from pushjax.identification.pushes import Pushes
-from pushjax.identification.unknowns import SPREADS, Layout, Parameters, Prior, PriorSurface, Unknowns
+from pushjax.identification.unknowns import NORMAL_PRIORS, Parameters, Unknowns
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FORMAT, VERSION = "pushjax identified", 1
-ARRAYS = ("z", "precision", "sigma", "direction", "gap", "residual", "information", "loss", "length")
-APPLIED = ("friction", "surface", "center", "inset", "end", "lag", "offset")
+ARRAYS = ("z", "precision", "sigma", "direction_sigma", "gap_sigma", "residual", "information", "loss", "length")
+# what slider, hand and path can represent
+CORRECTED = ("friction", "surface", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset")
 LOGISTIC_VARIANCE = np.pi**2 / 3
 
 
@@ -37,50 +39,50 @@ class Identified(eqx.Module):
         precision: (size, size) inverse covariance of z.
         prior: Prior of the unknowns; it converts z to physical parameters.
         sigma: Standard deviation in m of each of x, y and length * theta of a measured pose about its prediction.
-        direction: Standard deviation of each component of the unit vector along the motion under a measured wrench;
-            zero if no wrench was recorded.
-        gap: Standard deviation in m of the gap at the end of a push; zero unless `touching`.
+        direction_sigma: Standard deviation of each component of the unit vector along the motion under a measured
+            wrench; zero if no wrench was recorded.
+        gap_sigma: Standard deviation in m of the gap at the end of a push; zero unless `contact_at_end`.
         residual: (..., pushes, 3) predicted less measured final pose, in x, y and length * theta, m.
         information: (..., pushes, size) contribution of each push to the diagonal of the precision.
         loss: The minimized loss: twice the negative log posterior density, up to a constant.
         length: Length of the metric, m.
         steps: Number of steps of the optimizer.
         converged: Whether the optimizer converged.
-        single: Whether the pushes had no axis of conditions.
+        one_condition: Whether the pushes had no axis of conditions.
         robust: As given to `identify`.
-        touching: As given to `identify`.
+        contact_at_end: As given to `identify`.
     """
 
     z: Float[Array, "size"]
     precision: Float[Array, "size size"]
     prior: Prior
     sigma: Float[Array, ""]
-    direction: Float[Array, ""]
-    gap: Float[Array, ""]
+    direction_sigma: Float[Array, ""]
+    gap_sigma: Float[Array, ""]
     residual: Float[Array, "*conditions pushes 3"]
     information: Float[Array, "*conditions pushes size"]
     loss: Float[Array, ""]
     length: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
-    single: bool = eqx.field(static=True)
+    one_condition: bool = eqx.field(static=True)
     robust: float | None = eqx.field(static=True)
-    touching: bool = eqx.field(static=True, default=False)
+    contact_at_end: bool = eqx.field(static=True, default=False)
 
     @property
-    def physical(self) -> Parameters:
+    def parameters(self) -> Parameters:
         """All parameters that a push depends on, as arrays."""
-        return self._own(self.prior.physical(self.z))
+        return self._drop_condition_axis(self.prior.parameters(self.z))
 
     @property
     def friction(self) -> Float[Array, "*conditions"]:
         """Friction coefficient mu between the fingers and the slider."""
-        return self.physical.friction
+        return self.parameters.friction
 
     @property
     def surface(self) -> LimitSurface:
         """Limit surface, center of pressure included; with conditions, its arrays have a leading axis of conditions."""
-        return self._own(surfaces(self.prior, self.prior.physical(self.z)))
+        return self._drop_condition_axis(limit_surfaces(self.prior, self.prior.parameters(self.z)))
 
     @property
     def covariance(self) -> Float[Array, "size size"]:
@@ -99,7 +101,7 @@ class Identified(eqx.Module):
         The prior variance of a friction is that of the uniform distribution over its range. Near zero, the pushes do
         not determine the number.
         """
-        before = np.where(self.prior.layout.flat_prior > 0, 1.0, LOGISTIC_VARIANCE)
+        before = np.where(self.prior.layout.has_normal_prior > 0, 1.0, LOGISTIC_VARIANCE)
         share = 1 - np.diagonal(np.asarray(self.covariance, float)) / before
         return dict(zip(self.labels, np.clip(share, 0, 1).tolist(), strict=True))
 
@@ -117,9 +119,9 @@ class Identified(eqx.Module):
         """
         if name not in self.prior.layout.names:
             raise ValueError(f"name must be one of {', '.join(self.prior.layout.names)}; got {name!r}")
-        index = self.prior.layout.index[:, self.prior.layout.local[name]]
-        places = np.unique(index)
-        each = jnp.sum(self.information[..., places], axis=-1)
+        layout = self.prior.layout
+        positions = np.unique(layout.positions[:, layout.slices[name]])
+        each = jnp.sum(self.information[..., positions], axis=-1)
         total = jnp.sum(each)
         return each / jnp.where(total > 0, total, 1.0)
 
@@ -136,7 +138,7 @@ class Identified(eqx.Module):
         """
         return load_json(path, "what pushjax identified", FORMAT, VERSION, from_record)
 
-    def draws(self, key: PRNGKeyArray, n: int) -> Parameters:
+    def sample(self, key: PRNGKeyArray, n: int) -> Parameters:
         """Sample `n` values from the posterior distribution.
 
         Args:
@@ -144,11 +146,11 @@ class Identified(eqx.Module):
             n: Number of samples.
 
         Returns:
-            Independent samples; fields as in `physical`, with a leading axis (n,).
+            Independent samples; fields as in `parameters`, with a leading axis (n,).
         """
-        return jax.vmap(lambda z: self._own(self.prior.physical(z)))(self._draws(key, n))
+        return jax.vmap(lambda z: self._drop_condition_axis(self.prior.parameters(z)))(self._sample_z(key, n))
 
-    def _draws(self, key: PRNGKeyArray, n: int) -> Float[Array, "n size"]:
+    def _sample_z(self, key: PRNGKeyArray, n: int) -> Float[Array, "n size"]:
         """Sample `n` vectors z from the posterior distribution."""
         upper = jnp.linalg.cholesky(self.precision).T
         normal = jax.random.normal(key, (len(self.z), n), self.z.dtype)
@@ -171,7 +173,7 @@ class Identified(eqx.Module):
         if not 0 < level < 1:
             raise ValueError(f"level must be between 0 and 1; got {level!r}")
         reach = float(norm.ppf(0.5 + level / 2)) * jnp.sqrt(jnp.diagonal(self.covariance))
-        low, high = (self._own(self.prior.physical(self.z + sign * reach)) for sign in (-1, 1))
+        low, high = (self._drop_condition_axis(self.prior.parameters(self.z + sign * reach)) for sign in (-1, 1))
         names = [name for name in self.prior.layout.names if name != "surface"]
         return {name: (getattr(low, name), getattr(high, name)) for name in names}
 
@@ -192,7 +194,7 @@ class Identified(eqx.Module):
         """
         return uncertainty.bootstrap(key, self, pushes, slider, hand, n)[0]
 
-    def applied(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
+    def corrected(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
         """Return slider, hand and path as they really are, for use in rollouts.
 
         Args:
@@ -207,14 +209,17 @@ class Identified(eqx.Module):
             ValueError: If several conditions were identified, or if an unknown was identified that slider, hand and
                 path cannot represent, such as the table.
         """
-        if not self.single:
-            raise ValueError("applied is for what was found of one condition; of several there is `predict`")
-        more = [name for name in self.prior.layout.names if name not in APPLIED]
+        if not self.one_condition:
+            raise ValueError("corrected is for what was found of one condition; of several there is `predict`")
+        more = [name for name in self.prior.layout.names if name not in CORRECTED]
         if more:
-            raise ValueError(f"applied cannot tell of {', '.join(more)}; for what was found of them there is `predict`")
-        own = self.physical
+            raise ValueError(
+                f"corrected cannot represent {', '.join(more)}; for what was found of them there is `predict`"
+            )
+        own = self.parameters
         shape, hand = apply_inset(slider.shape, hand, own.inset)
-        return Slider(shape, self.surface), hand, correct_path(path, own.end, own.lag, own.offset)
+        path = correct_path(path, own.overshoot, own.lag_distance, own.hand_offset)
+        return Slider(shape, self.surface), hand, path
 
     def predict(self, pushes: Pushes, slider: Slider, hand: Hand) -> Trajectory:
         """Predict these or other pushes of the same conditions.
@@ -227,33 +232,36 @@ class Identified(eqx.Module):
         Returns:
             Trajectories; every array has leading axes (..., pushes).
         """
-        theta = self.prior.physical(self.z)
-        body = Scene(slider.shape, hand, self.prior.origin)
-        each = _trajectories(theta, surfaces(self.prior, theta), body, pushes.as_conditions())
-        return self._own(each)
+        parameters = self.prior.parameters(self.z)
+        scene = Scene(slider.shape, hand, self.prior.origin)
+        each = _predict_pushes(parameters, limit_surfaces(self.prior, parameters), scene, pushes.as_conditions())
+        return self._drop_condition_axis(each)
 
-    def _own(self, several: Any) -> Any:
+    def _drop_condition_axis(self, several: Any) -> Any:
         """Drop the axis of conditions if the pushes had none."""
-        return jax.tree.map(lambda leaf: leaf[0], several) if self.single else several
+        return jax.tree.map(lambda leaf: leaf[0], several) if self.one_condition else several
 
 
-_trajectories = quick_jit(trajectories)
+_predict_pushes = quick_jit(predict_pushes)
 
 
 def to_record(found: Identified) -> dict[str, Any]:
     """Return the result as numbers and lists, for a JSON file."""
-    unknowns, mean = found.prior.unknowns, found.prior.mean
-    record: dict[str, Any] = {"single": found.single, "robust": found.robust, "touching": found.touching}
+    unknowns, mean = found.prior.unknowns, found.prior.mean_surface
+    record: dict[str, Any] = {"one_condition": found.one_condition, "robust": found.robust}
+    record["contact_at_end"] = found.contact_at_end
     record |= {"steps": int(found.steps), "converged": bool(found.converged), "labels": found.labels}
     record |= {name: to_list(getattr(found, name)) for name in ARRAYS}
-    record["unknowns"] = {name: to_list(getattr(unknowns, name)) for name in ("friction", "dof", *SPREADS)}
+    record["unknowns"] = {
+        name: to_list(getattr(unknowns, name)) for name in ("friction", "surface_dof", *NORMAL_PRIORS)
+    }
     record["sides"] = unknowns.sides
     record["shared"] = unknowns.shared
     record["origin"] = to_list(found.prior.origin)
-    record["known_friction"] = to_list(found.prior.friction)
-    record["mean"] = {name: to_list(getattr(mean, name)) for name in ("lower", "spread", "length")}
+    record["known_friction"] = to_list(found.prior.known_friction)
+    record["mean_surface"] = {name: to_list(getattr(mean, name)) for name in ("factors", "relative_std", "length")}
     # for people who read the file: not read back
-    estimates = found.physical._asdict()
+    estimates = found.parameters._asdict()
     record["estimates"] = {name: to_list(value) for name, value in estimates.items() if value is not None}
     return record
 
@@ -266,8 +274,8 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
 
     known = {name: array(value) for name, value in record["unknowns"].items()}
     unknowns = Unknowns(known.pop("friction"), **known, sides=record["sides"], shared=tuple(record["shared"]))
-    mean = PriorSurface(**{name: array(value) for name, value in record["mean"].items()})
-    conditions, terms = mean.lower.shape[:2]
+    mean = PriorSurface(**{name: array(value) for name, value in record["mean_surface"].items()})
+    conditions, terms = mean.factors.shape[:2]
     layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
     origin = array(record["origin"])
     prior = Prior(unknowns, array(record["known_friction"]), mean, origin, layout)
@@ -279,7 +287,7 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
         prior=prior,
         steps=jnp.asarray(record["steps"], jnp.int32),
         converged=jnp.asarray(record["converged"], bool),
-        single=bool(record["single"]),
+        one_condition=bool(record["one_condition"]),
         robust=record["robust"],
-        touching=record["touching"],
+        contact_at_end=record["contact_at_end"],
     )

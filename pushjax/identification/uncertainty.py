@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pushjax._internal.jit import jit
 from pushjax.identification.fit import FixedEntries, Schedule, compiled_fit, fit
-from pushjax.identification.model import Problem, surfaces
+from pushjax.identification.model import Problem, limit_surfaces
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pushjax.identification.result import Identified
 
 POINTS, REACH = 3, 2.7  # points of a profile on either side, and its half-width in standard deviations
-ENOUGH = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
+TOLERANCE = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
 
 
 class Profile(NamedTuple):
@@ -67,31 +67,32 @@ def profile(
     Raises:
         ValueError: If `label` is another label.
     """
-    names = scalars(found)
-    if label not in names:
-        raise ValueError(f"label must be one of {', '.join(names)}; got {label!r}")
-    index = names[label]
-    several, setup = _setup(found, pushes, slider, hand)
-    deviation = float(np.sqrt(np.asarray(found.covariance)[index, index]))
-    apart = reach * np.arange(-points, points + 1) / points
+    positions = scalar_positions(found)
+    if label not in positions:
+        raise ValueError(f"label must be one of {', '.join(positions)}; got {label!r}")
+    position = positions[label]
+    pushes, problem = _problem(found, pushes, slider, hand)
+    covariance = found.covariance
+    std = float(np.sqrt(np.asarray(covariance)[position, position]))
+    distance = reach * np.arange(-points, points + 1) / points
     # from the center outwards: each fit starts from the one before
     order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]
-    loss, values = np.zeros(len(apart)), np.zeros(len(apart))
+    loss, values = np.zeros(len(distance)), np.zeros(len(distance))
     # the direction in which all other numbers would move if the posterior were normal
-    along = found.covariance[index] / found.covariance[index, index] * deviation
+    direction = covariance[position] / covariance[position, position] * std
     z, last = found.z, 0.0
     for k in order:
         if k in (points, points + 1):
             z, last = found.z, 0.0
-        z, last = z + (apart[k] - last) * along, apart[k]
-        held = FixedEntries(jnp.arange(len(z)) == index, z)
-        effort = Schedule.of(z.dtype, 1, ENOUGH)
-        known = jnp.array([True, True, True])
-        fitted = compiled_fit(setup, several, z, _sigma(found), known, held, effort, robust=found.robust)
+        z, last = z + (distance[k] - last) * direction, distance[k]
+        fixed = FixedEntries(jnp.arange(len(z)) == position, z)
+        schedule = Schedule.of(z.dtype, 1, TOLERANCE)
+        given = jnp.array([True, True, True])
+        fitted = compiled_fit(problem, pushes, z, _sigma(found), given, fixed, schedule, robust=found.robust)
         z, loss[k] = fitted.z, float(fitted.loss)
         values[k] = _value(found, fitted.z, label)
     rise = (loss - loss.min()) / 2
-    return Profile(label, values, rise, apart**2 / 2)
+    return Profile(label, values, rise, distance**2 / 2)
 
 
 def bootstrap(
@@ -112,28 +113,28 @@ def bootstrap(
     Returns:
         The estimates, with a leading axis (n,), and their z, (n, size).
     """
-    several, setup = _setup(found, pushes, slider, hand)
-    weights = np.asarray(several.weight)
+    pushes, problem = _problem(found, pushes, slider, hand)
+    weights = np.asarray(pushes.weight)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
-    there = weights > 0
-    counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in there] for _ in range(n)])
-    z = _refitted(setup, several, found.z, _sigma(found), jnp.asarray(counts * weights, found.z.dtype), found.robust)
-    return jax.vmap(lambda one: found._own(found.prior.physical(one)))(z), z
+    used = weights > 0
+    counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in used] for _ in range(n)])
+    z = _refitted(problem, pushes, found.z, _sigma(found), jnp.asarray(counts * weights, found.z.dtype), found.robust)
+    return jax.vmap(lambda one: found._drop_condition_axis(found.prior.parameters(one)))(z), z
 
 
 @jit
-def _refitted(setup: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
+def _refitted(problem: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
     """Fit z to each row of `weights`, with sigma fixed."""
-    held, known, once = FixedEntries.none(start), jnp.array([True, True, True]), Schedule.of(start.dtype, 1, ENOUGH)
+    fixed, given, once = FixedEntries.none(start), jnp.array([True, True, True]), Schedule.of(start.dtype, 1, TOLERANCE)
 
     def one(weight):
-        return fit(setup, pushes.weighted(weight), start, sigma, robust, known, held, once).z
+        return fit(problem, pushes.weighted(weight), start, sigma, robust, given, fixed, once).z
 
     return jax.vmap(one)(weights)
 
 
-def scalars(found: "Identified") -> dict[str, int]:
-    """Return the index in z of every number that is not part of the surface, by label."""
+def scalar_positions(found: "Identified") -> dict[str, int]:
+    """Return the position in z of every number that is not part of the surface, by label."""
     return {label: k for k, label in enumerate(found.labels) if not label.startswith("surface")}
 
 
@@ -148,9 +149,9 @@ def normal_interval(found: "Identified", label: str, level: float = 0.9) -> tupl
     Returns:
         Lowest and highest value, in the number's own unit.
     """
-    index = scalars(found)[label]
-    reach = float(norm.ppf(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[index, index]))
-    low, high = (_value(found, found.z.at[index].add(sign * reach), label) for sign in (-1, 1))
+    position = scalar_positions(found)[label]
+    reach = float(norm.ppf(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[position, position]))
+    low, high = (_value(found, found.z.at[position].add(sign * reach), label) for sign in (-1, 1))
     return low, high
 
 
@@ -177,22 +178,24 @@ def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float
     return ends[0], ends[1]
 
 
-def _setup(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
-    """Return pushes with a leading axis of conditions, and the setup of the fit, in the dtype of `found`."""
+def _problem(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
+    """Return pushes with a leading axis of conditions, and the problem of the fit, in the dtype of `found`."""
     dtype = found.z.dtype
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
-    own = surfaces(found.prior, found.prior.physical(found.z))
-    return pushes.as_conditions(), Problem(slider.shape, hand, own, found.prior, found.length, found.touching)
+    surface = limit_surfaces(found.prior, found.prior.parameters(found.z))
+    return pushes.as_conditions(), Problem(slider.shape, hand, surface, found.prior, found.length, found.contact_at_end)
 
 
 def _sigma(found: "Identified") -> Array:
     """Return the (3,) estimated sigma; 1 for kinds that were not recorded."""
-    return jnp.stack([found.sigma, *(jnp.where(each > 0, each, 1.0) for each in (found.direction, found.gap))])
+    return jnp.stack(
+        [found.sigma, *(jnp.where(each > 0, each, 1.0) for each in (found.direction_sigma, found.gap_sigma))]
+    )
 
 
 def _value(found: "Identified", z: Array, label: str) -> float:
-    """Return a number of z in its own unit, by its label, such as "friction[1]" or "center.0"."""
+    """Return a number of z in its own unit, by its label, such as "friction[1]" or "pressure_center.0"."""
     name, _, part = label.partition(".")
     name, _, condition = name.partition("[")
-    value = np.asarray(getattr(found.prior.physical(z), name))[int(condition.rstrip("]") or 0) if condition else 0]
+    value = np.asarray(getattr(found.prior.parameters(z), name))[int(condition.rstrip("]") or 0) if condition else 0]
     return float(value[int(part)] if part else value)

@@ -18,7 +18,7 @@ from pushjax.cli import main as cli
 from pushjax.datasets import LogError, load_recordings
 from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
-from pushjax.identification.noise import _Scatter, _score
+from pushjax.identification.noise import _LogNoise, _score
 from pushjax.identification.predictive import PredictiveModel
 from pushjax.identification.recordings import screen
 from pushjax.identification.uncertainty import bootstrap, profile_interval
@@ -198,16 +198,16 @@ def test_calibration_that_is_asked_for_is_looked_for(log, tmp_path, monkeypatch)
     class Asked(Exception):
         pass
 
-    def identify(pushes, slider, hand, unknowns, *, touching):
-        raise Asked(unknowns, touching)
+    def identify(pushes, slider, hand, unknowns, *, contact_at_end):
+        raise Asked(unknowns, contact_at_end)
 
     monkeypatch.setattr(pj, "identify", identify)
     with pytest.raises(Asked) as asked:
-        cli.main([*arguments(log, tmp_path), "--marker", "0.003", "--offset", "0.004", "--touching"])
-    unknowns, touching = asked.value.args
-    assert touching
-    assert unknowns.names == ("friction", "surface", "inset", "offset", "marker")
-    assert (float(unknowns.marker), float(unknowns.offset)) == pytest.approx((0.003, 0.004), rel=1e-6)
+        cli.main([*arguments(log, tmp_path), "--frame-offset", "0.003", "--hand-offset", "0.004", "--contact-at-end"])
+    unknowns, contact_at_end = asked.value.args
+    assert contact_at_end
+    assert unknowns.names == ("friction", "surface", "inset", "hand_offset", "frame_offset")
+    assert (float(unknowns.frame_offset), float(unknowns.hand_offset)) == pytest.approx((0.003, 0.004), rel=1e-6)
 
 
 def test_what_is_no_pushes_is_named(log, block, surface):
@@ -223,8 +223,8 @@ def test_what_is_no_pushes_is_named(log, block, surface):
 
 
 def test_units_of_what_is_found():
-    assert findings.unit("marker.1") == findings.unit("offset.0") == ("mm", 1e3)
-    assert findings.unit("marker.2") == ("°", 180 / np.pi)
+    assert findings.unit("frame_offset.1") == findings.unit("hand_offset.0") == ("mm", 1e3)
+    assert findings.unit("frame_offset.2") == ("°", 180 / np.pi)
     assert findings.unit("friction") == ("", 1.0)
 
 
@@ -273,9 +273,9 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     path, pose, _ = rollouts
     recordings = screen(load_recordings(log), block, pj.Hand.finger(RADIUS))
     pushes = pj.Pushes.of(recordings, STEPS, parts=3, shape=block.inset(INSET))
-    assert pushes.along.shape == (16, 2, 3)
+    assert pushes.poses_between.shape == (16, 2, 3)
     np.testing.assert_allclose(pushes.path, path, atol=1e-12)
-    np.testing.assert_array_equal(pushes.rows, [4, 8, 12])
+    np.testing.assert_array_equal(pushes.observed_steps, [4, 8, 12])
     np.testing.assert_allclose(pushes.poses, pose[:, [4, 8, 12]], atol=10 * NOISE / 0.03)
     there = np.any(np.asarray(pushes.wrench) != 0, axis=-1)
     assert there.mean() > 0.8
@@ -286,7 +286,7 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     assert np.median(angle) < 5
     alone = pj.Pushes.of(recordings, STEPS)
-    assert alone.along.shape == (16, 0, 3)
+    assert alone.poses_between.shape == (16, 0, 3)
     assert alone.wrench.shape == (16, 0, 3)
 
 
@@ -301,7 +301,7 @@ def test_logs_that_tell_less_than_others(log, block):
     for recordings, shapes in (([whole], (2, 3)), ([whole, unseen], (0, 0)), ([unfelt, whole], (2, 0))):
         pushes, _ = conditions(recordings, block, options, 0)
         assert pushes.start.shape == (16 * len(recordings), 3)
-        assert (pushes.along.shape[-2], pushes.wrench.shape[-2]) == shapes
+        assert (pushes.poses_between.shape[-2], pushes.wrench.shape[-2]) == shapes
 
 
 def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
@@ -310,11 +310,11 @@ def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
     pushes = pj.Pushes.of(recordings, STEPS, parts=3, shape=block.inset(INSET))
     wrong = pj.Ellipsoid(np.asarray(surface.A) * np.outer([1, 1, 1.7], [1, 1, 1.7]), surface.length)
     slider, hand = pj.Slider(block, wrong), pj.Hand.finger(RADIUS)
-    unknowns = pj.Unknowns((0.0, 1.0), dof=5, inset=0.002)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=5, inset=0.002)
     with_forces = pj.identify(pushes, slider, hand, unknowns)
     without = pj.identify(pj.Pushes.of(recordings, STEPS, parts=3), slider, hand, unknowns)
-    assert float(with_forces.direction) < 0.1
-    assert float(without.direction) == 0
+    assert float(with_forces.direction_sigma) < 0.1
+    assert float(without.direction_sigma) == 0
     shape = with_forces.surface.A / with_forces.surface.A[0, 0]
     np.testing.assert_allclose(np.diagonal(shape), np.diagonal(surface.A / surface.A[0, 0]), rtol=0.1)
     assert abs(float(with_forces.friction) - MU) < 0.02
@@ -333,7 +333,7 @@ def few(log, block):
 @pytest.fixture(scope="module")
 def found(few, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
-    return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), dof=None, inset=0.002), sigma=NOISE)
+    return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None, inset=0.002), sigma=NOISE)
 
 
 def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
@@ -381,8 +381,8 @@ def test_noise(few, found, block, surface, tmp_path):
     assert noise.history.shape == (60,)
     assert noise.score < noise.history[:5].mean()
     assert np.isfinite(noise.history).all()
-    assert 10 < float(noise.dof) < 30
-    assert float(noise.tails) < 10
+    assert 10 < float(noise.surface_dof) < 30
+    assert float(noise.student_dof) < 10
     assert noise.friction.shape == (2,)
     assert noise.model.friction.shape == (2,)
     noise.save(tmp_path / "noise.json")
@@ -407,13 +407,19 @@ def test_energy_score_has_a_mean_for_the_longest_tails(few, found, block, surfac
     hand's meter.
     """
     predictive = PredictiveModel.of(found, few, pj.Slider(block, surface), pj.Hand.finger(RADIUS), "sum_of_squares")
-    values = {"dof": 50.0, "spread": 0.1, "offset": 1.0, "sigma": 1e-4, "tails": 0.5}
+    values = {
+        "surface_dof": 50.0,
+        "friction_half_width": 0.1,
+        "hand_offset": 1.0,
+        "sigma": 1e-4,
+        "student_dof": 0.5,
+    }
 
     @jax.jit
     def scored(key, relative):
         numbers = {name: jnp.log(value) for name, value in values.items()}
-        scatter = _Scatter(**numbers, relative=jnp.log(jnp.full(2, relative)))
-        return _score(scatter, key, predictive, 8, "energy")[0]
+        log_noise = _LogNoise(**numbers, relative_error=jnp.log(jnp.full(2, relative)))
+        return _score(log_noise, key, predictive, 8, "energy")[0]
 
     keys = jax.random.split(jax.random.key(0), 20)
     changes = [float(scored(key, 0.05) - scored(key, 1e-6)) for key in keys]
@@ -441,7 +447,7 @@ def test_density(few, found, block, surface):
     expected = multivariate_t(np.zeros(3), sigma**2 * np.eye(3), tails).logpdf(apart)
     np.testing.assert_allclose(density, expected, atol=0.05)
     # with an error that grows with the slider's translation and rotation
-    growing = eqx.tree_at(lambda noise: noise.relative, known, jnp.array(relative))
+    growing = eqx.tree_at(lambda noise: noise.relative_error, known, jnp.array(relative))
     density = growing.log_density(jax.random.key(0), pj.Pushes(few.start, few.path, ends + off), slider, hand, 3)
     moved = np.asarray(ends - few.start) * [1, 1, float(found.length)]
     shares = relative[[0, 0, 1]] * moved
@@ -452,16 +458,16 @@ def test_density(few, found, block, surface):
     # centered on what was identified from other pushes
     other = eqx.tree_at(lambda f: f.z, found, found.z + 0.1)
     moved = eqx.tree_at(lambda noise: noise.friction, known, sure + jnp.array([-0.05, 0.05]))
-    again = moved.about(other)
+    again = moved.transferred_to(other)
     np.testing.assert_allclose(again.friction, other.friction + jnp.array([-0.05, 0.05]), atol=1e-12)
-    np.testing.assert_array_equal(again.found.z, other.z)
+    np.testing.assert_array_equal(again.identified.z, other.z)
     twice = jnp.stack([moved.friction, moved.friction])
     several = eqx.tree_at(lambda noise: noise.friction, moved, twice)  # two conditions with the same spread
-    np.testing.assert_array_equal(several.about(other).friction, again.friction)
+    np.testing.assert_array_equal(several.transferred_to(other).friction, again.friction)
     # identify the noise again
     friction = found.friction + 0.1 * jnp.array([-1.0, 1.0])
     values = (jnp.array(30.0), friction, jnp.array(2e-4))
-    truth = eqx.tree_at(lambda noise: (noise.dof, noise.friction, noise.offset), known, values)
+    truth = eqx.tree_at(lambda noise: (noise.surface_dof, noise.friction, noise.hand_offset), known, values)
     # Short pushes are needed too: the two kinds of error can be distinguished only by comparing short and long pushes.
     first = few.path[:, :1]
     short = eqx.tree_at(lambda pushes: pushes.path, few, first + 0.2 * (few.path - first))
@@ -480,9 +486,9 @@ def test_density(few, found, block, surface):
     assert first + 1 < best
     assert best - 0.3 < ours
     # with errors that grow
-    truth = eqx.tree_at(lambda noise: noise.relative, truth, jnp.array(relative))
+    truth = eqx.tree_at(lambda noise: noise.relative_error, truth, jnp.array(relative))
     seen = pj.Pushes(many.start, many.path, truth.predict(jax.random.key(1), many, slider, hand, 1)[:, 0])
     noise = pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=16, steps=90, score="density")
     assert 0.5 * sigma < float(noise.sigma) < 2 * sigma
-    shares = np.asarray(noise.relative)
+    shares = np.asarray(noise.relative_error)
     assert np.all((0.5 * relative < shares) & (shares < 2 * relative))

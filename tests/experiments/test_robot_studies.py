@@ -38,7 +38,7 @@ def test_causes(logs, data, monkeypatch, tmp_path):
     assert abs(shares["calibration + initial overlap"]["change_mm"]) < 0.1
     found = record["cells"][1]
     assert len(found["each_mm"]) == 196
-    assert 0.5e-3 < np.linalg.norm(found["found"]["offset"]) < 2e-3
+    assert 0.5e-3 < np.linalg.norm(found["found"]["hand_offset"]) < 2e-3
     assert record["cells"][3]["found"]["overlap"] == 1
     assert record["surfaces"]["abs"]["noise"] < record["surfaces"]["abs"]["calibration"]
     assert (tmp_path / "table1_causes.png").stat().st_size > 5000

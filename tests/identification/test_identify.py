@@ -9,7 +9,7 @@ import pytest
 import pushjax as pj
 from pushjax.geometry.se2 import compose, inverse
 from pushjax.identification.model import Problem, correct_path
-from pushjax.identification.unknowns import Layout, Prior
+from pushjax.identification.prior import Layout, Prior
 
 HALF, RADIUS, TRAVEL, STEPS = 0.045, 0.005, 0.03, 15
 MU = 0.3
@@ -68,7 +68,7 @@ def pushes(square, real, hand):
     return pj.Pushes(starts, paths, pushed(pj.Slider(square, real), hand, MU, jnp.asarray(starts), jnp.asarray(paths)))
 
 
-UNKNOWNS = pj.Unknowns((0.0, 1.0), dof=50, center=0.005)
+UNKNOWNS = pj.Unknowns((0.0, 1.0), surface_dof=50, pressure_center=0.005)
 
 
 def angles(one, other):
@@ -100,7 +100,7 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     predicted = found.predict(others, pj.Slider(square, expected), hand)
     assert not predicted.failed.any()
     # one of them, predicted directly
-    slider, finger, path = found.applied(pj.Slider(square, expected), hand, jnp.asarray(paths[0]))
+    slider, finger, path = found.corrected(pj.Slider(square, expected), hand, jnp.asarray(paths[0]))
     alone = pj.rollout(slider, finger, path, pose=jnp.asarray(starts[0]), friction=found.friction)
     np.testing.assert_allclose(alone.pose, predicted.pose[0], atol=1e-12)
     np.testing.assert_allclose(predicted.pose[:, -1], others.end, atol=2e-6)
@@ -118,7 +118,7 @@ def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     assert high - low < 0.1
     narrow = found.interval(0.5)["friction"]
     assert low < narrow[0] < found.friction < narrow[1] < high
-    assert set(found.interval()) == {"friction", "center"}
+    assert set(found.interval()) == {"friction", "pressure_center"}
     assert np.degrees(np.median(angles(found.surface, real))) < 3
     # pushes inform about friction only where the finger slides, and about the surface everywhere
     told = np.asarray(found.information_share("friction"))
@@ -140,13 +140,13 @@ def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     (tmp_path / "other.json").write_text('{"format": "pushjax limit surface"}')
     with pytest.raises(ValueError, match="does not hold what pushjax identified: its format is another"):
         pj.Identified.load(tmp_path / "other.json")
-    with pytest.raises(ValueError, match="name must be one of friction, surface, center; got 'inset'"):
+    with pytest.raises(ValueError, match="name must be one of friction, surface, pressure_center; got 'inset'"):
         found.information_share("inset")
     noise[:3] += [0.02, -0.02, 0.3]
     wild = pj.identify(pj.Pushes(pushes.start, pushes.path, pushes.end + noise), slider, hand, UNKNOWNS)
     assert abs(float(wild.friction) - float(found.friction)) < high - low
     # samples scatter as the covariance says
-    draws = np.asarray(found.draws(jax.random.key(0), 2000).friction)
+    draws = np.asarray(found.sample(jax.random.key(0), 2000).friction)
     share = np.mean((draws > low) & (draws < high))
     assert abs(share - 0.99) < 4 * np.sqrt(0.99 * 0.01 / 2000)
 
@@ -178,14 +178,14 @@ def test_conditions_share_the_calibration(square, hand):
         each.append(pj.Pushes(starts, paths, pushed(slider, hand, mu[k], jnp.asarray(starts), really)))
     many = pj.Pushes.conditions(each)
     assert many.weight.shape == (2, 20)
-    unknowns = pj.Unknowns((0.0, 1.0), dof=None, inset=0.002, end=0.002)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=None, inset=0.002, overshoot=0.002)
     found = pj.identify(many, pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, unknowns, sigma=1e-5)
-    assert found.labels == ("friction[0]", "friction[1]", "inset", "end")
+    assert found.labels == ("friction[0]", "friction[1]", "inset", "overshoot")
     np.testing.assert_allclose(found.friction, mu, rtol=1e-3)
-    with pytest.raises(ValueError, match="applied is for what was found of one condition"):
-        found.applied(pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, many.path[0, 0])
-    np.testing.assert_allclose(found.physical.inset, [inset, inset], atol=2e-6)
-    np.testing.assert_allclose(found.physical.end, [end, end], atol=2e-6)
+    with pytest.raises(ValueError, match="corrected is for what was found of one condition"):
+        found.corrected(pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, many.path[0, 0])
+    np.testing.assert_allclose(found.parameters.inset, [inset, inset], atol=2e-6)
+    np.testing.assert_allclose(found.parameters.overshoot, [end, end], atol=2e-6)
     # the padding of the shorter condition has no influence
     other = pj.Pushes(many.start, many.path, many.end.at[1, 15:].add(0.1), many.weight)
     again = pj.identify(other, pj.Slider(square, pj.Ellipsoid(np.eye(3), length)), hand, unknowns, sigma=1e-5)
@@ -194,28 +194,29 @@ def test_conditions_share_the_calibration(square, hand):
     # derivatives of the residuals
     surface = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pj.Ellipsoid(np.eye(3), length))
     prior = Prior.of(unknowns, surface, jnp.asarray(0.25), jnp.zeros(2))
-    setup = Problem(square, hand, surface, prior, jnp.asarray(0.05))
+    problem = Problem(square, hand, surface, prior, jnp.asarray(0.05))
     z, h = jnp.asarray([-1.0, 0.3, 0.2, -0.4]), 1e-6
-    local = eqx.filter_jit(setup.local)(z, many)
-    value, slopes = local.value, setup.slopes(z, local)
-    np.testing.assert_array_equal(setup.expanded(z, local), value)
-    residuals = eqx.filter_jit(setup.residuals)
+    at = eqx.filter_jit(problem.linearize)(z, many)
+    value, jacobian = at.value, problem.jacobian(z, at)
+    np.testing.assert_array_equal(problem.linear_residuals(z, at), value)
+    residuals = eqx.filter_jit(problem.residuals)
     np.testing.assert_allclose(value, residuals(z, many), atol=1e-15)
     for k in range(4):
         step = h * jnp.eye(4)[k]
-        off = slopes[..., k] - (residuals(z + step, many) - residuals(z - step, many)) / (2 * h)
+        off = jacobian[..., k] - (residuals(z + step, many) - residuals(z - step, many)) / (2 * h)
         # except where a push changes its mode between the two
         assert np.mean(np.abs(off) < 1e-8) > 0.97
 
 
 def test_layout_of_the_vector():
-    unknowns = pj.Unknowns((0.0, 1.0), dof=20, center=0.001, end=0.001, shared=("center", "end"))
+    shared = ("pressure_center", "overshoot")
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=20, pressure_center=0.001, overshoot=0.001, shared=shared)
     layout = Layout.of(unknowns, 2, 3)
     assert layout.size == 3 * 1 + 3 * 6 + 2 + 1
-    assert layout.index.shape == (3, 10)
+    assert layout.positions.shape == (3, 10)
     assert layout.labels[:5] == ("friction[0]", "friction[1]", "friction[2]", "surface[0].0", "surface[0].1")
-    assert layout.labels[-3:] == ("center.0", "center.1", "end")
-    assert layout.flat_prior.sum() == layout.size - 3
+    assert layout.labels[-3:] == ("pressure_center.0", "pressure_center.1", "overshoot")
+    assert layout.has_normal_prior.sum() == layout.size - 3
 
 
 def test_moved_paths():
@@ -256,7 +257,7 @@ def test_polygon_inset():
         (lambda: pj.Unknowns(friction=0.3), r"friction has shape \(\); expected \(2,\)"),
         (lambda: pj.Unknowns(inset=-0.001), "inset must be positive"),
         (lambda: pj.Unknowns(shared=("mu",)), "shared: 'mu' is not one of friction, surface"),
-        (lambda: pj.Unknowns(friction=None, dof=None), "nothing is to be found"),
+        (lambda: pj.Unknowns(friction=None, surface_dof=None), "nothing is to be found"),
         (lambda: pj.Pushes(np.zeros((2, 3)), np.zeros((2, 4, 2)), np.zeros((3, 3))), "end has shape"),
         (lambda: pj.Pushes(np.zeros((2, 3)), np.zeros((2, 1, 2)), np.zeros((2, 3))), "at least one step"),
         (lambda: pj.Pushes(np.full((2, 3), np.nan), np.zeros((2, 4, 2)), np.zeros((2, 3))), "start must be finite"),
@@ -284,60 +285,60 @@ def test_bad_arguments(pushes, square, expected, hand):
         pj.identify(pushes, slider, pj.Hand.two_fingers(0.002))
 
 
-def test_touching_tells_where_things_are(square, real, expected, hand, tmp_path):
-    """The condition that finger and slider touch reveals the offset of the tip and of the marker.
+def test_contact_at_end_tells_where_things_are(square, real, expected, hand, tmp_path):
+    """The condition that finger and slider touch reveals the offset of the tip and of the frame.
 
     The final poses are off by millimeters along the side, but by only about a tenth of a millimeter across it. Fingers
     that have lost the slider do not matter.
     """
     rng = np.random.default_rng(8)
     starts, paths = planned(rng, 60)
-    offset, marker = np.array([0.0012, -0.0008]), np.array([-0.0006, 0.0009, 0.01])
+    hand_offset, frame_offset = np.array([0.0012, -0.0008]), np.array([-0.0006, 0.0009, 0.01])
     slider = pj.Slider(square, real)
 
     @jax.jit
     @jax.vmap
     def ends(start, path):
-        run = pj.rollout(slider, hand, path + offset[None], pose=compose(start, marker), friction=MU)
+        run = pj.rollout(slider, hand, path + hand_offset[None], pose=compose(start, frame_offset), friction=MU)
         return run.pose[-1]
 
     really = np.array(ends(jnp.asarray(starts), jnp.asarray(paths)))
     # 3 mm along the side that is touched, 0.1 mm across it
     for k, pose in enumerate(really):
-        tip = paths[k, -1] + offset
+        tip = paths[k, -1] + hand_offset
         _, point, normal = square.closest(pj.se2.transform(pj.se2.inverse(pose), tip))
         tangent = np.array([-normal[1], normal[0]])
         rest = 0.02 - abs(float(point @ tangent))  # the finger stays on its side
         shift = np.clip(0.003 * rng.normal(), -max(rest, 0), max(rest, 0)) * tangent + 1e-4 * rng.normal() * normal
         really[k] = compose(pose, np.array([*shift, 0.0]))
     really[:4, :2] += 0.02  # lost the finger
-    seen = compose(really, inverse(marker))
+    seen = compose(really, inverse(frame_offset))
     pushes = pj.Pushes(starts, paths, seen)
-    unknowns = pj.Unknowns((0.0, 1.0), dof=50, inset=1e-3, offset=2e-3, marker=1e-3)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=50, inset=1e-3, hand_offset=2e-3, frame_offset=1e-3)
     mean = pj.Slider(square, expected)
     blind = pj.identify(pushes, mean, hand, unknowns)
-    found = pj.identify(pushes, mean, hand, unknowns, touching=True)
-    assert float(blind.gap) == 0
-    assert 0.5e-4 < float(found.gap) < 3e-4
+    found = pj.identify(pushes, mean, hand, unknowns, contact_at_end=True)
+    assert float(blind.gap_sigma) == 0
+    assert 0.5e-4 < float(found.gap_sigma) < 3e-4
 
     def off(one):
-        own = one.physical
-        return np.linalg.norm([*(own.offset - offset), *(own.marker[:2] - marker[:2])])
+        own = one.parameters
+        return np.linalg.norm([*(own.hand_offset - hand_offset), *(own.frame_offset[:2] - frame_offset[:2])])
 
     assert off(found) < 2.5e-4
     assert off(found) < off(blind) / 2
-    low, high = found.interval(0.99)["offset"]
-    assert np.all((low < offset) & (offset < high))
+    low, high = found.interval(0.99)["hand_offset"]
+    assert np.all((low < hand_offset) & (hand_offset < high))
     found.save(tmp_path / "found.json")
     again = pj.Identified.load(tmp_path / "found.json")
     assert jax.tree.structure(again) == jax.tree.structure(found)
-    np.testing.assert_array_equal(again.gap, found.gap)
+    np.testing.assert_array_equal(again.gap_sigma, found.gap_sigma)
     # profile and bootstrap use the condition too
-    profile = found.profile(pushes, mean, hand, "offset.0", points=1)
+    profile = found.profile(pushes, mean, hand, "hand_offset.0", points=1)
     assert profile.rise[1] < profile.rise[0]
     drawn = found.bootstrap(jax.random.key(0), pushes, mean, hand, 4)
-    assert np.all(np.linalg.norm(np.asarray(drawn.offset) - offset, axis=1) < 5e-4)
+    assert np.all(np.linalg.norm(np.asarray(drawn.hand_offset) - hand_offset, axis=1) < 5e-4)
     two = pj.Hand.two_fingers(RADIUS)
     wide = pj.Pushes(starts, jnp.zeros((*paths.shape[:2], two.dof)), starts)
-    with pytest.raises(ValueError, match="touching is for a single round finger; the hand has 2 fingers"):
-        pj.identify(wide, mean, two, touching=True)
+    with pytest.raises(ValueError, match="contact_at_end is for a single round finger; the hand has 2 fingers"):
+        pj.identify(wide, mean, two, contact_at_end=True)

@@ -26,9 +26,11 @@ def quartic():
 def test_form_is_of_one_polynomial(kind):
     """Gradient, Hessian and coefficients along a line agree with the value."""
     surface = quartic() if kind == "quartic" else pj.Ellipsoid(np.diag([1.0, 1.3, 0.8]), LENGTH)
-    table = pj.Table(grain=(0.2, -0.1), slope=(3.0, -2.0), curvature=(20.0, 5.0, -10.0), origin=(0.1, 0.0))
+    table = pj.Table(
+        anisotropy=(0.2, -0.1), log_gradient=(3.0, -2.0), log_hessian=(20.0, 5.0, -10.0), origin=(0.1, 0.0)
+    )
     form = TransformedForm(
-        surface.form(), table.warp(Vec3(jnp.asarray(0.3), jnp.asarray(-0.1), jnp.asarray(0.7)), LENGTH)
+        surface.form(), table.wrench_transform(Vec3(jnp.asarray(0.3), jnp.asarray(-0.1), jnp.asarray(0.7)), LENGTH)
     )
     f, b = jnp.array([0.4, -0.7, 0.5]), jnp.array([0.3, 0.2, -0.6])
 
@@ -63,18 +65,18 @@ def test_rising_friction_moves_the_pressure():
         slope = np.array([rise, -rise / 2])
         weights = 1 + RING @ slope
         wrench = jax.vmap(pj.Support.points(RING, weights / weights.sum()).wrench)(jnp.asarray(twists))
-        form = TransformedForm(surface, pj.Table(slope=slope).warp(there, LENGTH))
+        form = TransformedForm(surface, pj.Table(log_gradient=slope).wrench_transform(there, LENGTH))
         off.append((astray(form, wrench), astray(surface, wrench)))
     assert off[0][0] < off[0][1] / 3
     # for a small rise, the error of the fit itself remains
     assert off[1][0] < off[1][1]
 
 
-def test_grain_is_exact_for_translations():
+def test_anisotropy_is_exact_for_translations():
     """For a slider that does not turn, friction |S f| <= 1 at every point makes it slip along S^2 f."""
-    table = pj.Table(grain=(0.3, 0.2))
+    table = pj.Table(anisotropy=(0.3, 0.2))
     even = pj.Ellipsoid(np.eye(3), LENGTH).form()
-    form = TransformedForm(even, table.warp(Vec3(*(jnp.zeros(()),) * 3), LENGTH))
+    form = TransformedForm(even, table.wrench_transform(Vec3(*(jnp.zeros(()),) * 3), LENGTH))
     pull = 0.3, 0.2
     log = np.array([[pull[0], pull[1]], [pull[1], -pull[0]]])
     values, vectors = np.linalg.eigh(log)
@@ -84,7 +86,7 @@ def test_grain_is_exact_for_translations():
         g = form.gradient(Vec3.of(jnp.asarray([*f, 0.0]))).array()
         np.testing.assert_allclose(g[:2], 2 * stretch @ stretch @ f, rtol=1e-12)
     # along x it takes exp(2 g) times the force that it takes along y
-    only = TransformedForm(even, pj.Table(grain=(0.3, 0.0)).warp(Vec3(*(jnp.zeros(()),) * 3), LENGTH))
+    only = TransformedForm(even, pj.Table(anisotropy=(0.3, 0.0)).wrench_transform(Vec3(*(jnp.zeros(()),) * 3), LENGTH))
     along, across = (only.value(Vec3.of(jnp.asarray(f))) for f in ([1.0, 0, 0], [0, 1.0, 0]))
     assert np.sqrt(across / along) == pytest.approx(np.exp(0.6))
 
@@ -100,7 +102,9 @@ PATH = np.linspace([-0.04, 0.0], [0.0, 0.03], 16)
 
 def test_pushes_turn_with_the_world():
     """Table, slider and path rotated together give the same push; an even table has no effect, an uneven one has."""
-    table = pj.Table(grain=(0.3, -0.2), slope=(4.0, 2.0), curvature=(10.0, -20.0, 15.0), origin=(0.01, 0.02))
+    table = pj.Table(
+        anisotropy=(0.3, -0.2), log_gradient=(4.0, 2.0), log_hessian=(10.0, -20.0, 15.0), origin=(0.01, 0.02)
+    )
     here = push(table, START, PATH)
     assert not here.failed.any()
     even = push(None, START, PATH)
@@ -112,7 +116,7 @@ def test_pushes_turn_with_the_world():
     double = np.array([[np.cos(2 * turn[2]), -np.sin(2 * turn[2])], [np.sin(2 * turn[2]), np.cos(2 * turn[2])]])
     hess = rotation @ np.array([[10.0, 15.0], [15.0, -20.0]]) @ rotation.T
     there = pj.Table(
-        double @ table.grain, rotation @ table.slope, (hess[0, 0], hess[1, 1], hess[0, 1]),
+        double @ table.anisotropy, rotation @ table.log_gradient, (hess[0, 0], hess[1, 1], hess[0, 1]),
         rotation @ table.origin + turn[:2],
     )  # fmt: skip
     moved = push(there, compose(turn, START), PATH @ rotation.T + turn[:2])
@@ -123,8 +127,8 @@ def test_derivatives_and_bad_tables():
     """Derivatives by a table are right, also at an even one; a table that is not finite shows in the status."""
 
     def end(values):
-        grain, slope, curvature = values[:2], 5 * values[2:4], 50 * values[4:7]
-        return push(pj.Table(grain, slope, curvature), START, PATH).pose[-1]
+        anisotropy, gradient, hessian = values[:2], 5 * values[2:4], 50 * values[4:7]
+        return push(pj.Table(anisotropy, gradient, hessian), START, PATH).pose[-1]
 
     for at in (jnp.zeros(7), jnp.array([0.02, -0.01, 0.1, 0.2, -0.1, 0.1, 0.3])):
         forward = jax.jacfwd(end)(at)
@@ -133,35 +137,35 @@ def test_derivatives_and_bad_tables():
         for k in range(7):
             unit = step * jnp.eye(7)[k]
             np.testing.assert_allclose((end(at + unit) - end(at - unit)) / (2 * step), forward[:, k], atol=1e-7)
-    with pytest.raises(ValueError, match="grain has shape"):
-        pj.Table(grain=0.3)
-    with pytest.raises(ValueError, match="slope must be finite"):
-        pj.Table(slope=(np.nan, 0.0))
+    with pytest.raises(ValueError, match="anisotropy has shape"):
+        pj.Table(anisotropy=0.3)
+    with pytest.raises(ValueError, match="log_gradient must be finite"):
+        pj.Table(log_gradient=(np.nan, 0.0))
     with pytest.raises(TypeError, match="table"):
         push(0.3, START, PATH)
-    broken = eqx.tree_at(lambda t: t.slope, pj.Table(), jnp.array([jnp.nan, 0.0]))
+    broken = eqx.tree_at(lambda t: t.log_gradient, pj.Table(), jnp.array([jnp.nan, 0.0]))
     assert np.all(np.asarray(push(broken, START, PATH).status) == pj.Status.INVALID)
     np.testing.assert_array_equal(push(broken, START, PATH).pose[-1], START)
 
 
 def test_float32_table():
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), pj.Table(grain=(0.2, 0.1), slope=(3.0, 1.0)))
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), pj.Table(anisotropy=(0.2, 0.1), log_gradient=(3.0, 1.0)))
     slider = pj.Slider(pj.Polygon.rectangle(0.09, 0.09), quartic())
     cast = jax.tree.map(lambda x: x.astype(jnp.float32), (slider, pj.Hand.finger(RADIUS)))
     path, start = jnp.asarray(PATH, jnp.float32), jnp.asarray(START, jnp.float32)
     low = pj.rollout(*cast, path, pose=start, friction=jnp.float32(0.3), table=single)
     assert low.pose.dtype == jnp.float32
-    high = push(pj.Table(grain=(0.2, 0.1), slope=(3.0, 1.0)), START, PATH)
+    high = push(pj.Table(anisotropy=(0.2, 0.1), log_gradient=(3.0, 1.0)), START, PATH)
     np.testing.assert_allclose(low.pose, high.pose, atol=2e-6)
 
 
 def test_found_again(square, expected, hand):  # noqa: F811
-    """Grain, slope, curvature, marker, drift and sides are recovered from pushes simulated with them."""
+    """An uneven table, the offset of the frame, drift and sides are recovered from pushes simulated with them."""
     rng = np.random.default_rng(5)
     starts, paths = planned(rng, 120)
     age, side = np.linspace(0, 1, 120), rng.integers(3, size=120)
     table = pj.Table((0.1, -0.05), (2.0, -1.0), (10.0, -5.0, 8.0), origin=starts[:, :2].mean(axis=0))
-    marker = np.array([0.001, -0.0007, 0.02])
+    offset = np.array([0.001, -0.0007, 0.02])
     drift, sides = 0.3, np.array([0.2, -0.15, 0.1])
     mu = MU * np.exp(drift * age + sides[side])
     slider = pj.Slider(square, expected)
@@ -169,27 +173,36 @@ def test_found_again(square, expected, hand):  # noqa: F811
     @jax.jit
     @jax.vmap
     def ends(start, path, mu):
-        run = pj.rollout(slider, hand, path, pose=compose(start, marker), friction=mu, table=table)
-        return compose(run.pose[-1], inverse(marker))
+        run = pj.rollout(slider, hand, path, pose=compose(start, offset), friction=mu, table=table)
+        return compose(run.pose[-1], inverse(offset))
 
     pushes = pj.Pushes(starts, paths, ends(starts, paths, mu), age=age, side=side)
     unknowns = pj.Unknowns(
-        (0.0, 1.0), dof=None, marker=0.002, grain=0.1, slope=2.0, curvature=10.0, drift=0.3, side=0.3, sides=3
+        (0.0, 1.0),
+        surface_dof=None,
+        frame_offset=0.002,
+        anisotropy=0.1,
+        log_gradient=2.0,
+        log_hessian=10.0,
+        friction_drift=0.3,
+        friction_by_side=0.3,
+        sides=3,
     )
     found = pj.identify(pushes, slider, hand, unknowns, sigma=1e-5)
-    own = found.physical
-    np.testing.assert_allclose(own.grain, table.grain, atol=1e-3)
-    np.testing.assert_allclose(own.slope, table.slope, atol=0.02)
-    np.testing.assert_allclose(own.curvature, table.curvature, atol=0.3)
-    np.testing.assert_allclose(own.marker, marker, atol=2e-5)
-    np.testing.assert_allclose(own.drift, drift, atol=5e-3)
-    np.testing.assert_allclose(np.log(float(own.friction)) + own.side, np.log(MU) + sides, atol=5e-3)
+    own = found.parameters
+    np.testing.assert_allclose(own.anisotropy, table.anisotropy, atol=1e-3)
+    np.testing.assert_allclose(own.log_gradient, table.log_gradient, atol=0.02)
+    np.testing.assert_allclose(own.log_hessian, table.log_hessian, atol=0.3)
+    np.testing.assert_allclose(own.frame_offset, offset, atol=2e-5)
+    np.testing.assert_allclose(own.friction_drift, drift, atol=5e-3)
+    np.testing.assert_allclose(np.log(float(own.friction)) + own.friction_by_side, np.log(MU) + sides, atol=5e-3)
     predicted = found.predict(pushes, slider, hand)
     np.testing.assert_allclose(predicted.pose[:, -1], pushes.end, atol=1e-5)
-    assert found.labels[-3:] == ("side.0", "side.1", "side.2")
-    assert set(found.interval()) == {"friction", "marker", "grain", "slope", "curvature", "drift", "side"}
-    with pytest.raises(ValueError, match="applied cannot tell of marker, grain, slope, curvature, drift, side"):
-        found.applied(slider, hand, jnp.asarray(paths[0]))
+    assert found.labels[-3:] == tuple(f"friction_by_side.{k}" for k in range(3))
+    uneven = ["frame_offset", "anisotropy", "log_gradient", "log_hessian", "friction_drift", "friction_by_side"]
+    assert set(found.interval()) == {"friction", *uneven}
+    with pytest.raises(ValueError, match=f"corrected cannot represent {', '.join(uneven)};"):
+        found.corrected(slider, hand, jnp.asarray(paths[0]))
 
 
 def test_overlap_found_again(square, expected, hand):  # noqa: F811
@@ -211,8 +224,8 @@ def test_overlap_found_again(square, expected, hand):  # noqa: F811
         return run.pose[-1]
 
     pushes = pj.Pushes(starts, paths, ends(jnp.asarray(starts), jnp.asarray(paths)))
-    found = pj.identify(pushes, slider, hand, pj.Unknowns((0.0, 1.0), dof=None, overlap=0.5), sigma=1e-5)
-    assert float(found.physical.overlap) == pytest.approx(share, abs=2e-3)
+    found = pj.identify(pushes, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None, overlap=0.5), sigma=1e-5)
+    assert float(found.parameters.overlap) == pytest.approx(share, abs=2e-3)
     assert float(found.friction) == pytest.approx(MU, rel=1e-3)
     two = pj.Hand.two_fingers(RADIUS)
     wide = pj.Pushes(starts, jnp.zeros((*paths.shape[:2], two.dof)), starts)
@@ -223,7 +236,7 @@ def test_overlap_found_again(square, expected, hand):  # noqa: F811
 def test_saved_with_a_table(square, expected, hand, tmp_path):  # noqa: F811
     starts, paths = planned(np.random.default_rng(7), 5)
     pushes = pj.Pushes(starts, paths, starts)
-    unknowns = pj.Unknowns((0.0, 1.0), dof=None, grain=0.1, sides=2)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=None, anisotropy=0.1, sides=2)
     found = pj.identify(pushes, pj.Slider(square, expected), hand, unknowns)
     found.save(tmp_path / "found.json")
     again = pj.Identified.load(tmp_path / "found.json")

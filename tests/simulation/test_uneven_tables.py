@@ -7,7 +7,7 @@ import pytest
 
 import pushjax as pj
 
-TABLE = pj.Table(grain=(0.1, -0.05), slope=(2.0, 1.0), curvature=(10.0, 0.0, 5.0))
+TABLE = pj.Table(anisotropy=(0.1, -0.05), log_gradient=(2.0, 1.0), log_hessian=(10.0, 0.0, 5.0))
 MODEL = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
 
 
@@ -62,7 +62,7 @@ def test_what_is_no_table(push):
         pj.step(slider, hand, path[0], path[1], pose=pose, friction=0.2, table=3.0)
     with pytest.raises(TypeError, match="table"):
         pj.random_rollout(jax.random.key(0), slider, hand, path, pose=pose, model=MODEL, table=3.0)
-    bad = pj.Table(slope=(1.0, 2.0))
+    bad = pj.Table(log_gradient=(1.0, 2.0))
 
     def status(slope):
         table = jax.tree.map(lambda leaf: leaf + slope, bad)

@@ -19,17 +19,17 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.experiments.identify_logs import setting
-from pushjax.experiments.identify_logs.findings import Findings, parameters, predictions
+from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
 from pushjax.experiments.identify_logs.setting import Options
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.recordings import has_wrenches, observed_often_enough, screen
-from pushjax.identification.uncertainty import Profile, profile, scalars
+from pushjax.identification.uncertainty import Profile, profile, scalar_positions
 
-FEWEST = 3  # pushes; from fewer the size of their errors cannot be told
+MIN_PUSHES = 3  # pushes; from fewer the size of their errors cannot be told
 LEVEL = 0.9
-# The mean deviation must be below the share POOR of the mean motion; or below the mean motion and the share NO_BETTER
-# of the mean deviation expected before the fit. Otherwise there is a warning.
+# The mean deviation must be below the fraction POOR of the mean motion; or below the mean motion and the fraction
+# NO_BETTER of the mean deviation expected before the fit. Otherwise there is a warning.
 POOR, NO_BETTER = 0.4, 0.9
 
 
@@ -77,11 +77,11 @@ def run(
         {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | own,
         rows=parameters(findings, LEVEL),
         sigma_mm=1e3 * float(found.sigma),
-        direction=float(found.direction),
+        direction_sigma=float(found.direction_sigma),
         converged=bool(found.converged),
         steps=int(found.steps),
-        poses=len(findings.pushes.rows),
-        wrenches=int(np.sum(np.asarray(findings.pushes.paired))),
+        poses=len(findings.pushes.observed_steps),
+        wrenches=int(np.sum(np.asarray(findings.pushes.has_pair))),
         **predicted,
         warning=_warning(predicted),
         noise=noise,
@@ -114,8 +114,8 @@ def find(
         ValueError: If the options do not fit together or to the logs, or there are too few pushes.
     """
     if not logs:
-        raise ValueError("PATH: expected at least one file of recorded pushes; got none")
-    recordings, useless = _each(logs, load_recordings)
+        raise ValueError("LOGS: give at least one file of recorded pushes")
+    recordings, unreadable = _each(logs, load_recordings)
     shape = setting.shape_of(options.shape, recordings)
     hand = setting.hand_of(options.hand, options.radius, recordings)
     for one in recordings:
@@ -123,27 +123,18 @@ def find(
         if columns != hand.dof:
             raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
     _check_forces(recordings, options)
-    recordings, no_better = _each(recordings, lambda one: screen(one, shape, hand))
-    problems = (*useless, *no_better, *(problem for one in recordings for problem in one.problems))
+    recordings, unusable = _each(recordings, lambda one: screen(one, shape, hand))
+    problems = (*unreadable, *unusable, *(problem for one in recordings for problem in one.problems))
     count = sum(len(one.pushes) for one in recordings)
-    if count < FEWEST:
+    if count < MIN_PUSHES:
         why = f"; the first problem: {problems[0]}" if problems else ""
-        raise ValueError(f"expected at least {FEWEST} usable pushes; found {count} in {len(logs)} logs{why}")
+        raise ValueError(f"expected at least {MIN_PUSHES} usable pushes; found {count} in {len(logs)} logs{why}")
     pushes, slider = conditions(recordings, shape, options, seed)
-    unknowns = pj.Unknowns(
-        options.friction,
-        dof=options.dof,
-        center=options.center,
-        inset=options.inset,
-        end=options.end,
-        lag=options.lag,
-        offset=options.offset,
-        marker=options.marker,
-    )
-    touching = options.touching
+    asked = {name: getattr(options, name) for name in ("surface_dof", *LENGTHS)}
+    unknowns = pj.Unknowns(options.friction, **asked)
     say(f"fitting to {count} pushes (the first time this compiles, for up to a minute)")
-    found = pj.identify(pushes, slider, hand, unknowns, touching=touching)
-    labels = list(scalars(found))
+    found = pj.identify(pushes, slider, hand, unknowns, contact_at_end=options.contact_at_end)
+    labels = list(scalar_positions(found))
     total = len(labels) + 1
     progress(1, total)
     profiles: list[Profile] = []
@@ -157,7 +148,8 @@ def find(
         # Residuals of pushes that were learned from are too small. So the noise is fitted to every second push, about
         # what is identified from the others.
         odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
-        others = pj.identify(pushes.weighted(pushes.weight * (1 - odd)), slider, hand, unknowns, touching=touching)
+        even = pushes.weighted(pushes.weight * (1 - odd))
+        others = pj.identify(even, slider, hand, unknowns, contact_at_end=options.contact_at_end)
         second = pushes.weighted(pushes.weight * odd)
         noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]
@@ -246,12 +238,12 @@ def _warning(predicted: dict[str, Any]) -> str | None:
 def _noise(noise: Noise) -> dict[str, Any]:
     """Return the noise as numbers for the record, lengths in mm."""
     return {
-        "dof": float(noise.dof),
+        "surface_dof": float(noise.surface_dof),
         "friction": np.asarray(noise.friction),
-        "offset_mm": 1e3 * float(noise.offset),
+        "hand_offset_mm": 1e3 * float(noise.hand_offset),
         "sigma_mm": 1e3 * float(noise.sigma),
-        "relative": np.asarray(noise.relative),
-        "tails": float(noise.tails),
+        "relative_error": np.asarray(noise.relative_error),
+        "student_dof": float(noise.student_dof),
         "score_mm": 1e3 * float(noise.score),
     }
 
@@ -271,11 +263,12 @@ def summary(record: dict[str, Any]) -> str:
     lines += [f"  {problem}" for problem in problems[:10]]
     if len(problems) > 10:
         lines.append(f"  and {len(problems) - 10} more (see the JSON)")
-    lines += ["", f"{'':14}{'estimate':>10}{f'{level:.0%} interval':>20}{'profile':>20}{'determined':>12}"]
-    for row in record["rows"]:
+    names = [row["label"] + (f" / {row['unit']}" if row["unit"] else "") for row in record["rows"]]
+    width = max(14, *(len(name) + 2 for name in names))
+    lines += ["", f"{'':{width}}{'estimate':>10}{f'{level:.0%} interval':>20}{'profile':>20}{'determined':>12}"]
+    for name, row in zip(names, record["rows"], strict=True):
         normal, exact = (f"{row[name][0]:.3g} to {row[name][1]:.3g}" for name in ("interval", "profile"))
-        name = row["label"] + (f" / {row['unit']}" if row["unit"] else "")
-        lines.append(f"{name:14}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
+        lines.append(f"{name:{width}}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
     lines += [
         f"limit surface: {record['surface_determined']:.1f} of the {record['surface_numbers']} numbers that its prior "
         "varies are determined",
@@ -288,11 +281,11 @@ def summary(record: dict[str, Any]) -> str:
     if record["noise"] is not None:
         noise = record["noise"]
         friction = np.array2string(np.asarray(noise["friction"]), precision=3)
-        way, turn = noise["relative"]
+        of_distance, of_turn = noise["relative_error"]
         lines.append(
-            f"noise: dof {noise['dof']:.0f}, friction {friction}, hand off by {noise['offset_mm']:.2f} mm, poses by "
-            f"{noise['sigma_mm']:.2f} mm, {100 * way:.1f} % of their way and {100 * turn:.1f} % of their turn; energy "
-            f"score {noise['score_mm']:.2f} mm"
+            f"noise: dof {noise['surface_dof']:.0f}, friction {friction}, hand off by {noise['hand_offset_mm']:.2f} "
+            f"mm, poses by {noise['sigma_mm']:.2f} mm, {100 * of_distance:.1f} % of their distance and "
+            f"{100 * of_turn:.1f} % of their turn; energy score {noise['score_mm']:.2f} mm"
         )
     lines.append("interval: normal; profile: all else at its best; determined: how much of the doubt before is gone.")
     if record["failed_steps"]:

@@ -11,8 +11,9 @@ from pushjax.datasets import LogError
 from pushjax.identification.noise import Noise
 from pushjax.identification.uncertainty import Profile, normal_interval, profile_interval
 
-METERS = ("center", "inset", "end", "lag", "offset", "marker")
-ANGLE = "marker.2"
+# unknowns that are lengths, but for one number that is an angle
+LENGTHS = ("pressure_center", "inset", "overshoot", "lag_distance", "hand_offset", "frame_offset")
+ANGLE = "frame_offset.2"
 
 
 class Findings(NamedTuple):
@@ -51,8 +52,8 @@ class Findings(NamedTuple):
         Args:
             value: (..., pushes, ...), with the axes of conditions and pushes first.
         """
-        there = np.asarray(self.pushes.weight) > 0
-        return np.asarray(value, float)[there]
+        used = np.asarray(self.pushes.weight) > 0
+        return np.asarray(value, float)[used]
 
     def deviation_mm(self, poses: np.ndarray) -> np.ndarray:
         """Return the deviation of final poses (pushes, 3) from the measured ones, (pushes,), mm."""
@@ -63,7 +64,7 @@ def unit(label: str) -> tuple[str, float]:
     """Return the unit that a number is shown in, and how many of it make one SI unit."""
     if label == ANGLE:
         return "°", 180 / np.pi
-    return ("mm", 1e3) if label.startswith(METERS) else ("", 1.0)
+    return ("mm", 1e3) if label.startswith(LENGTHS) else ("", 1.0)
 
 
 def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
@@ -117,8 +118,8 @@ def predictions(findings: Findings) -> dict[str, Any]:
         "residual_mm": 1e3 * findings.rows(found.residual),
         "surface_numbers": len(determined),
         "surface_determined": float(sum(determined)),
-        "surface": np.asarray(found.physical.surface),
-        "length_m": np.asarray(found.prior.mean.length),
+        "surface": np.asarray(found.parameters.surface),
+        "length_m": np.asarray(found.prior.mean_surface.length),
         "information_share": {name: findings.rows(found.information_share(name)) for name in found.prior.layout.names},
     }
 
@@ -126,5 +127,5 @@ def predictions(findings: Findings) -> dict[str, Any]:
 def _expected(findings: Findings) -> jax.Array:
     """Predict final poses with the prior's mean, without any push, at the middle of the friction's range."""
     found = findings.found
-    before = eqx.tree_at(lambda one: one.z, found, found.prior.start)
+    before = eqx.tree_at(lambda one: one.z, found, found.prior.mean)
     return before.predict(findings.pushes, findings.slider, findings.hand).pose[..., -1, :]

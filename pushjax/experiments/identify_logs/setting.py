@@ -16,8 +16,8 @@ from pushjax.datasets.recordings import Recordings
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
 HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width and thickness of a pad)"
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
-PAIRS = 400
-CELLS = 100  # support points under a slider whose pressure is known everywhere
+NUM_PAIRS = 400
+NUM_POINTS = 100  # support points under a slider whose pressure is known everywhere
 
 
 Meters = Annotated[float | None, cli_option("M")]
@@ -35,38 +35,40 @@ class Options:
     radius: Meters = None
     """Of the fingers, m. Default: what the logs tell."""
     support: Annotated[str | None, cli_option("SUPPORT")] = None
-    """What carries the object, of which the limit surface is expected: uniform, rim, or points:x,y;x,y;x,y (m).
-    Default: what the logs tell, else uniform."""
+    """Pressure distribution under the object, which gives the prior of the limit surface: uniform, rim, or
+    points:x,y;x,y;x,y (m). Default: what the logs tell, else uniform."""
     surface: Literal["quartic", "ellipsoid"] = "quartic"
     """Kind of limit surface."""
-    dof: float = 50.0
-    """How well it is known beforehand: degrees of freedom; fewer, less well."""
+    surface_dof: float = 50.0
+    """How well the limit surface is known beforehand: degrees of freedom of its prior; fewer, less well."""
     friction: tuple[float, float] = (0.0, 1.0)
-    """Lowest and highest that the fingers' friction may be."""
-    center: Meters = None
-    """Find the center of pressure too; by how much it may be off, m (standard deviation; and so the next five)."""
+    """Lowest and highest friction coefficient of the fingers."""
+    pressure_center: Meters = None
+    """Estimate the center of pressure too; the value is the standard deviation of its prior, m. Likewise for the next
+    five options."""
     inset: Meters = None
-    """Find by how much the outline is smaller."""
-    end: Meters = None
-    """Find how far the hand went on after its path ends."""
-    lag: Meters = None
-    """Find how far the hand was behind where its path says."""
-    offset: Meters = None
-    """Find how far the hand's coordinates are off those of the object."""
-    marker: Meters = None
-    """Find how far the object's frame is off the one that was tracked; its angle, times the radius of gyration."""
-    touching: bool = False
-    """At the end of most pushes the finger touches the object: learn from the gap that was seen there."""
+    """Estimate by how much the outline is smaller."""
+    overshoot: Meters = None
+    """Estimate how far the hand went on after the end of its path."""
+    lag_distance: Meters = None
+    """Estimate the distance by which the hand was behind its path."""
+    hand_offset: Meters = None
+    """Estimate the displacement of the hand from its path."""
+    frame_offset: Meters = None
+    """Estimate the pose of the object's frame in the tracked frame; its angle times the length of the surface."""
+    contact_at_end: bool = False
+    """The finger touches the object at the end of most pushes: use the gap that was measured there."""
     separate: bool = False
-    """Each log has its own friction and surface; they share how the set-up is off. Default: all are alike."""
+    """Each log has its own friction and surface; all logs share the calibration. Default: they share everything."""
     steps: int = 40
-    """Steps of each push."""
+    """Number of steps of each push."""
     parts: int = 1
-    """After how many equal parts of a push the object's pose counts, where it was seen on the way."""
+    """Number of equally spaced poses per push to fit, if the object was tracked during the push (1: only the final
+    pose)."""
     forces: bool = False
-    """Learn from measured forces too; needs parts."""
+    """Use measured forces too; needs parts."""
     noise: bool = False
-    """Find by how much friction scatters, too."""
+    """Also estimate how much pushes scatter."""
 
 
 def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.Disk | pj.Ellipse:
@@ -145,9 +147,9 @@ def support_of(text: str | None, shape, recordings: Recordings) -> pj.Support:
     if text is None and recordings.support_points is not None and len(recordings.support_points):
         return pj.Support.tripod(recordings.support_points)
     if text in (None, "uniform"):
-        return pj.Support.uniform(shape, CELLS)
+        return pj.Support.uniform(shape, NUM_POINTS)
     if text == "rim":
-        return pj.Support.rim(shape, CELLS)
+        return pj.Support.rim(shape, NUM_POINTS)
     kind, _, rest = str(text).partition(":")
     if kind != "points":
         raise ValueError(f"--support: expected {SUPPORTS}; got {text!r}")
@@ -163,7 +165,7 @@ def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSur
         degree: 4 for a quartic, else an ellipsoid.
         seed: Seed of the wrench-twist pairs.
     """
-    pairs = support.wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    pairs = support.wrench_twist_pairs(jax.random.key(seed), NUM_PAIRS)
     return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
 
 
@@ -185,10 +187,10 @@ def _vertices(path: Path) -> np.ndarray:
     return np.array(numbers)
 
 
-def _numbers(option: str, given: str, text: str, apart: str, count: int, allowed: str) -> list[float]:
-    """Read `count` numbers that are separated by `apart`; raise ValueError with the option's name otherwise."""
+def _numbers(option: str, given: str, text: str, separator: str, count: int, allowed: str) -> list[float]:
+    """Read `count` numbers that are separated by `separator`; raise ValueError with the option's name otherwise."""
     try:
-        found = [float(part) for part in text.split(apart)]
+        found = [float(part) for part in text.split(separator)]
     except ValueError:
         found = []
     if len(found) != count:

@@ -93,7 +93,7 @@ def _cell(
         "paper_mm": paper_mm(log.surface, log.shape, model),
         "toolbox_mm": None if toolbox is None else float(deviation_mm(log, toolbox).mean()),
         "friction": predicted.friction,
-        "learned": int(np.sum(log.learned & log.whole.valid)),
+        "learned": int(np.sum(log.is_training & log.whole.valid)),
         "tested": len(off),
         "failed_steps": predicted.failed,
         **_calibration(predicted),
@@ -102,14 +102,18 @@ def _cell(
 
 
 def _calibration(predicted: Predicted) -> dict[str, Any]:
-    """Return what else was identified: lengths in mm, the angle of the marker in degrees."""
+    """Return what else was identified: lengths in mm, the angle of the object's frame in degrees."""
     if predicted.found is None:
         return {}
-    own = predicted.found.physical
-    found = {f"{name}_mm": 1e3 * np.asarray(getattr(own, name), float) for name in ("center", "offset", "inset")}
-    if own.marker is not None:
-        found |= {"marker_mm": 1e3 * np.asarray(own.marker[:2], float), "marker_deg": float(np.degrees(own.marker[2]))}
-    return found | {"sigma_mm": 1e3 * float(predicted.found.sigma), "gap_mm": 1e3 * float(predicted.found.gap)}
+    own = predicted.found.parameters
+    names = ("pressure_center", "hand_offset", "inset")
+    found = {f"{name}_mm": 1e3 * np.asarray(getattr(own, name), float) for name in names}
+    offset = own.frame_offset
+    if offset is not None:
+        found |= {"frame_offset_mm": 1e3 * np.asarray(offset[:2], float)}
+        found |= {"frame_offset_deg": float(np.degrees(offset[2]))}
+    sigma, gap_sigma = predicted.found.sigma, predicted.found.gap_sigma
+    return found | {"sigma_mm": 1e3 * float(sigma), "gap_sigma_mm": 1e3 * float(gap_sigma)}
 
 
 def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:

@@ -26,17 +26,16 @@ FRICTIONS = np.linspace(0.0, 0.6, 31)
 IDENTIFY_STEPS = 25
 # Largest numbers of pushes to learn from and to test with; arrays are padded to them.
 LEARNED, TESTED = 128, 304
-# Priors, as in `pj.Unknowns`. DOF is the degrees of freedom of the surface. The others are standard deviations, in m:
-# CENTER of the center of pressure, INSET of how much smaller the outline is, OFFSET of the tip in the world frame of
-# the tracker, and MARKER of the object in the frame that is tracked. All values were chosen on the surface abs.
-DOF, CENTER, INSET, OFFSET, MARKER = 10.0, 0.015, 0.001, 0.002, 0.001
+# Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. All values were chosen
+# on the surface abs.
+SURFACE_DOF, PRESSURE_CENTER, INSET, HAND_OFFSET, FRAME_OFFSET = 10.0, 0.015, 0.001, 0.002, 0.001
 NO_ROOM = 1e-6  # prior standard deviation of what must not be fitted
 UNKNOWNS: dict[str, Any] = {
-    "dof": DOF,
-    "center": CENTER,
+    "surface_dof": SURFACE_DOF,
+    "pressure_center": PRESSURE_CENTER,
     "inset": INSET,
-    "offset": OFFSET,
-    "marker": MARKER,
+    "hand_offset": HAND_OFFSET,
+    "frame_offset": FRAME_OFFSET,
     "overlap": NO_ROOM,
 }
 
@@ -87,7 +86,7 @@ class Setting(NamedTuple):
             model: "quartic" or "ellipsoid".
             steps: Steps of each push.
         """
-        rows = np.flatnonzero(log.learned & log.whole.valid)
+        rows = np.flatnonzero(log.is_training & log.whole.valid)
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
         return Setting(
@@ -140,7 +139,7 @@ def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: 
     Returns:
         The result, with the unknown `overlap` imposed and the standard deviation of its prior set to 1.
     """
-    found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, touching=True)
+    found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, contact_at_end=True)
     places = jnp.asarray([label.startswith("overlap") for label in found.labels])
     none = jnp.where(places, 1 - overlap, found.z).astype(found.z.dtype)
     return eqx.tree_at(lambda f: (f.z, f.prior.unknowns.overlap), found, (none, jnp.ones_like(found.sigma)))

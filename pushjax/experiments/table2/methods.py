@@ -27,7 +27,7 @@ FRICTIONS = np.linspace(0.0, 0.8, 41)
 TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
 IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same answer with more
 # Priors: the supports are known to about a millimeter, the robot's setup less well.
-DOF, INSET, END = 200.0, 0.002, 0.001
+SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
 
 
 class Predicted(NamedTuple):
@@ -110,7 +110,7 @@ def identified(
     steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
     pushes = pj.Pushes.conditions([recorded(log, geometry, steps) for log in logs])
     slider = pj.Slider(outline(logs[0], geometry), jax.tree.map(lambda *each: jnp.stack(each), *surfaces))
-    unknowns = pj.Unknowns((0.0, 1.0), dof=DOF, inset=INSET, end=END)
+    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, inset=INSET, overshoot=OVERSHOOT)
     hand, length = pj.Hand.finger(geometry.radius), logs[0].length
     errors, friction, failed = [], [], np.zeros(len(logs), int)
     for split in range(len(train[0])):

@@ -1,0 +1,231 @@
+"""The prior of the unknowns, and their coordinates z.
+
+The entries of the vector z are independent a priori and have variance one. The exception is the friction, of which only
+the range is known. So the prior term of the loss is |z|^2, and steps are well scaled. Conditions may share any of the
+unknowns.
+
+friction         mu = low + (high - low) logistic(z).
+surface          H(F) = sum_k (F' L_k L_k' F)^(d/2), L_k = L0_k (1 + E_k). L0_k belongs to the mean surface. E_k is
+                 lower triangular, with variance 1 / m below the diagonal and 1 / (2 m) on it. To first order, for many
+                 degrees of freedom m, this is the distribution from which `FrictionModel` draws ("sum_of_squares"),
+                 with the same meaning of dof. H is always convex.
+pressure_center  center of pressure c, about which the torque of the surface is taken: H(fx, fy, tau - c x f).
+the rest         see `Unknowns`: entries of z times their standard deviation.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.quartic import Quartic
+from pushjax.friction.random import dof_of_terms
+from pushjax.friction.sum_of_squares import TERMS, decompose, squared_quadratics, unpack_lower
+from pushjax.identification.unknowns import SIZES, Parameters, Unknowns
+
+
+class Layout(eqx.Module):
+    """Positions of the unknowns in the vector z.
+
+    Attributes:
+        names: Names of the unknowns.
+        sizes: How many numbers each has.
+        shared: Names that all conditions share.
+        conditions: Number of conditions.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    shared: tuple[str, ...] = eqx.field(static=True)
+    conditions: int = eqx.field(static=True)
+
+    @staticmethod
+    def of(unknowns: Unknowns, degree: int, conditions: int) -> "Layout":
+        """Return the layout for surfaces of degree 2 or 4."""
+        sizes = SIZES | {"surface": 6 * (TERMS if degree == 4 else 1), "friction_by_side": unknowns.sides}
+        names = unknowns.names
+        return Layout(names, tuple(sizes[name] for name in names), unknowns.shared, conditions)
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        """Slice of each unknown in the numbers of one condition."""
+        ends = np.cumsum((0, *self.sizes))
+        return {name: slice(int(a), int(b)) for name, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
+
+    @property
+    def positions(self) -> np.ndarray:
+        """(conditions, numbers) positions in z of the numbers of each condition."""
+        columns, used = [], 0
+        for name, size in zip(self.names, self.sizes, strict=True):
+            copies = 1 if name in self.shared else self.conditions
+            block = used + np.arange(copies * size).reshape(copies, size)
+            columns.append(np.broadcast_to(block, (self.conditions, size)))
+            used += copies * size
+        return np.concatenate(columns, axis=1)
+
+    @property
+    def size(self) -> int:
+        """Number of entries of z."""
+        return int(self.positions.max()) + 1
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A label for every entry of z."""
+        labels = [""] * self.size
+        for condition, row in enumerate(self.positions):
+            for name, part in self.slices.items():
+                for k, position in enumerate(row[part]):
+                    where = f"[{condition}]" if self.conditions > 1 and name not in self.shared else ""
+                    labels[position] = f"{name}{where}" + (f".{k}" if part.stop - part.start > 1 else "")
+        return tuple(labels)
+
+    @property
+    def has_normal_prior(self) -> np.ndarray:
+        """(size,) 1 for entries of z whose square is in the loss, 0 for frictions."""
+        normal = np.ones(self.size)
+        if "friction" in self.names:
+            normal[self.positions[:, self.slices["friction"]]] = 0
+        return normal
+
+
+class PriorSurface(eqx.Module):
+    """The mean limit surface of every condition, from which identification starts.
+
+    Attributes:
+        factors: (conditions, terms, 3, 3) lower triangular factors L0_k.
+        relative_std: (conditions,) standard deviation of an entry of E_k below the diagonal; zero if the surface is
+            known.
+        length: (conditions,) length of the surface, m.
+    """
+
+    factors: Float[Array, "conditions terms 3 3"]
+    relative_std: Float[Array, "conditions"]
+    length: Float[Array, "conditions"]
+
+    @staticmethod
+    def of(surface: LimitSurface, dof: Array | None) -> "PriorSurface":
+        """Return the mean for surfaces with a leading axis of conditions."""
+        factors = jax.vmap(_factors_of)(surface)
+        if dof is None:
+            return PriorSurface(factors, jnp.zeros_like(surface.length), surface.length)
+        n = jnp.asarray(dof, factors.dtype)
+        m = jax.vmap(lambda one: dof_of_terms(one, n))(factors) if isinstance(surface, Quartic) else n
+        return PriorSurface(factors, jnp.broadcast_to(1 / jnp.sqrt(m), surface.length.shape), surface.length)
+
+
+def _factors_of(surface: LimitSurface) -> Array:
+    """Return the factors L_k of a surface, (terms, 3, 3)."""
+    if isinstance(surface, Quartic):
+        return decompose(surface.coefficients).lower
+    if isinstance(surface, Ellipsoid):
+        return jnp.linalg.cholesky(surface.A)[None]
+    raise TypeError(f"surface: expected an Ellipsoid or a Quartic; got a {type(surface).__name__}")
+
+
+class Prior(eqx.Module):
+    """Prior of the unknowns: everything that converts z to physical parameters.
+
+    Attributes:
+        unknowns: What is estimated, and its prior.
+        known_friction: (conditions,) friction, used if it is known.
+        mean_surface: Mean surfaces, with a leading axis of conditions.
+        origin: (2,) world, m, reference point of the table friction.
+        layout: Positions of the unknowns in z.
+    """
+
+    unknowns: Unknowns
+    known_friction: Float[Array, "conditions"]
+    mean_surface: PriorSurface
+    origin: Float[Array, "2"]
+    layout: Layout = eqx.field(static=True)
+
+    @staticmethod
+    def of(unknowns: Unknowns, surface: LimitSurface, friction: Array, origin: Array) -> "Prior":
+        """Return the prior for surfaces with a leading axis of conditions."""
+        conditions = surface.length.shape[0]
+        layout = Layout.of(unknowns, surface.degree, conditions)
+        known = jnp.broadcast_to(friction, (conditions,)).astype(surface.length.dtype)
+        return Prior(unknowns, known, PriorSurface.of(surface, unknowns.surface_dof), origin, layout)
+
+    def parameters(self, z: Float[Array, "size"]) -> Parameters:
+        """Return the physical parameters of every condition."""
+        each = jax.vmap(lambda numbers, *rest: _parameters(numbers, self.layout, self.unknowns, *rest))
+        return each(z[self.layout.positions], self.known_friction, self.mean_surface)
+
+    def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
+        """Return the lower triangular factors L_k of every condition's surface."""
+        each = jax.vmap(lambda numbers, mean: _factors(_by_name(numbers, self.layout), self.unknowns, mean))
+        whole = each(z[self.layout.positions], self.mean_surface)
+        return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(whole, -1, -2), mode="r"), -1, -2)
+
+    @property
+    def mean(self) -> Float[Array, "size"]:
+        """The prior mean of z, which is zero."""
+        return jnp.zeros(self.layout.size, self.known_friction.dtype)
+
+
+def _by_name(z: Array, layout: Layout) -> dict[str, Any]:
+    """Split the numbers of one condition by name."""
+    return {name: z[where] for name, where in layout.slices.items()}
+
+
+def _scaled(part: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
+    """Return entries of z times their standard deviation; zeros for what is known."""
+    std = getattr(unknowns, name)
+    return jnp.zeros(SIZES[name], dtype) if std is None else std.astype(dtype) * part[name]
+
+
+def _factors(part: dict[str, Any], unknowns: Unknowns, mean: PriorSurface) -> Float[Array, "terms 3 3"]:
+    """Return L_k of the surface, with P_k = L_k L_k'; not triangular if the center of pressure is an unknown."""
+    factors = mean.factors
+    if "surface" in part:
+        factors = factors + mean.relative_std * factors @ _perturbation(part["surface"].reshape(-1, 6))
+    if "pressure_center" in part:
+        cx, cy = _scaled(part, unknowns, "pressure_center", factors.dtype) / mean.length
+        row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
+        shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
+        factors = shift.T[None] @ factors
+    return factors
+
+
+def _parameters(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mean: PriorSurface) -> Parameters:
+    """Return the physical parameters of one condition.
+
+    Args:
+        z: (numbers,) numbers of the condition.
+        layout: Positions of the unknowns.
+        unknowns: What is estimated, and its prior.
+        friction: Friction of the condition, used if it is known.
+        mean: Mean surface of the condition.
+    """
+    part = _by_name(z, layout)
+    mu = friction
+    if unknowns.friction is not None:
+        low, high = unknowns.friction.astype(z.dtype)
+        mu = low + (high - low) * jax.nn.sigmoid(part["friction"][0])
+    factors = _factors(part, unknowns, mean)
+    forms = factors @ jnp.swapaxes(factors, 1, 2)
+    surface = squared_quadratics(forms) if factors.shape[0] > 1 else forms[0]
+
+    def scaled(name: str) -> Array:
+        return _scaled(part, unknowns, name, z.dtype)
+
+    pressure_center, hand_offset = scaled("pressure_center"), scaled("hand_offset")
+    inset, overshoot, lag_distance = (scaled(name)[0] for name in ("inset", "overshoot", "lag_distance"))
+    optional = {name: scaled(name) for name in Parameters._field_defaults if name in part}
+    if "frame_offset" in optional:
+        optional["frame_offset"] = optional["frame_offset"].at[2].divide(mean.length)
+    optional = {name: value[0] if SIZES[name] == 1 else value for name, value in optional.items()}
+    return Parameters(mu, surface, pressure_center, inset, overshoot, lag_distance, hand_offset, **optional)
+
+
+def _perturbation(e: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+    """Return E_k in units of its standard deviation below the diagonal, from its six numbers."""
+    rows, columns = np.tril_indices(3)
+    size = np.where(rows == columns, np.sqrt(0.5), 1.0)
+    return unpack_lower(e * jnp.asarray(size, e.dtype)[None])
