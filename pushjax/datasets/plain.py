@@ -15,7 +15,7 @@ import numpy as np
 from pushjax.datasets._archive import Arrays, floats, read_archive
 from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, check_recording, collect
-from pushjax.datasets.records import Fault, quoted
+from pushjax.datasets.records import ParseError, quoted
 
 # Columns of a table: all of _REQUIRED, and each group of _FURTHER either as a whole or not at all.
 _PUSH = "push"
@@ -111,7 +111,7 @@ def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recordi
     """Read the rows of one push, or return the error that describes its first fault."""
     try:
         numbers = [_numbers(names, row) for row in rows]
-    except Fault as fault:
+    except ParseError as fault:
         return LogError(path, str(fault), push=index, line=fault.line)
 
     def columns(wanted: tuple[str, ...]) -> Floats:
@@ -132,13 +132,13 @@ def _numbers(names: list[str], row: _Row) -> Mapping[str, float]:
     """Read the numbers of a row, by column; a blank cell gives NaN where blanks are allowed.
 
     Raises:
-        Fault: If a cell is bad, or if the row has too many or too few.
+        ParseError: If a cell is bad, or if the row has too many or too few.
     """
     if len(row.cells) != len(names):
-        raise Fault(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
+        raise ParseError(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
     cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
     if not cells.pop(_PUSH):
-        raise Fault(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
+        raise ParseError(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
     return {name: _number(name, cell, row.line) for name, cell in cells.items()}
 
 
@@ -146,7 +146,7 @@ def _number(name: str, cell: str, line: int) -> float:
     """Read the number in a cell; a blank cell gives NaN where blanks are allowed.
 
     Raises:
-        Fault: If the cell has no number or, where it must, no finite one.
+        ParseError: If the cell has no number or, where it must, no finite one.
     """
     if not cell and name in _MAY_LACK:
         return math.nan
@@ -154,9 +154,9 @@ def _number(name: str, cell: str, line: int) -> float:
         value = float(cell)
     except ValueError:
         found = quoted(cell) if cell else "a blank"
-        raise Fault(f"expected a number in column {name}, found {found}", line) from None
+        raise ParseError(f"expected a number in column {name}, found {found}", line) from None
     if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_LACK):
-        raise Fault(f"expected a finite number in column {name}, found {cell}", line)
+        raise ParseError(f"expected a finite number in column {name}, found {cell}", line)
     return value
 
 

@@ -22,7 +22,7 @@ from pushjax.datasets.pushes import Floats, LogError
 
 POSE_COLUMNS, COUNT_COLUMNS, FORCE_COLUMNS, ROBOT_COLUMNS = 7, 1, 3, 8
 # A push has about 670 force samples and 220 robot samples. Even a very long push stays far below this.
-MOST_SAMPLES = 1_000_000
+MAX_SAMPLES = 1_000_000
 # No logged quantity (s, mm, N) comes near this value. Squares of larger numbers might overflow later.
 LARGEST_NUMBER = 1e12
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -57,12 +57,12 @@ class Record:
         return self.force_line + len(self.force) + 1
 
 
-class Fault(Exception):
-    """A fault in a record, raised before the file and the push that it belongs to are known.
+class ParseError(Exception):
+    """A record that cannot be read, raised before the file and the push that it belongs to are known.
 
     Attributes:
-        line: Line of the fault, from 1.
-        at_end: Whether the fault is that the log ends too early.
+        line: Line of the problem, from 1.
+        at_end: Whether the problem is that the log ends too early.
     """
 
     def __init__(self, message: str, line: int, *, at_end: bool = False) -> None:
@@ -88,22 +88,22 @@ def read_records(path: Path) -> Iterator[Record | LogError]:
     promised, fault = _header(lines)
     if fault is not None:
         yield LogError(path, str(fault), line=1)
-    at = 0 if promised is None and _start_score(lines, 0) >= 2 else 1
+    at = 0 if promised is None and _matching_start_lines(lines, 0) >= 2 else 1
     number = 0
     while at < len(lines):
         if number == promised:
             yield LogError(path, f"expected the end of the log after {promised} pushes, found more lines", line=at + 1)
-        if promised is not None and number >= promised and _start_score(lines, at) < 2:
+        if promised is not None and number >= promised and _matching_start_lines(lines, at) < 2:
             return
         try:
             record, at = _record(lines, at, number)
             yield record
-        except Fault as found:
-            ending = _promise(promised) + damage if found.at_end else ""
+        except ParseError as found:
+            ending = _promised_count(promised) + damage if found.at_end else ""
             yield LogError(path, str(found) + ending, push=number, line=found.line)
             if found.at_end:
                 return
-            at = _resume(lines, at, found.line - 1)
+            at = _next_record(lines, at, found.line - 1)
         number += 1
     if promised is not None and number < promised:
         message = f"expected {promised} pushes as in the header, found {number}: the log is truncated{damage}"
@@ -128,7 +128,7 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
             text = gzip.decompress(text)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             damage = f"; the gzip stream is damaged: {error}"
-            text = _undamaged(text)
+            text = _readable_part(text)
             # The stream may be cut inside a number, and the rest still looks like a number: drop the last line.
             text = text[: text.rfind(b"\n") + 1]
     lines = text.decode("ascii", errors="replace").rstrip().splitlines()
@@ -137,7 +137,7 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
     return lines, damage
 
 
-def _undamaged(zipped: bytes) -> bytes:
+def _readable_part(zipped: bytes) -> bytes:
     """Return what a gzip stream holds before its damage.
 
     The stream is decompressed byte by byte, because a call that fails returns nothing.
@@ -152,18 +152,18 @@ def _undamaged(zipped: bytes) -> bytes:
     return bytes(text)
 
 
-def _header(lines: list[str]) -> tuple[int | None, Fault | None]:
+def _header(lines: list[str]) -> tuple[int | None, ParseError | None]:
     """Read the promised number of pushes from the first line: the number, or None and the fault."""
     try:
         promised = _count(lines, 0, "pushes")
-    except Fault as fault:
+    except ParseError as fault:
         return None, fault
     if promised == 0:
-        return None, Fault("expected the number of pushes, found 0", 1)
+        return None, ParseError("expected the number of pushes, found 0", 1)
     return promised, None
 
 
-def _promise(promised: int | None) -> str:
+def _promised_count(promised: int | None) -> str:
     """Describe the number of pushes that the header promises, if it is known."""
     return "" if promised is None else f" (the header promises {promised} pushes)"
 
@@ -172,7 +172,7 @@ def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
     """Read the record that starts at line index `at`, and return it with the line index after its end.
 
     Raises:
-        Fault: If the record is damaged.
+        ParseError: If the record is damaged.
     """
     first = _table(lines, at, 1, POSE_COLUMNS, "object pose before the push")
     last = _table(lines, at + 1, 1, POSE_COLUMNS, "object pose after the push")
@@ -182,8 +182,10 @@ def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
     robot_count = _count(lines, robot_at, "robot samples")
     robot = _table(lines, robot_at + 1, robot_count, ROBOT_COLUMNS, "robot sample")
     end = robot_at + 1 + robot_count
-    if end < len(lines) and _start_score(lines, end) < 2 and _columns(lines, end) == ROBOT_COLUMNS:
-        raise Fault(f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1)
+    if end < len(lines) and _matching_start_lines(lines, end) < 2 and _columns(lines, end) == ROBOT_COLUMNS:
+        raise ParseError(
+            f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1
+        )
     return Record(number, at + 1, np.concatenate([first, last]), force, robot), end
 
 
@@ -191,16 +193,16 @@ def _count(lines: list[str], at: int, what: str) -> int:
     """Read the number of samples or pushes at line index `at`.
 
     Raises:
-        Fault: If the line is missing, is no integer, or is not between 0 and MOST_SAMPLES.
+        ParseError: If the line is missing, is no integer, or is not between 0 and MAX_SAMPLES.
     """
     if at >= len(lines):
-        raise Fault(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
+        raise ParseError(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
     try:
         count = int(lines[at])
     except ValueError:
-        raise Fault(f"expected the number of {what}, found {quoted(lines[at])}", at + 1) from None
-    if not 0 <= count <= MOST_SAMPLES:
-        raise Fault(f"expected the number of {what} (0 to {MOST_SAMPLES}), found {count}", at + 1)
+        raise ParseError(f"expected the number of {what}, found {quoted(lines[at])}", at + 1) from None
+    if not 0 <= count <= MAX_SAMPLES:
+        raise ParseError(f"expected the number of {what} (0 to {MAX_SAMPLES}), found {count}", at + 1)
     return count
 
 
@@ -208,7 +210,7 @@ def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Fl
     """Read a table of shape (count, columns) from `count` lines, starting at line index `at`.
 
     Raises:
-        Fault: If a line is missing or has other numbers than expected.
+        ParseError: If a line is missing or has other numbers than expected.
     """
     rows = [line.split() for line in lines[at : at + count]]
     try:
@@ -217,11 +219,11 @@ def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Fl
     except ValueError:
         good = False
     if not good or any(len(row) != columns for row in rows):
-        raise _table_fault(lines, at, count, columns, what)
+        raise _table_error(lines, at, count, columns, what)
     return table
 
 
-def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str) -> Fault:
+def _table_error(lines: list[str], at: int, count: int, columns: int, what: str) -> ParseError:
     """Find the first fault in the lines of a table that is known to be bad."""
     for row, line in enumerate(lines[at : at + count]):
         where = what if count == 1 else f"{what} {row + 1} of {count}"
@@ -230,18 +232,18 @@ def _table_fault(lines: list[str], at: int, count: int, columns: int, what: str)
             # If the last line of the file has too few numbers, it was cut off while it was written.
             cut = at + row == len(lines) - 1 and len(tokens) < columns
             found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {quoted(line)}"
-            return Fault(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
+            return ParseError(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
         for token in tokens:
             try:
                 value = float(token)
             except ValueError:
-                return Fault(f"expected a number ({where}), found {quoted(token)}", at + row + 1)
+                return ParseError(f"expected a number ({where}), found {quoted(token)}", at + row + 1)
             if not np.isfinite(value):
-                return Fault(f"expected finite numbers ({where}), found {token}", at + row + 1)
+                return ParseError(f"expected finite numbers ({where}), found {token}", at + row + 1)
             if abs(value) >= LARGEST_NUMBER:
-                return Fault(f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1)
+                return ParseError(f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1)
     have = max(len(lines) - at, 0)
-    return Fault(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
+    return ParseError(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
 
 
 def quoted(text: str) -> str:
@@ -254,7 +256,7 @@ def _columns(lines: list[str], at: int) -> int:
     return len(lines[at].split()) if at < len(lines) else -1
 
 
-def _start_score(lines: list[str], at: int) -> int:
+def _matching_start_lines(lines: list[str], at: int) -> int:
     """Count the lines, of the three from index `at`, whose number of columns fits the start of a record.
 
     An intact start scores 3. A start with one damaged line scores 2.
@@ -263,7 +265,7 @@ def _start_score(lines: list[str], at: int) -> int:
     return sum(_columns(lines, at + row) == columns for row, columns in enumerate(shape))
 
 
-def _resume(lines: list[str], at: int, fault_at: int) -> int:
+def _next_record(lines: list[str], at: int, fault_at: int) -> int:
     """Find the line index at which to continue after a damaged record.
 
     Args:
@@ -277,13 +279,13 @@ def _resume(lines: list[str], at: int, fault_at: int) -> int:
     try:
         robot_at = at + 3 + _count(lines, at + 2, "")
         end = robot_at + 1 + _count(lines, robot_at, "")
-        if end == len(lines) or _start_score(lines, end) >= 2:
+        if end == len(lines) or _matching_start_lines(lines, end) >= 2:
             return end
-    except Fault:
+    except ParseError:
         pass
     # The lines before the fault have been recognized as part of this record, so the search starts at the fault.
     for start in range(max(fault_at, at + 1), len(lines)):
-        if _start_score(lines, start) >= 2:
+        if _matching_start_lines(lines, start) >= 2:
             # A damaged line just before an intact start (score 3) also scores 2: skip it.
-            return start + 1 if _start_score(lines, start + 1) == 3 else start
+            return start + 1 if _matching_start_lines(lines, start + 1) == 3 else start
     return len(lines)

@@ -26,7 +26,7 @@ from pushjax.datasets.pushes import (
     rotation,
     wrap_angle,
 )
-from pushjax.datasets.records import Fault, Record, read_records
+from pushjax.datasets.records import ParseError, Record, read_records
 
 # The norms of logged quaternions deviate from one by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
 QUATERNION_TOLERANCE = 0.01
@@ -80,7 +80,7 @@ def load_triangle_log(
         if isinstance(record, Record):
             try:
                 pushes.append(_usable_push(record))
-            except Fault as fault:
+            except ParseError as fault:
                 problem = LogError(file, str(fault), push=record.index, line=fault.line)
         if problem is not None:
             if strict:
@@ -117,13 +117,13 @@ def _usable_push(record: Record) -> Push:
     """Convert a record to a push.
 
     Raises:
-        Fault: If the record cannot be trusted.
+        ParseError: If the record cannot be trusted.
     """
     _check(record)
     push = _push(record)
     _check_motion(push, record.line + 1)
     if not force_filter(push.force).any():
-        raise Fault(
+        raise ParseError(
             "expected the force to last after the first 30 % of the samples, found none there",
             record.force_line,
         )
@@ -134,7 +134,7 @@ def _check(record: Record) -> None:
     """Check that a record has enough samples, unit quaternions, and clocks that do not go back and overlap in time.
 
     Raises:
-        Fault: If a condition is violated.
+        ParseError: If a condition is violated.
     """
     robot_count_line = record.robot_line - 1
     for what, table, line in (
@@ -142,38 +142,40 @@ def _check(record: Record) -> None:
         ("robot", record.robot, robot_count_line),
     ):
         if len(table) < MIN_SAMPLES:
-            raise Fault(f"expected at least {MIN_SAMPLES} {what} samples, found {len(table)}", line)
+            raise ParseError(f"expected at least {MIN_SAMPLES} {what} samples, found {len(table)}", line)
     _check_quaternions(record.poses[:, 3:], record.line, "object pose")
     _check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
     _check_clock(record.force[:, 0], record.force_line, "force")
     _check_clock(record.robot[:, 0], record.robot_line, "robot")
     if record.robot[0, 0] > record.force[-1, 0] or record.robot[-1, 0] < record.force[0, 0]:
-        raise Fault("expected robot samples from the time of the force samples, found none", record.robot_line)
+        raise ParseError("expected robot samples from the time of the force samples, found none", record.robot_line)
 
 
 def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
     """Check that the quaternions, the first of which is on `line`, have unit norm.
 
     Raises:
-        Fault: For the first that has not.
+        ParseError: For the first that has not.
     """
     norm = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
     if len(bad):
-        raise Fault(f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0]))
+        raise ParseError(
+            f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0])
+        )
 
 
 def _check_clock(time: Floats, line: int, what: str) -> None:
     """Check that the times, the first of which is on `line`, do not decrease.
 
     Raises:
-        Fault: For the first that does.
+        ParseError: For the first that does.
     """
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         step = time[back[0] + 1] - time[back[0]]
         message = f"expected time stamps that do not decrease ({what} samples), found a step of {step:.3g} s"
-        raise Fault(message, line + int(back[0]) + 1)
+        raise ParseError(message, line + int(back[0]) + 1)
 
 
 def _check_motion(push: Push, line: int) -> None:
@@ -182,11 +184,11 @@ def _check_motion(push: Push, line: int) -> None:
     `line` is the line of the pose after the push, which is where a jump shows.
 
     Raises:
-        Fault: If a condition is violated.
+        ParseError: If a condition is violated.
     """
     travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
     if not travel >= MIN_TRAVEL:
-        raise Fault(
+        raise ParseError(
             f"expected the finger to move at least {MIN_TRAVEL * 1e3:g} mm, found {travel * 1e3:.2g} mm",
             line,
         )
@@ -197,7 +199,7 @@ def _check_motion(push: Push, line: int) -> None:
     if not (deviation <= MAX_MOTION and abs(gap) <= MAX_GAP):
         expected = f"less than {MAX_MOTION * 1e3:g} mm and to end within {MAX_GAP * 1e3:g} mm of the finger"
         found = f"{deviation * 1e3:.4g} mm and {gap * 1e3:.4g} mm"
-        raise Fault(f"the motion capture jumped: expected the object to move {expected}, found {found}", line)
+        raise ParseError(f"the motion capture jumped: expected the object to move {expected}, found {found}", line)
 
 
 def _end_gap(push: Push) -> float:

@@ -21,7 +21,7 @@ from pushjax.datasets import (
     load_triangle_log,
 )
 from pushjax.datasets import triangle_setup as setup
-from pushjax.datasets.records import MOST_SAMPLES
+from pushjax.datasets.records import MAX_SAMPLES
 
 # --- compared with the curated arrays ---
 
@@ -357,7 +357,7 @@ DAMAGES: dict[str, tuple[Damage, int, str]] = {
     "negative count": (
         set_line(FORCE_COUNT, "-5"),
         FORCE_COUNT,
-        f"expected the number of force samples (0 to {MOST_SAMPLES}), found -5",
+        f"expected the number of force samples (0 to {MAX_SAMPLES}), found -5",
     ),
     "absurd count": (set_line(ROBOT_COUNT, "99999999"), ROBOT_COUNT, "expected the number of robot samples"),
     "count of words": (
