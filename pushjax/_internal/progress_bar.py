@@ -34,6 +34,13 @@ class Reporter:
         else:
             self.bar.update(self.task, description=words)
 
+    def note(self, words: str) -> None:
+        """Print a line that stays, above the bar."""
+        if self.bar.disable:
+            print(f"pushjax: {words}", file=sys.stderr, flush=True)
+        else:
+            self.bar.console.print(words, markup=False, highlight=False)
+
 
 @contextmanager
 def progress_bar() -> Iterator[Reporter]:

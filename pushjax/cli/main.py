@@ -1,171 +1,124 @@
-"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax identify LOG…`."""
+"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax identify LOG…`, `pushjax data NAME`.
+
+JAX is imported only once a command runs, so that `--help` and wrong options are answered at once.
+"""
 
 import logging
 import sys
 import warnings
-from dataclasses import dataclass
+from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import tyro
 
-from pushjax._internal.compilation_cache import enable_compilation_cache
-from pushjax._internal.options import cli_option
-from pushjax._internal.progress import ProgressCallback
-from pushjax._internal.progress_bar import Reporter, progress_bar
-from pushjax.datasets import find_data
-from pushjax.experiments import identify_logs
+from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, Command, Common, Data, Demo, Identify, Reproduce
 
 
-@dataclass
-class Common:
-    """Options of every command."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line.
 
-    out: Path = Path("pushjax-out")
-    """Folder for pictures."""
-    json: Annotated[Path | None, cli_option("FILE")] = None
-    """File for every figure the command prints. Default: NAME.json in --out."""
-    seed: int = 0
-    """Seed of everything random."""
-    cache: bool = True
-    """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
+    Invalid input ends with one line on standard error and exit status 1, a wrong word with exit status 2.
 
-
-@dataclass
-class Demo(Common):
-    """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result."""
-
-
-Experiment = Literal[
-    "table1",
-    "table2",
-    "squeeze",
-    "jam",
-    "two-finger",
-    "stochastic-push",
-    "capture",
-    "grasp-rectangle",
-    "grasp-butterfly",
-]
-
-
-Method = Literal["ideal", "wrench_twist", "identified"]
-
-
-@dataclass
-class Reproduce(Common):
-    """Reproduce an experiment of the paper and compare with the paper's own figures.
-
-    - table1: eleven objects on two surfaces, pushed by a robot; predicted against measured final poses.
-    - table2: a triangle on three support points, pushed by a robot.
-    - two-finger: the triangle pushed by two fingers; predicted against measured poses.
-    - squeeze: a parallel jaw closes on a rectangle from four start poses.
-    - jam: two fingers that jam, and the friction from which they jam.
-    - stochastic-push: a square pushed 2000 times under random friction.
-    - capture: two fingers push a disk from anywhere.
-    - grasp-rectangle, grasp-butterfly: a parallel jaw closes on the object from random poses.
+    Args:
+        arguments: The command's arguments. Default: those of the process.
     """
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if given == ["--version"]:
+        from pushjax import __version__
 
-    experiment: Annotated[Experiment, tyro.conf.Positional] = tyro.MISSING
-    """Which."""
-    data: Annotated[Path | None, cli_option("FOLDER")] = None
-    """Folder of the recorded pushes. Default: the environment variable PUSHJAX_DATA."""
-    geometry: Annotated[Literal["nominal", "measured"] | None, cli_option("{nominal,measured}")] = None
-    """table2: nominal (the default), as in the paper; or measured, contact and the push's end as force sensor and robot
-    command tell."""
-    method: Annotated[tuple[Method, ...] | None, cli_option("{ideal,wrench_twist,identified} …")] = None
-    """table1, table2: where the limit surface is from: the known support (table2 only), measured forces, or final
-    poses. Default: all."""
-    surface: Annotated[tuple[Literal["abs", "plywood", "delrin"], ...] | None, cli_option("{abs,plywood,delrin} …")] = (
-        None
+        print(f"pushjax {__version__}")
+        return
+    _check_words(given)
+    command = parsed(given)
+    if isinstance(command, Reproduce):
+        command = command.experiment
+    try:
+        if isinstance(command, Data):
+            _fetch(command)
+        else:
+            _compute(command)
+    except (ValueError, OSError) as error:
+        print(f"pushjax: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def parsed(arguments: Sequence[str]) -> Any:
+    """Return the command that the arguments say, one of the classes in `Command`."""
+    return tyro.cli(
+        Command,  # pyright: ignore[reportArgumentType]
+        args=arguments,
+        prog="pushjax",
+        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
+        "`pushjax --version` tells which this is.",
+        config=(tyro.conf.OmitSubcommandPrefixes,),
     )
-    """table1: on what; delrin is in the published folders only. Default: abs, plywood."""
-    object: Annotated[tuple[str, ...] | None, cli_option("OBJECT …")] = None
-    """table1: which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter.
-    Default: all."""
-    steps: Annotated[int | None, cli_option("N")] = None
-    """Steps of each push or grasp. Default: the experiment's own."""
-    n: Annotated[int | None, cli_option("N")] = None
-    """Random experiments: how many pushes or grasps. Default: the paper's."""
-    dof: Annotated[tuple[float, ...] | None, cli_option("DOF …")] = None
-    """Random experiments: degrees of freedom of the limit surface's noise; capture: two, to compare."""
-    friction: Annotated[tuple[float, ...] | None, cli_option("MU …")] = None
-    """Random experiments: lowest and highest; capture: one or more to push with."""
 
 
-@dataclass
-class Identify(identify_logs.Options, Common):
-    """Identify friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
-
-    Logs are CSV files with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units, world frame;
-    blank where the object was not seen), NPZ files with start, path, end, MIT pushing data (JSON, HDF5), or triangle
-    logs (text).
-    """
-
-    logs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Files of recorded pushes."""
-
-
-Command = (
-    Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
-    | Annotated[Identify, tyro.conf.subcommand("identify")]
-)
-Result = tuple[dict[str, Any], str]
+def _check_words(given: list[str]) -> None:
+    """End with one line for commands, experiments and data sets that do not exist."""
+    if given[:1] == ["bench"]:
+        print("pushjax: benchmarks are in a clone of the repository: python -m benchmarks", file=sys.stderr)
+        raise SystemExit(1)
+    _check_word("command", given[:1], COMMANDS)
+    if given[:1] == ["reproduce"]:
+        _check_word("experiment", given[1:2], tuple(EXPERIMENTS))
+    if given[:1] == ["data"]:
+        _check_word("data set", given[1:2], DATA_SETS)
 
 
-def _demo(command: Demo, progress: ProgressCallback) -> Result:
-    from pushjax.experiments import demo
-
-    record = demo.run(command.seed, command.out)
-    return record, demo.summary(record)
-
-
-RANDOM = ("n", "steps", "dof", "friction")
-TAKES: dict[str, tuple[str, ...]] = {
-    "table1": ("data", "method", "steps", "surface", "object"),
-    "table2": ("data", "geometry", "method", "steps"),
-    "squeeze": ("steps",),
-    "jam": (),
-    "two-finger": ("data", "steps"),
-    "stochastic-push": RANDOM,
-    "capture": RANDOM,
-    "grasp-rectangle": RANDOM,
-    "grasp-butterfly": RANDOM,
-}
+def _check_word(kind: str, given: list[str], known: Sequence[str]) -> None:
+    """End with exit status 2 if a word is given that is no option and is not known."""
+    if not given or given[0].startswith("-") or given[0] in known:
+        return
+    close = get_close_matches(given[0], known, 1)
+    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    print(f"pushjax: no {kind} {given[0]!r}; {hint}", file=sys.stderr)
+    raise SystemExit(2)
 
 
-def _reproduce(command: Reproduce, progress: ProgressCallback) -> Result:
-    name = command.experiment
-    takes, given = TAKES[name], {}
-    for each in ("data", "geometry", "method", "surface", "object", *RANDOM):
-        value = getattr(command, each)
-        if value is None:
-            continue
-        if each not in takes:
-            others = ", ".join(other for other in TAKES if each in TAKES[other])
-            raise ValueError(f"--{each} is for {others}; got it with {name}")
-        given[each] = value
-    if "dof" in given and name != "capture":
-        if len(given["dof"]) != 1:
-            raise ValueError(f"--dof: {name} takes one; got {len(given['dof'])}")
-        given["dof"] = given["dof"][0]
-    if "friction" in given and name != "capture" and len(given["friction"]) != 2:
-        raise ValueError(f"--friction: {name} takes two, lowest and highest; got {len(given['friction'])}")
-    if "data" in takes:
-        given["folder"] = data_folder(given.pop("data", None))
-    if name not in ("squeeze", "jam"):
-        given["progress"] = progress
-    experiment: Any
-    if name.startswith("grasp-"):
-        from pushjax.experiments import grasps as experiment
+def _compute(command: Common) -> None:
+    """Run an experiment, print its summary, and write its record and page."""
+    from pushjax._internal.progress_bar import progress_bar
 
-        given["slider"] = name.removeprefix("grasp-")
-    else:
-        experiment = import_module(f"pushjax.experiments.{name.replace('-', '_')}")
-    record = experiment.run(seed=command.seed, out=command.out, **given)
-    return record, experiment.summary(record)
+    if isinstance(command, Identify):
+        command.check()
+        missing = [str(log) for log in command.logs if not log.exists()]
+        if len(missing) == len(command.logs):
+            raise ValueError(
+                f"LOG: give at least one file of recorded pushes; there is no {', '.join(missing) or 'file'}"
+            )
+    settings = command.settings()
+    if "data" in vars(command):
+        settings["folder"] = data_folder(settings.pop("data", None))
+    with progress_bar() as progress:
+        progress.say("importing JAX")
+        import matplotlib
+
+        matplotlib.use("Agg")  # draws to files, because there may be no screen
+        _keep_compiled(command.cache)
+        experiment: Any = import_module(f"pushjax.experiments.{command.module}")
+        if isinstance(command, Identify):
+            settings = {"logs": list(command.logs), "options": command, "say": progress.say, "note": progress.note}
+        if "progress" in experiment.run.__annotations__:
+            settings["progress"] = progress
+        progress.say(f"computing {command.title}")
+        record = experiment.run(seed=command.seed, out=command.out, **settings)
+    text = experiment.summary(record)
+    print(text)
+    _write(record, text, command)
+
+
+def _fetch(command: Data) -> None:
+    """Fetch a set of recorded pushes."""
+    from pushjax._internal.progress_bar import progress_bar
+    from pushjax.datasets.download import fetch_triangle
+
+    with progress_bar() as progress:
+        folder = fetch_triangle(command.to, progress=progress)
+    print(f"the logs are in {folder}")
 
 
 def data_folder(given: Path | None) -> Path:
@@ -174,18 +127,17 @@ def data_folder(given: Path | None) -> Path:
     Raises:
         ValueError: If there is none.
     """
+    from pushjax.datasets.data_folder import find_data
+
     folder = given or find_data()
     if folder is None:
-        raise ValueError("no recorded pushes found: give their folder with --data, or set PUSHJAX_DATA")
+        raise ValueError(
+            "no recorded pushes found: give their folder with --data, set PUSHJAX_DATA, or `pushjax data triangle`"
+        )
     return folder
 
 
-def _identify(command: Identify, progress: Reporter) -> Result:
-    record = identify_logs.run(list(command.logs), command, command.seed, command.out, progress, progress.say)
-    return record, identify_logs.summary(record)
-
-
-def _write(record: dict[str, Any], text: str, command: Demo | Reproduce | Identify) -> None:
+def _write(record: dict[str, Any], text: str, command: Common) -> None:
     """Write the record and, except for the demo, its page; then delete the cells that an interrupted run needs."""
     from pushjax._internal.cell_cache import CellCache
     from pushjax._internal.record import write_json
@@ -205,6 +157,8 @@ def _keep_compiled(cache: bool) -> None:
     The warning that programs cannot be cached is printed once, not for every program.
     """
     import jax
+
+    from pushjax._internal.compilation_cache import enable_compilation_cache
 
     if not cache:
         jax.config.update("jax_enable_compilation_cache", False)
@@ -230,49 +184,6 @@ def _keep_compiled(cache: bool) -> None:
             )
 
     warnings.showwarning = show_once
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run the command line.
-
-    Invalid input ends with one line on standard error and exit status 1.
-
-    Args:
-        arguments: The command's arguments. Default: those of the process.
-    """
-    if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
-        from pushjax import __version__
-
-        print(f"pushjax {__version__}")
-        return
-    if (sys.argv[1:] if arguments is None else arguments)[:1] == ["bench"]:
-        print("pushjax: benchmarks are in a clone of the repository: python -m benchmarks", file=sys.stderr)
-        raise SystemExit(1)
-    command = tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        args=arguments,
-        prog="pushjax",
-        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
-        "`pushjax --version` tells which this is.",
-    )
-    import matplotlib
-
-    matplotlib.use("Agg")  # draws to files, because there may be no screen
-
-    _keep_compiled(command.cache)
-    try:
-        with progress_bar() as progress:
-            if isinstance(command, Reproduce):
-                record, text = _reproduce(command, progress)
-            elif isinstance(command, Identify):
-                record, text = _identify(command, progress)
-            else:
-                record, text = _demo(command, progress)
-        print(text)
-        _write(record, text, command)
-    except (ValueError, OSError) as error:
-        print(f"pushjax: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Identification from a user's own logs: `experiment` builds on `setting`, `findings` and `picture`."""
+"""Identification from a user's own logs: `experiment` builds on `options`, `setting`, `findings` and `picture`."""
 
-from pushjax.experiments.identify_logs.experiment import run as run
-from pushjax.experiments.identify_logs.experiment import summary as summary
-from pushjax.experiments.identify_logs.setting import Options as Options
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

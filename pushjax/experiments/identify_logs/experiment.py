@@ -20,7 +20,7 @@ from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.experiments.identify_logs import setting
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
-from pushjax.experiments.identify_logs.setting import Options
+from pushjax.experiments.identify_logs.options import Options
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.recordings import has_wrenches, observed_often_enough, screen
@@ -40,6 +40,7 @@ def run(
     out: Path | None = None,
     progress: ProgressCallback = no_progress,
     say: Callable[[str], None] = lambda words: None,
+    note: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
     """Identify from logs, and draw and save the result.
 
@@ -50,6 +51,7 @@ def run(
         out: Folder for the pictures and `identified.json`. None: neither.
         progress: Called with the number of parts done and their total.
         say: Called with a description of what is done next.
+        note: Called with the problem of each push or log that is left out, before the fit begins.
 
     Returns:
         The record: one row per number that is no part of the surface, how well the pushes are predicted, the noise if
@@ -59,7 +61,7 @@ def run(
         LogError: If no log, or no push of any log, can be used.
         ValueError: If the options do not fit together or to the logs, or there are too few pushes.
     """
-    findings = find(logs, options, seed, progress, say)
+    findings = find(logs, options, seed, progress, say, note)
     found = findings.found
     pictures, saved = [], None
     if out is not None:
@@ -97,6 +99,7 @@ def find(
     seed: int,
     progress: ProgressCallback,
     say: Callable[[str], None],
+    note: Callable[[str], None],
 ) -> Findings:
     """Identify from logs, with intervals, predictions and noise.
 
@@ -108,6 +111,7 @@ def find(
         seed: Seed of the wrench-twist pairs of the expected surfaces, and of the noise.
         progress: Called with the number of parts done and their total.
         say: Called with a description of what is done next.
+        note: Called with the problem of each push or log that is left out.
 
     Raises:
         LogError: If no log, or no push of any log, can be used.
@@ -115,6 +119,8 @@ def find(
     """
     if not logs:
         raise ValueError("LOGS: give at least one file of recorded pushes")
+    options.check()
+    say(f"reading {len(logs)} {'log' if len(logs) == 1 else 'logs'}")
     recordings, unreadable = _each(logs, load_recordings)
     shape = setting.shape_of(options.shape, recordings)
     hand = setting.hand_of(options.hand, options.radius, recordings)
@@ -125,6 +131,8 @@ def find(
     _check_forces(recordings, options)
     recordings, unusable = _each(recordings, lambda one: screen(one, shape, hand))
     problems = (*unreadable, *unusable, *(problem for one in recordings for problem in one.problems))
+    for problem in problems:
+        note(f"left out: {problem}")
     count = sum(len(one.pushes) for one in recordings)
     if count < MIN_PUSHES:
         why = f"; the first problem: {problems[0]}" if problems else ""
@@ -160,12 +168,9 @@ def find(
 
 
 def _check_forces(recordings: list[Recordings], options: Options) -> None:
-    """Raise ValueError if forces are asked for that the options or the logs do not allow."""
+    """Raise ValueError if forces are asked for that the logs do not have."""
     if not options.forces:
         return
-    if options.parts < 2:
-        needs = "the parts of a push, each of which gives a wrench, to be 2 at least"
-        raise ValueError(f"--forces needs --parts, {needs}; got {options.parts}")
     for one in recordings:
         if not has_wrenches(one):
             raise ValueError(f"--forces: {one.source} does not have the forces of a single finger for every push")

@@ -1,0 +1,250 @@
+"""The commands with their options: one class each, of which tyro makes a parser.
+
+Nothing here imports JAX, so that `--help` and wrong options are answered at once. An experiment's defaults therefore
+stand twice, here and in the signature of its `run`; a test compares them.
+"""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Union
+
+import tyro
+
+from pushjax._internal.options import cli_option
+from pushjax.experiments.identify_logs.options import Options
+
+COMMANDS = ("demo", "reproduce", "identify", "data")
+DATA_SETS = ("triangle",)
+
+DataFolder = Annotated[Path | None, cli_option("FOLDER")]
+
+
+@dataclass
+class Common:
+    """Options of every command that computes.
+
+    Attributes:
+        module: Module of the experiment, below `pushjax.experiments`.
+    """
+
+    module: ClassVar[str] = ""
+
+    @property
+    def title(self) -> str:
+        """Name of the command, for messages."""
+        return self.module.replace("_", "-")
+
+    out: Path = Path("pushjax-out")
+    """Folder for pictures and pages."""
+    json: Annotated[Path | None, cli_option("FILE")] = None
+    """File for every figure that the command prints. Default: NAME.json in --out."""
+    seed: int = 0
+    """Seed of everything random."""
+    cache: bool = True
+    """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
+
+    def settings(self) -> dict[str, Any]:
+        """Return the arguments of the experiment's `run` that are its own; None stands for its default."""
+        common = {each.name for each in fields(Common)}
+        own = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in common}
+        return {name: value for name, value in own.items() if value is not None}
+
+
+@dataclass
+class Demo(Common):
+    """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result."""
+
+    module = "demo"
+
+
+@dataclass
+class Table1(Common):
+    """Eleven objects on two surfaces, pushed by a robot: predicted against measured final poses (table I)."""
+
+    module = "table1"
+
+    data: DataFolder = None
+    """Folder of the recorded pushes. Default: the environment variable PUSHJAX_DATA."""
+    method: Annotated[tuple[Literal["wrench_twist", "identified"], ...], cli_option("{wrench_twist,identified} …")] = (
+        "wrench_twist",
+        "identified",
+    )
+    """Where the limit surface is from: measured forces, or final poses. Default: both."""
+    surface: Annotated[tuple[Literal["abs", "plywood", "delrin"], ...] | None, cli_option("{abs,plywood,delrin} …")] = (
+        None
+    )
+    """What the objects lie on; delrin is in the published folders only. Default: abs, plywood."""
+    object: Annotated[tuple[str, ...] | None, cli_option("OBJECT …")] = None
+    """Which of rect1, rect2, rect3, tri1, tri2, tri3, ellip1, ellip2, ellip3, hex, butter. Default: all."""
+    steps: int = 100
+    """Steps of each push."""
+
+
+@dataclass
+class Table2(Common):
+    """A triangle on three support points, pushed by a robot: predicted against measured final poses (table II)."""
+
+    module = "table2"
+
+    data: DataFolder = None
+    """Folder of the recorded pushes. Default: PUSHJAX_DATA, else what `pushjax data triangle` has fetched."""
+    geometry: Literal["nominal", "measured"] = "nominal"
+    """nominal, as in the paper; or measured, contact and the push's end as force sensor and robot command tell."""
+    method: Annotated[
+        tuple[Literal["ideal", "wrench_twist", "identified"], ...], cli_option("{ideal,wrench_twist,identified} …")
+    ] = ("ideal", "wrench_twist", "identified")
+    """Where the limit surface is from: the known support, measured forces, or final poses. Default: all."""
+    steps: int = 100
+    """Steps of each push."""
+
+
+@dataclass
+class TwoFinger(Common):
+    """The triangle pushed by two fingers: predicted against measured poses (section V-B)."""
+
+    module = "two_finger"
+
+    data: DataFolder = None
+    """Folder of the recorded pushes. Default: PUSHJAX_DATA, else what `pushjax data triangle` has fetched."""
+    steps: int = 60
+    """Steps of each push."""
+
+
+@dataclass
+class Squeeze(Common):
+    """A parallel jaw closes on a rectangle from four start poses."""
+
+    module = "squeeze"
+
+    steps: int = 1500
+    """Steps in which the jaw closes."""
+
+
+@dataclass
+class Jam(Common):
+    """Two fingers that jam, and the friction from which they jam."""
+
+    module = "jam"
+
+
+@dataclass
+class StochasticPush(Common):
+    """A square pushed many times under random friction: the distribution of its motion."""
+
+    module = "stochastic_push"
+
+    n: int = 2000
+    """Number of pushes."""
+    steps: int = 200
+    """Steps of each push."""
+    dof: float = 20.0
+    """Degrees of freedom of the limit surface's noise; fewer, more noise."""
+    friction: Annotated[tuple[float, float], cli_option("LOWEST HIGHEST")] = (0.15, 0.35)
+    """Range of the friction coefficient. Default: 0.15 0.35."""
+
+
+@dataclass
+class Capture(Common):
+    """Two fingers push a disk from anywhere: from where they catch it."""
+
+    module = "capture"
+
+    n: int = 500
+    """Number of start poses."""
+    steps: int = 525
+    """Steps of each push."""
+    dof: Annotated[tuple[float, ...], cli_option("DOF DOF")] = (200.0, 10.0)
+    """Two degrees of freedom of the limit surface's noise, to compare. Default: 200 10."""
+    friction: Annotated[tuple[float, ...], cli_option("MU …")] = (0.25, 0.1, 0.5)
+    """Friction coefficients; the first one is drawn. Default: 0.25 0.1 0.5."""
+
+
+@dataclass
+class Grasp(Common):
+    """A parallel jaw closes on an object from random poses under random friction.
+
+    Attributes:
+        slider: Name of the object.
+    """
+
+    module = "grasps"
+    slider: ClassVar[str] = ""
+
+    n: Annotated[int | None, cli_option("N")] = None
+    """Number of grasps. Default: the paper's."""
+    steps: int = 840
+    """Steps of each grasp."""
+    dof: float = 250.0
+    """Degrees of freedom of the limit surface's noise; fewer, more noise."""
+    friction: Annotated[tuple[float, float], cli_option("LOWEST HIGHEST")] = (0.015, 0.02)
+    """Range of the friction coefficient. Default: 0.015 0.02."""
+
+    def settings(self) -> dict[str, Any]:
+        """Return the arguments of the experiment's `run` that are its own."""
+        return {"slider": self.slider} | super().settings()
+
+
+@dataclass
+class GraspRectangle(Grasp):
+    """A parallel jaw closes on a rectangle from random poses under random friction."""
+
+    slider = "rectangle"
+
+
+@dataclass
+class GraspButterfly(Grasp):
+    """A parallel jaw closes on a butterfly-shaped block from random poses under random friction."""
+
+    slider = "butterfly"
+
+
+EXPERIMENTS: dict[str, type[Common]] = {
+    "table1": Table1,
+    "table2": Table2,
+    "two-finger": TwoFinger,
+    "stochastic-push": StochasticPush,
+    "capture": Capture,
+    "squeeze": Squeeze,
+    "jam": Jam,
+    "grasp-rectangle": GraspRectangle,
+    "grasp-butterfly": GraspButterfly,
+}
+Experiment = Union[*(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in EXPERIMENTS.items())]  # pyright: ignore
+
+
+@dataclass
+class Reproduce:
+    """Reproduce an experiment of the paper and compare with the paper's own figures."""
+
+    experiment: Annotated[Experiment, tyro.conf.arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
+    """Which."""
+
+
+@dataclass
+class Identify(Options, Common):
+    """Identify friction, limit surface and calibration from logs of pushes, with intervals, and write a report."""
+
+    module = "identify_logs"
+
+    logs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG …", help_behavior_hint=""), tyro.conf.Positional] = ()
+    """Files of recorded pushes: CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units,
+    world frame; blank where the object was not seen), NPZ with start, path, end, MIT pushing data (JSON, HDF5), or
+    triangle logs (text)."""
+
+
+@dataclass
+class Data:
+    """Fetch recorded pushes from where they are published."""
+
+    name: Annotated[Literal["triangle"], tyro.conf.Positional]
+    """triangle: the authors' logs of the triangle, pushed by one finger and by two, 118 files of 34 MB in all."""
+    to: DataFolder = None
+    """Where to. Default: pushjax's data folder of this user, where `reproduce table2` and `two-finger` look."""
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
+    | Annotated[Identify, tyro.conf.subcommand("identify")]
+    | Annotated[Data, tyro.conf.subcommand("data")]
+)
