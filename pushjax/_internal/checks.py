@@ -13,11 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import ArrayLike as OneArrayLike
+from jaxtyping import ArrayLike as SingleArrayLike
+from typing_extensions import TypeAliasType
 
-from pushjax._internal.jit import outermost
+from pushjax._internal.jit import outside_trace
 
-ArrayLike = OneArrayLike | Sequence[Any]  # accepted in place of an array: also lists and tuples of numbers
+# Accepted in place of an array: also lists and tuples of numbers. `help` shows the name instead of a long union.
+ArrayLike = TypeAliasType("ArrayLike", SingleArrayLike | Sequence[Any])
 
 
 def concrete(value: Any) -> np.ndarray | None:
@@ -37,11 +39,11 @@ def as_float(value: Any, dtype: Any = None) -> jax.Array:
     """
     array = value
     if not isinstance(value, jax.Array):
-        held = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
-        array = jnp.asarray(value) if held else np.asarray(value)
+        holds_jax_arrays = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
+        array = jnp.asarray(value) if holds_jax_arrays else np.asarray(value)
     if dtype is None:
-        own = jnp.issubdtype(array.dtype, jnp.floating)
-        dtype = jax.dtypes.canonicalize_dtype(array.dtype) if own else jnp.result_type(float)
+        is_floating = jnp.issubdtype(array.dtype, jnp.floating)
+        dtype = jax.dtypes.canonicalize_dtype(array.dtype) if is_floating else jnp.result_type(float)
     if isinstance(array, np.ndarray):
         return on_device(array.astype(dtype))
     return array.astype(dtype)
@@ -52,7 +54,7 @@ def on_device(array: np.ndarray) -> jax.Array:
 
     Outside of a trace `jnp.asarray` would compile a program for every shape.
     """
-    return jax.device_put(array) if outermost() else jnp.asarray(array)
+    return jax.device_put(array) if outside_trace() else jnp.asarray(array)
 
 
 def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,7 +76,7 @@ def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
         if any(array is None for array in known):
             return function(jnp, *arrays, **static)
         dtype = jnp.result_type(*arrays)
-        return jax.tree.map(lambda found: on_device(np.asarray(found, dtype)), function(np, *known, **static))
+        return jax.tree.map(lambda entry: on_device(np.asarray(entry, dtype)), function(np, *known, **static))
 
     return call
 
@@ -119,14 +121,14 @@ def check_positive(name: str, value: Any) -> None:
     """Raise ValueError if `value` is known and has an entry that is not positive."""
     known = concrete(value)
     if known is not None and not np.all(known > 0):
-        raise ValueError(f"{name} must be positive; got {_brief(known)}")
+        raise ValueError(f"{name} must be positive; got {_describe(known)}")
 
 
 def check_non_negative(name: str, value: Any) -> None:
     """Raise ValueError if `value` is known and has an entry that is negative or NaN."""
     known = concrete(value)
     if known is not None and not np.all(known >= 0):
-        raise ValueError(f"{name} must not be negative; got {_brief(known)}")
+        raise ValueError(f"{name} must not be negative; got {_describe(known)}")
 
 
 def normalized_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
@@ -147,7 +149,8 @@ def normalized_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
     return value
 
 
-def _brief(value: np.ndarray) -> str:
+def _describe(value: np.ndarray) -> str:
+    """Return a number as text, or the range of several numbers, for an error message."""
     return f"{value.item():.6g}" if value.size == 1 else f"values from {np.nanmin(value)} to {np.nanmax(value)}"
 
 

@@ -8,7 +8,7 @@ import csv
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from pushjax._internal.progress import ProgressCallback, no_progress
@@ -81,7 +81,7 @@ def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: P
 
     total, done = sum(each.bytes for each in files), 0
     pooch.get_logger().setLevel("WARNING")  # it prints a line for each file
-    get = pooch.HTTPDownloader(timeout=TIMEOUT)
+    get: Any = pooch.HTTPDownloader(timeout=TIMEOUT)
     progress(done, total)
     for each in files:
         target, address = folder / each.file, source + quote(each.source)
