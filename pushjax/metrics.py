@@ -59,8 +59,8 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
     shape = jnp.broadcast_shapes(a.shape, b.shape)
     delta = jnp.broadcast_to(a, shape) - jnp.broadcast_to(b, shape)
     squared = delta[..., 0] ** 2 + delta[..., 1] ** 2
-    zero = squared == 0
-    distance = jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
+    coincide = squared == 0
+    distance = jnp.where(coincide, 0.0, jnp.sqrt(jnp.where(coincide, 1.0, squared)))
     # `abs` has the derivative one at zero; this has zero
     angle = delta[..., 2] * jnp.sign(delta[..., 2]) % (2 * jnp.pi)
     return distance + scale * jnp.minimum(angle, 2 * jnp.pi - angle)
@@ -99,20 +99,25 @@ def energy_score(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> 
 def _energy_score(x: Array, y: Array, scale: Array) -> Array:
     n = x.shape[0]
     # row by row, because all pairs at once would take the memory of n^2 numbers
-    within = jax.lax.map(lambda row: jnp.mean(_apart(row[None], x, scale)), x, batch_size=min(n, 64))
-    spread = jnp.mean(within) * (n / (n - 1))
-    to = jax.lax.map(lambda one: jnp.mean(_apart(one[None], x, scale)), y.reshape(-1, 3), batch_size=64)
-    return to.reshape(y.shape[:-1]) - spread / 2
+    to_other_samples = jax.lax.map(lambda row: jnp.mean(_score_distance(row[None], x, scale)), x, batch_size=min(n, 64))
+    mean_pair_distance = jnp.mean(to_other_samples) * (n / (n - 1))
+    to_samples = jax.lax.map(
+        lambda pose: jnp.mean(_score_distance(pose[None], x, scale)), y.reshape(-1, 3), batch_size=64
+    )
+    return to_samples.reshape(y.shape[:-1]) - mean_pair_distance / 2
 
 
-def _apart(a: Array, b: Array, length: Array) -> Array:
-    """Return the distance d of `energy_score`; its derivative at distance zero, where it has a corner, is zero."""
+def _score_distance(a: Array, b: Array, length: Array) -> Array:
+    """Return the distance d of `energy_score` between poses, m.
+
+    Its derivative at distance zero, where it has a corner, is zero.
+    """
     a, b = jnp.broadcast_arrays(a, b)
-    rel = a - b
-    chord = 2 * length * jnp.sin(rel[..., 2] / 2)
-    squared = rel[..., 0] ** 2 + rel[..., 1] ** 2 + chord**2
-    same = squared == 0
-    return jnp.where(same, 0.0, jnp.sqrt(jnp.where(same, 1.0, squared)))
+    difference = a - b
+    chord = 2 * length * jnp.sin(difference[..., 2] / 2)
+    squared = difference[..., 0] ** 2 + difference[..., 1] ** 2 + chord**2
+    coincide = squared == 0
+    return jnp.where(coincide, 0.0, jnp.sqrt(jnp.where(coincide, 1.0, squared)))
 
 
 def log_density(
@@ -142,10 +147,10 @@ def log_density(
 
 @jax.jit
 def _log_density(x: Array, y: Array, scale: Array, min_bandwidth: Array) -> Array:
-    points, at = _unrolled(x, y, scale)
+    points, observed_points = _flat_points(x, y, scale)
     kernel = _Kernel(points, min_bandwidth, scale)
-    flat = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log(p)), at.reshape(-1, 3))
-    return flat.reshape(at.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
+    log_sums = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log_densities(p)), observed_points.reshape(-1, 3))
+    return log_sums.reshape(observed_points.shape[:-1]) - jnp.log(jnp.asarray(x.shape[0], x.dtype))
 
 
 def coverage(
@@ -179,28 +184,32 @@ def coverage(
             is not positive.
     """
     x, y, scale = _checked(samples, observed, length)
-    asked = np.asarray(levels, float)
+    fractions = np.asarray(levels, float)
     check_positive("min_bandwidth", min_bandwidth)
-    if asked.ndim != 1 or not np.all((asked > 0) & (asked < 1)):
+    if fractions.ndim != 1 or not np.all((fractions > 0) & (fractions < 1)):
         raise ValueError(f"levels must be numbers between 0 and 1; got {levels!r}")
-    return _coverage(x, y, scale, jnp.asarray(asked, x.dtype), as_float(min_bandwidth, x.dtype))
+    return _coverage(x, y, scale, jnp.asarray(fractions, x.dtype), as_float(min_bandwidth, x.dtype))
 
 
 @jax.jit
 def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Array) -> Array:
-    points, at = _unrolled(x, y, scale)
+    points, observed_points = _flat_points(x, y, scale)
     kernel = _Kernel(points, min_bandwidth, scale)
 
-    def without(index: Array) -> Array:
-        log = kernel.log(points[index])
+    def leave_one_out(index: Array) -> Array:
+        log = kernel.log_densities(points[index])
         return jax.nn.logsumexp(jnp.where(jnp.arange(len(points)) == index, -jnp.inf, log))
 
-    own = jax.lax.map(without, jnp.arange(len(points)))
-    seen = jax.lax.map(lambda p: jax.nn.logsumexp(kernel.log(p)), at.reshape(-1, 3))
-    border = jnp.quantile(own, 1 - levels)
+    sample_densities = jax.lax.map(leave_one_out, jnp.arange(len(points)))
+    observed_densities = jax.lax.map(
+        lambda p: jax.nn.logsumexp(kernel.log_densities(p)), observed_points.reshape(-1, 3)
+    )
+    thresholds = jnp.quantile(sample_densities, 1 - levels)
     # leave-one-out densities sum n - 1 kernels, those of observations n: give both the same normalization
-    seen = seen - jnp.log(jnp.asarray(len(points) / (len(points) - 1), own.dtype))
-    return jnp.mean(seen[None] >= border[:, None], axis=1, dtype=own.dtype)
+    observed_densities = observed_densities - jnp.log(
+        jnp.asarray(len(points) / (len(points) - 1), sample_densities.dtype)
+    )
+    return jnp.mean(observed_densities[None] >= thresholds[:, None], axis=1, dtype=sample_densities.dtype)
 
 
 def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:
@@ -233,42 +242,49 @@ def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:
 
 
 class _Kernel:
-    """Gaussian kernels centered at the samples (n, 3), each repeated one full turn away on either side."""
+    """Gaussian kernels centered at the samples, each repeated one full turn away on either side.
+
+    Args:
+        points: Samples as points (n, 3), as from `_flat_points`, m.
+        min_bandwidth: Standard deviation that is added in every direction, m.
+        length: Length that weighs the angle, m.
+    """
 
     def __init__(self, points: Array, min_bandwidth: Array, length: Array):
         n = points.shape[0]
         self.turn = 2 * jnp.pi * length
         centered = points - jnp.mean(points, axis=0, keepdims=True)
         covariance = centered.T @ centered / (n - 1) * n ** (-2 / 7)
-        self.factor = jnp.linalg.cholesky(covariance + min_bandwidth**2 * jnp.eye(3, dtype=points.dtype))
-        self.points = self._white(points)
-        self.norm = jnp.sum(jnp.log(jnp.diagonal(self.factor))) + 1.5 * float(np.log(2 * np.pi))
+        self.cholesky = jnp.linalg.cholesky(covariance + min_bandwidth**2 * jnp.eye(3, dtype=points.dtype))
+        self.points = self._whitened(points)
+        self.log_normalization = jnp.sum(jnp.log(jnp.diagonal(self.cholesky))) + 1.5 * float(np.log(2 * np.pi))
 
-    def _white(self, points: Array) -> Array:
-        return jax.scipy.linalg.solve_triangular(self.factor, points.T, lower=True).T
+    def _whitened(self, points: Array) -> Array:
+        """Return points (k, 3) in coordinates in which the kernel's covariance is the identity."""
+        return jax.scipy.linalg.solve_triangular(self.cholesky, points.T, lower=True).T
 
-    def log(self, at: Float[Array, "3"]) -> Float[Array, "n"]:
+    def log_densities(self, at: Float[Array, "3"]) -> Float[Array, "n"]:
         images = jnp.stack([at.at[2].add(k * self.turn) for k in (-1, 0, 1)])
-        apart = self.points[None] - self._white(images)[:, None]
-        return jax.nn.logsumexp(-jnp.sum(apart**2, axis=2) / 2, axis=0) - self.norm
+        offsets = self.points[None] - self._whitened(images)[:, None]
+        return jax.nn.logsumexp(-jnp.sum(offsets**2, axis=2) / 2, axis=0) - self.log_normalization
 
 
-def _unrolled(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
-    """Return samples and observations as (x, y, length * theta), relative to the mean of the samples.
+def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
+    """Return samples and observations as points (x, y, length * theta), m, relative to the mean of the samples.
 
     Angles are unwrapped to within half a turn of the samples' mean direction. Positions are relative to their mean,
     because float32 has no digits to lose.
     """
     theta = samples[:, 2]
-    middle = jnp.arctan2(jnp.mean(jnp.sin(theta)), jnp.mean(jnp.cos(theta)))
-    center = jnp.concatenate([jnp.mean(samples[:, :2], axis=0), middle[None]])
+    mean_angle = jnp.arctan2(jnp.mean(jnp.sin(theta)), jnp.mean(jnp.cos(theta)))
+    mean_pose = jnp.concatenate([jnp.mean(samples[:, :2], axis=0), mean_angle[None]])
 
-    def about(poses: Array) -> Array:
-        rel = poses - jnp.broadcast_to(center, poses.shape)
-        angle = rel[..., 2] - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(rel[..., 2] / (2 * jnp.pi)))
-        return jnp.concatenate([rel[..., :2], (length * angle)[..., None]], axis=-1)
+    def relative_points(poses: Array) -> Array:
+        relative = poses - jnp.broadcast_to(mean_pose, poses.shape)
+        angle = relative[..., 2] - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(relative[..., 2] / (2 * jnp.pi)))
+        return jnp.concatenate([relative[..., :2], (length * angle)[..., None]], axis=-1)
 
-    return about(samples), about(observed)
+    return relative_points(samples), relative_points(observed)
 
 
 def _checked(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> tuple[Array, Array, Array]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
-FOUND = "found"
+SEARCH_RESULT = "found"
 
 
 def without_derivatives(search: Callable, *args) -> Any:
@@ -32,8 +32,9 @@ def without_derivatives(search: Callable, *args) -> Any:
         zeros = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, out)
         return out, zeros
 
-    return checkpoint_name(jax.lax.stop_gradient(opaque(args)), FOUND)
+    return checkpoint_name(jax.lax.stop_gradient(opaque(args)), SEARCH_RESULT)
 
 
-# Reverse mode saves the results of the searches of a step, so that the backward pass does not search again.
-keep_found = jax.checkpoint_policies.save_only_these_names(FOUND)
+# Policy for `jax.checkpoint`: only the results of searches are saved, so that the backward pass recomputes everything
+# else but does not search again.
+save_search_results = jax.checkpoint_policies.save_only_these_names(SEARCH_RESULT)

@@ -1,4 +1,8 @@
-"""Cells of a long run, kept in a file until its results are written, so that an interrupted run can continue."""
+"""Cells of a long run, kept in a file until its results are written, so that an interrupted run can continue.
+
+A cell is one entry of an experiment's table of results: a dictionary of labels that say which entry it is, and of the
+results that were computed for it.
+"""
 
 import json
 import time
@@ -28,7 +32,7 @@ class CellCache:
     """
 
     def __init__(self, experiment: str, folder: Path | None, settings: dict[str, Any]):
-        self.path = None if folder is None else _file(experiment, folder)
+        self.path = None if folder is None else _cache_file(experiment, folder)
         self.settings = settings
         self.cells: list[dict[str, Any]] = []
         if self.path is not None and self.path.exists():
@@ -57,26 +61,26 @@ class CellCache:
             cell = next((cell for cell in self.cells if labels.items() <= cell.items()), None)
             if cell is None:
                 begin = time.perf_counter()
-                found = compute()
-                cell = self.add(labels | found | {"run_s": time.perf_counter() - begin})
+                results = compute()
+                cell = self.add(labels | results | {"run_s": time.perf_counter() - begin})
             cells.append(cell)
             progress(len(cells), len(todo))
         return cells
 
     def add(self, cell: dict[str, Any]) -> dict[str, Any]:
-        """Append a cell, save all cells, and return the cell."""
+        """Append a cell, save all cells, and return the cell that was appended."""
         self.cells.append(cell)
         if self.path is not None:
-            aside = self.path.with_suffix(".part")
-            write_json({"settings": self.settings, "cells": self.cells}, aside)
-            aside.replace(self.path)  # atomic, so that an interruption cannot leave a half-written file
+            partial = self.path.with_suffix(".part")
+            write_json({"settings": self.settings, "cells": self.cells}, partial)
+            partial.replace(self.path)  # atomic, so that an interruption cannot leave a half-written file
         return cell
 
     @staticmethod
     def delete(experiment: str, folder: Path) -> None:
         """Delete the file of an experiment, if there is one: to be called when the results are on the disk."""
-        _file(experiment, folder).unlink(missing_ok=True)
+        _cache_file(experiment, folder).unlink(missing_ok=True)
 
 
-def _file(experiment: str, folder: Path) -> Path:
+def _cache_file(experiment: str, folder: Path) -> Path:
     return folder / f"{experiment}-cells.json"

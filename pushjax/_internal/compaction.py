@@ -25,101 +25,110 @@ def tile_size() -> int:
     return TILE if jax.default_backend() == "cpu" else ACCELERATOR_TILE
 
 
-def only_where(needed: Bool[Array, ""], work: Callable[..., Any], instead: Any, *args: Any) -> Any:
-    """Return `work(*args)` where `needed` holds, else `instead`.
+def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
+    """Return `compute(*args)` where `needed` holds, else `otherwise`.
 
     It handles one example, or a batch under any number of nested `vmap`. It cannot be differentiated.
 
     Args:
         needed: Whether this example needs the computation.
-        work: Function of `args`. It must not close over anything that is batched.
-        instead: Result where `needed` is False, of the same structure as the result of `work`.
-        *args: Arguments of `work`, pytrees of arrays.
+        compute: Function of `args`. It must not close over anything that is batched.
+        otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
+        *args: Arguments of `compute`, pytrees of arrays.
     """
 
     @jax.custom_batching.custom_vmap
-    def chosen(needed, instead, args):
-        return update_if(needed, lambda _: work(*args), instead)
+    def chosen(needed, otherwise, args):
+        return update_if(needed, lambda _: compute(*args), otherwise)
 
     @chosen.def_vmap
-    def _(size, batched, needed, instead, args):
-        return _of_batch(work, size, batched, needed, instead, args)
+    def _(size, batched, needed, otherwise, args):
+        return _batching_rule(compute, size, batched, needed, otherwise, args)
 
-    return chosen(needed, instead, args)
+    return chosen(needed, otherwise, args)
 
 
-def _of_batch(work: Callable[..., Any], size: int, batched: Any, needed, instead, args):
+def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed, otherwise, args):
     """Batching rule of `only_where`: return the result for a batch, and which of its leaves are batched (all are).
 
     Args:
-        work: Function of one example's arguments.
+        compute: Function of one example's arguments.
         size: Number of examples in the batch.
-        batched: For each of `needed`, `instead` and `args`, which of its leaves have a batch axis.
+        batched: For each of `needed`, `otherwise` and `args`, which of its leaves have a batch axis.
         needed: Which examples need the computation.
-        instead: Results of the other examples.
-        args: Arguments of `work`.
+        otherwise: Results of the other examples.
+        args: Arguments of `compute`.
     """
 
-    def spread(tree, which):
-        return jax.tree.map(lambda x, is_own: x if is_own else jnp.broadcast_to(x, (size, *jnp.shape(x))), tree, which)
+    def broadcast_unbatched(tree, is_batched):
+        """Give the leaves without a batch axis one, because the loop over tiles updates all of them by example."""
 
-    own = batched[2]
+        def with_axis(x, has_axis):
+            return x if has_axis else jnp.broadcast_to(x, (size, *jnp.shape(x)))
+
+        return jax.tree.map(with_axis, tree, is_batched)
+
+    args_batched = batched[2]
 
     @jax.custom_batching.custom_vmap
-    def batch(needed, instead, args):
-        return _in_tiles(work, own, needed, instead, args)
+    def batch(needed, otherwise, args):
+        return _compute_in_tiles(compute, args_batched, needed, otherwise, args)
 
     @batch.def_vmap
-    def _(outer, batched, needed, instead, args):
-        # A batch of batches is flattened into one longer batch. `ours` is whether an array has the axis of the inner
-        # `vmap`, `theirs` whether it has that of the outer one.
-        def joined(x, ours, theirs):
-            if not ours:
-                return jnp.repeat(x, size, axis=0) if theirs else x
-            x = x if theirs else jnp.broadcast_to(x, (outer, *x.shape))
-            return x.reshape(outer * size, *x.shape[2:])
+    def _(outer_size, batched, needed, otherwise, args):
+        # A batch of batches is flattened into one longer batch. `has_inner` is whether an array has the axis of the
+        # inner `vmap`, `has_outer` whether it has that of the outer one.
+        def flattened(x, has_inner, has_outer):
+            if not has_inner:
+                return jnp.repeat(x, size, axis=0) if has_outer else x
+            x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))
+            return x.reshape(outer_size * size, *x.shape[2:])
 
-        all_ours = jax.tree.map(lambda _: True, instead)
-        either = jax.tree.map(lambda ours, theirs: ours or theirs, own, batched[2])
-        found, _ = _of_batch(
-            work,
-            outer * size,
-            (True, all_ours, either),
-            joined(needed, True, batched[0]),
-            jax.tree.map(joined, instead, all_ours, batched[1]),
-            jax.tree.map(joined, args, own, batched[2]),
+        all_inner = jax.tree.map(lambda _: True, otherwise)
+        flat_args_batched = jax.tree.map(lambda has_inner, has_outer: has_inner or has_outer, args_batched, batched[2])
+        results, _ = _batching_rule(
+            compute,
+            outer_size * size,
+            (True, all_inner, flat_args_batched),
+            flattened(needed, True, batched[0]),
+            jax.tree.map(flattened, otherwise, all_inner, batched[1]),
+            jax.tree.map(flattened, args, args_batched, batched[2]),
         )
-        return jax.tree.map(lambda x: x.reshape(outer, size, *x.shape[1:]), found), all_ours
+        return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_inner
 
-    found = batch(spread(needed, batched[0]), spread(instead, batched[1]), args)
-    return found, jax.tree.map(lambda _: True, found)
+    results = batch(broadcast_unbatched(needed, batched[0]), broadcast_unbatched(otherwise, batched[1]), args)
+    return results, jax.tree.map(lambda _: True, results)
 
 
-def _in_tiles(work: Callable[..., Any], own: Any, needed, instead, args):
-    """Return the result for a batch, computed tile by tile for the examples that need it.
+def _compute_in_tiles(compute: Callable[..., Any], args_batched: Any, needed, otherwise, args):
+    """Return the results of a batch: computed tile by tile for the examples that need it, `otherwise` for the others.
 
     Args:
-        work: Function of one example's arguments.
-        own: Which leaves of `args` are batched, on axis 0. The other leaves are shared by all examples.
+        compute: Function of one example's arguments.
+        args_batched: Which leaves of `args` are batched, on axis 0. The other leaves are shared by all examples.
         needed: (batch,), which examples need the computation.
-        instead: Results of the other examples, each leaf batched on axis 0.
-        args: Arguments of `work`.
+        otherwise: Results of the other examples, each leaf batched on axis 0.
+        args: Arguments of `compute`.
     """
-    size = needed.shape[0]
-    tile = min(tile_size(), size)
-    count = jnp.sum(needed.astype(jnp.int32))
-    # Indices of the examples that need the computation, then `size` as padding. A padded entry of a tile computes the
-    # last example again (`which`), and its result is dropped, because its index (`at`) is out of range.
-    order = jnp.nonzero(needed, size=size + tile, fill_value=size)[0].astype(jnp.int32)
-    axes = jax.tree.map(lambda is_own: 0 if is_own else None, own)
+    batch = needed.shape[0]
+    tile = min(tile_size(), batch)
+    needed_count = jnp.sum(needed.astype(jnp.int32))
+    # Indices of the examples that need the computation, then `batch`, which is out of range, as padding. A padded entry
+    # of a tile computes the last example again (`gathered`), and the scatter to `positions` drops its result.
+    indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
+    axes = jax.tree.map(lambda batched_leaf: 0 if batched_leaf else None, args_batched)
 
     def next_tile(state):
-        begin, found = state
-        at = jax.lax.dynamic_slice(order, (begin,), (tile,))
-        which = jnp.minimum(at, size - 1)
-        mine = jax.tree.map(lambda x, is_own: x[which] if is_own else x, args, own)
-        done = jax.vmap(work, in_axes=axes, axis_size=tile)(*mine)
-        found = jax.tree.map(lambda old, new: old.at[at].set(new, mode="drop"), found, done)
-        return begin + tile, found
+        begin, results = state
+        positions = jax.lax.dynamic_slice(indices, (begin,), (tile,))
+        gathered = jnp.minimum(positions, batch - 1)
+        tile_args = jax.tree.map(lambda x, batched_leaf: x[gathered] if batched_leaf else x, args, args_batched)
+        tile_results = jax.vmap(compute, in_axes=axes, axis_size=tile)(*tile_args)
+        results = jax.tree.map(
+            lambda all_rows, tile_rows: all_rows.at[positions].set(tile_rows, mode="drop"), results, tile_results
+        )
+        return begin + tile, results
 
-    return jax.lax.while_loop(lambda state: state[0] < count, next_tile, (jnp.zeros((), jnp.int32), instead))[1]
+    return jax.lax.while_loop(lambda state: state[0] < needed_count, next_tile, (jnp.zeros((), jnp.int32), otherwise))[
+        1
+    ]

@@ -26,9 +26,9 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     Returns:
         The folder. JAX creates it when it writes the first program.
     """
-    known = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if folder is None and known:
-        return Path(known)
+    current = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder is None and current:
+        return Path(current)
     path = Path(folder).expanduser() if folder is not None else _default_folder()
     jax.config.update("jax_compilation_cache_dir", str(path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # small programs too: there are hundreds
@@ -47,8 +47,8 @@ def _default_folder() -> Path:
 
 def _processor() -> str:
     """Return a name for this kind of processor and its instruction set."""
-    told = Path("/proc/cpuinfo")
+    cpuinfo = Path("/proc/cpuinfo")
     features = platform.processor()
-    if told.is_file():
-        features = next((line for line in told.read_text().splitlines() if line.startswith("flags")), features)
+    if cpuinfo.is_file():
+        features = next((line for line in cpuinfo.read_text().splitlines() if line.startswith("flags")), features)
     return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:8]}"

@@ -1,4 +1,4 @@
-"""JSON files of records whose numbers are read back bit for bit."""
+"""JSON files of dictionaries whose floating-point numbers are read back bit for bit."""
 
 import json
 from collections.abc import Callable
@@ -11,35 +11,37 @@ import numpy as np
 T = TypeVar("T")
 
 
-def save_json(path: str | Path, form: str, version: int, dtype: Any, record: dict[str, Any]) -> None:
+def save_json(path: str | Path, format_name: str, version: int, dtype: Any, record: dict[str, Any]) -> None:
     """Write a record to a JSON file, with the header that `load_json` checks.
 
     Args:
         path: The file.
-        form: Name of the format.
+        format_name: Name of the format.
         version: Version of the format.
         dtype: Floating dtype of the record's numbers.
         record: Content that `json` can write (see `to_list`).
     """
-    whole = {"format": form, "version": version, "dtype": str(dtype)} | record
-    Path(path).write_text(json.dumps(whole, indent=1) + "\n")
+    with_header = {"format": format_name, "version": version, "dtype": str(dtype)} | record
+    Path(path).write_text(json.dumps(with_header, indent=1) + "\n")
 
 
 def to_list(value: Any) -> Any:
     """Return an array as nested lists of float64 numbers; None stays None.
 
-    Writing them as text is lossless for float32 and float64.
+    Their decimal text is lossless for float32 and float64.
     """
     return None if value is None else np.asarray(value, np.float64).tolist()
 
 
-def load_json(path: str | Path, what: str, form: str, version: int, build: Callable[[dict[str, Any], Any], T]) -> T:
+def load_json(
+    path: str | Path, content: str, format_name: str, version: int, build: Callable[[dict[str, Any], Any], T]
+) -> T:
     """Read a record that `save_json` wrote, and build an object from it.
 
     Args:
         path: The file.
-        what: The file's expected content in words, for the error message.
-        form: Name of the format that the file must have.
+        content: The file's expected content in words, for the error message.
+        format_name: Name of the format that the file must have.
         version: Version of the format that the file must have.
         build: Called as `build(record, dtype)`, where `dtype` is the floating dtype of the record's numbers.
 
@@ -51,12 +53,12 @@ def load_json(path: str | Path, what: str, form: str, version: int, build: Calla
     """
     try:
         record = json.loads(Path(path).read_text())
-        if record["format"] != form:
+        if record["format"] != format_name:
             raise ValueError("its format is another")
         if record["version"] != version:
             raise ValueError(f"version {record['version']!r} of the format; this program reads {version}")
         # float64 becomes float32 unless x64 is enabled
         return build(record, jax.dtypes.canonicalize_dtype(record["dtype"]))
     except (ValueError, KeyError, TypeError, IndexError) as error:
-        wrong = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} does not hold {what}: {wrong}") from error
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path} does not hold {content}: {reason}") from error

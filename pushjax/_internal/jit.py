@@ -20,23 +20,23 @@ except ImportError:  # JAX up to 0.9
 P = ParamSpec("P")
 R = TypeVar("R")
 
-MANY = 50_000  # a call that has created at least so many objects has traced something
-ASIDE = gc.get_freeze_count()  # objects that the interpreter itself has frozen
+OBJECTS_OF_A_TRACE = 50_000  # a call that has created at least this many Python objects has traced something
+FROZEN_AT_IMPORT = gc.get_freeze_count()  # objects that the interpreter itself has frozen
 
 
 # Later versions no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
-HAS_EMITTERS = jax.__version_info__ < (0, 11)
+HAS_FUSION_EMITTERS = jax.__version_info__ < (0, 11)
 # A program that is called by itself runs once or a few times, on one example, for milliseconds, so the user waits only
 # for its compilation. Level 0 is not an option: without fusion emitters, one solve in a hundred then does not converge.
-QUICK: dict[str, str | bool | int] = {"xla_backend_optimization_level": 1}
-if HAS_EMITTERS:
-    QUICK["xla_cpu_use_fusion_emitters"] = False
-OUTERMOST = get_opaque_trace_state()
+QUICK_OPTIONS: dict[str, str | bool | int] = {"xla_backend_optimization_level": 1}
+if HAS_FUSION_EMITTERS:
+    QUICK_OPTIONS["xla_cpu_use_fusion_emitters"] = False
+NO_TRACE = get_opaque_trace_state()  # this module is imported outside of any trace
 
 
-def outermost() -> bool:
+def outside_trace() -> bool:
     """Return whether nothing is being traced: the caller is not inside `jit`, `grad` or `vmap`."""
-    return get_opaque_trace_state() == OUTERMOST
+    return get_opaque_trace_state() == NO_TRACE
 
 
 def jit(function: Callable[P, R]) -> Callable[P, R]:
@@ -48,18 +48,18 @@ def jit(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` as `jit` does, but with the compiler options `QUICK` when it is called by itself.
+    """Compile `function` as `jit` does, but with the compiler options `QUICK_OPTIONS` when it is called by itself.
 
     With these options compilation takes a third of the time (JAX up to 0.10), and the program takes up to twice as long
     to run. Inside `jit` the function is part of the surrounding program and is compiled with that program's options.
     Inside `grad` and `vmap` it is compiled with the default options, because batches may be large.
     """
-    quick = eqx.filter_jit(function, compiler_options=QUICK)  # pyright: ignore[reportCallIssue]
+    quick = eqx.filter_jit(function, compiler_options=QUICK_OPTIONS)  # pyright: ignore[reportCallIssue]
     thorough = eqx.filter_jit(function)
 
     @functools.wraps(function, updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        return (quick if outermost() else thorough)(*args, **kwargs)
+        return (quick if outside_trace() else thorough)(*args, **kwargs)
 
     return without_gc(call)
 
@@ -86,16 +86,17 @@ def without_gc(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
         finally:
             try:
-                _age()
+                _promote_new_objects()
             finally:
                 gc.enable()
 
     return call
 
 
-def _age() -> None:
+def _promote_new_objects() -> None:
     """Promote all objects to the oldest generation if there are many new ones."""
-    if gc.get_count()[0] < MANY or gc.get_freeze_count() > ASIDE:  # objects that the user has frozen must stay frozen
+    # `unfreeze` below would also release objects that the user has frozen, so then nothing is promoted
+    if gc.get_count()[0] < OBJECTS_OF_A_TRACE or gc.get_freeze_count() > FROZEN_AT_IMPORT:
         return
     try:
         gc.freeze()

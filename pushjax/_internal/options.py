@@ -6,7 +6,7 @@ import tyro
 
 
 def cli_option(metavar: str) -> Any:
-    """Return the settings of an option whose help text states its own default.
+    """Return the tyro settings of an option whose help text states the default in words, so that tyro does not add it.
 
     Args:
         metavar: Placeholder that the help shows for the option's value.

@@ -1,4 +1,4 @@
-"""How long work reports its progress: a function that is called with the number of parts done and their total."""
+"""The type of a progress callback: a function that is called with the number of parts done and their total."""
 
 from collections.abc import Callable
 

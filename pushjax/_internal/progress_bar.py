@@ -10,6 +10,8 @@ from rich.text import Text
 
 
 class _Rate(ProgressColumn):
+    """Column of the bar with the parts done per second."""
+
     def render(self, task: Task) -> Text:
         return Text("" if task.speed is None else f"{task.speed:,.0f}/s")
 
@@ -28,7 +30,7 @@ class Reporter:
         self.bar.update(self.task, completed=done, total=total)
 
     def say(self, words: str) -> None:
-        """Name the task that begins now."""
+        """Show `words` as the description of the task that begins now."""
         if self.bar.disable:
             print(f"pushjax: {words}", file=sys.stderr, flush=True)
         else:

@@ -45,8 +45,8 @@ def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> 
 
 def _processor() -> str:
     """Return the name of the processor's model, or its architecture where the system does not tell."""
-    listed = Path("/proc/cpuinfo")
-    lines = listed.read_text().splitlines() if listed.exists() else []
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or platform.machine())
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 Scalar = Float[Array, ""]
 
 
-def compute_once(values, like: Scalar):
+def compute_once(values, runtime_scalar: Scalar):
     """Return `values` unchanged, but force XLA to compute each of them exactly once.
 
     XLA may recompute a value inside every fusion that uses it, and round it differently there (with or without fused
@@ -25,12 +25,13 @@ def compute_once(values, like: Scalar):
 
     In reverse mode, cotangents that pass through `compute_once` are also computed once. Without it, they are computed
     once for every input. With it, `grad` of two contacts takes an eighth of the time to run and three fifths of the
-    time to compile. Under `jacrev` there is no such gain, because the cotangents are batched and `like` is not.
+    time to compile. Under `jacrev` there is no such gain, because the cotangents are batched and `runtime_scalar` is
+    not.
 
     Args:
         values: Pytree of floating and boolean scalars.
-        like: Any finite scalar that is not a compile-time constant. Its value does not matter. If it is not finite,
-            floats become NaN and booleans become False.
+        runtime_scalar: Any finite scalar that is not a compile-time constant. Its value does not matter. If it is not
+            finite, floats become NaN and booleans become False.
 
     Returns:
         The pytree of values.
@@ -38,44 +39,44 @@ def compute_once(values, like: Scalar):
     Raises:
         TypeError: If a value is neither floating nor boolean.
     """
-    one = jax.lax.stop_gradient(like) * 0 + 1
+    one = jax.lax.stop_gradient(runtime_scalar) * 0 + 1
 
-    def settled(value):
+    def divided_by_one(value):
         if jnp.issubdtype(value.dtype, jnp.floating):
             return value / one
         if value.dtype != bool:
             raise TypeError(f"compute_once takes floats and booleans, not {value.dtype}")
         return value.astype(one.dtype) / one > 0.5
 
-    return jax.tree.map(settled, values)
+    return jax.tree.map(divided_by_one, values)
 
 
-def decide(conditions, like: Scalar):
+def decide(conditions, runtime_scalar: Scalar):
     """Compute conditions exactly once, so that all code that uses a condition sees the same result.
 
     This is `compute_once` under a name that says why it is called.
 
     Args:
         conditions: Pytree of boolean scalars.
-        like: As in `compute_once`.
+        runtime_scalar: As in `compute_once`.
 
     Returns:
         The pytree of conditions.
     """
-    return compute_once(conditions, like)
+    return compute_once(conditions, runtime_scalar)
 
 
 def update_if(condition: Bool[Array, ""], update: Callable, state):
     """Return `update(state)` if `condition` holds, else `state`.
 
     Under `vmap`, `lax.cond` always runs both branches. This function skips `update` if the condition is False for the
-    whole batch. It cannot be differentiated in reverse mode.
+    whole batch: it is a `while_loop` of at most one iteration. It cannot be differentiated in reverse mode.
     """
 
-    def once(left):
-        return left[0] & False, update(left[1])
+    def run_update(loop_state):
+        return loop_state[0] & False, update(loop_state[1])
 
-    return jax.lax.while_loop(lambda left: left[0], once, (condition, state))[1]
+    return jax.lax.while_loop(lambda loop_state: loop_state[0], run_update, (condition, state))[1]
 
 
 def tree_where(condition, yes, no):
@@ -83,18 +84,22 @@ def tree_where(condition, yes, no):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def map_items(of: Callable, items: tuple) -> tuple:
+def map_items(function: Callable, items: tuple) -> tuple:
     """Return `(of(item), ...)` for all items, in a loop if they have the same structure, shapes and dtypes.
 
-    A loop compiles `of` once. Other items are unrolled, which compiles `of` once for every item. Compilation takes most
-    of the time of a first call.
+    A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
+    Compilation takes most of the time of a first call.
+
+    Args:
+        function: Function of one item.
+        items: Pytrees of arrays.
     """
 
-    def kind(item):
+    def structure_and_types(item):
         leaves = jax.tree.leaves(item)
         return jax.tree.structure(item), tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
 
-    if len(items) == 1 or len({kind(item) for item in items}) > 1:
-        return tuple(of(item) for item in items)
-    found = jax.lax.map(of, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
-    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], found) for k in range(len(items)))
+    if len(items) == 1 or len({structure_and_types(item) for item in items}) > 1:
+        return tuple(function(item) for item in items)
+    stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
+    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(items)))

@@ -1,5 +1,7 @@
 """Checks of the arguments of steps and rollouts, and their conversion to one floating dtype."""
 
+import sys
+import warnings
 from typing import Any
 
 import jax
@@ -26,7 +28,7 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, overlaps
 
-OVERLAPS = 4096  # poses whose overlaps are computed together
+POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
 
 
 def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
@@ -66,8 +68,44 @@ def checked_arguments(
         raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
     check_finite("friction", mu)
     check_non_negative("friction", mu)
+    warn_about_units(slider, pose, *paths)
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
+
+
+def warn_about_units(slider: Slider, pose: ArrayLike, *paths: ArrayLike) -> None:
+    """Warn if numbers are probably in millimeters or degrees. Traced values are not looked at.
+
+    Args:
+        slider: The slider. The length of its surface, m, says how large it is.
+        pose: Poses of the slider, (..., 3).
+        *paths: Configurations of the hand, (..., dof), world; at least the first two numbers are lengths.
+    """
+    length, angle = concrete(slider.surface.length), concrete(pose)
+    if length is not None and float(length) > MAX_LENGTH:
+        _warn(f"slider: its surface has a length of {float(length):.3g} m: are its coordinates in millimeters?")
+    elif length is not None:
+        for path in paths:
+            known = concrete(path)
+            if known is None or not known.size:
+                continue
+            extent = float(np.max(np.abs(known[..., :2])))
+            if extent > MAX_REACH * float(length):
+                _warn(
+                    f"path: it goes {extent:.3g} m from the origin, {extent / float(length):.0f} times the length of "
+                    "the slider's surface: are its coordinates in millimeters?"
+                )
+                break
+    if angle is not None and angle.size and float(np.max(np.abs(angle[..., 2]))) > MAX_TURN:
+        _warn(f"pose: its angle is {float(np.max(np.abs(angle[..., 2]))):.3g} rad: is it in degrees?")
+
+
+def _warn(message: str) -> None:
+    """Show a warning at the line of code outside the package that made the call."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("pushjax."):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, UserWarning, stacklevel=level)
 
 
 def checked_rollout_arguments(
@@ -80,16 +118,16 @@ def checked_rollout_arguments(
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
     if pushes is not None and np.ndim(path) == 3:
-        p = as_float(path, dtype)
-        check_shape("path", p, (pushes, "steps + 1", hand.dof))
-        check_finite("path", p)
-        if p.shape[1] < 2:
-            raise ValueError(f"path must have at least two configurations; got shape {p.shape}")
+        path_array = as_float(path, dtype)
+        check_shape("path", path_array, (pushes, "steps + 1", hand.dof))
+        check_finite("path", path_array)
+        if path_array.shape[1] < 2:
+            raise ValueError(f"path must have at least two configurations; got shape {path_array.shape}")
     else:
-        p = checked_path(path, hand.dof, dtype)
-    check_opening(hand, p)
-    check_start(slider, hand, start, p[..., 0, :])
-    return slider, hand, p, start, mu
+        path_array = checked_path(path, hand.dof, dtype)
+    check_opening(hand, path_array)
+    check_start(slider, hand, start, path_array[..., 0, :])
+    return slider, hand, path_array, start, mu
 
 
 def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:
@@ -105,33 +143,33 @@ def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) 
         return
     count = max(np.atleast_2d(poses).shape[0], np.atleast_2d(configuration).shape[0])
     many = np.broadcast_to(poses, (count, 3))
-    begun = np.broadcast_to(configuration, (count, hand.dof))
-    some, found = min(count, OVERLAPS), []
-    for first in range(0, count, some):  # parts of equal size; the last one is padded
-        part = np.minimum(np.arange(first, first + some), count - 1)
-        found.append(np.asarray(overlaps(slider, hand, jnp.asarray(many[part]), jnp.asarray(begun[part]))))
-    overlap = np.concatenate(found)
-    worst = int(np.argmax(overlap))
+    configurations = np.broadcast_to(configuration, (count, hand.dof))
+    part_size, depths = min(count, POSES_AT_ONCE), []
+    for first in range(0, count, part_size):  # parts of equal size; the last one is padded
+        part = np.minimum(np.arange(first, first + part_size), count - 1)
+        depths.append(np.asarray(overlaps(slider, hand, jnp.asarray(many[part]), jnp.asarray(configurations[part]))))
+    depth = np.concatenate(depths)
+    worst = int(np.argmax(depth))
     allowed = MAX_PENETRATION * float(slider.surface.length)
-    if overlap[worst] > allowed:
+    if depth[worst] > allowed:
         where = "" if poses.ndim == configuration.ndim == 1 else f" in push {worst}"
         raise ValueError(
-            f"path starts with the hand inside the slider{where}: a finger overlaps it by {1e3 * overlap[worst]:.3g} "
+            f"path starts with the hand inside the slider{where}: a finger overlaps it by {1e3 * depth[worst]:.3g} "
             f"mm; at most {1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
         )
 
 
 def check_opening(hand: Hand, path: Array) -> None:
     """Raise ValueError if a path closes the hand on itself, unless values are traced."""
-    least, known = hand.least, concrete(path)
-    if least is None or known is None or traced(least):
+    least, known_path = hand.least, concrete(path)
+    if least is None or known_path is None or traced(least):
         return
-    opening = np.atleast_2d(known)[..., -1]
+    opening = np.atleast_2d(known_path)[..., -1]
     narrow = np.argwhere(opening < float(least))
     if narrow.size:
-        at = tuple(narrow[0].tolist())
+        index = tuple(narrow[0].tolist())
         raise ValueError(
-            f"path closes the hand on itself: d is {opening[at]:.6g} m at index {', '.join(map(str, at))}; "
+            f"path closes the hand on itself: d is {opening[index]:.6g} m at index {', '.join(map(str, index))}; "
             f"with these fingers it must be at least {float(least):.6g} m"
         )
 

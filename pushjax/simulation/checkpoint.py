@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-MANIFEST, NAME = "manifest.json", re.compile(r"pushes-\d{12}-\d{12}\.npz")
+MANIFEST, BLOCK_FILE = "manifest.json", re.compile(r"pushes-\d{12}-\d{12}\.npz")
 FORMAT = 1
 
 
@@ -26,23 +26,23 @@ class CheckpointError(ValueError):
 
 def digest(*trees: Any) -> str:
     """Hash of pytrees: of their structure, static parts included, and of every bit of their arrays."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     leaves, structure = jax.tree.flatten(trees)
-    found.update(_plain(structure).encode())
+    hasher.update(_without_addresses(structure).encode())
     for leaf in leaves:
         array = np.asarray(leaf)
-        found.update(f"{array.dtype} {array.shape}".encode())
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:16]
+        hasher.update(f"{array.dtype} {array.shape}".encode())
+        hasher.update(np.ascontiguousarray(array).tobytes())
+    return hasher.hexdigest()[:16]
 
 
-def _plain(structure: Any) -> str:
+def _without_addresses(structure: Any) -> str:
     """Text of a tree structure without memory addresses of functions, which differ between processes.
 
     What a hand's function does shows in where it puts the fingers.
     """
-    words = str(structure).split(" at 0x")
-    return words[0] + "".join(word[word.find(">") :] for word in words[1:])
+    pieces = str(structure).split(" at 0x")
+    return pieces[0] + "".join(piece[piece.find(">") :] for piece in pieces[1:])
 
 
 class Checkpoint:
@@ -52,55 +52,55 @@ class Checkpoint:
 
     Args:
         folder: The folder.
-        parts: What identifies the run, by name; values that JSON can hold.
+        identity: What identifies the run, by name; values that JSON can hold.
         writes: Whether this process writes files.
 
     Raises:
         CheckpointError: If the folder holds another run, or is damaged.
     """
 
-    def __init__(self, folder: Path, parts: dict[str, Any], writes: bool = True):
+    def __init__(self, folder: Path, identity: dict[str, Any], writes: bool = True):
         """Open the folder, and write its manifest if it has none."""
         self.folder, self.writes = folder, writes
-        wanted = {"format": FORMAT} | parts
+        wanted = {"format": FORMAT} | identity
         path = folder / MANIFEST
         if path.exists():
-            self._same(path, wanted)
-        elif self._files():
+            self._check_manifest(path, wanted)
+        elif self._block_files():
             raise CheckpointError(
                 f"checkpoint: {folder} has pushes but no {MANIFEST} to say whose; give another folder"
             )
         elif writes:
-            self._write(path, lambda file: file.write(json.dumps(wanted, indent=2).encode()))
+            self._write_file(path, lambda file: file.write(json.dumps(wanted, indent=2).encode()))
 
-    def _same(self, path: Path, wanted: dict[str, Any]) -> None:
+    def _check_manifest(self, path: Path, wanted: dict[str, Any]) -> None:
         """Raise CheckpointError unless the manifest at `path` equals `wanted`."""
         try:
-            there = json.loads(path.read_text())
-            others = [name for name in {**wanted, **there} if there.get(name) != wanted.get(name)]
+            existing = json.loads(path.read_text())
+            different = [name for name in {**wanted, **existing} if existing.get(name) != wanted.get(name)]
         except (ValueError, AttributeError, OSError) as error:
-            why = error.strerror if isinstance(error, OSError) else "it is damaged"
-            raise CheckpointError(f"checkpoint: {path} cannot be read ({why}); give another folder") from None
-        if others:
-            name = others[0]
+            reason = error.strerror if isinstance(error, OSError) else "it is damaged"
+            raise CheckpointError(f"checkpoint: {path} cannot be read ({reason}); give another folder") from None
+        if different:
+            name = different[0]
             raise CheckpointError(
-                f"checkpoint: {self.folder} holds another run: {', '.join(others)} differ ({name} was "
-                f"{there.get(name)!r}, is {wanted.get(name)!r}); give another folder"
+                f"checkpoint: {self.folder} holds another run: {', '.join(different)} differ ({name} was "
+                f"{existing.get(name)!r}, is {wanted.get(name)!r}); give another folder"
             )
 
-    def _files(self) -> list[Path]:
-        return sorted(path for path in self.folder.glob("pushes-*.npz") if NAME.fullmatch(path.name))
+    def _block_files(self) -> list[Path]:
+        return sorted(path for path in self.folder.glob("pushes-*.npz") if BLOCK_FILE.fullmatch(path.name))
 
     def blocks(self) -> list[tuple[int, int, Path]]:
         """The blocks that exist, in order, up to the first gap."""
-        found, reached = [], 0
-        for path in self._files():
+        blocks, end = [], 0
+        for path in self._block_files():
             first, last = (int(word) for word in path.stem.split("-")[1:])
-            if first != reached:
+            if first != end:
                 break
-            found.append((first, last, path))
-            reached = last
-        return found
+            blocks.append((first, last, path))
+            end = last
+        return blocks
 
     def read(self, path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         """Read the named arrays of a block.
@@ -129,21 +129,21 @@ class Checkpoint:
             CheckpointError: If it cannot be written. All earlier blocks are left as they are.
         """
         if self.writes:
-            self._write(
+            self._write_file(
                 self.folder / f"pushes-{first:012d}-{last:012d}.npz",
                 lambda file: np.savez(file, allow_pickle=False, **arrays),
             )
 
-    def _write(self, path: Path, put: Any) -> None:
-        """Write a file with `put` under a temporary name, and rename it to `path` when it is complete."""
+    def _write_file(self, path: Path, write_content: Any) -> None:
+        """Write a file with `write_content` under a temporary name, and rename it to `path` when it is complete."""
         partial = None
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            for left in self.folder.glob(".partial-*"):  # from a run that was killed while it wrote
-                left.unlink(missing_ok=True)
+            for leftover in self.folder.glob(".partial-*"):  # from a run that was killed while it wrote
+                leftover.unlink(missing_ok=True)
             with tempfile.NamedTemporaryFile(dir=self.folder, prefix=".partial-", delete=False) as file:
                 partial = Path(file.name)
-                put(file)
+                write_content(file)
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(partial, path)

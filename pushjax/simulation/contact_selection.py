@@ -22,7 +22,7 @@ SAME_PLACE, SAME_BUMP = 1e-3, 0.1
 
 
 def select_contacts(
-    touches: Candidates, length: Scalar, outline: Outline, path: Vec2
+    candidates: Candidates, length: Scalar, outline: Outline, path: Vec2
 ) -> tuple[Int[Array, ""] | int, ...]:
     """Select which places are contacts, the likeliest first. The selection is not differentiated.
 
@@ -31,96 +31,104 @@ def select_contacts(
     third place is selected. Places that are not in an array are all selected.
 
     Args:
-        touches: All places, as from `contact_candidates`.
+        candidates: All places, as from `contact_candidates`.
         length: Characteristic length of the limit surface, m.
         outline: The slider's outline.
         path: Displacement of the finger in the rest of the step, slider's frame, m.
     """
-    if not isinstance(touches, Candidate):
-        return tuple(range(len(touches)))
-    touches, path = jax.lax.stop_gradient((touches, path))
+    if not isinstance(candidates, Candidate):
+        return tuple(range(len(candidates)))
+    candidates, path = jax.lax.stop_gradient((candidates, path))
     if is_nonconvex_polygon(outline):
-        touches = touches._replace(distance=touches.distance - touches.normal.dot(path))
-        return _apart(touches, length)
-    distance = touches.distance
+        candidates = candidates._replace(distance=candidates.distance - candidates.normal.dot(path))
+        return _select_three(candidates, length)
+    distance = candidates.distance
     first = jnp.argmin(distance)
-    nearest = _at(touches, first)
-    apart = touches.point - nearest.point
-    same = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
-    elsewhere = apart.dot(apart) > (same * length) ** 2
+    nearest = _take(candidates, first)
+    apart = candidates.point - nearest.point
+    separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
+    elsewhere = apart.dot(apart) > (separation * length) ** 2
     elsewhere = decide(elsewhere & (distance < nearest.distance + 1e3 * length), length)
     second = jnp.where(jnp.any(elsewhere), jnp.argmin(jnp.where(elsewhere, distance, jnp.inf)), first)
     return first.astype(jnp.int32), second.astype(jnp.int32)
 
 
-def _apart(touches: Candidate, length: Scalar) -> tuple[Int[Array, ""], ...]:
+def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""], ...]:
     """The nearest place, and the two that constrain most of the motions that it leaves free.
 
     A pad that lies flat across two arms then rests on its outermost places. A pad in an inner corner then rests on both
     edges. Neither rests on places side by side.
     """
-    chosen = [jnp.argmin(touches.distance).astype(jnp.int32)]
-    nearest = _at(touches, chosen[0])
-    elsewhere, reach = touches.distance < nearest.distance + 1e3 * length, jnp.zeros_like(touches.distance)
-    last = nearest
+    chosen = [jnp.argmin(candidates.distance).astype(jnp.int32)]
+    nearest = _take(candidates, chosen[0])
+    elsewhere, travel = candidates.distance < nearest.distance + 1e3 * length, jnp.zeros_like(candidates.distance)
+    previous = nearest
     for _ in range(2):
-        free, far = _beyond(touches, last, length)
-        elsewhere, reach = compute_once((elsewhere & free, jnp.maximum(reach, far)), length)
-        best = jnp.argmin(jnp.where(elsewhere, reach, jnp.inf))
+        differs, distance = _distances_in_other_directions(candidates, previous, length)
+        elsewhere, travel = compute_once((elsewhere & differs, jnp.maximum(travel, distance)), length)
+        best = jnp.argmin(jnp.where(elsewhere, travel, jnp.inf))
         chosen.append(jnp.where(jnp.any(elsewhere), best, chosen[0]).astype(jnp.int32))
-        last = _at(touches, chosen[-1])
+        previous = _take(candidates, chosen[-1])
     return tuple(chosen)
 
 
-def _beyond(touches: Candidate, last: Candidate, length: Scalar) -> tuple[Bool[Array, " places"], Scalar]:
-    """Which places constrain a different motion than `last`, and the distance to each, m.
+def _distances_in_other_directions(
+    candidates: Candidate, previous: Candidate, length: Scalar
+) -> tuple[Bool[Array, " places"], Scalar]:
+    """Return which candidates constrain a different motion than `previous`, and the distance to each, m.
 
-    The distance is how far a slider that stays in contact at `last` has to move until it touches at the other place.
+    The distance is how far a slider that stays in contact at `previous` has to move until it touches at the candidate.
     """
-    lever = (touches.point - last.point).cross(touches.normal) / length
-    shared = touches.normal.dot(last.normal)
-    free = jnp.sqrt(jnp.maximum(1 - jnp.maximum(shared, 0) ** 2, 0) + lever**2)
-    gap = jnp.maximum(touches.distance - shared * last.distance, 0) + SAME_PLACE * length
-    return free > SAME_PLACE, gap / jnp.maximum(free, SAME_PLACE)
+    lever = (candidates.point - previous.point).cross(candidates.normal) / length
+    shared = candidates.normal.dot(previous.normal)
+    freedom = jnp.sqrt(jnp.maximum(1 - jnp.maximum(shared, 0) ** 2, 0) + lever**2)
+    gap = jnp.maximum(candidates.distance - shared * previous.distance, 0) + SAME_PLACE * length
+    return freedom > SAME_PLACE, gap / jnp.maximum(freedom, SAME_PLACE)
 
 
-def selected_candidates(touches: Candidates, chosen: tuple[Any, ...]) -> tuple[Candidate, ...]:
+def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tuple[Candidate, ...]:
     """The selected places; a place that is selected a second time is moved out of reach."""
-    if not isinstance(touches, Candidate):
-        return touches
-    first, *others = (_at(touches, index) for index in chosen)
-    again = [index == chosen[0] for index in chosen[1:]]
-    far = [jnp.where(same, 1.0, 0.0).astype(first.distance.dtype) for same in again]
-    return first, *(one._replace(distance=one.distance + off) for one, off in zip(others, far, strict=True))
+    if not isinstance(candidates, Candidate):
+        return candidates
+    first, *others = (_take(candidates, index) for index in chosen)
+    repeated = [index == chosen[0] for index in chosen[1:]]
+    offsets = [jnp.where(same, 1.0, 0.0).astype(first.distance.dtype) for same in repeated]
+    return first, *(
+        other._replace(distance=other.distance + offset) for other, offset in zip(others, offsets, strict=True)
+    )
 
 
 def track_contacts(
-    touches: Candidates, chosen: tuple[Any, ...], begun: tuple[Candidate, ...], finger: Finger, outline: Outline
+    candidates: Candidates, chosen: tuple[Any, ...], at_start: tuple[Candidate, ...], finger: Finger, outline: Outline
 ) -> tuple[Any, ...]:
     """Indices of the same places later in the step, when `contact_candidates` may return them in another order.
 
     The order changes in an inner corner, where the edge that a pad's corner is nearest to changes.
 
     Args:
-        touches: All places now.
+        candidates: All places now.
         chosen: Indices at the start of the step.
-        begun: The selected places at the start of the step.
+        at_start: The selected places at the start of the step.
         finger: The finger.
         outline: The slider's outline.
     """
-    if not isinstance(finger, Pad) or not isinstance(touches, Candidate) or not is_nonconvex_polygon(outline):
+    if not isinstance(finger, Pad) or not isinstance(candidates, Candidate) or not is_nonconvex_polygon(outline):
         return chosen
-    tips = len(edges(finger.shape.outline()))
-    other = touches.distance.size - tips  # index offset from (corner, nearest edge) to (same corner, next edge)
-    found = []
-    for index, before in zip(chosen, begun, strict=True):
-        twin = jnp.where(index < tips, index + other, jnp.where(index >= other, index - other, index))
-        now, then = (_at(touches, k).normal.dot(before.normal) for k in (index, twin))
-        found.append(jnp.where(decide(then > now + SAME_PLACE, now), twin, index))
-    return tuple(found)
+    pad_corners = len(edges(finger.shape.outline()))
+    twin_offset = (
+        candidates.distance.size - pad_corners
+    )  # index offset from (corner, nearest edge) to (same corner, next edge)
+    indices = []
+    for index, original in zip(chosen, at_start, strict=True):
+        twin = jnp.where(
+            index < pad_corners, index + twin_offset, jnp.where(index >= twin_offset, index - twin_offset, index)
+        )
+        same_normal, twin_normal = (_take(candidates, k).normal.dot(original.normal) for k in (index, twin))
+        indices.append(jnp.where(decide(twin_normal > same_normal + SAME_PLACE, same_normal), twin, index))
+    return tuple(indices)
 
 
-def _at(touches: Candidate, index: Int[Array, ""]) -> Candidate:
+def _take(candidates: Candidate, index: Int[Array, ""]) -> Candidate:
     """`touches[index]`, computed as a masked sum, which is cheap in a batch."""
-    mark = jnp.arange(touches.distance.size) == index
-    return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), touches)
+    mark = jnp.arange(candidates.distance.size) == index
+    return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), candidates)

@@ -35,15 +35,15 @@ MAX_PENETRATION = 0.2
 # A corner can touch an edge only if neither of the two edges at the corner points toward it. A tilt up to this sine is
 # allowed, so that where two edges are almost parallel both ends are contacts, and neither end sinks in as the edge
 # comes down.
-BLUNT = 0.3
+TILT_TOLERANCE = 0.3
 # Keyed by the bytes of a float; in units of an edge's length. A corner that is past the end of an edge by up to this
 # still projects onto the edge. Otherwise two corners that lie on each other to roundoff (the corner of a pad whose side
 # rests on an arm, and the corner at the arm's end) would each be past the end of the other's edge, and would touch
 # nowhere.
-LOOSE = {4: 2e-5, 8: 1e-6}
+END_TOLERANCE = {4: 2e-5, 8: 1e-6}
 # In units of the length. An edge is extended by this past an inner (reflex) corner, into the slider, so that what sinks
 # into one edge of that corner still projects onto the other.
-PAST = 0.05
+REFLEX_EXTENSION = 0.05
 OUT_OF_REACH = 1e3  # m, out of reach
 
 
@@ -79,41 +79,52 @@ Candidates = tuple[Candidate, ...] | Candidate
 
 
 def contact_candidates(
-    finger: Finger, outline: Outline, at: FingerPose, path: Vec2, length: Scalar, seen: EdgeSupport | None = None
+    finger: Finger,
+    outline: Outline,
+    finger_pose: FingerPose,
+    path: Vec2,
+    length: Scalar,
+    supports: EdgeSupport | None = None,
 ) -> Candidates:
     """Return every place where a finger and the slider may touch.
 
     Args:
         finger: The finger.
         outline: The slider's outline.
-        at: Pose of the finger in the slider's frame.
+        finger_pose: Pose of the finger in the slider's frame.
         path: Displacement of the finger in the slider's frame, m. It decides which edge is touched where a corner lies
             on a corner.
         length: Characteristic length of the limit surface, m.
-        seen: Result of `edge_supports`, if it is known already.
+        supports: Result of `edge_supports`, if it is known already.
     """
     if isinstance(finger, RoundFinger):
         return tuple(
-            Candidate(s.distance - finger.radius, s.point, -s.normal) for s in outline.contact_candidates(at.center)
+            Candidate(s.distance - finger.radius, s.point, -s.normal)
+            for s in outline.contact_candidates(finger_pose.center)
         )
-    pad, angle = finger.shape.outline(), _angle(at)
+    pad, angle = finger.shape.outline(), _pad_angle(finger_pose)
     if isinstance(outline, DiskOutline):
-        near = pad.closest((outline.center - at.center).unrotate(angle))
-        normal = near.normal.rotate(angle)
-        return (Candidate(near.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
+        closest = pad.closest((outline.center - finger_pose.center).unrotate(angle))
+        normal = closest.normal.rotate(angle)
+        return (Candidate(closest.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
     if not isinstance(outline, PolygonOutline):
-        if seen is None:
-            seen = edge_supports(finger, outline, at)
-        return _smooth_candidates(pad, outline, at.center, angle, length, seen)
-    mine, next_ = _vertex_edge_candidates(outline, corners(pad).turned(angle, at.center), path, length)
-    away, own = Vec2(angle.x, -angle.y), corners(outline)
-    near, _ = _vertex_edge_candidates(
-        pad, own.turned(away, (-at.center).unrotate(angle)), (-path).unrotate(angle), length
+        if supports is None:
+            supports = edge_supports(finger, outline, finger_pose)
+        return _smooth_candidates(pad, outline, finger_pose.center, angle, length, supports)
+    pad_on_slider, pad_on_next_edge = _vertex_edge_candidates(
+        outline, corners(pad).turned(angle, finger_pose.center), path, length
     )
-    theirs = Candidate(near.distance, own.point, -near.normal.rotate(angle))
+    inverse_angle, slider_corners = Vec2(angle.x, -angle.y), corners(outline)
+    closest, _ = _vertex_edge_candidates(
+        pad,
+        slider_corners.turned(inverse_angle, (-finger_pose.center).unrotate(angle)),
+        (-path).unrotate(angle),
+        length,
+    )
+    slider_on_pad = Candidate(closest.distance, slider_corners.point, -closest.normal.rotate(angle))
     # in an inner corner of the slider, a corner of the pad touches both edges
-    each = (mine, theirs) if outline.convex else (mine, theirs, next_)
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *each)
+    groups = (pad_on_slider, slider_on_pad) if outline.convex else (pad_on_slider, slider_on_pad, pad_on_next_edge)
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
 
 
 class Corner(NamedTuple):
@@ -149,47 +160,51 @@ def _vertex_edge_candidates(
     """
     found: tuple[tuple[Candidate, Scalar, Scalar, Array], tuple[Candidate, Scalar, Scalar, Array]] | None = None
     # an inner (reflex) corner cannot touch a straight edge
-    outer = corner.onward.cross(corner.back) >= -roundoff(jnp.ones_like(corner.point.x))
+    is_convex_corner = corner.onward.cross(corner.back) >= -roundoff(jnp.ones_like(corner.point.x))
     sides = edges(outline)
     inside = compute_once(_inside(sides, corner.point), corner.point.x)
     for k, edge in enumerate(sides):
         rel = corner.point - edge.start
         along, height = rel.dot(edge.along), edge.normal.dot(rel)
-        loose = LOOSE[edge.length.dtype.itemsize] * edge.length
-        begin, end = -loose, edge.length + loose
+        tolerance = END_TOLERANCE[edge.length.dtype.itemsize] * edge.length
+        begin, end = -tolerance, edge.length + tolerance
         past = jnp.zeros(along.shape, bool)
         if is_nonconvex_polygon(outline):
             # An edge is extended past an inner corner: a point that is past the edge's end there is inside the slider,
             # behind this edge and the next.
             before, after = sides[k - 1].along, sides[(k + 1) % len(sides)].along
             past = (along < begin) | (along > end)
-            begin -= jnp.where(before.cross(edge.along) < 0, PAST * length, 0.0)
-            end += jnp.where(edge.along.cross(after) < 0, PAST * length, 0.0)
-        points = (corner.onward.dot(edge.normal) >= -BLUNT) & (corner.back.dot(edge.normal) >= -BLUNT) & outer
+            begin -= jnp.where(before.cross(edge.along) < 0, REFLEX_EXTENSION * length, 0.0)
+            end += jnp.where(edge.along.cross(after) < 0, REFLEX_EXTENSION * length, 0.0)
+        faces = (
+            (corner.onward.dot(edge.normal) >= -TILT_TOLERANCE)
+            & (corner.back.dot(edge.normal) >= -TILT_TOLERANCE)
+            & is_convex_corner
+        )
         # A point that is behind an edge but not inside the polygon is on the far side of another edge. A point that is
         # deeper than twice the limit counts as on the far side, too.
-        behind = (height >= -loose) | (inside & (height > -2 * MAX_PENETRATION * length))
-        beside = points & (along >= begin) & (along <= end) & behind
-        touch = Candidate(
+        behind = (height >= -tolerance) | (inside & (height > -2 * MAX_PENETRATION * length))
+        beside = faces & (along >= begin) & (along <= end) & behind
+        candidate = Candidate(
             jnp.where(beside, height, OUT_OF_REACH), corner.point - edge.normal.scale(height), -edge.normal
         )
-        away = jnp.maximum(jnp.abs(touch.distance), loose)
-        pressed = jnp.broadcast_to(-edge.normal.dot(path), away.shape)
-        this = touch, away, pressed, past
+        gap = jnp.maximum(jnp.abs(candidate.distance), tolerance)
+        pressing = jnp.broadcast_to(-edge.normal.dot(path), gap.shape)
+        entry = candidate, gap, pressing, past
         if found is None:
-            far = touch._replace(distance=jnp.full_like(away, OUT_OF_REACH))
-            found = this, (far, jnp.full_like(away, OUT_OF_REACH), pressed, past)
+            nothing = candidate._replace(distance=jnp.full_like(gap, OUT_OF_REACH))
+            found = entry, (nothing, jnp.full_like(gap, OUT_OF_REACH), pressing, past)
             continue
         first, second = found
-        nearer = (away < first[1]) | ((away == loose) & (first[1] <= loose) & (pressed > first[2]))
-        nearer, next_ = compute_once((nearer, away < second[1]), corner.point.x)
-        found = tree_where(nearer, this, first), tree_where(nearer, first, tree_where(next_, this, second))
+        nearer = (gap < first[1]) | ((gap == tolerance) & (first[1] <= tolerance) & (pressing > first[2]))
+        nearer, second_nearer = compute_once((nearer, gap < second[1]), corner.point.x)
+        found = tree_where(nearer, entry, first), tree_where(nearer, first, tree_where(second_nearer, entry, second))
     assert found is not None
-    (nearest, *_, past), (next_, *_, beyond) = found
+    (nearest, *_, past), (second_nearest, *_, second_past) = found
     # next to a convex corner, a point inside is pushed out by the nearest edge alone
-    outside = next_.distance >= -LOOSE[length.dtype.itemsize] * length
-    both = decide(outside | past | beyond, corner.point.x)
-    return nearest, next_._replace(distance=jnp.where(both, next_.distance, OUT_OF_REACH))
+    outside = second_nearest.distance >= -END_TOLERANCE[length.dtype.itemsize] * length
+    both = decide(outside | past | second_past, corner.point.x)
+    return nearest, second_nearest._replace(distance=jnp.where(both, second_nearest.distance, OUT_OF_REACH))
 
 
 def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
@@ -202,29 +217,38 @@ def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
     return inside
 
 
-def edge_supports(finger: Finger, outline: Outline, at: FingerPose) -> EdgeSupport | None:
+def edge_supports(finger: Finger, outline: Outline, finger_pose: FingerPose) -> EdgeSupport | None:
     """Return the places of a smooth outline that face a pad's edges; None for round fingers, polygons and disks.
 
     Several functions need the result, so it can be computed once and passed to them.
     """
     if isinstance(finger, RoundFinger) or isinstance(outline, PolygonOutline | DiskOutline):
         return None
-    return pad_on_curve.edge_support_points(edges(finger.shape.outline()), outline, at.center, _angle(at))
+    return pad_on_curve.edge_support_points(
+        edges(finger.shape.outline()), outline, finger_pose.center, _pad_angle(finger_pose)
+    )
 
 
 def _smooth_candidates(
-    pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, seen: EdgeSupport | None
+    pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, supports: EdgeSupport | None
 ) -> Candidate:
     """For each corner of a pad, the closest point of a smooth outline; then the places that face the pad's edges."""
-    assert seen is not None
-    deep, corner = -2 * MAX_PENETRATION * length, corners(pad).turned(angle, center)
-    near = jax.vmap(outline.closest)(corner.point)
-    points = (corner.onward.dot(near.normal) >= -BLUNT) & (corner.back.dot(near.normal) >= -BLUNT)
-    points &= near.distance > deep
-    loose = LOOSE[seen.length.dtype.itemsize] * seen.length
-    beside = seen.valid & (seen.along >= -loose) & (seen.along <= seen.length + loose) & (seen.height > deep)
-    at_corners = Candidate(jnp.where(points, near.distance, OUT_OF_REACH), near.point, -near.normal)
-    at_edges = Candidate(jnp.where(beside, seen.height, OUT_OF_REACH), seen.point, seen.normal)
+    assert supports is not None
+    too_deep, corner = -2 * MAX_PENETRATION * length, corners(pad).turned(angle, center)
+    closest = jax.vmap(outline.closest)(corner.point)
+    faces = (corner.onward.dot(closest.normal) >= -TILT_TOLERANCE) & (
+        corner.back.dot(closest.normal) >= -TILT_TOLERANCE
+    )
+    faces &= closest.distance > too_deep
+    tolerance = END_TOLERANCE[supports.length.dtype.itemsize] * supports.length
+    beside = (
+        supports.valid
+        & (supports.along >= -tolerance)
+        & (supports.along <= supports.length + tolerance)
+        & (supports.height > too_deep)
+    )
+    at_corners = Candidate(jnp.where(faces, closest.distance, OUT_OF_REACH), closest.point, -closest.normal)
+    at_edges = Candidate(jnp.where(beside, supports.height, OUT_OF_REACH), supports.point, supports.normal)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), at_corners, at_edges)
 
 
@@ -245,23 +269,23 @@ def is_nonconvex_polygon(outline: Outline) -> bool:
     return isinstance(outline, PolygonOutline) and not outline.convex
 
 
-def time_of_impact(finger: Finger, outline: Outline, at: FingerPose, path: Vec2, length: Scalar) -> Scalar:
+def time_of_impact(finger: Finger, outline: Outline, finger_pose: FingerPose, path: Vec2, length: Scalar) -> Scalar:
     """Return the fraction of `path` after which a finger first touches the slider, or one if it never does.
 
     The finger moves along `path` without turning, in the frame of a slider at rest.
     """
-    seen = edge_supports(finger, outline, at)
-    pressing, touches = jnp.zeros((), bool), contact_candidates(finger, outline, at, path, length, seen)
-    for touch in (touches,) if isinstance(touches, Candidate) else touches:
+    supports = edge_supports(finger, outline, finger_pose)
+    presses, candidates = jnp.zeros((), bool), contact_candidates(finger, outline, finger_pose, path, length, supports)
+    for candidate in (candidates,) if isinstance(candidates, Candidate) else candidates:
         # in contact and pressing: the push begins at once
-        pressing |= jnp.any((touch.distance <= 0) & (touch.normal.dot(path) > touch.distance))
+        presses |= jnp.any((candidate.distance <= 0) & (candidate.normal.dot(path) > candidate.distance))
     # Otherwise the first hit along the path counts, also for a finger that touches but moves away.
-    hit = _sweep(finger, outline, at, path, seen)
-    pressing, hits = compute_once((pressing, hit <= 1), at.center.x)
-    return jnp.where(pressing, 0.0, jnp.where(hits, hit, 1.0))
+    hit = _sweep(finger, outline, finger_pose, path, supports)
+    presses, hits = compute_once((presses, hit <= 1), finger_pose.center.x)
+    return jnp.where(presses, 0.0, jnp.where(hits, hit, 1.0))
 
 
-def penetration_depth(finger: Finger, outline: Outline, at: FingerPose) -> Scalar:
+def penetration_depth(finger: Finger, outline: Outline, finger_pose: FingerPose) -> Scalar:
     """Penetration depth of a finger in the slider, m; where they are apart, minus their distance.
 
     For a pad it is the depth of the deepest corner of either body in the other. Where edges cross and no corner is
@@ -269,55 +293,57 @@ def penetration_depth(finger: Finger, outline: Outline, at: FingerPose) -> Scala
     the depth of the deepest corner, or of the deepest place of the outline that faces an edge.
     """
     if isinstance(finger, RoundFinger):
-        return finger.radius - outline.closest(at.center).distance
-    pad, angle = finger.shape.outline(), _angle(at)
+        return finger.radius - outline.closest(finger_pose.center).distance
+    pad, angle = finger.shape.outline(), _pad_angle(finger_pose)
     if isinstance(outline, DiskOutline):
-        return outline.radius - pad.closest((outline.center - at.center).unrotate(angle)).distance
-    tips = at.center + corners(pad).point.rotate(angle)
+        return outline.radius - pad.closest((outline.center - finger_pose.center).unrotate(angle)).distance
+    pad_corners = finger_pose.center + corners(pad).point.rotate(angle)
     if not isinstance(outline, PolygonOutline):
-        seen = edge_supports(finger, outline, at)
-        assert seen is not None
-        return pad_on_curve.overlap(pad, seen, outline, tips)
-    own = (corners(outline).point - at.center).unrotate(angle)
-    theirs = pad.closest(own).distance
-    mine = outline.closest(tips).distance
-    return jnp.maximum(jnp.maximum(jnp.max(-mine), jnp.max(-theirs)), _across(pad, own))
+        supports = edge_supports(finger, outline, finger_pose)
+        assert supports is not None
+        return pad_on_curve.penetration_depth(pad, supports, outline, pad_corners)
+    slider_corners = (corners(outline).point - finger_pose.center).unrotate(angle)
+    slider_in_pad = pad.closest(slider_corners).distance
+    pad_in_slider = outline.closest(pad_corners).distance
+    return jnp.maximum(jnp.maximum(jnp.max(-pad_in_slider), jnp.max(-slider_in_pad)), _chord_depth(pad, slider_corners))
 
 
-def _across(pad: PolygonOutline, corner: Vec2) -> Scalar:
+def _chord_depth(pad: PolygonOutline, slider_corners: Vec2) -> Scalar:
     """Depth in the pad of the midpoint of the chord that the pad cuts from an edge; negative if it cuts none.
 
     The edges join consecutive corners of the slider, here in the pad's frame, and the deepest midpoint counts. Depth is
     concave along a chord, so the midpoint is at least half as deep as the deepest point of the chord.
     """
-    begins = [-side.normal.dot(corner - side.start) for side in edges(pad)]
-    depths = compute_once([(first, jnp.roll(first, -1)) for first in begins], corner.x[0])
-    enter, leave = jnp.zeros_like(corner.x), jnp.ones_like(corner.x)
+    edge_depths = [-side.normal.dot(slider_corners - side.start) for side in edges(pad)]
+    depths = compute_once([(first, jnp.roll(first, -1)) for first in edge_depths], slider_corners.x[0])
+    enter, leave = jnp.zeros_like(slider_corners.x), jnp.ones_like(slider_corners.x)
     for first, last in depths:
         crossing = first / jnp.where(first != last, first - last, 1.0)
         enter = jnp.where((first < 0) & (last > first), jnp.maximum(enter, crossing), enter)
         leave = jnp.where((last < 0) & (first > last), jnp.minimum(leave, crossing), leave)
-    enter, leave = compute_once((enter, leave), corner.x[0])
+    enter, leave = compute_once((enter, leave), slider_corners.x[0])
     middle = (enter + leave) / 2
     depth = functools.reduce(jnp.minimum, [first + middle * (last - first) for first, last in depths])
     return jnp.max(jnp.where(enter < leave, depth, -jnp.inf))
 
 
-def _sweep(finger: Finger, outline: Outline, at: FingerPose, path: Vec2, seen: EdgeSupport | None) -> Scalar:
+def _sweep(
+    finger: Finger, outline: Outline, finger_pose: FingerPose, path: Vec2, supports: EdgeSupport | None
+) -> Scalar:
     """Fraction of `path` at which the finger first hits the outline; inf if it does not."""
     if isinstance(finger, RoundFinger):
-        return outline.sweep(at.center, path, finger.radius)
-    pad, angle, zero = finger.shape.outline(), _angle(at), jnp.zeros_like(path.x)
-    back = (-path).unrotate(angle)
+        return outline.sweep(finger_pose.center, path, finger.radius)
+    pad, angle, zero = finger.shape.outline(), _pad_angle(finger_pose), jnp.zeros_like(path.x)
+    slider_path = (-path).unrotate(angle)
     if isinstance(outline, DiskOutline):
-        return pad.sweep((outline.center - at.center).unrotate(angle), back, outline.radius)
-    tips = at.center + corners(pad).point.rotate(angle)
+        return pad.sweep((outline.center - finger_pose.center).unrotate(angle), slider_path, outline.radius)
+    pad_corners = finger_pose.center + corners(pad).point.rotate(angle)
     if not isinstance(outline, PolygonOutline):
-        assert seen is not None
-        return pad_on_curve.sweep(pad, seen, outline, tips, path, back)
-    mine = outline.sweep(tips, path, zero)
-    theirs = pad.sweep((corners(outline).point - at.center).unrotate(angle), back, zero)
-    return jnp.minimum(jnp.min(mine), jnp.min(theirs))
+        assert supports is not None
+        return pad_on_curve.sweep(pad, supports, outline, pad_corners, path, slider_path)
+    pad_corner_hits = outline.sweep(pad_corners, path, zero)
+    slider_corner_hits = pad.sweep((corners(outline).point - finger_pose.center).unrotate(angle), slider_path, zero)
+    return jnp.minimum(jnp.min(pad_corner_hits), jnp.min(slider_corner_hits))
 
 
 def edges(outline: Outline) -> tuple[Edge, ...]:
@@ -333,12 +359,12 @@ def edges(outline: Outline) -> tuple[Edge, ...]:
 def corners(outline: Outline) -> Corner:
     """The corners of a polygon with few edges, as arrays."""
     sides = edges(outline)
-    each = [Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides)]
-    return jax.tree.map(lambda *entries: jnp.stack(entries), *each)
+    entries_by_corner = [Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides)]
+    return jax.tree.map(lambda *entries: jnp.stack(entries), *entries_by_corner)
 
 
-def _angle(at: FingerPose) -> Vec2:
+def _pad_angle(finger_pose: FingerPose) -> Vec2:
     """The angle of a pad; raises ValueError if the kinematics give none."""
-    if at.angle is None:
+    if finger_pose.angle is None:
         raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
-    return at.angle
+    return finger_pose.angle

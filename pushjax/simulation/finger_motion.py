@@ -20,7 +20,7 @@ GRASP_GAP = 1e-4
 # After a step a finger may be this deep in the slider, as a fraction of the largest displacement of the fingers in the
 # step, if it was not deeper before: the midpoint rule leaves that much at a corner. The floor is in units of the length
 # and allows for roundoff.
-TOLERATED, FLOOR = 0.1, 1e-5
+DEPTH_PER_DISPLACEMENT, DEPTH_FLOOR = 0.1, 1e-5
 
 
 class BodyFrame(NamedTuple):
@@ -43,19 +43,21 @@ class BodyFrame(NamedTuple):
         """A world point in the body frame."""
         return (world - self.pose.xy).unrotate(self.angle)
 
-    def moved(self, contact: Vec2, motion: Vec3, seen: Vec2) -> "BodyFrame":
+    def moved(self, contact: Vec2, twist: Vec3, frame_angle: Vec2) -> "BodyFrame":
         """The pose after a body twist that moves a point of the slider in a straight line.
 
         Args:
             contact: The point, body frame, m.
-            motion: The twist.
-            seen: Unit vector of the angle of the frame in which the twist is given; it rotates the twist to the world.
+            twist: The body twist, m and rad.
+            frame_angle: Unit vector of the angle of the body frame in which the twist is given; it rotates the twist to
+                the world.
         """
-        straight = (motion.xy + contact.perp().scale(motion.z)).rotate(seen)
-        theta = self.pose.z + motion.z
+        displacement = (twist.xy + contact.perp().scale(twist.z)).rotate(frame_angle)
+        theta = self.pose.z + twist.z
         angle = compute_once(cos_sin(theta), self.pose.x)
-        swing = contact.rotate(angle) - contact.rotate(self.angle)
-        return BodyFrame(Vec3(self.pose.x + straight.x - swing.x, self.pose.y + straight.y - swing.y, theta), angle)
+        lever_change = contact.rotate(angle) - contact.rotate(self.angle)
+        x, y = self.pose.x + displacement.x - lever_change.x, self.pose.y + displacement.y - lever_change.y
+        return BodyFrame(Vec3(x, y, theta), angle)
 
 
 class FingerMotion(NamedTuple):
@@ -77,15 +79,15 @@ class FingerMotion(NamedTuple):
     angle: Scalar | None
     turning: Scalar | None
 
-    def seen(self, slider: BodyFrame, share: Scalar) -> FingerPose:
-        """Pose of the finger in the slider's frame after the fraction `share` of the step."""
-        center = slider.local(self.center + self.path.scale(share))
+    def pose_in_slider(self, slider: BodyFrame, fraction: Scalar) -> FingerPose:
+        """Pose of the finger in the slider's frame after the fraction `fraction` of the step."""
+        center = slider.local(self.center + self.path.scale(fraction))
         if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
             return FingerPose(center, None)
         if self.angle is None or self.turning is None:
             raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
         return FingerPose(
-            center, compute_once(cos_sin(self.angle + share * self.turning), center.x).unrotate(slider.angle)
+            center, compute_once(cos_sin(self.angle + fraction * self.turning), center.x).unrotate(slider.angle)
         )
 
     def part(self, begin: Scalar, size: Scalar) -> "FingerMotion":
@@ -96,35 +98,37 @@ class FingerMotion(NamedTuple):
         center = self.center + self.path.scale(begin)
         return FingerMotion(self.finger, self.friction, center, self.path.scale(size), angle, turning)
 
-    def motion(self, slider: BodyFrame, point: Vec2, center: Vec2, rest: Scalar, first: Bool[Array, ""]) -> Vec2:
+    def material_displacement(
+        self, slider: BodyFrame, point: Vec2, center: Vec2, remaining: Scalar, in_predictor: Bool[Array, ""]
+    ) -> Vec2:
         """Displacement of the finger's material at a point of the slider, slider's frame, m.
 
         Args:
             slider: Pose of the slider.
             point: The point of the slider, slider's frame, m.
             center: Center of the finger, slider's frame, m.
-            rest: Fraction of the step that is left; the displacement is the one in that last fraction.
-            first: True in the predictor stage, which is evaluated at the start of that fraction and not halfway. A
-                turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
+            remaining: Fraction of the step that is left; the displacement is the one in that last fraction.
+            in_predictor: True in the predictor stage, which is evaluated at the start of that fraction and not halfway.
+                A turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
                 toward each other on what they hold, and cause a jam.
         """
-        straight = self.path.scale(rest).unrotate(slider.angle)
+        translation = self.path.scale(remaining).unrotate(slider.angle)
         if self.turning is None:
-            return straight
-        straight = straight.unrotate(cos_sin(jnp.where(first, rest * self.turning / 2, 0.0)))
+            return translation
+        translation = translation.unrotate(cos_sin(jnp.where(in_predictor, remaining * self.turning / 2, 0.0)))
         # the chord of a rotation about the center; seen from halfway through the turn it is exact
-        return straight + (point - center).perp().scale(2 * jnp.sin(rest * self.turning / 2))
+        return translation + (point - center).perp().scale(2 * jnp.sin(remaining * self.turning / 2))
 
 
 def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[FingerMotion, ...]:
     """Motion of each finger over a step, from its poses before and after (see `unstack_finger_poses`)."""
-    grips = []
+    motions = []
     for k, finger in enumerate(hand.fingers):
-        a, b = before[k], after[k]
-        angle, turning = (a[2], _wrap_to_pi(b[2] - a[2])) if len(a) == 3 else (None, None)
-        center = Vec2(a[0], a[1])
-        grips.append(FingerMotion(finger, friction[k], center, Vec2(b[0], b[1]) - center, angle, turning))
-    return tuple(grips)
+        start, end = before[k], after[k]
+        angle, turning = (start[2], _wrap_to_pi(end[2] - start[2])) if len(start) == 3 else (None, None)
+        center = Vec2(start[0], start[1])
+        motions.append(FingerMotion(finger, friction[k], center, Vec2(end[0], end[1]) - center, angle, turning))
+    return tuple(motions)
 
 
 def _wrap_to_pi(angle: Scalar) -> Scalar:
@@ -141,39 +145,39 @@ def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
     return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
 
 
-def max_penetration(outline: Outline, grips: tuple[FingerMotion, ...], pose: Vec3, share: float) -> Scalar:
+def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: Vec3, fraction: float) -> Scalar:
     """Depth of the deepest finger in the slider after a fraction of the step, m; negative where all are apart.
 
     Not differentiated.
 
     Args:
         outline: The slider's outline.
-        grips: Motion of each finger over the step.
+        motions: Motion of each finger over the step.
         pose: Pose of the slider, world.
-        share: Fraction of the step that the fingers have done.
+        fraction: Fraction of the step that the fingers have done.
     """
-    outline, grips, pose = jax.lax.stop_gradient((outline, grips, pose))
-    there = BodyFrame.at(pose)
+    outline, motions, pose = jax.lax.stop_gradient((outline, motions, pose))
+    frame = BodyFrame.at(pose)
 
-    def of(grip: FingerMotion) -> Scalar:
+    def depth_of(motion: FingerMotion) -> Scalar:
         return penetration_depth(
-            grip.finger, outline, compute_once(grip.seen(there, jnp.full_like(pose.x, share)), pose.x)
+            motion.finger, outline, compute_once(motion.pose_in_slider(frame, jnp.full_like(pose.x, fraction)), pose.x)
         )
 
-    return functools.reduce(jnp.maximum, map_items(of, grips))
+    return functools.reduce(jnp.maximum, map_items(depth_of, motions))
 
 
-def max_displacement(grips: tuple[FingerMotion, ...]) -> Scalar:
+def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:
     """Largest displacement of a finger's center in the step, m, along a straight line. Not differentiated."""
-    paths = jax.lax.stop_gradient([grip.path for grip in grips])
+    paths = jax.lax.stop_gradient([motion.path for motion in motions])
     return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
 
 
-def holding_distance(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
+def holding_distance(motions: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
     """Distance within which a finger holds a jammed slider, m."""
-    return jnp.maximum(GRASP_GAP * length, 4 * max_displacement(grips))
+    return jnp.maximum(GRASP_GAP * length, 4 * max_displacement(motions))
 
 
-def allowed_penetration(grips: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
+def allowed_penetration(motions: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
     """Largest depth of a finger in the slider after a step, m, unless it was deeper before."""
-    return jnp.maximum(FLOOR * length, TOLERATED * max_displacement(grips))
+    return jnp.maximum(DEPTH_FLOOR * length, DEPTH_PER_DISPLACEMENT * max_displacement(motions))

@@ -25,14 +25,14 @@ from pushjax.simulation.arguments import checked_rollout_arguments, checked_tabl
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
-from pushjax.simulation.monte_carlo_tiles import Devices, Outcome, Setup, fetch, placed, submit
+from pushjax.simulation.monte_carlo_tiles import Devices, PushResults, Setup, copy_to_devices, fetch_round, start_round
 from pushjax.simulation.slider import Slider
 
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
 ACCELERATOR_TILE = 1 << 18  # the same for an accelerator, whose kernels take long to start but compute many at once
-GRAIN = 64  # a tile for fewer pushes is a multiple of this
+TILE_MULTIPLE = 64  # a tile for fewer pushes is a multiple of this
 # At most this is between two files of a checkpoint: pushes, and s; in both cases plus the rest of a round.
-BLOCK, PATIENCE = 16 * TILE, 20.0
+BLOCK_PUSHES, BLOCK_SECONDS = 16 * TILE, 20.0
 
 
 def monte_carlo(
@@ -91,7 +91,7 @@ def monte_carlo(
 
     Reference: Zhou et al. 2017, sections V and VI.
     """
-    begun = time.perf_counter()
+    start_time = time.perf_counter()
     if traced((key, slider, hand, path, pose, model, table)):
         raise TypeError(
             "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
@@ -100,33 +100,41 @@ def monte_carlo(
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
     n = int(n)
-    slider, hand, p, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
-    raw, impl = _raw(key)
-    on = Devices.of(devices)
-    tile = TILE if on.mine[0].platform == "cpu" else ACCELERATOR_TILE
-    width = int(batch_size) if batch_size is not None else min(tile, -(-n // GRAIN) * GRAIN)
-    if on.several:
+    slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
+    key_data, impl = _key_data(key)
+    used = Devices.of(devices)
+    default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
+    tile = int(batch_size) if batch_size is not None else min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
+    if used.multiprocess:
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         multihost_utils.sync_global_devices("pushjax monte_carlo")
-    shared = raw, model.around(slider.surface), model, slider.shape, hand, solver, checked_table(table, start.dtype)
-    run = _Run(n, width, Setup(*shared), impl, on, np.asarray(start), np.asarray(p), trajectories)
-    kept: Checkpoint | None = None
+    shared = (
+        key_data,
+        model.around(slider.surface),
+        model,
+        slider.shape,
+        hand,
+        solver,
+        checked_table(table, start.dtype),
+    )
+    run = _Run(n, tile, Setup(*shared), impl, used, np.asarray(start), np.asarray(path_array), trajectories)
+    saved: Checkpoint | None = None
     if checkpoint is not None:
-        parts = {"n": n, "batch_size": width, "trajectories": trajectories, "key": digest(raw, impl)}
-        parts |= {"slider": digest(slider), "hand": digest(hand, hand.poses(p)), "path": digest(p)}
-        parts |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
-        parts |= {"table": digest(table) if table else "uniform"}
+        identity = {"n": n, "batch_size": tile, "trajectories": trajectories, "key": digest(key_data, impl)}
+        identity |= {"slider": digest(slider), "hand": digest(hand, hand.poses(path_array)), "path": digest(path_array)}
+        identity |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
+        identity |= {"table": digest(table) if table else "uniform"}
         versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
-        parts |= versions | {"platform": on.mine[0].platform}
+        identity |= versions | {"platform": used.local[0].platform}
         folder = Path(checkpoint)
-        kept = run.together(lambda: Checkpoint(folder, parts, writes=on.writes))
-    with _shown(progress) as report:
-        found = run.all(kept, report)
+        saved = run.in_all_processes(lambda: Checkpoint(folder, identity, writes=used.writes))
+    with _progress_report(progress) as report:
+        results = run.compute_all(saved, report)
     starts = np.broadcast_to(run.start, (n, 3))
-    return MonteCarlo(starts, *found, time.perf_counter() - begun)
+    return MonteCarlo(starts, *results, time.perf_counter() - start_time)
 
 
-def _shown(progress: bool | ProgressCallback) -> Any:
+def _progress_report(progress: bool | ProgressCallback) -> Any:
     """Context that gives the function to report progress to."""
     if progress is True:
         # drawing on terminals is not needed by those who only import this
@@ -136,7 +144,7 @@ def _shown(progress: bool | ProgressCallback) -> Any:
     return nullcontext(progress or no_progress)
 
 
-def _raw(key: Any) -> tuple[Any, Any]:
+def _key_data(key: Any) -> tuple[Any, Any]:
     """The raw data of a key, and the name of its PRNG implementation."""
     message = f"key must be one key, of jax.random.key or PRNGKey; got {key!r}"
     if not isinstance(key, (jax.Array, np.ndarray)):
@@ -162,13 +170,13 @@ class _Run:
         devices: Devices,
         start: np.ndarray,
         path: np.ndarray,
-        keep: bool,
+        keep_trajectories: bool,
     ):
-        self.n, self.tile, self.impl, self.devices, self.keep = n, tile, impl, devices, keep
+        self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
         self.start, self.path = start, path
-        self.setups, self.round = placed(setup, devices), tile * devices.count
+        self.setups, self.round = copy_to_devices(setup, devices), tile * devices.count
 
-    def together(self, action: Callable[[], Any]) -> Any:
+    def in_all_processes(self, action: Callable[[], Any]) -> Any:
         """Return `action()`; if it fails in one process, fail in all, so that none waits for another."""
         error, value = None, None
         try:
@@ -176,74 +184,82 @@ class _Run:
         except CheckpointError as caught:
             error = caught
         failed = error is not None
-        if self.devices.several:
+        if self.devices.multiprocess:
             failed = bool(np.any(multihost_utils.process_allgather(np.int32(failed))))
         if failed:
             raise error or CheckpointError("checkpoint: another process could not go on; it says why")
         return value
 
-    def _due(self, pushes: int, seconds: float) -> bool:
+    def _block_is_due(self, pushes: int, seconds: float) -> bool:
         """Whether a block of the checkpoint is to be written; all processes get the answer of the first."""
-        due = pushes >= BLOCK or seconds >= PATIENCE
-        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.several else due
+        due = pushes >= BLOCK_PUSHES or seconds >= BLOCK_SECONDS
+        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.multiprocess else due
 
-    def all(self, kept: Checkpoint | None, report: ProgressCallback) -> Outcome:
-        """Compute all pushes that `kept` does not hold, and return all pushes."""
+    def compute_all(self, saved: Checkpoint | None, report: ProgressCallback) -> PushResults:
+        """Compute all pushes that `saved` does not hold, and return all pushes."""
         with ThreadPoolExecutor(len(self.setups)) as pool:
-            return self._all(kept, report, pool)
+            return self._compute_rounds(saved, report, pool)
 
-    def _all(self, kept: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor) -> Outcome:
-        parts, done = self._resumed(kept)
+    def _compute_rounds(
+        self, saved: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor
+    ) -> PushResults:
+        parts, done = self._saved_blocks(saved)
         # block: pushes that are not in the checkpoint yet; begun: index of the first of them
-        block, begun, since = [], done, time.perf_counter()
-        waiting: tuple[int, int, list[Outcome]] | None = None
+        block, block_begin, block_time = [], done, time.perf_counter()
+        running: tuple[int, int, list[PushResults]] | None = None
         report(done, self.n)
-        while done < self.n or waiting is not None:
+        while done < self.n or running is not None:
             # the devices compute the next round while the host copies this one
-            ahead = self._submit(done, pool) if done < self.n else None
-            if waiting is not None:
-                first, last, outcome = waiting
-                host = fetch(outcome, self.devices)
-                block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], host))
-                if kept is not None and (last == self.n or self._due(last - begun, time.perf_counter() - since)):
-                    parts.append(_joined(block))
-                    self.together(partial(kept.write, begun, last, _named(parts[-1])))
-                    block, begun, since = [], last, time.perf_counter()
+            next_round = self._start_round(done, pool) if done < self.n else None
+            if running is not None:
+                first, last, device_results = running
+                results = fetch_round(device_results, self.devices)
+                block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], results))
+                if saved is not None and (
+                    last == self.n or self._block_is_due(last - block_begin, time.perf_counter() - block_time)
+                ):
+                    parts.append(_concatenated(block))
+                    self.in_all_processes(partial(saved.write, block_begin, last, _arrays_by_name(parts[-1])))
+                    block, block_begin, block_time = [], last, time.perf_counter()
                 report(last, self.n)
-            waiting = ahead
-            done = done if ahead is None else ahead[1]
-        return _joined(parts + block)
+            running = next_round
+            done = done if next_round is None else next_round[1]
+        return _concatenated(parts + block)
 
-    def _submit(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[Outcome]]:
+    def _start_round(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[PushResults]]:
         """Start the round that begins with push `first`; the last round repeats its last push."""
         last = min(first + self.round, self.n)
         indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
         poses = np.broadcast_to(self.start, (self.n, 3))[indices]
         # a path that all pushes share is sent once
         paths = self.path if self.path.ndim == 2 else self.path[indices]
-        return first, last, submit(self.setups, self.impl, self.devices, indices, poses, paths, self.keep, pool)
+        return (
+            first,
+            last,
+            start_round(self.setups, self.impl, self.devices, indices, poses, paths, self.keep_trajectories, pool),
+        )
 
-    def _resumed(self, kept: Checkpoint | None) -> tuple[list[Outcome], int]:
+    def _saved_blocks(self, saved: Checkpoint | None) -> tuple[list[PushResults], int]:
         """Pushes that the checkpoint holds, in blocks, and their number."""
-        if kept is None:
+        if saved is None:
             return [], 0
-        blocks = kept.blocks()
-        reached = blocks[-1][1] if blocks else 0
-        names = tuple(name for name in Outcome._fields if self.keep or name != "trajectory")
+        blocks = saved.blocks()
+        end = blocks[-1][1] if blocks else 0
+        names = tuple(name for name in PushResults._fields if self.keep_trajectories or name != "trajectory")
 
-        def read() -> list[Outcome]:
-            if self.devices.several and len(np.unique(multihost_utils.process_allgather(np.int32(reached)))) > 1:
+        def read() -> list[PushResults]:
+            if self.devices.multiprocess and len(np.unique(multihost_utils.process_allgather(np.int32(end)))) > 1:
                 raise CheckpointError(
-                    f"checkpoint: not every process sees the same in {kept.folder}; give a shared one"
+                    f"checkpoint: not every process sees the same in {saved.folder}; give a shared one"
                 )
-            return [Outcome(**({"trajectory": None} | kept.read(path, names))) for _, _, path in blocks]
+            return [PushResults(**({"trajectory": None} | saved.read(path, names))) for _, _, path in blocks]
 
-        return self.together(read), reached
+        return self.in_all_processes(read), end
 
 
-def _joined(parts: list[Outcome]) -> Outcome:
+def _concatenated(parts: list[PushResults]) -> PushResults:
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def _named(outcome: Outcome) -> dict[str, np.ndarray]:
+def _arrays_by_name(outcome: PushResults) -> dict[str, np.ndarray]:
     return {name: leaf for name, leaf in outcome._asdict().items() if leaf is not None}

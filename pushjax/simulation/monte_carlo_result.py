@@ -61,9 +61,9 @@ class MonteCarlo:
             Counts of "grasped", "jammed", "free" (neither grasped nor jammed) and "failed" (a step failed).
         """
         failed = self.failed > 0
-        grasped, jammed = (~failed & (self.status == kind) for kind in (Status.GRASPED, Status.JAMMED))
-        counted = {"grasped": grasped, "jammed": jammed, "free": ~(failed | grasped | jammed), "failed": failed}
-        return {name: int(np.sum(which)) for name, which in counted.items()}
+        grasped, jammed = (~failed & (self.status == status) for status in (Status.GRASPED, Status.JAMMED))
+        masks = {"grasped": grasped, "jammed": jammed, "free": ~(failed | grasped | jammed), "failed": failed}
+        return {name: int(np.sum(mask)) for name, mask in masks.items()}
 
     def histogram(self, values: np.ndarray, bins: int | np.ndarray = 40) -> dict[str, np.ndarray]:
         """Histogram of one number per push.

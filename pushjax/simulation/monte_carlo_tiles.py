@@ -26,7 +26,7 @@ from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.random_rollout import draw, push_under
+from pushjax.simulation.random_rollout import draw, rollout_under_draws
 
 
 class Setup(NamedTuple):
@@ -34,7 +34,7 @@ class Setup(NamedTuple):
 
     Attributes:
         key: Raw data of the PRNG key.
-        around: Distribution of limit surfaces around their mean.
+        surfaces: Distribution of limit surfaces around their mean.
         model: Distribution of friction.
         shape: Outline of the slider.
         hand: The hand.
@@ -43,7 +43,7 @@ class Setup(NamedTuple):
     """
 
     key: Array
-    around: SurfaceDistribution
+    surfaces: SurfaceDistribution
     model: FrictionModel
     shape: Shape
     hand: Hand
@@ -51,7 +51,7 @@ class Setup(NamedTuple):
     table: Table | None
 
 
-class Outcome(NamedTuple):
+class PushResults(NamedTuple):
     """Results of pushes, fields as in `MonteCarlo`.
 
     Attributes:
@@ -75,16 +75,16 @@ class Devices(NamedTuple):
 
     Attributes:
         count: Number of devices of all processes.
-        mine: Devices of this process.
+        local: Devices of this process.
         first: Index of the first of this process's devices among all.
-        several: Whether other processes take part.
+        multiprocess: Whether other processes take part.
         writes: Whether this process writes files.
     """
 
     count: int
-    mine: tuple[Any, ...]
+    local: tuple[Any, ...]
     first: int
-    several: bool
+    multiprocess: bool
     writes: bool
 
     @staticmethod
@@ -94,34 +94,35 @@ class Devices(NamedTuple):
         Raises:
             ValueError: For no devices, or unless they are this process's own or as many of each process.
         """
-        every = list(jax.devices() if devices is None else devices)
-        if not every:
+        all_devices = list(jax.devices() if devices is None else devices)
+        if not all_devices:
             raise ValueError("devices must not be empty")
-        me = jax.process_index()
-        held = [[d for d in every if d.process_index == process] for process in range(jax.process_count())]
-        part = [len(devices) for devices in held if devices]
-        if len(part) not in (1, jax.process_count()) or len(set(part)) != 1 or not held[me]:
+        this_process = jax.process_index()
+        by_process = [[d for d in all_devices if d.process_index == process] for process in range(jax.process_count())]
+        counts = [len(devices) for devices in by_process if devices]
+        if len(counts) not in (1, jax.process_count()) or len(set(counts)) != 1 or not by_process[this_process]:
             raise ValueError("devices must be this process's own, or as many of each of all processes")
-        several = len(part) > 1
-        first = me * part[0] if several else 0
-        return Devices(len(every), tuple(held[me]), first, several, me == 0 or not several)
+        multiprocess = len(counts) > 1
+        first = this_process * counts[0] if multiprocess else 0
+        writes = this_process == 0 or not multiprocess
+        return Devices(len(all_devices), tuple(by_process[this_process]), first, multiprocess, writes)
 
 
-def placed(setup: Setup, devices: Devices) -> list[Setup]:
+def copy_to_devices(setup: Setup, devices: Devices) -> list[Setup]:
     """Copy the setup to each device of this process."""
-    return [jax.device_put(setup, device) for device in devices.mine]
+    return [jax.device_put(setup, device) for device in devices.local]
 
 
-def submit(
+def start_round(
     setups: list[Setup],
     impl: Any,
     devices: Devices,
     indices: np.ndarray,
     poses: np.ndarray,
     paths: np.ndarray,
-    keep: bool,
+    keep_trajectories: bool,
     pool: Executor,
-) -> list[Outcome]:
+) -> list[PushResults]:
     """Start one round without waiting for it; reading its numbers waits.
 
     Args:
@@ -131,49 +132,53 @@ def submit(
         indices: Indices of the pushes, (devices, tile), for the devices of all processes.
         poses: Poses of the slider at the start, (devices, tile, 3), for the devices of all processes.
         paths: Configurations of the hand, (steps + 1, dof) for all pushes, or (devices, tile, steps + 1, dof).
-        keep: Whether to keep trajectories.
+        keep_trajectories: Whether to keep trajectories.
         pool: Threads, one for each device of this process.
     """
 
-    def start(k: int) -> Outcome:
-        setup, there = setups[k], devices.first + k
-        path = paths if paths.ndim == 2 else paths[there]
-        index, pose, path = jax.device_put((indices[there], poses[there], path), devices.mine[k])
-        draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.around, setup.model, index)
-        rest = setup.shape, setup.hand, setup.solver, setup.table
-        return _push(setup.model.resample_every, keep, draws, rest, path, pose)
+    def start_on(k: int) -> PushResults:
+        setup, position = setups[k], devices.first + k
+        path = paths if paths.ndim == 2 else paths[position]
+        index, pose, path = jax.device_put((indices[position], poses[position], path), devices.local[k])
+        draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index)
+        shared = setup.shape, setup.hand, setup.solver, setup.table
+        return _push(setup.model.resample_every, keep_trajectories, draws, shared, path, pose)
 
     # in parallel, because each device compiles its own program, once
-    return list(pool.map(start, range(len(setups))))
+    return list(pool.map(start_on, range(len(setups))))
 
 
-def fetch(outcomes: list[Outcome], devices: Devices) -> Outcome:
+def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
     """Copy the results of a round, of all processes, to the host, in order."""
-    mine = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *outcomes)
-    if not devices.several:
-        return mine
-    return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), mine)
+    local = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *results)
+    if not devices.multiprocess:
+        return local
+    return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), local)
 
 
 @without_gc
 @partial(jax.jit, static_argnums=(0, 1))
-def _draw(impl: Any, steps: int, key: Array, around: SurfaceDistribution, model: FrictionModel, index: Array):
+def _draw(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array):
     root = jax.random.wrap_key_data(key, impl=impl)
-    return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), around, model, steps))(index)
+    return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), surfaces, model, steps))(index)
 
 
 @without_gc
 @partial(jax.jit, static_argnums=(0, 1))
-def _push(every: int | None, keep: bool, draws, rest: tuple, paths: Array, poses: Array) -> Outcome:
-    each = (0, None if paths.ndim == 2 else 0, 0)
-    return jax.vmap(lambda draws, path, pose: _outcome(draws, rest, path, pose, every, keep), each)(draws, paths, poses)
+def _push(
+    resample_every: int | None, keep_trajectories: bool, draws, shared: tuple, paths: Array, poses: Array
+) -> PushResults:
+    axes = (0, None if paths.ndim == 2 else 0, 0)
+    return jax.vmap(
+        lambda draws, path, pose: _push_results(draws, shared, path, pose, resample_every, keep_trajectories), axes
+    )(draws, paths, poses)
 
 
-def _outcome(draws, rest: tuple, path, pose, every, keep) -> Outcome:
-    shape, hand, solver, table = rest
-    push = push_under(draws, shape, hand, path, pose, solver, every, table)
+def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:
+    shape, hand, solver, table = shared
+    push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table)
     mode = push.mode
-    return Outcome(
+    return PushResults(
         push.pose[-1],
         push.status[-1],
         mode[-1],
@@ -183,5 +188,5 @@ def _outcome(draws, rest: tuple, path, pose, every, keep) -> Outcome:
         push.stopped.astype(jnp.int32),
         draws.friction,
         draws.shrinkage,
-        push.pose if keep else None,
+        push.pose if keep_trajectories else None,
     )

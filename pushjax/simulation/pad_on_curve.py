@@ -48,39 +48,41 @@ def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2,
         angle: Angle of the pad in the outline's frame, as a unit vector.
     """
 
-    def facing_one(edge: Edge) -> EdgeSupport:
+    def supports_of_edge(edge: Edge) -> EdgeSupport:
         normal = edge.normal.rotate(angle)
         facing = outline.facing(-normal)
         local = (facing.point - center).unrotate(angle)
-        rel = local - edge.start
-        height = edge.normal.dot(rel)
+        relative = local - edge.start
+        height = edge.normal.dot(relative)
         normal, length = jax.tree.map(lambda entry: jnp.full_like(height, entry), (normal, edge.length))
-        return EdgeSupport(facing.valid, facing.point, normal, local, rel.dot(edge.along), length, height)
+        return EdgeSupport(facing.valid, facing.point, normal, local, relative.dot(edge.along), length, height)
 
     # All edges at once: unrolled edge by edge, the program for a jaw took much longer to trace and to compile.
     stacked = jax.tree.map(lambda *entries: jnp.stack(entries), *edges)
-    return jax.tree.map(jnp.ravel, jax.vmap(facing_one)(stacked))
+    return jax.tree.map(jnp.ravel, jax.vmap(supports_of_edge)(stacked))
 
 
-def sweep(pad: PolygonOutline, seen: EdgeSupport, outline: Outline, corners: Vec2, path: Vec2, back: Vec2) -> Scalar:
+def sweep(
+    pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2, path: Vec2, outline_path: Vec2
+) -> Scalar:
     """Return the fraction of `path` after which a pad and an outline first touch; inf if they do not.
 
     Args:
         pad: Outline of the pad.
-        seen: Places that face the pad's edges at the start.
+        supports: Places that face the pad's edges at the start.
         outline: The smooth outline.
         corners: Corners of the pad, in the outline's frame, m.
         path: Displacement of the pad, in the outline's frame, m.
-        back: Displacement of the outline, in the pad's frame, m.
+        outline_path: Displacement of the outline, in the pad's frame, m.
     """
     zero = jnp.zeros_like(path.x)
-    first = jnp.min(jax.vmap(lambda corner: outline.sweep(corner, path, zero))(corners))
-    met = pad.sweep(seen.local, back, zero)
-    return jnp.minimum(first, jnp.min(jnp.where(seen.valid, met, jnp.inf)))
+    corner_hit = jnp.min(jax.vmap(lambda corner: outline.sweep(corner, path, zero))(corners))
+    edge_hits = pad.sweep(supports.local, outline_path, zero)
+    return jnp.minimum(corner_hit, jnp.min(jnp.where(supports.valid, edge_hits, jnp.inf)))
 
 
-def overlap(pad: PolygonOutline, seen: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
+def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
     """Depth of the deepest corner in the outline, or of the deepest facing place in the pad, m; negative if apart."""
-    deepest = jnp.max(-jax.vmap(lambda corner: outline.closest(corner).distance)(corners))
-    depth = -pad.closest(seen.local).distance
-    return jnp.maximum(deepest, jnp.max(jnp.where(seen.valid, depth, -jnp.inf)))
+    corner_depth = jnp.max(-jax.vmap(lambda corner: outline.closest(corner).distance)(corners))
+    support_depths = -pad.closest(supports.local).distance
+    return jnp.maximum(corner_depth, jnp.max(jnp.where(supports.valid, support_depths, -jnp.inf)))

@@ -40,8 +40,8 @@ def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+
 
 @in_numpy
 def _line(xp: Any, start: Array, end: Array, *, steps: int) -> Array:
-    t = xp.arange(steps + 1, dtype=start.dtype)[:, None] / steps
-    return start[None] * (1 - t) + end[None] * t  # exact at both ends
+    fraction = xp.arange(steps + 1, dtype=start.dtype)[:, None] / steps
+    return start[None] * (1 - fraction) + end[None] * fraction  # exact at both ends
 
 
 def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
@@ -68,26 +68,26 @@ def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Fl
     """
     _check_steps(steps)
     dtype = common_dtype(start, center, angle)
-    first, about, turn = (as_float(value, dtype) for value in (start, center, angle))
-    check_shape("start", first, ("dof",))
-    if first.shape[0] < 2:
-        raise ValueError(f"start must hold at least x and y; got shape {first.shape}")
-    check_shape("center", about, (2,))
-    check_shape("angle", turn, ())
-    for name, value in (("start", first), ("center", about), ("angle", turn)):
+    start_array, center_array, angle_array = (as_float(value, dtype) for value in (start, center, angle))
+    check_shape("start", start_array, ("dof",))
+    if start_array.shape[0] < 2:
+        raise ValueError(f"start must hold at least x and y; got shape {start_array.shape}")
+    check_shape("center", center_array, (2,))
+    check_shape("angle", angle_array, ())
+    for name, value in (("start", start_array), ("center", center_array), ("angle", angle_array)):
         check_finite(name, value)
-    return _arc(first, about, turn, steps=steps)
+    return _arc(start_array, center_array, angle_array, steps=steps)
 
 
 @in_numpy
 def _arc(xp: Any, start: Array, center: Array, angle: Array, *, steps: int) -> Array:
-    turned = xp.arange(steps + 1, dtype=start.dtype) / steps * angle
-    cos, sin = xp.cos(turned), xp.sin(turned)
-    x, y = start[0] - center[0], start[1] - center[1]
-    columns = [center[0] + cos * x - sin * y, center[1] + sin * x + cos * y]
+    angles = xp.arange(steps + 1, dtype=start.dtype) / steps * angle
+    cos, sin = xp.cos(angles), xp.sin(angles)
+    offset_x, offset_y = start[0] - center[0], start[1] - center[1]
+    columns = [center[0] + cos * offset_x - sin * offset_y, center[1] + sin * offset_x + cos * offset_y]
     if start.shape[0] > 2:
-        columns.append(start[2] + turned)
-    columns += [xp.full_like(turned, 1) * start[k] for k in range(3, start.shape[0])]
+        columns.append(start[2] + angles)
+    columns += [xp.full_like(angles, 1) * start[k] for k in range(3, start.shape[0])]
     return xp.stack(columns, axis=-1)
 
 
@@ -105,12 +105,16 @@ def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Arra
         ValueError: For fewer than two way points, for fewer than one step on a stretch, for a wrong number of `steps`,
             or for values that are not finite.
     """
-    p = checked_path(configurations, None)
-    stretches = p.shape[0] - 1
-    each: list[Any] = np.broadcast_to(steps, stretches).tolist() if np.ndim(steps) == 0 else np.ravel(steps).tolist()
-    if len(each) != stretches:
-        raise ValueError(f"steps must be one number, or one for each of {stretches} stretches; got {len(each)}")
-    return jnp.concatenate([p[:1], *(line(p[k], p[k + 1], n)[1:] for k, n in enumerate(each))])
+    waypoints = checked_path(configurations, None)
+    num_stretches = waypoints.shape[0] - 1
+    counts: list[Any] = (
+        np.broadcast_to(steps, num_stretches).tolist() if np.ndim(steps) == 0 else np.ravel(steps).tolist()
+    )
+    if len(counts) != num_stretches:
+        raise ValueError(f"steps must be one number, or one for each of {num_stretches} stretches; got {len(counts)}")
+    return jnp.concatenate(
+        [waypoints[:1], *(line(waypoints[k], waypoints[k + 1], n)[1:] for k, n in enumerate(counts))]
+    )
 
 
 def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
@@ -131,17 +135,17 @@ def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
         ValueError: For fewer than two points or one step, or for values that are not finite.
     """
     _check_steps(steps)
-    p = checked_path(path, None)
-    arc = arc_length(p)
-    return interpolate_arc_length(p, arc, jnp.arange(steps + 1, dtype=p.dtype) / steps * arc[-1])
+    points = checked_path(path, None)
+    lengths = arc_length(points)
+    return interpolate_arc_length(points, lengths, jnp.arange(steps + 1, dtype=points.dtype) / steps * lengths[-1])
 
 
 def arc_length(points: Float[Array, "points n"]) -> Float[Array, "points"]:
     """Length from the first point to each point, straight from point to point."""
     squared = jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1)
     moves = squared > 0  # the derivative of the square root is infinite where a recording pauses
-    hops = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
-    return jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(hops)])
+    distances = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
+    return jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(distances)])
 
 
 def interpolate_arc_length(path: Array, arc: Float[Array, "points"], at: Float[Array, "k"]) -> Float[Array, "k dof"]:
@@ -169,13 +173,13 @@ def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[A
     Raises:
         ValueError: For a wrong shape, fewer than two configurations, or values that are not finite.
     """
-    p = as_float(path, dtype)
-    check_shape("path", p, ("steps + 1", "dof" if dof is None else dof))
-    if p.shape[0] < 2:
-        raise ValueError(f"path needs at least one step, two configurations; got {p.shape[0]}")
-    known = concrete(p)
+    array = as_float(path, dtype)
+    check_shape("path", array, ("steps + 1", "dof" if dof is None else dof))
+    if array.shape[0] < 2:
+        raise ValueError(f"path needs at least one step, two configurations; got {array.shape[0]}")
+    known = concrete(array)
     if known is not None:
         bad = np.flatnonzero(~np.isfinite(known).all(axis=1))
         if bad.size:
             raise ValueError(f"path must be finite; {bad.size} configuration(s) are not, the first at index {bad[0]}")
-    return p
+    return array

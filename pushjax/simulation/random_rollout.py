@@ -17,7 +17,7 @@ from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.rollout import on_table, simulate
+from pushjax.simulation.rollout import friction_on_table, simulate
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
@@ -61,18 +61,18 @@ def draw(key: PRNGKeyArray, around: SurfaceDistribution, model: FrictionModel, s
         steps: Number of steps of the push.
     """
 
-    def one(key):
-        first, second = jax.random.split(key)
-        sample = around.sample(first)
-        return Draws(sample.surface, model.sample_friction(second), sample.shrinkage)
+    def sample_once(key):
+        surface_key, friction_key = jax.random.split(key)
+        sample = around.sample(surface_key)
+        return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
 
     if model.resample_every is None:
-        return jax.tree.map(lambda leaf: leaf[None], one(key))
+        return jax.tree.map(lambda leaf: leaf[None], sample_once(key))
     indices = jnp.arange(-(-steps // model.resample_every))
-    return jax.vmap(lambda k: one(jax.random.fold_in(key, k)))(indices)
+    return jax.vmap(lambda k: sample_once(jax.random.fold_in(key, k)))(indices)
 
 
-def push_under(
+def rollout_under_draws(
     draws: Draws,
     shape: Shape,
     hand: Hand,
@@ -84,17 +84,17 @@ def push_under(
 ) -> Trajectory:
     """Roll out a push under friction that was sampled before; after `resample_every` steps, the next draw is used."""
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
-    forms = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
+    surfaces_and_frictions = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
 
-    def drawn(index):
-        return jax.tree.map(lambda leaf: leaf[index], forms)
+    def draw_at(index):
+        return jax.tree.map(lambda leaf: leaf[index], surfaces_and_frictions)
 
-    only = drawn(0)
+    first_draw = draw_at(0)
 
     def friction_at(step, pose):
-        return only if resample_every is None else drawn(step // resample_every)
+        return first_draw if resample_every is None else draw_at(step // resample_every)
 
-    return simulate(shape, hand, path, pose, solver, on_table(table, friction_at))
+    return simulate(shape, hand, path, pose, solver, friction_on_table(table, friction_at))
 
 
 def random_rollout(
@@ -134,12 +134,16 @@ def random_rollout(
 
     Reference: Zhou et al. 2017, section V.
     """
-    slider, hand, p, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
+    slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
     table = checked_table(table, start.dtype)
-    return _random_rollout(key, model.around(slider.surface), slider.shape, hand, p, start, model, solver, table)
+    return _random_rollout(
+        key, model.around(slider.surface), slider.shape, hand, path_array, start, model, solver, table
+    )
 
 
 @quick_jit
 def _random_rollout(key, around, shape, hand, path, pose, model, solver, table) -> RandomRollout:
     draws = draw(key, around, model, len(path) - 1)
-    return RandomRollout(push_under(draws, shape, hand, path, pose, solver, model.resample_every, table), draws)
+    return RandomRollout(
+        rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table), draws
+    )

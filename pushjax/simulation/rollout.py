@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from pushjax._internal.autodiff import keep_found
+from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
@@ -28,7 +28,7 @@ from pushjax.simulation.finger_motion import finger_motions, holding_distance, m
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import ScalarStep, step_in_scalars
-from pushjax.simulation.substeps import divided, stopping
+from pushjax.simulation.substeps import hand_stops, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 
 
@@ -77,7 +77,7 @@ def step(
 @quick_jit
 def _step(slider, hand, q0, q1, pose, friction, solver, table) -> Step:
     uniform = to_scalars(slider.surface, friction)
-    friction_at = on_table(table, lambda step, pose: uniform)
+    friction_at = friction_on_table(table, lambda step, pose: uniform)
     push = simulate(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, friction_at)
     fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
     return Step(**fields)
@@ -143,7 +143,7 @@ def rollout(
 @quick_jit
 def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
     uniform = to_scalars(slider.surface, friction)
-    friction_at = on_table(table, lambda step, pose: uniform)
+    friction_at = friction_on_table(table, lambda step, pose: uniform)
     return simulate(slider.shape, hand, path, pose, solver, friction_at)
 
 
@@ -151,17 +151,17 @@ def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
 FrictionAt = Callable[[Array, Vec3], tuple[Form, Array]]
 
 
-def on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
+def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
     """Return the friction on a table from that on a uniform one. If the table is not finite, no contact is valid."""
     if table is None:
         return friction_at
-    known = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(table)))
+    is_finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(table)))
 
-    def changed(step: Array, pose: Vec3) -> tuple[Form, Array]:
+    def friction_at_table(step: Array, pose: Vec3) -> tuple[Form, Array]:
         form, mu = friction_at(step, pose)
-        return TransformedForm(form, table.wrench_transform(pose, form.length)), jnp.where(known, mu, jnp.nan)
+        return TransformedForm(form, table.wrench_transform(pose, form.length)), jnp.where(is_finite, mu, jnp.nan)
 
-    return changed
+    return friction_at_table
 
 
 def simulate(
@@ -186,38 +186,43 @@ def simulate(
     outline, poses, steps = shape.outline(), hand.poses(path), len(path) - 1
     start = Vec3.of(pose)
 
-    def grips_at(step: Array, mu: Array):
+    def motions_at(step: Array, mu: Array):
         before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
         return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
 
     if sum(num_contacts(finger, outline) for finger in hand.fingers) == 1:
-        records, share = _undivided(outline, steps, grips_at, solver, start, friction_at), jnp.zeros_like(start.x)
+        records, fraction = (
+            _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at),
+            jnp.zeros_like(start.x),
+        )
     else:
-        records, share = divided(outline, steps, grips_at, solver, start, friction_at)
-    done = to_arrays(records, friction_at(jnp.zeros((), jnp.int32), start)[0].length)
-    stopped = first_true(stopping(done.status))
-    reached = jnp.where(stopped >= 0, stopped, steps)
+        records, fraction = simulate_in_substeps(outline, steps, motions_at, solver, start, friction_at)
+    results = to_arrays(records, friction_at(jnp.zeros((), jnp.int32), start)[0].length)
+    stop_step = first_true(hand_stops(results.status))
+    last_done = jnp.where(stop_step >= 0, stop_step, steps)
     index = jnp.arange(steps + 1)
     # in a step that was divided the hand stops on the way
-    onward = jax.lax.stop_gradient(share) * (path[jnp.minimum(reached + 1, steps)] - path[reached])
-    configuration = path[jnp.minimum(index, reached)] + jnp.where(index > reached, 1.0, 0.0)[:, None] * onward[None]
-    poses = jnp.concatenate([pose[None], done.pose])
-    rest = {name: getattr(done, name) for name in Step.__dataclass_fields__ if name != "pose"}
-    return Trajectory(pose=poses, configuration=configuration, **rest)
+    last_displacement = jax.lax.stop_gradient(fraction) * (path[jnp.minimum(last_done + 1, steps)] - path[last_done])
+    configuration = (
+        path[jnp.minimum(index, last_done)] + jnp.where(index > last_done, 1.0, 0.0)[:, None] * last_displacement[None]
+    )
+    poses = jnp.concatenate([pose[None], results.pose])
+    other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
+    return Trajectory(pose=poses, configuration=configuration, **other_fields)
 
 
-def _undivided(outline, steps, grips_at, solver, start, friction_at) -> ScalarStep:
+def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at) -> ScalarStep:
     """Records of all steps for one round finger on a convex outline, which has only one contact to check."""
 
     def body(pose: Vec3, step: Array):
         form, mu = friction_at(step, pose)
-        grips = grips_at(step, mu)
-        before = max_penetration(outline, grips, pose, 0.0)  # contact detection starts with the same query
-        record, _ = step_in_scalars(form, outline, grips, solver, pose, before, holding_distance(grips, form.length))
-        return record.pose, record._replace(overlap=before)
+        motions = motions_at(step, mu)
+        depth = max_penetration(outline, motions, pose, 0.0)  # contact detection starts with the same query
+        record, _ = step_in_scalars(form, outline, motions, solver, pose, depth, holding_distance(motions, form.length))
+        return record.pose, record._replace(overlap=depth)
 
-    body = jax.checkpoint(body, prevent_cse=False, policy=keep_found)
-    last, records = jax.lax.scan(body, start, jnp.arange(steps))
-    grips = grips_at(jnp.asarray(steps - 1), friction_at(jnp.asarray(steps - 1), last)[1])
-    final = max_penetration(outline, grips, last, 1.0)
-    return records._replace(overlap=jnp.concatenate([records.overlap[1:], final[None]]))
+    body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
+    last_pose, records = jax.lax.scan(body, start, jnp.arange(steps))
+    motions = motions_at(jnp.asarray(steps - 1), friction_at(jnp.asarray(steps - 1), last_pose)[1])
+    final_depth = max_penetration(outline, motions, last_pose, 1.0)
+    return records._replace(overlap=jnp.concatenate([records.overlap[1:], final_depth[None]]))

@@ -15,7 +15,7 @@ from pushjax.geometry.shape import Shape
 from pushjax.simulation.finger_motion import finger_motions, max_penetration, unstack_finger_poses
 from pushjax.simulation.hand import Hand
 
-PAIRS = 400  # wrench-twist pairs of a fit; more change the fit by less than its own error
+FIT_PAIRS = 400  # wrench-twist pairs of a fit; more change the fit by less than its own error
 
 
 class Slider(eqx.Module):
@@ -67,13 +67,13 @@ class Slider(eqx.Module):
             degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
 
         Returns:
-            The slider. Its limit surface is fitted to `PAIRS` wrench-twist pairs of the support. The pairs are drawn
-            with the key 0, so the same arguments give the same bits.
+            The slider. Its limit surface is fitted to 400 wrench-twist pairs of the support. The pairs are drawn with
+            the key 0, so the same arguments give the same bits.
 
         Raises:
             ValueError: As in `Support.wrench_twist_pairs` and `fit_limit_surface`.
         """
-        pairs = support.wrench_twist_pairs(jax.random.key(0), PAIRS)
+        pairs = support.wrench_twist_pairs(jax.random.key(0), FIT_PAIRS)
         return Slider(shape, fit_limit_surface(*pairs, degree=degree))
 
 
@@ -81,9 +81,9 @@ class Slider(eqx.Module):
 def overlaps(slider: Slider, hand: Hand, poses: Array, configurations: Array) -> Array:
     """Depth of the deepest finger in the slider, m, for each of as many poses and configurations."""
 
-    def one(pose: Array, configuration: Array) -> Array:
-        where = unstack_finger_poses(hand.poses(configuration))
-        grips = finger_motions(hand, jnp.zeros(len(hand.fingers), poses.dtype), where, where)
-        return max_penetration(slider.shape.outline(), grips, Vec3.of(pose), 0.0)
+    def depth_of(pose: Array, configuration: Array) -> Array:
+        finger_poses = unstack_finger_poses(hand.poses(configuration))
+        motions = finger_motions(hand, jnp.zeros(len(hand.fingers), poses.dtype), finger_poses, finger_poses)
+        return max_penetration(slider.shape.outline(), motions, Vec3.of(pose), 0.0)
 
-    return jax.vmap(one)(poses, configurations)
+    return jax.vmap(depth_of)(poses, configurations)

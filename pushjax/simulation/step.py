@@ -50,7 +50,7 @@ from pushjax.simulation.detection import (
     time_of_impact,
 )
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
-from pushjax.simulation.working_set import Urgency, WorkingSet, together, violated
+from pushjax.simulation.working_set import Urgency, WorkingSet, num_solved_together, violations
 
 # rad. If a step, or a part of one, turns the slider farther than this, its result is rejected: contacts are detected at
 # the start of the step, and nothing checks what the slider passes on the way.
@@ -91,7 +91,7 @@ class Stage(NamedTuple):
         point: Point of the slider that moves in a straight line, body frame, m.
         angle: Unit vector of the angle of the frame in which the twist is given.
         status: `Status` so far.
-        begun: For each finger, its contacts as they were at the start of the step.
+        at_start: For each finger, its contacts as they were at the start of the step.
         chosen: For each finger, the index of each of its contacts among the places where it may touch.
         holds: Whether every finger is near enough to hold a jammed slider.
     """
@@ -100,7 +100,7 @@ class Stage(NamedTuple):
     point: Vec2
     angle: Vec2
     status: Int[Array, ""]
-    begun: tuple[tuple[Candidate, ...], ...]
+    at_start: tuple[tuple[Candidate, ...], ...]
     chosen: tuple[tuple[Int[Array, ""] | int, ...], ...]
     holds: Bool[Array, ""]
 
@@ -115,8 +115,8 @@ class Stage(NamedTuple):
         zero = jnp.zeros_like(start.pose.x)
         still, nowhere = Vec3(zero, zero, zero), Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
         none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
-        begun = tuple((nowhere,) * n for n in counts)
-        return Stage(still, Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8), begun, none, jnp.zeros((), bool))
+        at_start = tuple((nowhere,) * n for n in counts)
+        return Stage(still, Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8), at_start, none, jnp.zeros((), bool))
 
 
 class FingerContacts(NamedTuple):
@@ -125,13 +125,13 @@ class FingerContacts(NamedTuple):
     Attributes:
         contacts: The contacts as they are now, with the gaps of the start of the step.
         chosen: Index of each among the places where the finger may touch.
-        begun: Each as it was at the start of the step.
+        at_start: Each as it was at the start of the step.
         near: Whether one of them is near enough to hold a jammed slider.
     """
 
     contacts: tuple[Contact, ...]
     chosen: tuple[Int[Array, ""], ...]
-    begun: tuple[Candidate, ...]
+    at_start: tuple[Candidate, ...]
     near: Bool[Array, ""]
 
 
@@ -156,48 +156,54 @@ class PushingPart(NamedTuple):
 
     def contacts_of(
         self,
-        there: BodyFrame,
-        share: Scalar,
-        first: Bool[Array, ""],
-        grip: FingerMotion,
+        frame: BodyFrame,
+        fraction: Scalar,
+        in_predictor: Bool[Array, ""],
+        finger_motion: FingerMotion,
         chosen: tuple[Int[Array, ""] | int, ...],
-        begun: tuple[Candidate, ...],
+        at_start: tuple[Candidate, ...],
     ) -> FingerContacts:
         """Contacts of one finger in a stage.
 
         Args:
-            there: Pose of the slider in this stage.
-            share: Fraction of the pushing part that is done in this stage.
-            first: True in the predictor.
-            grip: Motion of the finger over the step.
+            frame: Pose of the slider in this stage.
+            fraction: Fraction of the pushing part that is done in this stage.
+            in_predictor: True in the predictor.
+            finger_motion: Motion of the finger over the step.
             chosen: Index of each contact among the places where the finger may touch; not used in the predictor.
-            begun: The contacts as they were at the start of the step; not used in the predictor.
+            at_start: The contacts as they were at the start of the step; not used in the predictor.
         """
         x = self.start.pose.x
-        at = compute_once(grip.seen(there, self.begin + self.rest * share), x)
-        path = grip.path.unrotate(there.angle)
-        touches = compute_once(contact_candidates(grip.finger, self.outline, at, path, self.length), x)
-        nearest = select_contacts(touches, self.length, self.outline, path.scale(self.rest))
-        same = track_contacts(touches, chosen, begun, grip.finger, self.outline)
-        mine = tuple(jnp.where(first, new, old) for new, old in zip(nearest, same, strict=True))
-        each, fresh, near = [], [], jnp.zeros((), bool)
-        for touch, before in zip(selected_candidates(touches, mine), begun, strict=True):
-            before = tree_where(first, touch, before)
+        finger_pose = compute_once(finger_motion.pose_in_slider(frame, self.begin + self.rest * fraction), x)
+        path = finger_motion.path.unrotate(frame.angle)
+        candidates = compute_once(
+            contact_candidates(finger_motion.finger, self.outline, finger_pose, path, self.length), x
+        )
+        selected = select_contacts(candidates, self.length, self.outline, path.scale(self.rest))
+        tracked = track_contacts(candidates, chosen, at_start, finger_motion.finger, self.outline)
+        indices = tuple(jnp.where(in_predictor, new, old) for new, old in zip(selected, tracked, strict=True))
+        contacts, originals, is_near = [], [], jnp.zeros((), bool)
+        for candidate, original in zip(selected_candidates(candidates, indices), at_start, strict=True):
+            original = tree_where(in_predictor, candidate, original)
             # a corner that has passed the end of an edge by now keeps its contact from the start of the step
-            touch = tree_where(decide(touch.distance > OUT_OF_REACH / 2, x), before, touch)
+            candidate = tree_where(decide(candidate.distance > OUT_OF_REACH / 2, x), original, candidate)
             # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
-            gap = before.distance
-            motion = grip.motion(there, touch.point, at.center, self.rest, first)
-            each.append(compute_once(Contact(touch.point, touch.normal, motion, grip.friction, gap), x))
-            near |= gap <= self.reach
-            fresh.append(before)
-        return FingerContacts(tuple(each), mine, tuple(fresh), near)
+            gap = original.distance
+            displacement = finger_motion.material_displacement(
+                frame, candidate.point, finger_pose.center, self.rest, in_predictor
+            )
+            contacts.append(
+                compute_once(Contact(candidate.point, candidate.normal, displacement, finger_motion.friction, gap), x)
+            )
+            is_near |= gap <= self.reach
+            originals.append(original)
+        return FingerContacts(tuple(contacts), indices, tuple(originals), is_near)
 
 
 def step_in_scalars(
     form: Form,
     outline: Outline,
-    grips: tuple[FingerMotion, ...],
+    motions: tuple[FingerMotion, ...],
     solver: ContactSolver | StickingSolver | None,
     pose: Vec3,
     before: Scalar,
@@ -210,7 +216,7 @@ def step_in_scalars(
     Args:
         form: Limit surface in scalars.
         outline: The slider's outline.
-        grips: Motion of each finger over the step.
+        motions: Motion of each finger over the step.
         solver: Solver of contact problems; None for the default.
         pose: Pose of the slider at the start, world.
         before: Depth of the deepest finger at the start, m.
@@ -222,66 +228,72 @@ def step_in_scalars(
         The record of the step, and the urgency of each contact after it (None if `urgency` is None).
     """
     start = BodyFrame.at(pose)
-    begin = _first_contact(grips, outline, start, form.length)
+    begin = _first_contact(motions, outline, start, form.length)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
-    counts = [num_contacts(grip.finger, outline) for grip in grips]
-    working = WorkingSet.most_urgent(urgency, together(counts))
-    on = (jnp.asarray(ongoing),) * together(counts)
+    counts = [num_contacts(finger_motion.finger, outline) for finger_motion in motions]
+    working = WorkingSet.most_urgent(urgency, num_solved_together(counts))
+    active = (jnp.asarray(ongoing),) * num_solved_together(counts)
 
-    def stage(carry: Stage, share: Scalar):
-        """Solve the contacts as they are after the fraction `share` of the previous stage's motion."""
-        there = start.moved(carry.point, carry.twist.scale(share), carry.angle)
-        first = share == 0
-        found = map_items(
-            lambda gripped: part.contacts_of(there, share, first, *gripped),
-            tuple(zip(grips, carry.chosen, carry.begun, strict=True)),
+    def stage(carry: Stage, fraction: Scalar):
+        """Solve the contacts as they are after the fraction `fraction` of the previous stage's motion."""
+        frame = start.moved(carry.point, carry.twist.scale(fraction), carry.angle)
+        in_predictor = fraction == 0
+        finger_contacts = map_items(
+            lambda item: part.contacts_of(frame, fraction, in_predictor, *item),
+            tuple(zip(motions, carry.chosen, carry.at_start, strict=True)),
         )
-        contacts, chosen, begun, near = zip(*found, strict=True)
-        each, holds = sum(contacts, ()), jnp.ones((), bool)
-        for one in near:
-            holds &= one
-        motion = solve_in_scalars(form, working.of(each), on, solver, margin=False)
-        motion = working.spread(motion, len(each))
-        missed = None if urgency is None else violated(each, motion.twist, motion.force)
+        contacts, chosen, at_start, near = zip(*finger_contacts, strict=True)
+        contacts, holds = sum(contacts, ()), jnp.ones((), bool)
+        for finger_is_near in near:
+            holds &= finger_is_near
+        solution = solve_in_scalars(form, working.select(contacts), active, solver, margin=False)
+        solution = working.spread(solution, len(contacts))
+        urgency_after = None if urgency is None else violations(contacts, solution.twist, solution.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
-        status = jnp.where(carry.status == Status.MOVING, motion.status, jnp.maximum(carry.status, motion.status))
-        where = _force_weighted_point(each, motion.force)
-        following = Stage(motion.twist, where, there.angle, status, begun, chosen, holds)
-        return following, (motion, _points_and_normals(each), missed)
+        status = jnp.where(carry.status == Status.MOVING, solution.status, jnp.maximum(carry.status, solution.status))
+        straight_point = _force_weighted_point(contacts, solution.force)
+        next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds)
+        return next_stage, (solution, _points_and_normals(contacts), urgency_after)
 
-    carry, answers = jax.lax.scan(stage, Stage.before(start, counts), jnp.array([0.0, 0.5], pose.x.dtype))
-    motion, places, missed = jax.tree.map(lambda leaf: leaf[-1], answers)
-    moved = start.moved(carry.point, carry.twist, carry.angle).pose
-    return _keep_pose_unless_moving(motion, places, moved, pose, _status(carry, before, form.length)), missed
+    carry, outputs = jax.lax.scan(stage, Stage.before(start, counts), jnp.array([0.0, 0.5], pose.x.dtype))
+    solution, places, urgency_after = jax.tree.map(lambda leaf: leaf[-1], outputs)
+    moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
+    return _keep_pose_unless_moving(
+        solution, places, moved_pose, pose, _status(carry, before, form.length)
+    ), urgency_after
 
 
-def _status(after: Stage, before: Scalar, length: Scalar) -> Int[Array, ""]:
+def _status(last_stage: Stage, depth: Scalar, length: Scalar) -> Int[Array, ""]:
     """Status of a step.
 
     Args:
-        after: What the corrector left.
-        before: Depth of the deepest finger at the start of the step, m.
+        last_stage: What the corrector left.
+        depth: Depth of the deepest finger at the start of the step, m.
         length: Characteristic length of the limit surface, m.
     """
-    status = jnp.where((after.status == Status.JAMMED) & after.holds, Status.GRASPED, after.status)
-    too_far = (status == Status.MOVING) & (jnp.abs(after.twist.z) > MAX_ROTATION_PER_STEP)
+    status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
+    too_far = (status == Status.MOVING) & (jnp.abs(last_stage.twist.z) > MAX_ROTATION_PER_STEP)
     status = jnp.where(too_far, Status.NOT_CONVERGED, status)
-    overlapping = (before > MAX_PENETRATION * length) & (status != Status.INVALID)
+    overlapping = (depth > MAX_PENETRATION * length) & (status != Status.INVALID)
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
 
 
-def _first_contact(grips: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
+def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
     """Fraction of the step after which a finger first touches a slider at rest, or one if none does."""
     begin = jnp.ones_like(start.pose.x)
 
-    def of(grip: FingerMotion) -> Scalar:
-        at, path = compute_once(
-            (grip.seen(start, jnp.zeros_like(start.pose.x)), grip.path.unrotate(start.angle)), start.pose.x
+    def impact_of(finger_motion: FingerMotion) -> Scalar:
+        finger_pose, path = compute_once(
+            (
+                finger_motion.pose_in_slider(start, jnp.zeros_like(start.pose.x)),
+                finger_motion.path.unrotate(start.angle),
+            ),
+            start.pose.x,
         )
-        return time_of_impact(grip.finger, outline, at, path, length)
+        return time_of_impact(finger_motion.finger, outline, finger_pose, path, length)
 
-    for met in map_items(of, grips):
-        begin = jnp.minimum(begin, met)
+    for impact in map_items(impact_of, motions):
+        begin = jnp.minimum(begin, impact)
     return compute_once(begin, start.pose.x)
 
 
@@ -303,27 +315,27 @@ def _force_weighted_point(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...
 
 
 def _keep_pose_unless_moving(
-    motion: ScalarSolution, places: tuple[Array, Array], moved: Vec3, pose: Vec3, status: Int[Array, ""]
+    solution: ScalarSolution, places: tuple[Array, Array], moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]
 ) -> ScalarStep:
     """The record of a step, where a slider that does not move keeps its pose bit for bit.
 
     Without motion the pose is not touched by arithmetic that might have failed.
     """
-    finite_pose = jnp.isfinite(moved.x + moved.y + moved.z)
+    finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
     moves = decide((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
 
-    def kept(moving):
-        return jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), moving)
+    def zero_unless_moving(values):
+        return jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), values)
 
     return ScalarStep(
-        tree_where(moves, moved, pose),
-        kept(motion.twist),
-        kept(motion.wrench),
-        kept(motion.force),
-        kept(places[0]),
-        kept(places[1]),
-        tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in motion.mode),
+        tree_where(moves, moved_pose, pose),
+        zero_unless_moving(solution.twist),
+        zero_unless_moving(solution.wrench),
+        zero_unless_moving(solution.force),
+        zero_unless_moving(places[0]),
+        zero_unless_moving(places[1]),
+        tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in solution.mode),
         status,
         jnp.zeros_like(pose.x),
     )

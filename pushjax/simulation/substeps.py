@@ -2,18 +2,18 @@
 
 A step is too long if its result leaves a finger inside the slider. This happens if the slider turned so far that
 another of its corners came to touch, or if it slid past the end of what a finger rests on; no contact that is detected
-at the start shows either. Such a step is undone and tried again with half the size, down to a part of `SMALLEST`. A
-part that succeeds is followed by one of twice the size, or, right after a failure, first by one of the same size.
-Before a part is halved, a place that the result violates and that was not in the contact problem joins the problem
-(`working_set`), which is then solved again. If the smallest part fails, the step is NOT_CONVERGED, and the slider stays
-where the step began.
+at the start shows either. Such a step is undone and tried again with half the size, down to a part of `SMALLEST_PART`
+of the step. A part that succeeds is followed by one of twice the size. Right after a failure it is first followed by
+one of the same size. Before a part is halved, a candidate contact that the result violates and that was not in the
+contact problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
+NOT_CONVERGED, and the slider stays where the step began.
 
 Each push of a batch advances at its own pace: a round of the one loop is the next trial of every push, in whichever
 step that push is. So a push that divides its steps delays the others only at the end, and no trial is made for a push
 that has ended. Trials that are undone do not contribute to derivatives, which are those of the accepted parts.
 
 A jam is proved to first order only: within a long step the slider may turn out of it. So a whole step that jams is
-divided, too, and its first part has the size `CONFIRMED`. If a part of that size jams, the hand stops where that part
+divided, too, and its first part has the size `JAM_PART`. If a part of that size jams, the hand stops where that part
 began. If all parts move, so does the step.
 """
 
@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._internal.autodiff import keep_found
+from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.xla import compute_once, decide, tree_where
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver
@@ -36,19 +36,19 @@ from pushjax.geometry.shape import Outline
 from pushjax.simulation.detection import num_contacts
 from pushjax.simulation.finger_motion import FingerMotion, allowed_penetration, holding_distance, max_penetration
 from pushjax.simulation.step import ScalarStep, step_in_scalars
-from pushjax.simulation.working_set import LOADED, Urgency, likeliest
+from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
-SMALLEST = 1 / 256  # of a step
-CONFIRMED = 1 / 16  # of a step that jams as a whole: size of the part that has to jam, too
+SMALLEST_PART = 1 / 256  # of a step
+JAM_PART = 1 / 16  # of a step that jams as a whole: size of the part that has to jam, too
 # A path of n steps has TRIALS_A_STEP * n + TRIALS trials. What is left of it after that is NOT_CONVERGED. A grasp of a
 # slider with many corners takes 1.1 trials per step.
-TRIALS_A_STEP, TRIALS = 4, 64
-SWAPS = 3  # changes of the working set before a part is divided
+TRIALS_PER_STEP, EXTRA_TRIALS = 4, 64
+MAX_SWAPS = 3  # changes of the working set before a part is divided
 # A place that is not in the contact problem may be violated by this much, as a fraction of the tolerance for the whole.
-MISSED = 0.01
+MISSED_FRACTION = 0.01
 
 
-class Trial(NamedTuple):
+class PushState(NamedTuple):
     """State of a push, and what is tried next.
 
     Attributes:
@@ -58,14 +58,14 @@ class Trial(NamedTuple):
         done: Fraction of the step that is done.
         part: Fraction of the step that is tried next.
         halved: Whether the part has its size because a part of twice that size failed.
-        jammed: Whether the step as a whole jams.
+        whole_step_jams: Whether the step as a whole jams.
         urgency: Urgency of each contact; None if all are solved together.
         swaps: How often the working set of this part has changed.
         overlap: Current depth of the deepest finger, m.
-        stopped: Status that stopped the hand, or zero.
-        given_up: Status of a step that is given up, or zero.
+        stop_status: Status that stopped the hand, or zero.
+        abandon_status: Status of a step that is given up, or zero.
         failed: Whether the previous step failed.
-        so_far: Record of the parts of the step that are done.
+        accepted_parts: Record of the parts of the step that are done.
     """
 
     pose: Vec3
@@ -74,20 +74,20 @@ class Trial(NamedTuple):
     done: Scalar
     part: Scalar
     halved: Bool[Array, ""]
-    jammed: Bool[Array, ""]
+    whole_step_jams: Bool[Array, ""]
     urgency: Urgency | None
     swaps: Int[Array, ""]
     overlap: Scalar
-    stopped: Int[Array, ""]
-    given_up: Int[Array, ""]
+    stop_status: Int[Array, ""]
+    abandon_status: Int[Array, ""]
     failed: Bool[Array, ""]
-    so_far: ScalarStep
+    accepted_parts: ScalarStep
 
 
-def divided(
+def simulate_in_substeps(
     outline: Outline,
     steps: int,
-    grips_at: Callable[[Int[Array, ""], Array], tuple[FingerMotion, ...]],
+    motions_at: Callable[[Int[Array, ""], Array], tuple[FingerMotion, ...]],
     solver: ContactSolver | StickingSolver | None,
     pose: Vec3,
     friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]],
@@ -97,7 +97,7 @@ def divided(
     Args:
         outline: The slider's outline.
         steps: Number of steps of the path.
-        grips_at: Function that gives the motion of the fingers over a step, from its index and the friction of each
+        motions_at: Function that gives the motion of the fingers over a step, from its index and the friction of each
             finger.
         solver: Solver of contact problems; None for the default.
         pose: Pose of the slider at the start, world.
@@ -108,41 +108,43 @@ def divided(
     """
     first = jnp.zeros((), jnp.int32)
     form, mu = friction_at(first, pose)
-    grips = grips_at(first, mu)
-    most = TRIALS_A_STEP * steps + TRIALS
-    overlap = max_penetration(outline, grips, pose, 0.0)
+    motions = motions_at(first, mu)
+    max_trials = TRIALS_PER_STEP * steps + EXTRA_TRIALS
+    overlap = max_penetration(outline, motions, pose, 0.0)
     zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
-    none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
-    urgency = likeliest([num_contacts(grip.finger, outline) for grip in grips], pose.x)
-    nothing = _nothing(form, outline, grips, solver, pose, urgency)
-    begin = Trial(pose, pose, first, zero, one, no, no, urgency, none, overlap, none, none, no, nothing)
+    zero_status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+    urgency = initial_urgency([num_contacts(motion.finger, outline) for motion in motions], pose.x)
+    idle_record = _idle_record(form, outline, motions, solver, pose, urgency)
+    initial_state = PushState(
+        pose, pose, first, zero, one, no, no, urgency, zero_status, overlap, zero_status, zero_status, no, idle_record
+    )
 
-    def next_trial(trial: Trial) -> tuple[Trial, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
-        form, mu = friction_at(trial.step, trial.origin)
-        grips = grips_at(trial.step, mu)
-        reach, tolerance = holding_distance(grips, form.length), allowed_penetration(grips, form.length)
-        part = tuple(grip.part(trial.done, trial.part) for grip in grips)
-        ongoing = trial.step < steps
-        record, missed = step_in_scalars(
-            form, outline, part, solver, trial.pose, trial.overlap, reach, trial.urgency, ongoing
+    def next_trial(state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
+        form, mu = friction_at(state.step, state.origin)
+        motions = motions_at(state.step, mu)
+        reach, tolerance = holding_distance(motions, form.length), allowed_penetration(motions, form.length)
+        part = tuple(motion.part(state.done, state.part) for motion in motions)
+        ongoing = state.step < steps
+        record, urgency_after = step_in_scalars(
+            form, outline, part, solver, state.pose, state.overlap, reach, state.urgency, ongoing
         )
-        following, found = _judged(trial, record, missed, outline, part, tolerance, steps)
-        if missed is not None and urgency is not None:
-            following = following._replace(urgency=jnp.where(following.swaps > 0, missed, urgency))
-        return following, found
+        next_state, record_and_end = _next_state(state, record, urgency_after, outline, part, tolerance, steps)
+        if urgency_after is not None and urgency is not None:
+            next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, urgency_after, urgency))
+        return next_state, record_and_end
 
-    def skipped(trial: Trial):
-        return trial, (nothing, jnp.zeros((), bool), trial.step)
+    def skipped(state: PushState):
+        return state, (idle_record, jnp.zeros((), bool), state.step)
 
-    def round_(trial: Trial, _):
-        left = eqxi.unvmap_any(trial.step < steps)
-        return jax.lax.cond(left, next_trial, skipped, trial)
+    def trial_of_batch(state: PushState, _):
+        any_ongoing = eqxi.unvmap_any(state.step < steps)
+        return jax.lax.cond(any_ongoing, next_trial, skipped, state)
 
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
-    round_ = jax.checkpoint(round_, prevent_cse=False, policy=keep_found)
-    last, (records, ends, step) = jax.lax.scan(round_, begin, length=most)
-    return _records_of_steps(records, ends, step, steps, last, nothing), last.done
+    trial_of_batch = jax.checkpoint(trial_of_batch, prevent_cse=False, policy=save_search_results)
+    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, length=max_trials)
+    return _records_of_steps(records, ends, step, steps, last, idle_record), last.done
 
 
 def _records_of_steps(
@@ -150,8 +152,8 @@ def _records_of_steps(
     ends: Bool[Array, " rounds"],
     step: Int[Array, " rounds"],
     steps: int,
-    last: Trial,
-    nothing: ScalarStep,
+    last: PushState,
+    idle_record: ScalarStep,
 ) -> ScalarStep:
     """For each step, the record of the round that ended it, or what the last round left if no round ended it.
 
@@ -161,16 +163,16 @@ def _records_of_steps(
         step: Index of the step of each round.
         steps: Number of steps.
         last: State after the last round.
-        nothing: Record of a step in which nothing pushes.
+        idle_record: Record of a step in which nothing pushes.
     """
-    most = len(ends)
-    at = jnp.full(steps, most).at[jnp.where(ends, step, steps)].set(jnp.arange(most), mode="drop")
-    status = jnp.where(last.stopped != 0, last.stopped, Status.NOT_CONVERGED).astype(jnp.int8)
-    rest = nothing._replace(pose=last.pose, status=status, overlap=last.overlap)
-    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[at], records, rest)
+    rounds = len(ends)
+    round_of_step = jnp.full(steps, rounds).at[jnp.where(ends, step, steps)].set(jnp.arange(rounds), mode="drop")
+    status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
+    rest = idle_record._replace(pose=last.pose, status=status, overlap=last.overlap)
+    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[round_of_step], records, rest)
 
 
-class Outcome(NamedTuple):
+class Decision(NamedTuple):
     """What follows from a trial: one of these, or else a smaller part is tried next.
 
     Attributes:
@@ -190,108 +192,112 @@ class Outcome(NamedTuple):
     reason: Int[Array, ""]
 
 
-def _outcome(trial: Trial, record: ScalarStep, missed: Urgency | None, depth: Scalar, tolerance: Scalar) -> Outcome:
+def _decide(
+    state: PushState, record: ScalarStep, urgency_after: Urgency | None, depth: Scalar, tolerance: Scalar
+) -> Decision:
     """Decide what follows from a trial.
 
     Args:
-        trial: The state before the trial.
+        state: The state before the trial.
         record: Result of the trial.
-        missed: Urgency of each contact after the trial; None if all are solved together.
+        urgency_after: Urgency of each contact after the trial; None if all are solved together.
         depth: Depth of the deepest finger after the trial, m.
         tolerance: How much deeper a finger may be after a whole step, m.
     """
-    fails = trial.given_up != 0
-    goes = (record.status == Status.MOVING) | (record.status == Status.FREE)
+    fails = state.abandon_status != 0
+    is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
     # overlaps do not accumulate, for the next part pushes them out: so the smallest part may leave as much as a whole
     # step
-    share = jnp.where(trial.part < 2 * SMALLEST, 1.0, trial.part)
-    clear = depth <= jnp.maximum(trial.overlap, share * tolerance)
+    allowed_share = jnp.where(state.part < 2 * SMALLEST_PART, 1.0, state.part)
+    clear = depth <= jnp.maximum(state.overlap, allowed_share * tolerance)
     # In a step that is divided for another reason, only the smallest part can confirm a jam, because a slider that
     # squirts out turns far in one step.
-    smallest = jnp.where(trial.jammed, CONFIRMED, SMALLEST)
+    smallest = jnp.where(state.whole_step_jams, JAM_PART, SMALLEST_PART)
     # if the slider was left behind in the previous step, the step is not tried in parts again
-    final = (trial.part < 2 * smallest) | trial.failed
-    stops = final & stopping(record.status) & ~fails
+    may_not_divide = (state.part < 2 * smallest) | state.failed
+    stops = may_not_divide & hand_stops(record.status) & ~fails
     joins = jnp.zeros((), bool)
-    if missed is not None:
-        worst = jnp.max(jnp.where(missed < LOADED, missed, -jnp.inf))
-        joins = goes & ~fails & (trial.swaps < SWAPS) & (worst > MISSED * trial.part * tolerance)
-    accepted, stops, joins = compute_once((goes & clear & ~fails & ~joins, stops, joins), trial.pose.x)
-    hopeless = (trial.part / 2 < SMALLEST) | trial.failed | (record.status >= Status.OVERLAPPING)
+    if urgency_after is not None:
+        worst = jnp.max(jnp.where(urgency_after < LOADED, urgency_after, -jnp.inf))
+        joins = is_solved & ~fails & (state.swaps < MAX_SWAPS) & (worst > MISSED_FRACTION * state.part * tolerance)
+    accepted, stops, joins = compute_once((is_solved & clear & ~fails & ~joins, stops, joins), state.pose.x)
+    hopeless = (state.part / 2 < SMALLEST_PART) | state.failed | (record.status >= Status.OVERLAPPING)
     abandons = hopeless & ~accepted & ~stops & ~fails & ~joins
     # If nothing moved and the trial took the hand to the end of the step, its overlap is known and no further trial is
     # needed.
-    at_once = abandons & ~goes & (trial.part == 1)
-    reason = jnp.where(goes, Status.NOT_CONVERGED, record.status)
-    reason = jnp.where(fails, trial.given_up, reason).astype(jnp.int8)
-    return Outcome(accepted, joins, stops, abandons & ~at_once, decide(fails | at_once, trial.pose.x), reason)
+    at_once = abandons & ~is_solved & (state.part == 1)
+    reason = jnp.where(is_solved, Status.NOT_CONVERGED, record.status)
+    reason = jnp.where(fails, state.abandon_status, reason).astype(jnp.int8)
+    return Decision(accepted, joins, stops, abandons & ~at_once, decide(fails | at_once, state.pose.x), reason)
 
 
-def _judged(
-    trial: Trial,
+def _next_state(
+    state: PushState,
     record: ScalarStep,
-    missed: Urgency | None,
+    urgency_after: Urgency | None,
     outline: Outline,
     part: tuple[FingerMotion, ...],
     tolerance: Scalar,
     steps: int,
 ):
     """Return the next state; and, of the step, the record, whether it ended with this trial, and the index."""
-    ongoing = trial.step < steps
-    pose = tree_where(decide(trial.given_up != 0, trial.pose.x), trial.origin, record.pose)
+    ongoing = state.step < steps
+    pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
-    outcome = _outcome(trial, record, missed, depth, tolerance)
-    accepted, stops, fails = outcome.accepted, outcome.stops, outcome.fails
+    decision = _decide(state, record, urgency_after, depth, tolerance)
+    accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
     moves = decide(record.status == Status.MOVING, pose.x)
-    so_far = tree_where(moves, record, trial.so_far)
-    so_far = so_far._replace(twist=trial.so_far.twist + record.twist, pose=pose, overlap=depth)
-    so_far = so_far._replace(status=jnp.where(moves, record.status, trial.so_far.status))
-    done = trial.done + trial.part
+    accepted_parts = tree_where(moves, record, state.accepted_parts)
+    accepted_parts = accepted_parts._replace(twist=state.accepted_parts.twist + record.twist, pose=pose, overlap=depth)
+    accepted_parts = accepted_parts._replace(status=jnp.where(moves, record.status, state.accepted_parts.status))
+    done = state.done + state.part
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
-    failed = _still(record, trial.origin)._replace(status=outcome.reason, overlap=depth)
-    held = trial.so_far._replace(pose=trial.pose, status=record.status, overlap=trial.overlap)
-    ended = tree_where(stops, held, tree_where(accepted, so_far, failed))
+    failed_record = _resting(record, state.origin)._replace(status=decision.reason, overlap=depth)
+    stopped_record = state.accepted_parts._replace(pose=state.pose, status=record.status, overlap=state.overlap)
+    end_record = tree_where(stops, stopped_record, tree_where(accepted, accepted_parts, failed_record))
 
     # the next trial: where it starts, and how large its part is
-    onward = decide(accepted & ~ends, pose.x)
-    anew = (ends & ~stops) | outcome.abandons
-    jams = (trial.part == 1) & stopping(record.status)
-    smaller = jnp.where(outcome.joins, trial.part, jnp.where(jams, CONFIRMED, trial.part / 2))
-    larger = jnp.where(trial.halved, trial.part, 2 * trial.part)
-    following = Trial(
-        pose=tree_where(ends, ended.pose, tree_where(onward, pose, trial.pose)),
-        origin=tree_where(ends, ended.pose, trial.origin),
-        step=jnp.where(ends, jnp.where(stops, steps, trial.step + 1), trial.step),
-        done=jnp.where(anew, 0.0, jnp.where(accepted, done, trial.done)),
-        part=jnp.where(anew, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
-        halved=jnp.where(outcome.joins, trial.halved, ~(anew | accepted | jams)),
-        jammed=(trial.jammed | jams) & ~(ends | anew),
-        urgency=trial.urgency,
-        swaps=jnp.where(outcome.joins, trial.swaps + 1, 0).astype(jnp.int8),
-        overlap=jnp.where(ends, ended.overlap, jnp.where(accepted, depth, trial.overlap)),
-        stopped=jnp.where(stops, record.status, trial.stopped).astype(jnp.int8),
-        given_up=jnp.where(outcome.abandons, outcome.reason, 0).astype(jnp.int8),
-        failed=jnp.where(ends, fails, trial.failed),
-        so_far=tree_where(ends, _still(record, ended.pose), tree_where(onward, so_far, trial.so_far)),
+    continues = decide(accepted & ~ends, pose.x)
+    restarts = (ends & ~stops) | decision.abandons
+    jams = (state.part == 1) & hand_stops(record.status)
+    smaller = jnp.where(decision.joins, state.part, jnp.where(jams, JAM_PART, state.part / 2))
+    larger = jnp.where(state.halved, state.part, 2 * state.part)
+    next_state = PushState(
+        pose=tree_where(ends, end_record.pose, tree_where(continues, pose, state.pose)),
+        origin=tree_where(ends, end_record.pose, state.origin),
+        step=jnp.where(ends, jnp.where(stops, steps, state.step + 1), state.step),
+        done=jnp.where(restarts, 0.0, jnp.where(accepted, done, state.done)),
+        part=jnp.where(restarts, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
+        halved=jnp.where(decision.joins, state.halved, ~(restarts | accepted | jams)),
+        whole_step_jams=(state.whole_step_jams | jams) & ~(ends | restarts),
+        urgency=state.urgency,
+        swaps=jnp.where(decision.joins, state.swaps + 1, 0).astype(jnp.int8),
+        overlap=jnp.where(ends, end_record.overlap, jnp.where(accepted, depth, state.overlap)),
+        stop_status=jnp.where(stops, record.status, state.stop_status).astype(jnp.int8),
+        abandon_status=jnp.where(decision.abandons, decision.reason, 0).astype(jnp.int8),
+        failed=jnp.where(ends, fails, state.failed),
+        accepted_parts=tree_where(
+            ends, _resting(record, end_record.pose), tree_where(continues, accepted_parts, state.accepted_parts)
+        ),
     )
-    following = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), following, trial)
-    return following, (ended, ends, trial.step)
+    next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
+    return next_state, (end_record, ends, state.step)
 
 
-def stopping(status: Array) -> Bool[Array, "..."]:
+def hand_stops(status: Array) -> Bool[Array, "..."]:
     """Whether the hand stops for good."""
     return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
-def _still(record: ScalarStep, pose: Vec3) -> ScalarStep:
+def _resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
     """Record of a slider that stays at `pose` while nothing pushes."""
     rest = jax.tree.map(jnp.zeros_like, record)
     return rest._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
-def _nothing(form, outline, grips, solver, pose, urgency) -> ScalarStep:
+def _idle_record(form, outline, motions, solver, pose, urgency) -> ScalarStep:
     """Record of a step in which nothing pushes, in the shapes and dtypes that `step_in_scalars` gives."""
-    shapes = jax.eval_shape(lambda: step_in_scalars(form, outline, grips, solver, pose, pose.x, pose.x, urgency)[0])
+    shapes = jax.eval_shape(lambda: step_in_scalars(form, outline, motions, solver, pose, pose.x, pose.x, urgency)[0])
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return _still(blank, pose)
+    return _resting(blank, pose)

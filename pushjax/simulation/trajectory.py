@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._math.vec import Scalar
 from pushjax.contact.status import Status
 from pushjax.simulation.step import ScalarStep
-from pushjax.simulation.substeps import stopping
+from pushjax.simulation.substeps import hand_stops
 
 
 class Step(eqx.Module):
@@ -99,7 +99,7 @@ class Trajectory(eqx.Module):
     @property
     def stopped(self) -> Int[Array, ""]:
         """Index of the step at which the hand jammed or grasped, or -1."""
-        return first_true(stopping(self.status))
+        return first_true(hand_stops(self.status))
 
     @property
     def first_failure(self) -> Int[Array, ""]:
@@ -107,9 +107,9 @@ class Trajectory(eqx.Module):
         return first_true(self.failed)
 
 
-def first_true(steps: Bool[Array, "... steps"]) -> Int[Array, "..."]:
+def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
     """Index of the first step that is True, or -1."""
-    return jnp.where(jnp.any(steps, axis=-1), jnp.argmax(steps, axis=-1), -1)
+    return jnp.where(jnp.any(mask, axis=-1), jnp.argmax(mask, axis=-1), -1)
 
 
 def to_arrays(record: ScalarStep, length: Scalar) -> Step:

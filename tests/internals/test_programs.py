@@ -11,7 +11,7 @@ import pytest
 
 import pushjax as pj
 from pushjax._internal import jit as _programs
-from pushjax._internal.jit import jit, outermost, quick_jit, without_gc
+from pushjax._internal.jit import jit, outside_trace, quick_jit, without_gc
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def collector(monkeypatch):
     gc.enable()
     gc.unfreeze()
     gc.set_threshold(700, 10, 10)
-    monkeypatch.setattr(_programs, "ASIDE", 0)
+    monkeypatch.setattr(_programs, "FROZEN_AT_IMPORT", 0)
     yield gc
     gc.set_threshold(*threshold)
     if aside:
@@ -35,7 +35,7 @@ def collector(monkeypatch):
 
 def many() -> list[list[int]]:
     """Create more new objects than a call that traces nothing."""
-    return [[k] for k in range(2 * _programs.MANY)]
+    return [[k] for k in range(2 * _programs.OBJECTS_OF_A_TRACE)]
 
 
 def test_the_collector_pauses_for_the_call_and_only_for_it(collector):
@@ -77,7 +77,7 @@ def test_what_was_put_aside_stays_aside_and_nothing_is_added(collector):
     before = collector.get_freeze_count()
     kept = without_gc(many)()
     assert before - 100 < collector.get_freeze_count() <= before
-    assert len(kept) == 2 * _programs.MANY
+    assert len(kept) == 2 * _programs.OBJECTS_OF_A_TRACE
 
 
 def test_calls_that_make_little_leave_the_collector_to_its_work(collector):
@@ -154,7 +154,7 @@ def test_whether_anything_is_traced():
     seen = []
 
     def look(x):
-        seen.append(outermost())
+        seen.append(outside_trace())
         return x
 
     look(1.0)

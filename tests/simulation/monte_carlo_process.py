@@ -27,7 +27,7 @@ def setting(dtype=np.float32):
     import pushjax as pj
     from pushjax.simulation import monte_carlo as engine
 
-    engine.BLOCK, engine.PATIENCE = 128, 1e9  # a file for this number of pushes, however slow they are
+    engine.BLOCK_PUSHES, engine.BLOCK_SECONDS = 128, 1e9  # a file for this number of pushes, however slow they are
     slider = pj.Slider(pj.Disk(np.asarray(0.05, dtype)), pj.Ellipsoid(np.eye(3, dtype=dtype), np.asarray(0.035, dtype)))
     path = np.linspace((-0.06, 0.02), (-0.03, 0.02), 11).astype(dtype)
     model = pj.FrictionModel(dof=np.asarray(10, dtype), friction=np.asarray((0.1, 0.4), dtype))
