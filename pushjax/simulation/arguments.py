@@ -29,6 +29,9 @@ from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, overlaps
 
 POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
+# Numbers beyond these are probably in other units: length of a surface, m; distance of a hand from the origin, in
+# lengths of the surface; angle of a pose, rad (angles are never wrapped, so a few turns are no mistake).
+MAX_LENGTH, MAX_REACH, MAX_TURN = 3.0, 1000.0, 8 * np.pi
 
 
 def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
@@ -102,7 +105,7 @@ def warn_about_units(slider: Slider, pose: ArrayLike, *paths: ArrayLike) -> None
 
 def _warn(message: str) -> None:
     """Show a warning at the line of code outside the package that made the call."""
-    level, frame = 1, sys._getframe(1)
+    level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("pushjax."):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, UserWarning, stacklevel=level)
@@ -113,7 +116,7 @@ def checked_rollout_arguments(
 ):
     """Prepare the arguments of a rollout: slider, hand, path, start and friction, in one dtype and checked.
 
-    `path` is as in `rollout`, and may also be (pushes, steps + 1, dof) where the number of pushes is given. The other
+    `path` is as in `rollout`, and may also be (pushes, steps + 1, dof) if the number of pushes is given. The other
     arguments are as in `checked_arguments`.
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
