@@ -13,7 +13,7 @@ from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection
 from pushjax.geometry.spline import SAMPLES, SplineOutline
 from pushjax.geometry.spline_segment import spline_segments
 
-# Nodes per segment for the arc length. The speed is smooth between two nodes.
+# Intervals per segment over which the arc length is integrated. The speed is smooth within an interval.
 ARC_NODES = 8
 # Iterations of a fit. Each one fits the curve and moves every parameter toward the closest point on the curve.
 FIT_ITERATIONS = 20
@@ -67,9 +67,9 @@ class Curve(Shape):
             ValueError: As for `Curve`.
         """
         array = _check_points("points", points, least=4)
-        one = jnp.eye(len(array), dtype=array.dtype)
-        at_points = (4 * one + jnp.roll(one, 1, axis=0) + jnp.roll(one, -1, axis=0)) / 6
-        return Curve(jnp.linalg.solve(at_points, array), convex=convex)
+        identity = jnp.eye(len(array), dtype=array.dtype)
+        knot_weights = (4 * identity + jnp.roll(identity, 1, axis=0) + jnp.roll(identity, -1, axis=0)) / 6
+        return Curve(jnp.linalg.solve(knot_weights, array), convex=convex)
 
     @staticmethod
     def fit(points: ArrayLike, controls: int = 24, *, convex: bool | None = None) -> "Curve":
@@ -110,64 +110,70 @@ class Curve(Shape):
         return self.control[0] + moment / (jnp.sum(weight * (x * dy - y * dx)) / 2)
 
     def _quadrature(self) -> tuple[Array, ...]:
-        """Return points, derivatives and weights of Gauss-Legendre quadrature along the curve.
+        """Return (x, y, dx, dy, weight) at the nodes of Gauss-Legendre quadrature along the curve.
 
-        The five points per segment are exact for integrands up to degree nine.
+        The points (x, y), m, are relative to the first control point. The derivatives (dx, dy) are by the segment's
+        parameter. Five nodes per segment are exact for integrands up to degree nine.
         """
-        # Points are relative to the first control point, so that a curve far from the origin does not lose digits.
-        pieces = jax.tree.map(lambda field: field[:, None], spline_segments(self.control - self.control[:1]))
-        at, weight = (jnp.asarray(part / 2, self.control.dtype)[None] for part in np.polynomial.legendre.leggauss(5))
-        point, velocity, _ = pieces.at(at + 0.5)
-        return *point, *velocity, weight
+        # Relative points keep a curve far from the origin from losing digits.
+        segments = jax.tree.map(lambda field: field[:, None], spline_segments(self.control - self.control[:1]))
+        nodes, weights = (
+            jnp.asarray(part / 2, self.control.dtype)[None] for part in np.polynomial.legendre.leggauss(5)
+        )
+        point, velocity, _ = segments.evaluate(nodes + 0.5)
+        return *point, *velocity, weights
 
     @property
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-        pieces = spline_segments(self.control)
-        low, high = zip(*(_coordinate_range(*fields) for fields in zip(*pieces[:4], strict=True)), strict=True)
+        segments = spline_segments(self.control)
+        low, high = zip(*(_coordinate_range(*fields) for fields in zip(*segments[:4], strict=True)), strict=True)
         return jnp.stack(low), jnp.stack(high)
 
     @property
     def perimeter(self) -> Float[Array, ""]:
         """Length of the curve, m."""
-        at, weight = (part / 2 for part in np.polynomial.legendre.leggauss(5))
-        fine = (np.arange(ARC_NODES)[:, None] + at + 0.5).ravel() / ARC_NODES
-        pieces = jax.tree.map(lambda field: field[:, None], spline_segments(self.control))
-        _, velocity, _ = pieces.at(jnp.asarray(fine, self.control.dtype)[None])
-        weights = jnp.asarray(np.tile(weight, ARC_NODES) / ARC_NODES, self.control.dtype)
-        return jnp.sum(jnp.hypot(*velocity) * weights[None])
+        nodes, weights = (part / 2 for part in np.polynomial.legendre.leggauss(5))
+        all_nodes = (np.arange(ARC_NODES)[:, None] + nodes + 0.5).ravel() / ARC_NODES
+        segments = jax.tree.map(lambda field: field[:, None], spline_segments(self.control))
+        _, velocity, _ = segments.evaluate(jnp.asarray(all_nodes, self.control.dtype)[None])
+        all_weights = jnp.asarray(np.tile(weights, ARC_NODES) / ARC_NODES, self.control.dtype)
+        return jnp.sum(jnp.hypot(*velocity) * all_weights[None])
 
     def boundary(self, points: int) -> Float[Array, "points 2"]:
         count = len(self.control)
         nodes = jnp.linspace(0, count, count * ARC_NODES + 1, dtype=self.control.dtype)
-        at, _ = equally_spaced(lambda at: jnp.hypot(*self._at(at)[1]), nodes, points)
-        return jnp.stack(self._at(at)[0], axis=1)
+        parameters, _ = equally_spaced(lambda parameters: jnp.hypot(*self._evaluate(parameters)[1]), nodes, points)
+        return jnp.stack(self._evaluate(parameters)[0], axis=1)
 
-    def _at(self, parameter: Array):
-        """Evaluate the point and the derivatives at parameters of any shape, counted in segments."""
+    def _evaluate(self, parameter: Array):
+        """Return the point and its first and second derivative at parameters of any shape, counted in segments."""
         count = len(self.control)
         index = jnp.clip(jnp.floor(parameter).astype(int), 0, count - 1)
-        return spline_segments(self.control).chosen(index).at(parameter - index)
+        return spline_segments(self.control).select(index).evaluate(parameter - index)
 
     def outline(self) -> SplineOutline:
-        pieces = spline_segments(self.control)
-        at = jnp.arange(SAMPLES, dtype=self.control.dtype) / SAMPLES
-        node, velocity, _ = jax.tree.map(lambda field: field[:, None], pieces).at(at[None])
-        flat, slow = (Vec2(field.x.reshape(-1), field.y.reshape(-1)) for field in (node, velocity))
+        segments = spline_segments(self.control)
+        nodes = jnp.arange(SAMPLES, dtype=self.control.dtype) / SAMPLES
+        points, velocities, _ = jax.tree.map(lambda field: field[:, None], segments).evaluate(nodes[None])
+        flat_points, flat_velocities = (
+            Vec2(field.x.reshape(-1), field.y.reshape(-1)) for field in (points, velocities)
+        )
         # Computed once here, and not again for each query of a batch.
-        outline = SplineOutline(pieces, flat, slow.scale(1 / SAMPLES), self.perimeter, self.convex)
+        outline = SplineOutline(segments, flat_points, flat_velocities.scale(1 / SAMPLES), self.perimeter, self.convex)
         return compute_once(outline, self.control[0, 0])
 
 
 def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
-    """Return the least and largest value of one coordinate over all segments.
+    """Return the least and largest value of one coordinate over all segments, given its power coefficients.
 
     The candidates are the ends of the segments and the stationary points between them.
     """
-    inside = c2 * c2 - 3 * c1 * c3
-    half = -(c2 + jnp.where(c2 < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(inside > 0, inside, 0.0)))
-    turns = half / jnp.where(c3 == 0, jnp.inf, 3 * c3), c1 / jnp.where(half == 0, jnp.inf, half)
-    places = [jnp.zeros_like(c0), *(jax.lax.stop_gradient(jnp.clip(t, 0, 1)) for t in turns)]
-    values = jnp.stack([c0 + t * (c1 + t * (c2 + t * c3)) for t in places])
+    discriminant = c2 * c2 - 3 * c1 * c3
+    # q / (3 c3) and c1 / q are the roots of the derivative, in the forms without cancellation.
+    q = -(c2 + jnp.where(c2 < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(discriminant > 0, discriminant, 0.0)))
+    stationary = q / jnp.where(c3 == 0, jnp.inf, 3 * c3), c1 / jnp.where(q == 0, jnp.inf, q)
+    candidates = [jnp.zeros_like(c0), *(jax.lax.stop_gradient(jnp.clip(t, 0, 1)) for t in stationary)]
+    values = jnp.stack([c0 + t * (c1 + t * (c2 + t * c3)) for t in candidates])
     return jnp.min(values), jnp.max(values)
 
 
@@ -190,12 +196,12 @@ def _check_points(name: str, points: ArrayLike, least: int) -> Array:
     return array
 
 
-# Maps the four control points around a segment (before it, at its two ends, after it) to its power coefficients.
+# Maps the four control points around a segment (before it, near its two ends, after it) to its power coefficients.
 _BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 
 
 def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Evaluate points and first and second derivatives of a known curve.
+    """Return points and first and second derivatives of a known curve, each of shape (parameters, 2).
 
     This repeats `spline_segments` and `SplineSegment.at` in NumPy, to compute in float64 whatever precision JAX runs
     in.
@@ -227,7 +233,7 @@ def _check_curve(control: np.ndarray) -> float:
 
 
 def _is_convex(control: Array, claimed: bool | None) -> bool:
-    """Whether the curve turns inwards nowhere, up to roundoff; if traced, as claimed."""
+    """Return whether the curve turns inward nowhere, up to roundoff; if traced, return `claimed`."""
     known = concrete(control)
     if known is None:
         return bool(claimed)
@@ -236,49 +242,50 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     curvature = velocity[:, 0] * second[:, 1] - velocity[:, 1] * second[:, 0]
     curvature /= np.linalg.norm(velocity, axis=1) ** 3
     # Error of the curvature from roundoff in the second differences of the control points.
-    slack = (
+    tolerance = (
         16
         * float(jnp.finfo(control.dtype).eps)
         * count**2
         * np.max(np.abs(known))
         / np.max(np.ptp(points, axis=0)) ** 2
     )
-    convex = bool(curvature.min() >= -slack)
+    convex = bool(curvature.min() >= -tolerance)
     if claimed and not convex:
         near = int(np.argmin(curvature)) // 32
-        raise ValueError(f"convex is True, but the curve is not: it turns inwards near control point {near}")
+        raise ValueError(f"convex is True, but the curve is not: it turns inward near control point {near}")
     return convex if claimed is None else bool(claimed)
 
 
 def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
-    """Fit control points by alternating least squares.
+    """Return the control points, shape (controls, 2), m, that alternating least squares fits to `points`.
 
     Each iteration solves for the control points at fixed parameters, then moves the parameter of every point toward the
     closest point of the curve. A point's parameter starts at its fraction of the outline's length. The first iterations
     minimize the whole distance between a point and the curve's point at its parameter. The later ones weight mostly
-    the distance across the curve, because the parameter can compensate for the distance along it.
+    the distance along the normal, because the parameter can compensate for the distance along the tangent.
     """
     before, after = (np.linalg.norm(points - np.roll(points, k, axis=0), axis=1) for k in (1, -1))
     weight = np.sqrt((before + after) / 2)[:, None]
-    arc = np.concatenate([[0], np.cumsum(after)])
-    parameter = arc[:-1] / arc[-1] * controls
-    across, along = np.broadcast_to(np.eye(2)[:, None], (2, len(points), 2))
+    arc_length = np.concatenate([[0], np.cumsum(after)])
+    parameter = arc_length[:-1] / arc_length[-1] * controls
+    normal, tangent = np.broadcast_to(np.eye(2)[:, None], (2, len(points), 2))
     for iteration in range(FIT_ITERATIONS):
         index = np.floor(parameter).astype(int)
         basis = (parameter - index)[:, None] ** np.arange(4)[None] @ _BASIS
         design = np.zeros((len(points), controls))
         for k in range(4):
             design[np.arange(len(points)), (index + k - 1) % controls] += basis[:, k]
-        slack = 1.0 if iteration < FIT_ITERATIONS // 4 else 0.1
-        rows = [weight * scale * direction for scale, direction in ((1.0, across), (slack, along))]
-        matrix = np.concatenate([(row[:, :, None] * design[:, None]).reshape(len(points), -1) for row in rows])
-        value = np.concatenate([np.sum(row * points, axis=1) for row in rows])
-        control = np.linalg.lstsq(matrix, value, rcond=None)[0].reshape(2, controls).T
-        at, first, second = _evaluate_in_numpy(control, parameter)
+        tangent_weight = 1.0 if iteration < FIT_ITERATIONS // 4 else 0.1
+        rows = [weight * scale * direction for scale, direction in ((1.0, normal), (tangent_weight, tangent))]
+        stacked_design = np.concatenate([(row[:, :, None] * design[:, None]).reshape(len(points), -1) for row in rows])
+        stacked_value = np.concatenate([np.sum(row * points, axis=1) for row in rows])
+        control = np.linalg.lstsq(stacked_design, stacked_value, rcond=None)[0].reshape(2, controls).T
+        point, first, second = _evaluate_in_numpy(control, parameter)
+        # One Newton step for the parameters. The lower bound on the curvature keeps it a descent step.
         squared = np.sum(first**2, axis=1)
-        stiff = np.maximum(squared - np.sum((points - at) * second, axis=1), 0.5 * squared)
-        parameter = parameter + np.clip(np.sum((points - at) * first, axis=1) / stiff, -0.25, 0.25)
-        along = _evaluate_in_numpy(control, parameter)[1]
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        across = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        curvature = np.maximum(squared - np.sum((points - point) * second, axis=1), 0.5 * squared)
+        parameter = parameter + np.clip(np.sum((points - point) * first, axis=1) / curvature, -0.25, 0.25)
+        tangent = _evaluate_in_numpy(control, parameter)[1]
+        tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+        normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     return control

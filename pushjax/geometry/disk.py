@@ -22,14 +22,14 @@ class DiskOutline(Outline):
     radius: Scalar
 
     def closest(self, x: Vec2) -> ClosestPoint:
-        rel = x - self.center
-        squared = rel.dot(rel)
+        offset = x - self.center
+        squared = offset.dot(offset)
         at_center = squared <= jnp.finfo(squared.dtype).tiny
         length = jnp.sqrt(jnp.where(at_center, 1.0, squared))
         # At the center all boundary points are equally close. The choice of +x keeps the result finite.
-        aside = Vec2(jnp.ones_like(length), jnp.zeros_like(length))
-        normal = tree_where(at_center, aside, rel.scale(1 / length))
-        distance = jnp.where(at_center, normal.dot(rel), length) - self.radius
+        plus_x = Vec2(jnp.ones_like(length), jnp.zeros_like(length))
+        normal = tree_where(at_center, plus_x, offset.scale(1 / length))
+        distance = jnp.where(at_center, normal.dot(offset), length) - self.radius
         return ClosestPoint(distance, self.center + normal.scale(self.radius), normal)
 
     def facing(self, direction: Vec2) -> FacingPoints:

@@ -1,9 +1,10 @@
 """Ellipses: closest point and sweep, each by one root on the outline.
 
-The outline is parameterized by a unit vector q = (c, s). The point at q is p = (a c, b s), and the outward normal n is
-(b c, a s), normalized. Each query is one root in q. A fixed number of bracketed iterations finds the root outside the
-derivative. One more, differentiable iteration then gives the root its derivatives. Angles appear only as small turns of
-q.
+The semi-axes are a along x and b along y; coordinates are relative to the center. The outline is parameterized by a
+unit vector q = (c, s) = (cos phi, sin phi). The point at q is p = (a c, b s), and the outward normal n is (b c, a s),
+normalized. Each query is one root in q. A fixed number of bracketed iterations, which JAX does not differentiate, finds
+the root. One more, differentiable iteration then gives the root its derivatives. Derivatives are by phi, but angles
+appear only as small rotations of q.
 
 Closest point to x: q is a critical point of the distance where f(q) = (a^2 - b^2) s c - a |x| s + b |y| c = 0. In the
 quadrant of (|x|, |y|), f falls through zero at exactly one q, and this is the closest point. The iterations use
@@ -45,22 +46,22 @@ class EllipseOutline(Outline):
     center: Vec2
     semi: Vec2
 
-    def _at(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
-        """Return the outline's point at `q`, the outward normal there, and the speed: arc length per angle of `q`."""
-        across = Vec2(self.semi.y * q.x, self.semi.x * q.y)
-        speed = jnp.sqrt(across.dot(across))
-        return Vec2(self.semi.x * q.x, self.semi.y * q.y), across.scale(1 / speed), speed
+    def _evaluate(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
+        """Return the point at `q` relative to the center, the outward unit normal, and the speed, m per rad."""
+        scaled_normal = Vec2(self.semi.y * q.x, self.semi.x * q.y)
+        speed = jnp.sqrt(scaled_normal.dot(scaled_normal))
+        return Vec2(self.semi.x * q.x, self.semi.y * q.y), scaled_normal.scale(1 / speed), speed
 
     def closest(self, x: Vec2) -> ClosestPoint:
         rel = x - self.center
         q = _closest_parameter(self.semi, rel)
-        foot, normal, _ = self._at(q)
+        foot, normal, _ = self._evaluate(q)
         return ClosestPoint(normal.dot(rel - foot), self.center + foot, normal)
 
     def facing(self, direction: Vec2) -> FacingPoints:
-        across = Vec2(self.semi.x * direction.x, self.semi.y * direction.y)
-        reach = jnp.sqrt(across.dot(across))
-        point = self.center + Vec2(self.semi.x * across.x, self.semi.y * across.y).scale(1 / reach)
+        scaled_direction = Vec2(self.semi.x * direction.x, self.semi.y * direction.y)
+        height = jnp.sqrt(scaled_direction.dot(scaled_direction))
+        point = self.center + Vec2(self.semi.x * scaled_direction.x, self.semi.y * scaled_direction.y).scale(1 / height)
         return FacingPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
@@ -71,7 +72,7 @@ class EllipseOutline(Outline):
         # This step makes q exact to first order. Below, q only selects the tangent line that is hit, so the fraction is
         # exact to third order.
         q = _rotated(q, -height / jnp.where(slope < 0, slope, -jnp.inf))
-        foot, normal, _ = self._at(q)
+        foot, normal, _ = self._evaluate(q)
         gap = normal.dot(rel - foot) - radius
         approach = -normal.dot(path)
         size = jnp.abs(rel.x) + jnp.abs(rel.y) + radius + self.semi.x + self.semi.y
@@ -90,8 +91,8 @@ def _rotated(q: Vec2, angle: Scalar) -> Vec2:
     return _unit(q + q.perp().scale(angle))
 
 
-def _is_on_arc(q: Vec2, low: Vec2, high: Vec2) -> Array:
-    """Whether `q` lies on the counterclockwise arc from `low` to `high`, up to roundoff."""
+def _lies_on_arc(q: Vec2, low: Vec2, high: Vec2) -> Array:
+    """Return whether `q` lies on the counterclockwise arc from `low` to `high`, up to roundoff."""
     slack = -4 * jnp.finfo(q.x.dtype).eps
     return (low.cross(q) >= slack) & (q.cross(high) >= slack)
 
@@ -101,7 +102,9 @@ def _arc_midpoint(low: Vec2, high: Vec2) -> Vec2:
     return _unit(low + high + low.perp().scale(float(jnp.finfo(low.x.dtype).eps)))
 
 
-def _falling_root(function, q: Vec2, low: Vec2, high: Vec2, small: Scalar, iterations: int, like: Scalar) -> Vec2:
+def _falling_root_on_circle(
+    function, q: Vec2, low: Vec2, high: Vec2, zero_tolerance: Scalar, iterations: int, like: Scalar
+) -> Vec2:
     """Find where a function of q falls through zero in a bracket; not differentiated.
 
     Args:
@@ -109,111 +112,130 @@ def _falling_root(function, q: Vec2, low: Vec2, high: Vec2, small: Scalar, itera
         q: Initial guess.
         low: Start of the bracket; the function is positive after it.
         high: End of the bracket, counterclockwise from `low`; the function is negative before it.
-        small: Magnitude up to which a value is zero up to roundoff.
+        zero_tolerance: Magnitude up to which a value is zero up to roundoff.
         iterations: Number of iterations.
         like: As in `compute_once`.
 
     Returns:
-        The root.
+        The root, a unit vector.
     """
 
     def iterate(_, carry):
         q, low, high = carry
         value, slope, step = function(q)
         proposal = _rotated(q, step)
-        above, done = decide((value > 0, jnp.abs(value) <= small), like)
-        low, high = tree_where(above, q, low), tree_where(above, high, q)
-        (inside,) = decide((_is_on_arc(proposal, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
-        return tree_where(done, q, tree_where(inside, proposal, _arc_midpoint(low, high))), low, high
+        is_positive, is_zero = decide((value > 0, jnp.abs(value) <= zero_tolerance), like)
+        low, high = tree_where(is_positive, q, low), tree_where(is_positive, high, q)
+        (is_usable,) = decide((_lies_on_arc(proposal, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
+        return tree_where(is_zero, q, tree_where(is_usable, proposal, _arc_midpoint(low, high))), low, high
 
     return jax.lax.fori_loop(0, iterations, iterate, (q, low, high))[0]
 
 
-def _closest_residual(excess: Scalar, a: Scalar, b: Scalar, q: Vec2, flat: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return f(q) = excess s c - a s + b c, its slope, and Halley's step to its root.
+def _closest_residual(
+    a2_minus_b2: Scalar, ax: Scalar, by: Scalar, q: Vec2, least_slope: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Return f(q), its derivative by the angle of q, and Halley's step to its root, in rad.
 
-    In the step, a slope whose magnitude is at most `flat` is replaced by -flat.
+    Args:
+        a2_minus_b2: a^2 - b^2, m^2.
+        ax: a |x|, m^2.
+        by: b |y|, m^2.
+        q: Where to evaluate f, a unit vector.
+        least_slope: In the step, a derivative of at most this magnitude is replaced by -least_slope, m^2.
     """
     c, s = q
-    value = excess * s * c - a * s + b * c
-    slope = excess * (c * c - s * s) - a * c - b * s
-    bend = -4 * excess * s * c + a * s - b * c
-    steep = jnp.where(jnp.abs(slope) > flat, slope, -flat)
-    newton = -value / steep
-    return value, slope, newton / (1 - jnp.clip(-newton * bend / (2 * steep), -1.0, 0.5))
+    value = a2_minus_b2 * s * c - ax * s + by * c
+    slope = a2_minus_b2 * (c * c - s * s) - ax * c - by * s
+    second_derivative = -4 * a2_minus_b2 * s * c + ax * s - by * c
+    safe_slope = jnp.where(jnp.abs(slope) > least_slope, slope, -least_slope)
+    newton = -value / safe_slope
+    return value, slope, newton / (1 - jnp.clip(-newton * second_derivative / (2 * safe_slope), -1.0, 0.5))
 
 
 def _closest_parameter(semi: Vec2, rel: Vec2) -> Vec2:
     """Find q of the outline's point closest to `rel`, a point relative to the center; differentiable."""
-    x, y = jnp.where(rel.x < 0, -1.0, 1.0), jnp.where(rel.y < 0, -1.0, 1.0)
-    excess = (semi.x + semi.y) * (semi.x - semi.y)
-    a, b = semi.x * x * rel.x, semi.y * y * rel.y
-    fixed, fixed_semi = jax.lax.stop_gradient(((excess, a, b), semi))
+    sign_x, sign_y = jnp.where(rel.x < 0, -1.0, 1.0), jnp.where(rel.y < 0, -1.0, 1.0)
+    a2_minus_b2 = (semi.x + semi.y) * (semi.x - semi.y)
+    ax, by = semi.x * sign_x * rel.x, semi.y * sign_y * rel.y
+    fixed, fixed_semi = jax.lax.stop_gradient(((a2_minus_b2, ax, by), semi))
     q = _closest_in_first_quadrant(*fixed, fixed_semi)
     # The closest point has no derivative on the evolute. Close to the evolute the step would only magnify roundoff.
-    flat = jnp.sqrt(jnp.finfo(a.dtype).eps) * (jnp.abs(fixed[0]) + fixed[1] + fixed[2] + fixed_semi.dot(fixed_semi))
-    *_, step = _closest_residual(excess, a, b, q, flat)
+    least_slope = jnp.sqrt(jnp.finfo(ax.dtype).eps) * (
+        jnp.abs(fixed[0]) + fixed[1] + fixed[2] + fixed_semi.dot(fixed_semi)
+    )
+    *_, step = _closest_residual(a2_minus_b2, ax, by, q, least_slope)
     q = _rotated(q, step)
-    return Vec2(x * q.x, y * q.y)
+    return Vec2(sign_x * q.x, sign_y * q.y)
 
 
-def _closest_in_first_quadrant(excess: Scalar, a: Scalar, b: Scalar, semi: Vec2) -> Vec2:
-    """Find the root of f in the first quadrant.
+def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi: Vec2) -> Vec2:
+    """Find the root of f in the first quadrant, for the arguments of `_closest_residual` and the semi-axes.
 
-    The arguments are those of `_closest_residual`. Neither a nor b is negative.
+    Neither `ax` nor `by` is negative.
     """
-    one, zero = jnp.ones_like(a), jnp.zeros_like(a)
+    one, zero = jnp.ones_like(ax), jnp.zeros_like(ax)
     # Halley's method can overshoot a root at an end of the quadrant. Where f has the right sign beyond that end, the
     # bracket extends past it. Where it does not, a root at that end is a critical point that is not the closest point,
     # and the search must not begin there.
-    past_start, past_end = decide((a > excess, b > -excess), a)
+    past_start, past_end = decide((ax > a2_minus_b2, by > -a2_minus_b2), ax)
     low = tree_where(past_start, Vec2(0.8 * one, -0.6 * one), Vec2(one, zero))
     high = tree_where(past_end, Vec2(-0.6 * one, 0.8 * one), Vec2(zero, one))
-    # Initial guess: the point that follows from a bound t on the distance.
-    t = jnp.maximum(a - semi.x * semi.x, b - semi.y * semi.y)
-    guess = Vec2(a * (t + semi.y * semi.y), b * (t + semi.x * semi.x))
-    size = jnp.abs(guess.x) + jnp.abs(guess.y)
-    least = 0.05 * size + jnp.finfo(size.dtype).tiny
-    guess = Vec2(jnp.where(past_end, guess.x, guess.x + least), jnp.where(past_start, guess.y, guess.y + least))
-    guess = guess.scale(1 / (jnp.abs(guess.x) + jnp.abs(guess.y) + jnp.finfo(size.dtype).tiny))
-    undirected = decide(guess.x + guess.y < 0.5, a)
-    q = _unit(tree_where(undirected, Vec2(one, one), guess))
-    small = 2 * jnp.finfo(a.dtype).eps * (jnp.abs(excess) + a + b)
-    tiny = jnp.full_like(a, jnp.finfo(a.dtype).tiny)
-    iterations = CLOSEST_ITERATIONS[a.dtype == jnp.float64]
-    return _falling_root(lambda q: _closest_residual(excess, a, b, q, tiny), q, low, high, small, iterations, a)
+    # The closest point satisfies c = ax / (t + a^2) and s = by / (t + b^2) for one t, which is a b / speed times the
+    # signed distance. Since c and s are at most one, t has a lower bound. Initial guess: (c, s) for that bound.
+    t_bound = jnp.maximum(ax - semi.x * semi.x, by - semi.y * semi.y)
+    guess = Vec2(ax * (t_bound + semi.y * semi.y), by * (t_bound + semi.x * semi.x))
+    guess_size = jnp.abs(guess.x) + jnp.abs(guess.y)
+    margin = 0.05 * guess_size + jnp.finfo(guess_size.dtype).tiny
+    guess = Vec2(jnp.where(past_end, guess.x, guess.x + margin), jnp.where(past_start, guess.y, guess.y + margin))
+    guess = guess.scale(1 / (jnp.abs(guess.x) + jnp.abs(guess.y) + jnp.finfo(guess_size.dtype).tiny))
+    is_degenerate = decide(guess.x + guess.y < 0.5, ax)
+    q = _unit(tree_where(is_degenerate, Vec2(one, one), guess))
+    zero_tolerance = 2 * jnp.finfo(ax.dtype).eps * (jnp.abs(a2_minus_b2) + ax + by)
+    least_slope = jnp.full_like(ax, jnp.finfo(ax.dtype).tiny)
+    iterations = CLOSEST_ITERATIONS[ax.dtype == jnp.float64]
+    return _falling_root_on_circle(
+        lambda q: _closest_residual(a2_minus_b2, ax, by, q, least_slope),
+        q,
+        low,
+        high,
+        zero_tolerance,
+        iterations,
+        ax,
+    )
 
 
 def _center_height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
-    """Return g(q), its slope by the angle of q, and Newton's step.
+    """Return g(q), its derivative by the angle of q, and Newton's step to its root, in rad.
 
-    g is the height, over the line of the path, of the center of a disk that touches at `q` (times the path's length).
+    g is the height, over the line of the path, of the center of a disk that touches at `q`, times the path's length:
+    m^2.
     """
-    across = Vec2(semi.y * q.x, semi.x * q.y)
-    squared = across.dot(across)
+    scaled_normal = Vec2(semi.y * q.x, semi.x * q.y)
+    squared = scaled_normal.dot(scaled_normal)
     speed = jnp.sqrt(squared)
-    normal = across.scale(1 / speed)
-    place = Vec2(semi.x * q.x, semi.y * q.y) + normal.scale(radius)
+    normal = scaled_normal.scale(1 / speed)
+    center = Vec2(semi.x * q.x, semi.y * q.y) + normal.scale(radius)
     slope = path.dot(normal) * (speed + radius * semi.x * semi.y / squared)
-    value = path.cross(place - rel)
+    value = path.cross(center - rel)
     return value, slope, -value / jnp.where(slope < 0, slope, -jnp.inf)
 
 
 def _contact_parameter(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar) -> tuple[Vec2, Array]:
     """Find q where a disk first touches on its path, and whether it touches anywhere on the line of the path."""
-    moves = path.dot(path) > 0
-    along = tree_where(moves, path, Vec2(jnp.ones_like(path.x), jnp.zeros_like(path.x)))
-    end = _unit(Vec2(semi.x * along.y, -semi.y * along.x))  # where the tangent is parallel to the path
-    first, last = (_center_height(semi, rel, along, radius, side)[0] for side in (-end, end))
-    (crosses,) = decide((moves & (first > 0) & (last < 0),), rel.x)
+    is_moving = path.dot(path) > 0
+    direction = tree_where(is_moving, path, Vec2(jnp.ones_like(path.x), jnp.zeros_like(path.x)))
+    end = _unit(Vec2(semi.x * direction.y, -semi.y * direction.x))  # where the tangent is parallel to the path
+    start_height, end_height = (_center_height(semi, rel, direction, radius, side)[0] for side in (-end, end))
+    (crosses,) = decide((is_moving & (start_height > 0) & (end_height < 0),), rel.x)
     # Initial guess: between its ends, g is a cosine if the radius is zero. Else it is nearly a cosine, most closely at
     # the ends.
-    cosine = jnp.clip((first + last) / jnp.where(crosses, first - last, 1.0), -1.0, 1.0)
-    begin = _unit(end.scale(cosine) - end.perp().scale(jnp.sqrt((1 - cosine) * (1 + cosine))))
+    cosine = jnp.clip((start_height + end_height) / jnp.where(crosses, start_height - end_height, 1.0), -1.0, 1.0)
+    guess = _unit(end.scale(cosine) - end.perp().scale(jnp.sqrt((1 - cosine) * (1 + cosine))))
     size = jnp.abs(rel.x) + jnp.abs(rel.y) + semi.x + semi.y + radius
-    small = 0.5 * jnp.finfo(size.dtype).eps * size * jnp.sqrt(along.dot(along))
-    height = partial(_center_height, semi, rel, along, radius)
-    return _falling_root(height, begin, -end, end, small, SWEEP_ITERATIONS, rel.x), crosses
+    zero_tolerance = 0.5 * jnp.finfo(size.dtype).eps * size * jnp.sqrt(direction.dot(direction))
+    height = partial(_center_height, semi, rel, direction, radius)
+    return _falling_root_on_circle(height, guess, -end, end, zero_tolerance, SWEEP_ITERATIONS, rel.x), crosses
 
 
 class Ellipse(Shape):
@@ -266,7 +288,7 @@ class Ellipse(Shape):
         return self.center[None] + jnp.stack([self.semi_x * jnp.cos(angle), self.semi_y * jnp.sin(angle)], axis=1)
 
     def _equally_spaced(self, points: int):
-        """Return the angles of points equally spaced in arc length, and the perimeter."""
+        """Return the angles phi of points equally spaced in arc length, rad, and the perimeter, m."""
         nodes = jnp.linspace(0, 2 * jnp.pi, ARC_NODES + 1, dtype=self.semi_x.dtype)
         return equally_spaced(
             lambda angle: jnp.hypot(self.semi_x * jnp.sin(angle), self.semi_y * jnp.cos(angle)), nodes, points

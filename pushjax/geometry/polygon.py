@@ -20,7 +20,7 @@ from pushjax._internal.checks import (
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Shape, check_simple_polygon, signed_area
 
-# Up to this many edges, the search over the edges is unrolled, so that a batch is vectorized across its examples. For
+# Up to this many edges, the search over the edges is unrolled, so that XLA vectorizes a batch across its examples. For
 # more edges, arrays over the edges keep the compiled program small.
 UNROLLED_EDGES = 12
 
@@ -125,92 +125,97 @@ class Polygon(Shape):
     def boundary(self, points: int) -> Float[Array, "points 2"]:
         closed = jnp.concatenate([self.vertices, self.vertices[:1]])
         edge = jnp.diff(closed, axis=0)
-        arc = jnp.concatenate([jnp.zeros(1, edge.dtype), jnp.cumsum(jnp.hypot(edge[:, 0], edge[:, 1]))])
-        at = (jnp.arange(points, dtype=edge.dtype) + 0.5) / points * arc[-1]
-        return jnp.stack([jnp.interp(at, arc, closed[:, 0]), jnp.interp(at, arc, closed[:, 1])], axis=1)
+        arc_length = jnp.concatenate([jnp.zeros(1, edge.dtype), jnp.cumsum(jnp.hypot(edge[:, 0], edge[:, 1]))])
+        wanted = (jnp.arange(points, dtype=edge.dtype) + 0.5) / points * arc_length[-1]
+        return jnp.stack(
+            [jnp.interp(wanted, arc_length, closed[:, 0]), jnp.interp(wanted, arc_length, closed[:, 1])], axis=1
+        )
 
     def inset(self, depth: ArrayLike) -> "Polygon":
-        """Move every edge of the polygon inwards.
+        """Move every edge of the polygon inward.
 
         Args:
-            depth: Distance by which each edge moves inwards, m; negative moves it outwards. It must be small enough
+            depth: Distance by which each edge moves inward, m; negative moves it outward. It must be small enough
                 that no edge vanishes.
 
         Returns:
             The polygon between the moved edges.
         """
-        by = as_float(depth, self.vertices.dtype)
+        distance = as_float(depth, self.vertices.dtype)
         edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
         normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
-        before = jnp.roll(normal, 1, axis=0)
+        previous_normal = jnp.roll(normal, 1, axis=0)
         # A corner's shift s satisfies n . s = -depth for the normals n of both of its edges.
-        corner = (before + normal) / (1 + jnp.sum(before * normal, axis=1, keepdims=True))
-        return Polygon(self.vertices - by * corner, convex=self.convex)
+        corner_shift = (previous_normal + normal) / (1 + jnp.sum(previous_normal * normal, axis=1, keepdims=True))
+        return Polygon(self.vertices - distance * corner_shift, convex=self.convex)
 
     def outline(self) -> PolygonOutline:
-        v = self.vertices
-        edge = jnp.roll(v, -1, axis=0) - v
+        vertices = self.vertices
+        edge = jnp.roll(vertices, -1, axis=0) - vertices
         length = jnp.sqrt(jnp.sum(edge**2, axis=1))
         along = edge / length[:, None]
         normal = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
         bisector = normal + jnp.roll(normal, 1, axis=0)  # at the start of each edge
         bisector = bisector / jnp.sqrt(jnp.sum(bisector**2, axis=1, keepdims=True))
-        back = jnp.roll(along, 1, axis=0)
-        turn = back[:, 0] * along[:, 1] - back[:, 1] * along[:, 0]
-        starts = (bisector[:, 0], bisector[:, 1]), turn
-        (a_x, a_y), turn_a = starts
-        (b_x, b_y), turn_b = jax.tree.map(lambda field: jnp.roll(field, -1), starts)
-        edges = Edge(v[:, 0], v[:, 1], along[:, 0], along[:, 1], length, a_x, a_y, b_x, b_y, turn_a, turn_b)
-        if len(v) > UNROLLED_EDGES:
+        previous = jnp.roll(along, 1, axis=0)
+        turn = previous[:, 0] * along[:, 1] - previous[:, 1] * along[:, 0]
+        start_fields = (bisector[:, 0], bisector[:, 1]), turn
+        (a_x, a_y), turn_a = start_fields
+        (b_x, b_y), turn_b = jax.tree.map(lambda field: jnp.roll(field, -1), start_fields)
+        edges = Edge(
+            vertices[:, 0], vertices[:, 1], along[:, 0], along[:, 1], length, a_x, a_y, b_x, b_y, turn_a, turn_b
+        )
+        if len(vertices) > UNROLLED_EDGES:
             return PolygonOutline(edges, self.convex)
-        each = tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(v)))
-        return PolygonOutline(each, self.convex)
+        unrolled = tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(vertices)))
+        return PolygonOutline(unrolled, self.convex)
 
 
 @in_numpy
 def _rectangle(xp, width, height):
-    """Vertices of a rectangle about the origin, counterclockwise."""
+    """Return the vertices of a rectangle about the origin, counterclockwise, shape (4, 2), m."""
     signs = xp.asarray([[-1, -1], [1, -1], [1, 1], [-1, 1]], width.dtype)
     return signs * xp.stack([width / 2, height / 2])[None]
 
 
 @in_numpy
 def _area(xp, vertices):
-    """Area of the polygon, positive if the vertices run counterclockwise."""
+    """Return the area of the polygon, m^2, positive if the vertices run counterclockwise."""
     # Vertices are relative to the first one, so that a polygon far from the origin does not lose digits.
-    a = vertices - vertices[:1]
-    b = xp.roll(a, -1, axis=0)
-    return xp.sum(a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]) / 2
+    start = vertices - vertices[:1]
+    end = xp.roll(start, -1, axis=0)
+    return xp.sum(start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]) / 2
 
 
 @in_numpy
 def _centroid(xp, vertices):
-    """Centroid of the area."""
-    a = vertices - vertices[:1]  # relative, as for the area
-    b = xp.roll(a, -1, axis=0)
-    twice = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    return vertices[0] + xp.sum((a + b) * twice[:, None], axis=0) / (3 * xp.sum(twice))
+    """Return the centroid of the area, shape (2,), m."""
+    start = vertices - vertices[:1]  # relative, as for the area
+    end = xp.roll(start, -1, axis=0)
+    double_area = start[:, 0] * end[:, 1] - end[:, 0] * start[:, 1]
+    return vertices[0] + xp.sum((start + end) * double_area[:, None], axis=0) / (3 * xp.sum(double_area))
 
 
 @in_numpy
 def _bounds(xp, vertices):
-    """Lower and upper corner of the box around the vertices."""
+    """Return the lower and upper corner of the box around the vertices, each of shape (2,), m."""
     return xp.min(vertices, axis=0), xp.max(vertices, axis=0)
 
 
 def _is_convex(vertices: Array, claimed: bool | None) -> bool:
-    """Whether no vertex lies inside the line between its neighbors by more than roundoff; if traced, as claimed."""
+    """Return whether no vertex lies inside the line between its neighbors, up to roundoff; if traced, `claimed`."""
     known = concrete(vertices)
     if known is None:
         return bool(claimed)
-    v = known.astype(np.float64)
-    chord = np.roll(v, -1, axis=0) - np.roll(v, 1, axis=0)
-    arm = v - np.roll(v, 1, axis=0)
-    # How far each vertex lies outside that line. Where the chord has length zero, the outline turns back on itself.
+    points = known.astype(np.float64)
+    chord = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
+    from_previous = points - np.roll(points, 1, axis=0)
+    # How far each vertex lies outside the line between its neighbors, m. If these coincide, the chord has length
+    # zero, because the outline turns back on itself.
     length = np.maximum(np.linalg.norm(chord, axis=1), np.finfo(np.float64).tiny)
-    bulge = (arm[:, 0] * chord[:, 1] - arm[:, 1] * chord[:, 0]) / length
-    inner = int(np.argmin(bulge))
-    convex = bool(bulge[inner] >= -16 * float(jnp.finfo(vertices.dtype).eps) * np.max(np.abs(v)))
+    bulge = (from_previous[:, 0] * chord[:, 1] - from_previous[:, 1] * chord[:, 0]) / length
+    innermost = int(np.argmin(bulge))
+    convex = bool(bulge[innermost] >= -16 * float(jnp.finfo(vertices.dtype).eps) * np.max(np.abs(points)))
     if claimed and not convex:
-        raise ValueError(f"convex is True, but the vertices are not: vertex {inner} is a reflex corner")
+        raise ValueError(f"convex is True, but the vertices are not: vertex {innermost} is a reflex corner")
     return convex if claimed is None else bool(claimed)

@@ -1,4 +1,7 @@
-"""Outlines of polygons, convex or not: closest points, second contacts and sweep."""
+"""Outlines of polygons, convex or not: closest points, second contacts and sweep.
+
+A second contact is another local minimum of the distance to the query point; see `Outline.contact_candidates`.
+"""
 
 from typing import NamedTuple
 
@@ -13,7 +16,7 @@ from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersectio
 
 
 class Edge(NamedTuple):
-    """One edge of a polygon, or an array of edges; end a is the start, end b the end. Body frame.
+    """One edge of a polygon, or an array of edges, in the body frame. Suffix a is its start, suffix b its end.
 
     Attributes:
         start_x: x of the start, m.
@@ -25,8 +28,8 @@ class Edge(NamedTuple):
         bisector_a_y: y of that bisector.
         bisector_b_x: x of the unit bisector of the two outward normals that meet at the end.
         bisector_b_y: y of that bisector.
-        turn_a: Sine of the turn of the outline at the start; negative at a reflex corner.
-        turn_b: Sine of the turn of the outline at the end; negative at a reflex corner.
+        turn_a: Sine of the angle by which the outline turns at the start; negative at a reflex vertex.
+        turn_b: Sine of the angle by which the outline turns at the end; negative at a reflex vertex.
     """
 
     start_x: Scalar
@@ -72,7 +75,7 @@ class Edge(NamedTuple):
         return s, clipped, rel - self.along.scale(clipped)
 
 
-# One boolean per edge; a list or an array, like the edges.
+# One boolean per edge: a list for unrolled edges, an array for an `Edge` of arrays.
 EdgeMask = list[Bool[Array, ""]] | Bool[Array, "edges"]
 
 
@@ -90,13 +93,13 @@ class PolygonOutline(Outline):
     def _nearest_edge(self, x: Vec2) -> tuple[Edge, EdgeMask]:
         """Return the edge nearest to `x`, and for each edge whether it is that one."""
         if isinstance(self.edges, Edge):
-            *_, diff = self.edges.foot(x)
-            nearest = jnp.argmin(diff.dot(diff))
-            return jax.tree.map(lambda field: field[nearest], self.edges), jnp.arange(diff.x.size) == nearest
+            *_, from_edge = self.edges.foot(x)
+            nearest = jnp.argmin(from_edge.dot(from_edge))
+            return jax.tree.map(lambda field: field[nearest], self.edges), jnp.arange(from_edge.x.size) == nearest
         best, best_squared, is_nearest = self.edges[0], None, []
         for edge in self.edges:
-            *_, diff = edge.foot(x)
-            squared = compute_once(diff.dot(diff), x.x)
+            *_, from_edge = edge.foot(x)
+            squared = compute_once(from_edge.dot(from_edge), x.x)
             if best_squared is None:
                 best_squared = squared
                 is_nearest = [jnp.ones_like(squared, bool)]
@@ -127,13 +130,15 @@ class PolygonOutline(Outline):
         normal = tree_where(found, tree_where(on_edge, other.normal, at_vertex.normal), first.normal)
         return first, ClosestPoint(distance, point, normal)
 
-    def _second_edge(self, x: Vec2, is_nearest: EdgeMask, gap: Scalar) -> tuple[Edge, Bool[Array, ""], Bool[Array, ""]]:
+    def _second_edge(
+        self, x: Vec2, is_nearest: EdgeMask, nearest_distance: Scalar
+    ) -> tuple[Edge, Bool[Array, ""], Bool[Array, ""]]:
         """Find the second contact.
 
         Args:
             x: Query point, m, body frame.
             is_nearest: For each edge, whether it is the nearest one.
-            gap: Signed distance to the nearest edge, m.
+            nearest_distance: Signed distance to the nearest edge, m.
 
         Returns:
             A tuple of the edge of the second contact, whether the contact is with the edge itself (else with its start
@@ -141,17 +146,17 @@ class PolygonOutline(Outline):
         """
         if isinstance(self.edges, Edge):
             is_nearest = jnp.asarray(is_nearest)
-            before = jax.tree.map(lambda field: jnp.roll(field, 1), self.edges)
+            previous = jax.tree.map(lambda field: jnp.roll(field, 1), self.edges)
             neighbors = (jnp.roll(is_nearest, 1), is_nearest, jnp.roll(is_nearest, -1))
-            on_edge, on_vertex, squared = _is_second_contact(self.edges, before, x, neighbors, gap)
+            on_edge, on_vertex, squared = _test_second_contact(self.edges, previous, x, neighbors, nearest_distance)
             chosen = jnp.argmin(jnp.where(on_edge | on_vertex, squared, jnp.inf))
             return jax.tree.map(lambda field: field[chosen], (self.edges, on_edge, on_edge | on_vertex))
         count = len(self.edges)
-        best, best_squared = self.edges[0], jnp.full_like(gap, jnp.inf)
-        found_on_edge, found = jnp.zeros_like(gap, bool), jnp.zeros_like(gap, bool)
+        best, best_squared = self.edges[0], jnp.full_like(nearest_distance, jnp.inf)
+        found_on_edge, found = jnp.zeros_like(nearest_distance, bool), jnp.zeros_like(nearest_distance, bool)
         for k, edge in enumerate(self.edges):
             neighbors = (is_nearest[k - 1], is_nearest[k], is_nearest[(k + 1) % count])
-            on_edge, on_vertex, squared = _is_second_contact(edge, self.edges[k - 1], x, neighbors, gap)
+            on_edge, on_vertex, squared = _test_second_contact(edge, self.edges[k - 1], x, neighbors, nearest_distance)
             on_edge, nearer = compute_once((on_edge, (on_edge | on_vertex) & (squared < best_squared)), x.x)
             best = tree_where(nearer, edge, best)
             found_on_edge, best_squared = (
@@ -162,16 +167,16 @@ class PolygonOutline(Outline):
         return best, found_on_edge, found
 
     def _sweep_edge(self, edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        """Fraction of `path` after which a disk first touches `edge` or its start vertex."""
+        """Return the fraction of `path` of first contact with `edge` or its start vertex, or inf."""
         rel = x - edge.start
         approach = -edge.normal.dot(path)
         gap = edge.normal.dot(rel) - radius
         fraction = gap / jnp.where(approach > 0, approach, 1.0)
-        foot = rel.dot(edge.along) + fraction * path.dot(edge.along)
+        contact_position = rel.dot(edge.along) + fraction * path.dot(edge.along)
         # The tolerance is for two cases that would be missed by roundoff: a disk that starts in contact, and a point
         # that aims at a vertex.
         tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + radius + edge.length)
-        on_edge = (foot >= -tolerance) & (foot <= edge.length + tolerance)
+        on_edge = (contact_position >= -tolerance) & (contact_position <= edge.length + tolerance)
         hits = (approach > 0) & (gap >= -tolerance) & (fraction <= 1) & on_edge
         return jnp.minimum(
             jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf), ray_circle_intersection(rel, path, radius)
@@ -187,30 +192,30 @@ class PolygonOutline(Outline):
 
 
 def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
-    """Return distance, point and normal for the query point `x` from its nearest edge alone.
+    """Return the signed distance, closest point and normal for the query point `x`, from its nearest edge alone.
 
     If `x` projects onto the interior of the edge, the signed distance is linear in `x`, and its sign is right inside
     and outside. If a vertex is the closest point, the sign is that of the component along the bisector: outside a
     convex vertex, inside a reflex one. This sign stays right for vertices that are almost straight.
     """
-    s, clipped, diff = compute_once(edge.foot(x), x.x)
-    over_edge = (s > 0) & (s < edge.length)
+    position, clipped, from_edge = compute_once(edge.foot(x), x.x)
+    projects_inside = (position > 0) & (position < edge.length)
     bisector = tree_where(
-        s <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
+        position <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
     )
-    squared = diff.dot(diff)
+    squared = from_edge.dot(from_edge)
     on_vertex = squared <= jnp.finfo(squared.dtype).tiny
     length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
-    sign = jnp.where(bisector.dot(diff) >= 0, 1.0, -1.0)
-    radial = tree_where(on_vertex, bisector, diff.scale(sign / length))
+    sign = jnp.where(bisector.dot(from_edge) >= 0, 1.0, -1.0)
+    radial = tree_where(on_vertex, bisector, from_edge.scale(sign / length))
     # On the vertex itself the distance is zero, and its gradient is the bisector.
-    vertex_distance = jnp.where(on_vertex, bisector.dot(diff), sign * length)
-    normal = tree_where(over_edge, edge.normal, radial)
-    distance = jnp.where(over_edge, edge.normal.dot(x - edge.start), vertex_distance)
+    vertex_distance = jnp.where(on_vertex, bisector.dot(from_edge), sign * length)
+    normal = tree_where(projects_inside, edge.normal, radial)
+    distance = jnp.where(projects_inside, edge.normal.dot(x - edge.start), vertex_distance)
     return ClosestPoint(distance, edge.start + edge.along.scale(clipped), normal)
 
 
-def _is_second_contact(edge: Edge, before: Edge, x: Vec2, nearest: tuple, gap: Scalar):
+def _test_second_contact(edge: Edge, previous: Edge, x: Vec2, is_nearest: tuple, nearest_distance: Scalar):
     """Test whether an edge, or its start vertex, is another local minimum of the distance from `x`.
 
     An edge is a second contact if `x` projects onto it and lies on its outer side. An edge that `x` faces only through
@@ -223,23 +228,25 @@ def _is_second_contact(edge: Edge, before: Edge, x: Vec2, nearest: tuple, gap: S
 
     Args:
         edge: The edge to test.
-        before: The edge before it.
+        previous: The edge before it.
         x: Query point, m, body frame.
-        nearest: Whether the nearest edge is the edge before `edge`, `edge` itself, or the edge after it.
-        gap: Signed distance to the nearest edge, m.
+        is_nearest: Three booleans: whether the nearest edge is the edge before `edge`, `edge` itself, or the edge after
+            it.
+        nearest_distance: Signed distance to the nearest edge, m.
 
     Returns:
-        A tuple of whether the edge is a second contact, whether its start vertex is one, and the squared distance, m^2.
+        A tuple of whether the edge is a second contact, whether its start vertex is one, and the squared distance from
+        `x` to the edge, m^2.
     """
-    s, _, diff = edge.foot(x)
+    position, _, from_edge = edge.foot(x)
     rel = x - edge.start
     tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + edge.length)
-    straight = roundoff(jnp.ones_like(gap))
-    reflex_a, reflex_b = edge.turn_a < -straight, edge.turn_b < -straight
-    is_before, is_this, is_after = nearest
-    same_point = (is_before & ~reflex_a) | (is_after & ~reflex_b)
-    wedged = ((is_before & reflex_a) | (is_after & reflex_b)) & (gap <= tolerance)
-    faces = (s >= -tolerance) & (s <= edge.length + tolerance) & (edge.normal.dot(rel) >= -tolerance)
-    on_edge = ~is_this & ~same_point & (faces | wedged)
-    in_sector = (s <= 0) & (rel.dot(before.along) >= 0) & ~reflex_a
-    return on_edge, in_sector & ~is_this & ~is_before & ~on_edge, diff.dot(diff)
+    turn_tolerance = roundoff(jnp.ones_like(nearest_distance))
+    reflex_a, reflex_b = edge.turn_a < -turn_tolerance, edge.turn_b < -turn_tolerance
+    previous_is_nearest, this_is_nearest, next_is_nearest = is_nearest
+    shares_point = (previous_is_nearest & ~reflex_a) | (next_is_nearest & ~reflex_b)
+    is_wedged = ((previous_is_nearest & reflex_a) | (next_is_nearest & reflex_b)) & (nearest_distance <= tolerance)
+    is_faced = (position >= -tolerance) & (position <= edge.length + tolerance) & (edge.normal.dot(rel) >= -tolerance)
+    on_edge = ~this_is_nearest & ~shares_point & (is_faced | is_wedged)
+    in_vertex_sector = (position <= 0) & (rel.dot(previous.along) >= 0) & ~reflex_a
+    return on_edge, in_vertex_sector & ~this_is_nearest & ~previous_is_nearest & ~on_edge, from_edge.dot(from_edge)

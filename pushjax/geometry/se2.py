@@ -2,10 +2,10 @@
 
 A pose (x, y, theta) places the body frame in the world: the body point p is the world point (x, y) + R(theta) p.
 A twist (vx, vy, omega) and a wrench (fx, fy, tau) are expressed in the body frame about its origin, linear part first.
-Angles are in rad and are never wrapped.
+Lengths are in m, forces in N. Angles are in rad and are never wrapped.
 
-The last axis of every argument has length three (points: two). All functions broadcast over the axes before it and
-raise ValueError for other shapes.
+The last axis of a pose, twist or wrench has length three, that of a point length two. All functions broadcast over the
+axes before it and raise ValueError for other shapes.
 """
 
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ Twist = Float[Array, "*batch 3"]
 Wrench = Float[Array, "*batch 3"]
 
 
-def _parts(**named: ArrayLike) -> list[tuple[Array, ...]]:
+def _components(**named: ArrayLike) -> list[tuple[Array, ...]]:
     """Split each argument into its components along the last axis, in one dtype and broadcast over the other axes."""
     dtype = common_dtype(*named.values())
     arrays = {name: as_float(value, dtype) for name, value in named.items()}
@@ -47,7 +47,7 @@ def compose(pose: ArrayLike, relative: ArrayLike) -> Pose:
     Raises:
         ValueError: If a last axis does not have length three, or the other axes do not broadcast.
     """
-    (x, y, theta), (dx, dy, dtheta) = _parts(pose=pose, relative=relative)
+    (x, y, theta), (dx, dy, dtheta) = _components(pose=pose, relative=relative)
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([x + c * dx - s * dy, y + s * dx + c * dy, theta + dtheta], axis=-1)
 
@@ -64,7 +64,7 @@ def inverse(pose: ArrayLike) -> Pose:
     Raises:
         ValueError: If the last axis does not have length three.
     """
-    ((x, y, theta),) = _parts(pose=pose)
+    ((x, y, theta),) = _components(pose=pose)
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([-c * x - s * y, s * x - c * y, -theta], axis=-1)
 
@@ -83,22 +83,30 @@ def transform(pose: ArrayLike, point: ArrayLike) -> Float[Array, "*batch 2"]:
         ValueError: If the last axis of `pose` does not have length three, or that of `point` length two, or the other
             axes do not broadcast.
     """
-    (x, y, theta), (px, py) = _parts(pose=pose, point=point)
+    (x, y, theta), (px, py) = _components(pose=pose, point=point)
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([x + c * px - s * py, y + s * px + c * py], axis=-1)
 
 
 def _sinc_pair(omega: Array) -> tuple[Array, Array]:
-    """Return sin(w)/w and (1 - cos(w))/w, whose values and derivatives are smooth through w = 0."""
+    """Return sin(w)/w and (1 - cos(w))/w for w = omega; values and derivatives are right through w = 0 too."""
     # Below the threshold, the first omitted term of the series is below roundoff. Above it, the cancellation in the
     # derivative of sin(w)/w is below roundoff.
     small = jnp.abs(omega) < (0.25 if jnp.finfo(omega.dtype).bits <= 32 else 0.03)
-    safe = jnp.where(small, 1.0, omega)  # keeps the derivative of the unused branch finite
-    w2 = omega * omega
-    a = jnp.where(small, 1 - w2 / 6 * (1 - w2 / 20 * (1 - w2 / 42 * (1 - w2 / 72))), jnp.sin(safe) / safe)
+    safe_omega = jnp.where(small, 1.0, omega)  # keeps the derivative of the unused branch finite
+    squared = omega * omega
+    sine_ratio = jnp.where(
+        small,
+        1 - squared / 6 * (1 - squared / 20 * (1 - squared / 42 * (1 - squared / 72))),
+        jnp.sin(safe_omega) / safe_omega,
+    )
     # 2 sin(w/2)^2 / w avoids the cancellation in 1 - cos(w).
-    b = jnp.where(small, omega / 2 * (1 - w2 / 12 * (1 - w2 / 30 * (1 - w2 / 56))), 2 * jnp.sin(safe / 2) ** 2 / safe)
-    return a, b
+    cosine_ratio = jnp.where(
+        small,
+        omega / 2 * (1 - squared / 12 * (1 - squared / 30 * (1 - squared / 56))),
+        2 * jnp.sin(safe_omega / 2) ** 2 / safe_omega,
+    )
+    return sine_ratio, cosine_ratio
 
 
 def exp(twist: ArrayLike) -> Pose:
@@ -113,7 +121,7 @@ def exp(twist: ArrayLike) -> Pose:
     Raises:
         ValueError: If the last axis does not have length three.
     """
-    ((vx, vy, omega),) = _parts(twist=twist)
+    ((vx, vy, omega),) = _components(twist=twist)
     a, b = _sinc_pair(omega)
     return jnp.stack([a * vx - b * vy, b * vx + a * vy, omega], axis=-1)
 
@@ -132,7 +140,7 @@ def log(relative: ArrayLike) -> Twist:
     Raises:
         ValueError: If the last axis does not have length three.
     """
-    ((x, y, omega),) = _parts(relative=relative)
+    ((x, y, omega),) = _components(relative=relative)
     a, b = _sinc_pair(omega)
     scale = 1.0 / (a * a + b * b)
     return jnp.stack([scale * (a * x + b * y), scale * (a * y - b * x), omega], axis=-1)
@@ -143,15 +151,15 @@ def transport_twist(relative: ArrayLike, twist: ArrayLike) -> Twist:
 
     Args:
         relative: Pose of B in A, shape (..., 3), m and rad.
-        twist: Twist in frame B about its origin, shape (..., 3).
+        twist: Twist in frame B about its origin, shape (..., 3), m and rad per unit time.
 
     Returns:
-        The same twist in frame A about its origin, shape (..., 3).
+        The same twist in frame A about its origin, shape (..., 3), m and rad per unit time.
 
     Raises:
         ValueError: If a last axis does not have length three, or the other axes do not broadcast.
     """
-    (x, y, theta), (vx, vy, omega) = _parts(relative=relative, twist=twist)
+    (x, y, theta), (vx, vy, omega) = _components(relative=relative, twist=twist)
     c, s = jnp.cos(theta), jnp.sin(theta)
     return jnp.stack([c * vx - s * vy + y * omega, s * vx + c * vy - x * omega, omega], axis=-1)
 
@@ -171,7 +179,7 @@ def transport_wrench(relative: ArrayLike, wrench: ArrayLike) -> Wrench:
     Raises:
         ValueError: If a last axis does not have length three, or the other axes do not broadcast.
     """
-    (x, y, theta), (fx, fy, tau) = _parts(relative=relative, wrench=wrench)
+    (x, y, theta), (fx, fy, tau) = _components(relative=relative, wrench=wrench)
     c, s = jnp.cos(theta), jnp.sin(theta)
-    gx, gy = c * fx - s * fy, s * fx + c * fy
-    return jnp.stack([gx, gy, tau + x * gy - y * gx], axis=-1)
+    fx_a, fy_a = c * fx - s * fy, s * fx + c * fy
+    return jnp.stack([fx_a, fy_a, tau + x * fy_a - y * fx_a], axis=-1)

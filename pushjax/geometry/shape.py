@@ -44,9 +44,10 @@ class FacingPoints(NamedTuple):
 
 
 class Outline(eqx.Module):
-    """The boundary of a shape as contact detection uses it: in scalars (see `pushjax._math.vec`), for distance queries.
+    """The boundary of a shape, prepared for the distance queries of contact detection.
 
-    Whatever does not depend on the query point is computed once, when `Shape.outline` creates the outline.
+    Its methods take and return `Vec2` instead of arrays; `pushjax._math.vec` says why. Whatever does not depend on the
+    query point is computed once, when `Shape.outline` creates the outline.
     """
 
     @abstractmethod
@@ -94,7 +95,7 @@ class Outline(eqx.Module):
         """
 
     def facing(self, direction: Vec2) -> FacingPoints:
-        """Find the points of a smooth outline where the outward normal is `direction` and the curvature is convex.
+        """Find the locally convex points of a smooth outline at which the outward normal is `direction`.
 
         A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
 
@@ -115,7 +116,7 @@ class Shape(eqx.Module):
 
     @abstractmethod
     def outline(self) -> Outline:
-        """Prepare the shape for queries."""
+        """Return the boundary, prepared for distance queries."""
 
     @property
     @abstractmethod
@@ -196,7 +197,7 @@ class Shape(eqx.Module):
 
 
 def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
-    """Find the fraction of a path at which a moving point comes within `reach` of the origin.
+    """Find the fraction of a straight path at which a moving point comes within `reach` of the origin.
 
     This is the smaller root of |x + t path|^2 = reach^2, in a form without cancellation. It is valid only for a point
     that approaches and starts outside, or inside by no more than roundoff.
@@ -215,8 +216,8 @@ def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
     c = squared - reach * reach
     # The discriminant is b^2 - a c. In that form it would be a small difference of large numbers for a distant
     # start. So it is computed as a reach^2 - (x cross path)^2, which is equal.
-    side = x.cross(path)
-    discriminant = a * reach * reach - side * side
+    cross = x.cross(path)
+    discriminant = a * reach * reach - cross * cross
     hits = (b < 0) & (c >= -roundoff(16 * squared)) & (discriminant > 0)
     root = jnp.sqrt(jnp.where(hits, discriminant, 1.0))
     fraction = jnp.maximum(c / jnp.where(hits, root - b, 1.0), 0)
@@ -234,30 +235,30 @@ def equally_spaced(
     """Find parameters of points that are equally spaced in arc length along a closed smooth outline.
 
     Args:
-        speed: Function from an array of parameters to the arc length per parameter there.
+        speed: Function from an array of parameters to the derivative of the arc length there, m per parameter.
         nodes: Increasing parameters from start to end, dense enough that the speed is smooth between two of them.
         points: Number of points.
 
     Returns:
-        A tuple of the parameters, shape (points,), and the length of the outline. The first point is half a spacing
+        A tuple of the parameters, shape (points,), and the length of the outline, m. The first point is half a spacing
         from the start.
     """
-    at, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
-    at = at + 0.5
+    nodes_in_unit, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
+    nodes_in_unit = nodes_in_unit + 0.5
 
-    def along(start, width):
-        """Arc length over the parameters from `start` to `start + width`, by Gauss-Legendre quadrature."""
-        return width * jnp.sum(weights[None] * speed(start[:, None] + width[:, None] * at[None]), axis=1)
+    def arc_length(start, width):
+        """Return the lengths from `start` to `start + width`, by Gauss-Legendre quadrature with five nodes."""
+        return width * jnp.sum(weights[None] * speed(start[:, None] + width[:, None] * nodes_in_unit[None]), axis=1)
 
     width = jnp.diff(nodes)
-    arc = jnp.concatenate([jnp.zeros(1, nodes.dtype), jnp.cumsum(along(nodes[:-1], width))])
-    wanted = (jnp.arange(points, dtype=nodes.dtype) + 0.5) / points * arc[-1]
-    node = jnp.clip(jnp.searchsorted(arc, wanted, side="right") - 1, 0, width.size - 1)
-    start, rest, most = nodes[node], wanted - arc[node], width[node]
-    offset = most * rest / (arc[node + 1] - arc[node])
+    arc_at_node = jnp.concatenate([jnp.zeros(1, nodes.dtype), jnp.cumsum(arc_length(nodes[:-1], width))])
+    wanted = (jnp.arange(points, dtype=nodes.dtype) + 0.5) / points * arc_at_node[-1]
+    node = jnp.clip(jnp.searchsorted(arc_at_node, wanted, side="right") - 1, 0, width.size - 1)
+    start, remaining, full_width = nodes[node], wanted - arc_at_node[node], width[node]
+    offset = full_width * remaining / (arc_at_node[node + 1] - arc_at_node[node])
     for _ in range(4):  # Newton's method; the speed hardly changes between two nodes
-        offset = jnp.clip(offset + (rest - along(start, offset)) / speed(start + offset), 0, most)
-    return start + offset, arc[-1]
+        offset = jnp.clip(offset + (remaining - arc_length(start, offset)) / speed(start + offset), 0, full_width)
+    return start + offset, arc_at_node[-1]
 
 
 def signed_area(v: np.ndarray) -> float:
@@ -269,9 +270,9 @@ def signed_area(v: np.ndarray) -> float:
     Returns:
         Signed area, m^2.
     """
-    rel = v - v[0]
-    after = np.roll(rel, -1, axis=0)
-    return float(np.sum(rel[:, 0] * after[:, 1] - after[:, 0] * rel[:, 1]) / 2)
+    relative = v - v[0]
+    next_vertex = np.roll(relative, -1, axis=0)
+    return float(np.sum(relative[:, 0] * next_vertex[:, 1] - next_vertex[:, 0] * relative[:, 1]) / 2)
 
 
 def check_simple_polygon(name: str, v: np.ndarray) -> None:
@@ -313,23 +314,24 @@ def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] |
     n = len(v)
     a, b = v, np.roll(v, -1, axis=0)
 
-    def side(p, q, r):
+    def orientation(p, q, r):
+        """Return twice the signed area of the triangle (p, q, r): its sign tells on which side of p q lies r."""
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
 
     p, q, r, s = a[:, None], b[:, None], a[None], b[None]
-    crossing = (side(p, q, r) * side(p, q, s) < 0) & (side(r, s, p) * side(r, s, q) < 0)
+    crossing = (orientation(p, q, r) * orientation(p, q, s) < 0) & (orientation(r, s, p) * orientation(r, s, q) < 0)
     on_edge = _is_near_segment(p, q, r, tolerance)  # a vertex on an edge; its own edges are excluded below
     index = np.arange(n)
-    own = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
-    bad = crossing | (on_edge & ~own)
-    if not bad.any():
+    is_own_vertex = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
+    touching = crossing | (on_edge & ~is_own_vertex)
+    if not touching.any():
         return None
-    i, j = np.argwhere(bad)[0]
+    i, j = np.argwhere(touching)[0]
     return int(i), int(j)
 
 
 def _is_near_segment(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether the point `r` lies within `tolerance` of the segment from `p` to `q`."""
+    """Return whether each point `r` lies within `tolerance` of the segment from `p` to `q`; arrays broadcast."""
     edge = q - p
-    s = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
-    return np.linalg.norm(r - p - s[..., None] * edge, axis=-1) <= tolerance
+    fraction = np.clip(np.sum((r - p) * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
+    return np.linalg.norm(r - p - fraction[..., None] * edge, axis=-1) <= tolerance

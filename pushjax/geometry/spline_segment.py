@@ -12,7 +12,8 @@ from pushjax._math.vec import Scalar, Vec2
 class SplineSegment(NamedTuple):
     """One segment, or an array of segments: p(t) = c0 + c1 t + c2 t^2 + c3 t^3 for t from 0 to 1.
 
-    With the jumps of c3, a segment also represents its two neighbors, for t from -1 to 2.
+    At a knot, the spline has continuous second derivatives, so the cubics of two neighbors differ by a multiple of
+    (t - knot)^3 only: the jump of c3. With these jumps a segment also represents its two neighbors, for t from -1 to 2.
 
     Attributes:
         c0: Constant coefficient, m.
@@ -30,7 +31,7 @@ class SplineSegment(NamedTuple):
     left: Vec2
     right: Vec2
 
-    def at(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
+    def evaluate(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
         """Evaluate the point and its first and second derivative with respect to t.
 
         Args:
@@ -39,6 +40,7 @@ class SplineSegment(NamedTuple):
         Returns:
             A tuple of the point and the two derivatives, m.
         """
+        # How far t lies past the end of the segment, and how far before its start.
         over, under = jnp.maximum(t - 1, 0), jnp.maximum(-t, 0)
         point = self.c0 + (self.c1 + (self.c2 + self.c3.scale(t)).scale(t)).scale(t)
         first = self.c1 + (self.c2.scale(2) + self.c3.scale(3 * t)).scale(t)
@@ -49,12 +51,12 @@ class SplineSegment(NamedTuple):
             second + self.right.scale(6 * over) + self.left.scale(6 * under),
         )
 
-    def third(self, t: Scalar) -> Vec2:
+    def third_derivative(self, t: Scalar) -> Vec2:
         """Evaluate the third derivative with respect to t, for t from -1 to 2, m."""
         right, left = jnp.where(t > 1, 6.0, 0.0), jnp.where(t < 0, 6.0, 0.0)
         return self.c3.scale(6) + self.right.scale(right) - self.left.scale(left)
 
-    def chosen(self, index) -> "SplineSegment":
+    def select(self, index) -> "SplineSegment":
         """Index every field: select one segment, or several, from an array of segments."""
         return jax.tree.map(lambda field: field[index], self)
 
@@ -66,11 +68,11 @@ def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
         control: Control points, shape (controls, 2), m.
 
     Returns:
-        An array of segments, one for each control point. The first segment starts near the first control point.
+        An array of segments, one for each control point. Segment k starts near control point k.
     """
     before, here, after, next_ = (jnp.roll(control, k, axis=0) for k in (1, 0, -1, -2))
     c3 = (next_ - before) / 6 + (here - after) / 2
-    fields = (
+    coefficients = (
         (before + 4 * here + after) / 6,
         (after - before) / 2,
         (before - 2 * here + after) / 2,
@@ -78,17 +80,17 @@ def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
         c3 - jnp.roll(c3, 1, axis=0),
         jnp.roll(c3, -1, axis=0) - c3,
     )
-    return SplineSegment(*(Vec2(field[:, 0], field[:, 1]) for field in fields))
+    return SplineSegment(*(Vec2(field[:, 0], field[:, 1]) for field in coefficients))
 
 
 def outward_normal(velocity: Vec2) -> tuple[Vec2, Scalar]:
     """Return the outward unit normal and the speed of a counterclockwise outline.
 
     Args:
-        velocity: Derivative of the outline's point with respect to its parameter.
+        velocity: Derivative of the outline's point with respect to its parameter, m.
 
     Returns:
-        A tuple of the outward unit normal and the length of `velocity`.
+        A tuple of the outward unit normal and the norm of `velocity`, m.
     """
     squared = velocity.dot(velocity)
     speed = jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))

@@ -1,9 +1,11 @@
 """First contact of a disk that moves along a straight path with a closed cubic spline.
 
-A disk of radius r touches the outline at u where x + t path = p(u) + r n(u), so g(u) = cross(path, p + r n - x) = 0.
-The first contact is the root with the least t, because at every root the disk's center is at most r from the outline.
+A disk of radius r that starts at x touches the outline's point p(u) where x + t path = p(u) + r n(u), with the outward
+normal n. So g(u) = cross(path, p + r n - x) = 0. The first contact is the root with the least t, because at every root
+the disk's center is at most r from the outline.
 
-The derivative is g' = cross(path, p') (1 + r kappa). It changes sign at two kinds of places only. The first are those
+The derivative is g' = cross(path, p') (1 + r kappa), where kappa is the curvature, negative in a hollow (a concave part
+of the outline). The derivative changes sign at two kinds of places only. The first are those
 where the outline is parallel to the path; a quadratic per segment gives them exactly. The second are those where the
 disk has the same curvature as the hollow it is in; they do not depend on the path. Between these places g is monotone.
 So the values of g at these places decide whether there is a root, and no contact is missed.
@@ -23,18 +25,18 @@ from pushjax.geometry.shape import roundoff
 from pushjax.geometry.spline_segment import SplineSegment, outward_normal
 
 SWEEP_ITERATIONS = 10
-# How many of the places where the line of the path enters the outline are solved for, nearest first. More than one is
-# needed because their order is known only approximately beforehand.
+# How many of the places where the disk enters the outline on the line of the path are solved for, nearest first. More
+# than one is needed because their order is known only approximately beforehand.
 MAX_ENTRIES = 3
 # Intervals per segment; at their ends it is checked whether the disk fits into the curvature of the hollow.
 HOLLOW_SAMPLES = 16
 
 
-def first_contact(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool) -> Scalar:
+def first_contact(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool) -> Scalar:
     """Find the fraction of a path after which a disk first touches a closed spline; see `Outline.sweep`.
 
     Args:
-        pieces: All segments of the outline, counterclockwise.
+        segments: All segments of the outline, counterclockwise, as one `SplineSegment` of arrays.
         x: Center of the disk at the start, m, body frame.
         path: Displacement of the disk, m, body frame.
         radius: Radius of the disk, m.
@@ -43,13 +45,13 @@ def first_contact(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *,
     Returns:
         Fraction of `path`, from 0 to 1; infinite if the disk does not touch.
     """
-    fixed = jax.lax.stop_gradient((pieces, x, path, radius))
+    fixed = jax.lax.stop_gradient((segments, x, path, radius))
     index, t, fraction = _first_root(*fixed, convex=convex)
     # Evaluated again with the differentiable arguments, to give the fraction its derivatives.
-    return jnp.where(fraction <= 1, _contact_fraction(pieces.chosen(index), t, x, path, radius), jnp.inf)
+    return jnp.where(fraction <= 1, _contact_fraction(segments.select(index), t, x, path, radius), jnp.inf)
 
 
-class Offset(NamedTuple):
+class OffsetPoint(NamedTuple):
     """The center of a disk that touches a segment from outside: a point of the offset curve.
 
     Attributes:
@@ -61,13 +63,13 @@ class Offset(NamedTuple):
     velocity: Vec2
 
     @staticmethod
-    def of(piece: SplineSegment, t: Scalar, radius: Scalar) -> "Offset":
-        """Evaluate the offset curve of `piece` for a disk of `radius` that touches at the parameter `t`."""
-        point, first, second = piece.at(t)
+    def of(segment: SplineSegment, t: Scalar, radius: Scalar) -> "OffsetPoint":
+        """Evaluate the offset curve of `segment` for a disk of `radius` that touches at the parameter `t`."""
+        point, first, second = segment.evaluate(t)
         normal, speed = outward_normal(first)
         # 1 + r kappa; negative where the hollow is too tight for the disk
         stretch = 1 + radius * first.cross(second) / (speed * speed * speed)
-        return Offset(point + normal.scale(radius), first.scale(stretch))
+        return OffsetPoint(point + normal.scale(radius), first.scale(stretch))
 
     def relative_to_path(self, x: Vec2, path: Vec2) -> tuple[Scalar, Scalar, Scalar]:
         """Return g, its derivative by the segment's parameter, and the position along the path.
@@ -78,7 +80,7 @@ class Offset(NamedTuple):
         return path.cross(rel), path.cross(self.velocity), path.dot(rel)
 
 
-def _contact_fraction(piece: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
+def _contact_fraction(segment: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
     """Return the fraction of the path at which a disk touches at the root `t` of g; infinite if not on the path.
 
     The value is the projection of the touching disk's center on the path. It is well-conditioned even for a path that
@@ -86,10 +88,10 @@ def _contact_fraction(piece: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radi
     `t`, which is the same fraction. One Newton step for `t` makes these derivatives exact to third order. The value of
     that step is removed by `stop_gradient`, because for a grazing path it is magnified roundoff.
     """
-    height, slope, along = Offset.of(piece, t, radius).relative_to_path(x, path)
+    height, slope, along = OffsetPoint.of(segment, t, radius).relative_to_path(x, path)
     step = -height / jnp.where(slope < 0, slope, -jnp.inf)
     t = t + step - jax.lax.stop_gradient(step)
-    point, first, _ = piece.at(t)
+    point, first, _ = segment.evaluate(t)
     normal, _ = outward_normal(first)
     rel, squared, approach = x - point, path.dot(path), -normal.dot(path)
     fraction = jax.lax.stop_gradient(along / jnp.where(squared > 0, squared, 1.0))
@@ -153,21 +155,25 @@ class FreeInterval(NamedTuple):
 
     low: Scalar
     high: Scalar
-    at_low: Offset
-    at_high: Offset
+    at_low: OffsetPoint
+    at_high: OffsetPoint
 
 
 def _monotone_intervals(
-    piece: SplineSegment, free_intervals: list[FreeInterval], x: Vec2, path: Vec2, radius: Scalar
+    segment: SplineSegment, free_intervals: list[FreeInterval], x: Vec2, path: Vec2, radius: Scalar
 ) -> list[MonotoneInterval]:
     """Return the intervals of a segment, or of an array of segments, on which g is monotone; some can be empty."""
     # The two parameters at which the outline is parallel to the path: roots of a quadratic.
-    constant, linear, square = (path.cross(c.scale(k)) for k, c in enumerate((piece.c1, piece.c2, piece.c3), start=1))
-    inside = linear * linear - 4 * constant * square
-    half = -(linear + jnp.where(linear < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(inside, 0))) / 2
-    one, other = half / jnp.where(square == 0, jnp.inf, square), constant / jnp.where(half == 0, jnp.inf, half)
-    turning = [jnp.where(inside > 0, jnp.clip(f(one, other), 0, 1), 0) for f in (jnp.minimum, jnp.maximum)]
-    turned = [Offset.of(piece, t, radius).relative_to_path(x, path) for t in turning]
+    constant, linear, square = (
+        path.cross(c.scale(k)) for k, c in enumerate((segment.c1, segment.c2, segment.c3), start=1)
+    )
+    discriminant = linear * linear - 4 * constant * square
+    q = -(linear + jnp.where(linear < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(discriminant, 0))) / 2
+    first_root, second_root = q / jnp.where(square == 0, jnp.inf, square), constant / jnp.where(q == 0, jnp.inf, q)
+    turning = [
+        jnp.where(discriminant > 0, jnp.clip(f(first_root, second_root), 0, 1), 0) for f in (jnp.minimum, jnp.maximum)
+    ]
+    heights = [OffsetPoint.of(segment, t, radius).relative_to_path(x, path) for t in turning]
     intervals = []
     for low, high, *ends in free_intervals:
         first, last = (end.relative_to_path(x, path) for end in ends)
@@ -177,55 +183,57 @@ def _monotone_intervals(
             height, _, along = tree_where(before, first, tree_where(after, last, turning_point))
             return jnp.clip(t, low, high), height, along, ~before & ~after
 
-        stops = [within(t, turning_point) for t, turning_point in zip(turning, turned, strict=True)]
+        stops = [within(t, turning_point) for t, turning_point in zip(turning, heights, strict=True)]
         stops = [(low, first[0], first[2], low > 0), *stops, (high, last[0], last[2], high < 1)]
         # The fields of `MonotoneInterval` alternate between the start and the end.
         intervals += [MonotoneInterval(*(end[k] for k in range(4) for end in ends)) for ends in pairwise(stops)]
     return intervals
 
 
-def _free_intervals(pieces: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
-    """Find the intervals of each segment that a disk can touch from outside: where it fits into the curvature.
+def _free_intervals(segments: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
+    """Return the first and last interval of each segment that a disk can touch from outside.
 
-    At most two intervals are kept, the first and the last. An interval is empty, with equal ends, if there is none.
+    These are the intervals in which the disk fits into the curvature. Each interval is a tuple of arrays of its start
+    and its end, as segment parameters. If a segment has no such interval, its ends are equal.
     """
-    zero = jnp.zeros_like(pieces.c0.x)
+    zero = jnp.zeros_like(segments.c0.x)
     if convex:
         return [(zero, zero + 1)]
     grid = jnp.linspace(0, 1, HOLLOW_SAMPLES + 1, dtype=zero.dtype)
-    spread = jax.tree.map(lambda field: field[:, None], pieces)
+    columns = jax.tree.map(lambda field: field[:, None], segments)
 
-    def clearance(pieces, t):
-        _, first, second = pieces.at(t)
+    def clearance(segments, t):
+        _, first, second = segments.evaluate(t)
         _, speed = outward_normal(first)
         return speed * speed * speed + radius * first.cross(second)
 
-    inside = clearance(spread, jnp.broadcast_to(grid[None], (zero.size, grid.size))) > 0
-    closed = jnp.pad(inside, ((0, 0), (1, 1)))
-    rises, falls = inside & ~closed[:, :-2], inside & ~closed[:, 2:]
+    fits = clearance(columns, jnp.broadcast_to(grid[None], (zero.size, grid.size))) > 0
+    padded = jnp.pad(fits, ((0, 0), (1, 1)))
+    rises, falls = fits & ~padded[:, :-2], fits & ~padded[:, 2:]
 
-    def edge(at, outward):
+    def interval_end(node, outward):
         """Locate the end of an interval between its last node, where the disk fits, and the next, where it does not."""
-        within, beyond = grid[at], jnp.clip(grid[at] + outward / HOLLOW_SAMPLES, 0, 1)
-        values = clearance(pieces, within), clearance(pieces, beyond)
+        inner, outer = grid[node], jnp.clip(grid[node] + outward / HOLLOW_SAMPLES, 0, 1)
+        values = clearance(segments, inner), clearance(segments, outer)
         for _ in range(6):  # false position; the value at the end that stays is halved
-            t = within + (beyond - within) * values[0] / jnp.where(
-                values[0] == values[1], jnp.inf, values[0] - values[1]
-            )
-            value = clearance(pieces, t)
+            t = inner + (outer - inner) * values[0] / jnp.where(values[0] == values[1], jnp.inf, values[0] - values[1])
+            value = clearance(segments, t)
             kept = value > 0
-            within, beyond = jnp.where(kept, t, within), jnp.where(kept, beyond, t)
+            inner, outer = jnp.where(kept, t, inner), jnp.where(kept, outer, t)
             values = jnp.where(kept, value, values[0] / 2), jnp.where(kept, values[1] / 2, value)
-        return within
+        return inner
 
     last = grid.size - 1
-    low, high = edge(jnp.argmax(rises, axis=1), -1), edge(jnp.argmax(falls, axis=1), 1)
+    low, high = interval_end(jnp.argmax(rises, axis=1), -1), interval_end(jnp.argmax(falls, axis=1), 1)
     low_2, high_2 = (
-        edge(last - jnp.argmax(rises[:, ::-1], axis=1), -1),
-        edge(last - jnp.argmax(falls[:, ::-1], axis=1), 1),
+        interval_end(last - jnp.argmax(rises[:, ::-1], axis=1), -1),
+        interval_end(last - jnp.argmax(falls[:, ::-1], axis=1), 1),
     )
-    some, two = jnp.any(inside, axis=1), jnp.sum(rises, axis=1) > 1
-    return [(jnp.where(some, low, 0), jnp.where(some, high, 0)), (jnp.where(two, low_2, 1), jnp.where(two, high_2, 1))]
+    has_one, has_two = jnp.any(fits, axis=1), jnp.sum(rises, axis=1) > 1
+    return [
+        (jnp.where(has_one, low, 0), jnp.where(has_one, high, 0)),
+        (jnp.where(has_two, low_2, 1), jnp.where(has_two, high_2, 1)),
+    ]
 
 
 def _entry_estimate(interval: MonotoneInterval, squared: Scalar, tolerance: Scalar) -> Scalar:
@@ -240,57 +248,64 @@ def _entry_estimate(interval: MonotoneInterval, squared: Scalar, tolerance: Scal
     return jnp.where(enters & on_path, along, jnp.inf)
 
 
-def _first_root(pieces: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool):
-    """Find the first root of g on the path: its segment's index, the segment's parameter, the fraction of the path."""
-    # These do not depend on the path, so they are computed once for a batch of paths and not for each path.
-    known = pieces.c0.x[0]
+def _first_root(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool):
+    """Find the first root of g on the path.
+
+    Returns:
+        A tuple of its segment's index, the parameter on that segment, and the fraction of the path, which is infinite
+        if there is no root on the path.
+    """
+    # The free intervals and the extent do not depend on the path, so they are computed once for a batch of paths.
+    like = segments.c0.x[0]
     free_intervals = [
-        FreeInterval(low, high, Offset.of(pieces, low, radius), Offset.of(pieces, high, radius))
-        for low, high in compute_once(_free_intervals(pieces, radius, convex), known)
+        FreeInterval(low, high, OffsetPoint.of(segments, low, radius), OffsetPoint.of(segments, high, radius))
+        for low, high in compute_once(_free_intervals(segments, radius, convex), like)
     ]
-    extent = jnp.max(jnp.abs(pieces.c0.x)) + jnp.max(jnp.abs(pieces.c0.y))
-    free_intervals, extent = compute_once((free_intervals, extent), known)
+    extent = jnp.max(jnp.abs(segments.c0.x)) + jnp.max(jnp.abs(segments.c0.y))
+    free_intervals, extent = compute_once((free_intervals, extent), like)
     squared = path.dot(path)
     length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
     tolerance = roundoff(extent + jnp.abs(x.x) + jnp.abs(x.y) + radius) * length
-    intervals = _monotone_intervals(pieces, free_intervals, x, path, radius)
-    order = jnp.concatenate([_entry_estimate(interval, squared, tolerance) for interval in intervals])
+    intervals = _monotone_intervals(segments, free_intervals, x, path, radius)
+    entry_estimates = jnp.concatenate([_entry_estimate(interval, squared, tolerance) for interval in intervals])
 
-    def entry(_, carry):
-        order, best = carry
-        chosen = jnp.argmin(order)
-        part, index = jnp.divmod(chosen, pieces.c0.x.size)
-        piece, free = jax.tree.map(lambda field: field[index], (pieces, free_intervals))
-        intervals = _monotone_intervals(piece, free, x, path, radius)
+    def solve_nearest_entry(_, carry):
+        entry_estimates, best = carry
+        chosen = jnp.argmin(entry_estimates)
+        interval_number, index = jnp.divmod(chosen, segments.c0.x.size)
+        segment, free = jax.tree.map(lambda field: field[index], (segments, free_intervals))
+        intervals = _monotone_intervals(segment, free, x, path, radius)
         interval = intervals[0]
         for k, candidate in enumerate(intervals[1:], start=1):
-            interval = tree_where(part == k, candidate, interval)
-        t = _root_in_interval(piece, interval, x, path, radius)
-        fraction = _contact_fraction(piece, t, x, path, radius)
-        (sooner,) = decide(((order[chosen] < jnp.inf) & (fraction < best[2]),), x.x)
-        order = jnp.where(jnp.arange(order.size) == chosen, jnp.inf, order)
-        return order, tree_where(sooner, (index, t, fraction), best)
+            interval = tree_where(interval_number == k, candidate, interval)
+        t = _root_in_interval(segment, interval, x, path, radius)
+        fraction = _contact_fraction(segment, t, x, path, radius)
+        (is_sooner,) = decide(((entry_estimates[chosen] < jnp.inf) & (fraction < best[2]),), x.x)
+        entry_estimates = jnp.where(jnp.arange(entry_estimates.size) == chosen, jnp.inf, entry_estimates)
+        return entry_estimates, tree_where(is_sooner, (index, t, fraction), best)
 
-    none = jnp.zeros_like(jnp.argmin(order)), jnp.zeros_like(tolerance), jnp.full_like(tolerance, jnp.inf)
-    return jax.lax.fori_loop(0, MAX_ENTRIES, entry, (order, none))[1]
+    none = jnp.zeros_like(jnp.argmin(entry_estimates)), jnp.zeros_like(tolerance), jnp.full_like(tolerance, jnp.inf)
+    return jax.lax.fori_loop(0, MAX_ENTRIES, solve_nearest_entry, (entry_estimates, none))[1]
 
 
-def _root_in_interval(piece: SplineSegment, interval: MonotoneInterval, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-    """Find where g falls through zero in an interval, by Newton's method with bisection if it leaves the bracket.
+def _root_in_interval(
+    segment: SplineSegment, interval: MonotoneInterval, x: Vec2, path: Vec2, radius: Scalar
+) -> Scalar:
+    """Return where g falls through zero in an interval, by Newton's method with bisection if it leaves the bracket.
 
     If g is nearly parabolic about an end, Newton's method solves for the squared distance from that end.
     """
-    begin, early, late = interval.initial_guess()
-    flat, parabolic = jnp.where(early, interval.start, interval.end), early | late
+    guess, early, late = interval.initial_guess()
+    center, parabolic = jnp.where(early, interval.start, interval.end), early | late
 
     def propose(t: Scalar) -> Proposal:
-        height, slope, _ = Offset.of(piece, t, radius).relative_to_path(x, path)
+        height, slope, _ = OffsetPoint.of(segment, t, radius).relative_to_path(x, path)
         step = -height / jnp.where(slope < 0, slope, -jnp.inf)
-        arm = t - flat
-        squared = arm * (arm + 2 * step)
-        root = flat + jnp.where(arm < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(squared, 0))
-        proposal = jnp.where(parabolic & (squared >= 0), root, t + step)
+        offset = t - center
+        target_squared = offset * (offset + 2 * step)
+        parabolic_root = center + jnp.where(offset < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(target_squared, 0))
+        proposal = jnp.where(parabolic & (target_squared >= 0), parabolic_root, t + step)
         return Proposal(height > 0, proposal, usable=slope < 0, is_tiny=jnp.abs(proposal - t) < 1e-6)
 
-    start = interval.start + begin * (interval.end - interval.start)
+    start = interval.start + guess * (interval.end - interval.start)
     return compute_once(bracketed_root(propose, start, interval.start, interval.end, SWEEP_ITERATIONS), x.x)
