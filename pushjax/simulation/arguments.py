@@ -71,36 +71,30 @@ def checked_arguments(
         raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
     check_finite("friction", mu)
     check_non_negative("friction", mu)
-    warn_about_units(slider, pose, *paths)
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
 
 
-def warn_about_units(slider: Slider, pose: ArrayLike, *paths: ArrayLike) -> None:
-    """Warn if numbers are probably in millimeters or degrees. Traced values are not looked at.
+def warn_about_units(slider: Slider, pose: Array, *paths: Array) -> None:
+    """Warn if numbers are probably in millimeters or degrees, unless any value is traced.
 
     Args:
         slider: The slider. The length of its surface, m, says how large it is.
         pose: Poses of the slider, (..., 3).
         *paths: Configurations of the hand, (..., dof), world; at least the first two numbers are lengths.
     """
-    length, angle = concrete(slider.surface.length), concrete(pose)
-    if length is not None and float(length) > MAX_LENGTH:
-        _warn(f"slider: its surface has a length of {float(length):.3g} m: are its coordinates in millimeters?")
-    elif length is not None:
-        for path in paths:
-            known = concrete(path)
-            if known is None or not known.size:
-                continue
-            extent = float(np.max(np.abs(known[..., :2])))
-            if extent > MAX_REACH * float(length):
-                _warn(
-                    f"path: it goes {extent:.3g} m from the origin, {extent / float(length):.0f} times the length of "
-                    "the slider's surface: are its coordinates in millimeters?"
-                )
-                break
-    if angle is not None and angle.size and float(np.max(np.abs(angle[..., 2]))) > MAX_TURN:
-        _warn(f"pose: its angle is {float(np.max(np.abs(angle[..., 2]))):.3g} rad: is it in degrees?")
+    if traced((slider, pose, paths)):
+        return
+    length = float(slider.surface.length)
+    reach = max((float(np.max(np.abs(np.asarray(path)[..., :2]), initial=0)) for path in paths), default=0.0)
+    angle = float(np.max(np.abs(np.asarray(pose)[..., 2]), initial=0))
+    if length > MAX_LENGTH:
+        _warn(f"slider: its surface has a length of {length:.3g} m: are its coordinates in millimeters?")
+    elif reach > MAX_REACH * length:
+        times = f"{reach / length:.0f} times the length of the slider's surface"
+        _warn(f"path: it goes {reach:.3g} m from the origin, {times}: are its coordinates in millimeters?")
+    if angle > MAX_TURN:
+        _warn(f"pose: its angle is {angle:.3g} rad: is it in degrees?")
 
 
 def _warn(message: str) -> None:
@@ -128,6 +122,7 @@ def checked_rollout_arguments(
             raise ValueError(f"path must have at least two configurations; got shape {path_array.shape}")
     else:
         path_array = checked_path(path, hand.dof, dtype)
+    warn_about_units(slider, start, path_array)
     check_opening(hand, path_array)
     check_start(slider, hand, start, path_array[..., 0, :])
     return slider, hand, path_array, start, mu

@@ -22,7 +22,13 @@ from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import check_opening, checked_arguments, checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import (
+    check_opening,
+    checked_arguments,
+    checked_rollout_arguments,
+    checked_table,
+    warn_about_units,
+)
 from pushjax.simulation.detection import num_contacts
 from pushjax.simulation.finger_motion import finger_motions, holding_distance, max_penetration, unstack_finger_poses
 from pushjax.simulation.hand import Hand
@@ -71,6 +77,7 @@ def step(
         check_shape(name, q, (hand.dof,))
         check_finite(name, q)
         check_opening(hand, q)
+    warn_about_units(slider, start, *ends)
     return _step(slider, hand, *ends, start, mu, solver, checked_table(table, dtype))
 
 
@@ -136,8 +143,8 @@ def rollout(
     Reference: Zhou et al. 2017, section IV.A, and open problem 2 of section VII. The header of
     `pushjax.simulation.step` has the scheme.
     """
-    slider, hand, p, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
-    return _rollout(slider, hand, p, start, mu, solver, checked_table(table, start.dtype))
+    slider, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
+    return _rollout(slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype))
 
 
 @quick_jit
@@ -147,12 +154,20 @@ def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
     return simulate(slider.shape, hand, path, pose, solver, friction_at)
 
 
-# From the index of a step and the pose before it: H of the limit surface, and the friction of each finger.
+# Called as `friction_at(step, pose)` with the index of a step and the pose of the slider before it. Returns H of the
+# limit surface, and the coefficient of friction mu of each finger.
 FrictionAt = Callable[[Array, Vec3], tuple[Form, Array]]
 
 
 def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
-    """Return the friction on a table from that on a uniform one. If the table is not finite, no contact is valid."""
+    """Return the friction on a table, given the friction that would hold if the table were uniform.
+
+    If the table has a value that is not finite, the coefficients of friction are NaN, so every step is INVALID.
+
+    Args:
+        table: The table; None for a uniform one.
+        friction_at: Limit surface and friction on a uniform table.
+    """
     if table is None:
         return friction_at
     is_finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(table)))
@@ -191,17 +206,15 @@ def simulate(
         return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
 
     if sum(num_contacts(finger, outline) for finger in hand.fingers) == 1:
-        records, fraction = (
-            _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at),
-            jnp.zeros_like(start.x),
-        )
+        records = _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at)
+        fraction = jnp.zeros_like(start.x)
     else:
         records, fraction = simulate_in_substeps(outline, steps, motions_at, solver, start, friction_at)
     results = to_arrays(records, friction_at(jnp.zeros((), jnp.int32), start)[0].length)
     stop_step = first_true(hand_stops(results.status))
     last_done = jnp.where(stop_step >= 0, stop_step, steps)
     index = jnp.arange(steps + 1)
-    # in a step that was divided the hand stops on the way
+    # if the step of the jam was divided, the hand did the first part of it
     last_displacement = jax.lax.stop_gradient(fraction) * (path[jnp.minimum(last_done + 1, steps)] - path[last_done])
     configuration = (
         path[jnp.minimum(index, last_done)] + jnp.where(index > last_done, 1.0, 0.0)[:, None] * last_displacement[None]
@@ -212,12 +225,16 @@ def simulate(
 
 
 def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at) -> ScalarStep:
-    """Records of all steps for one round finger on a convex outline, which has only one contact to check."""
+    """Return the records of all steps of a hand with one contact: a round finger on a convex outline, or a pad on a disk.
+
+    Such steps are not divided: their overlap is recorded but not checked. Arguments as in `simulate_in_substeps`.
+    """
 
     def body(pose: Vec3, step: Array):
         form, mu = friction_at(step, pose)
         motions = motions_at(step, mu)
-        depth = max_penetration(outline, motions, pose, 0.0)  # contact detection starts with the same query
+        # this is also the overlap after the previous step, and costs little: contact detection computes the same
+        depth = max_penetration(outline, motions, pose, 0.0)
         record, _ = step_in_scalars(form, outline, motions, solver, pose, depth, holding_distance(motions, form.length))
         return record.pose, record._replace(overlap=depth)
 
