@@ -27,7 +27,7 @@ from pushjax._internal.xla import compute_once, decide
 from pushjax._math.linalg import Cholesky, Column, Lower, add_scaled, congruence, entry
 from pushjax._math.vec import Scalar
 
-# The six products v are x², y², z², xy, xz, yz.
+# The six products v are x², y², z², xy, xz, yz, with F = (x, y, z).
 # The matrix of <N, adj S> in their basis. For each entry of N (xx, yy, zz, xy, xz, yz): the places in the lower
 # triangle to which it contributes, and the factors.
 ADJUGATE_PLACES = (
@@ -68,11 +68,11 @@ INITIAL_SCALES = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
 
 
 class Gram(NamedTuple):
-    """The two blocks of a Gram matrix (see the header of this module), as lower triangles.
+    """The two blocks of a 9 x 9 Gram matrix (see the header of this module), as lower triangles.
 
     Attributes:
-        symmetric: The 6 x 6 block G, with v' G v = H.
-        antisymmetric: The 3 x 3 block N.
+        symmetric: The 6 x 6 block G, with v' G v = H, 1/N^4.
+        antisymmetric: The 3 x 3 block N, 1/N^4.
     """
 
     symmetric: Lower
@@ -80,7 +80,7 @@ class Gram(NamedTuple):
 
     @staticmethod
     def of(coefficients: Column, n: Column) -> "Gram":
-        """Return the Gram matrix of a quartic for a given N.
+        """Return the Gram matrix of a quartic for a given block N.
 
         Args:
             coefficients: The 15 coefficients, in the order of `Quartic`.
@@ -98,7 +98,7 @@ class Gram(NamedTuple):
 
     def plus(self, factor: Scalar, other: "Gram") -> "Gram":
         """Return self + factor * other."""
-        return Gram(*(add_scaled(mine, factor, its) for mine, its in zip(self, other, strict=True)))
+        return Gram(*(add_scaled(own, factor, others) for own, others in zip(self, other, strict=True)))
 
 
 def coefficients_of(symmetric: Lower) -> Column:
@@ -110,7 +110,7 @@ def coefficients_of(symmetric: Lower) -> Column:
 
 
 def antisymmetric_of(symmetric: Lower) -> Column:
-    """Return the N for which `symmetric` is the 6 x 6 block of the Gram matrix of its quartic."""
+    """Return the entries of the N for which `symmetric` is the 6 x 6 block of the Gram matrix of its quartic."""
     found = []
     for places in ADJUGATE_PLACES:
         (above, a), (below, b) = ((symmetric[i][j], value) for (i, j), value in places.items())
@@ -138,9 +138,10 @@ def max_feasible_scale(
 ) -> Certificate:
     """Find the largest scale s for which Gram(N) - s * reference is positive semi-definite for some N.
 
-    If the quartic is convex, the largest s is not below zero. The search follows the central path of this problem: it
-    applies Newton's method to the logarithmic barrier, and each round takes the best of a few step lengths. The result
-    lies strictly inside the feasible set. So it is a proof, whatever the roundoff of the search.
+    Gram(N) stands for `Gram.of(coefficients, N)`. If the quartic is convex, the largest s is not below zero. The search
+    follows the central path of this problem: it applies Newton's method to the logarithmic barrier, and each round
+    takes the best of a few step lengths. The result lies strictly inside the feasible set. So it is a proof, whatever
+    the roundoff of the search.
 
     Args:
         coefficients: The 15 coefficients of the quartic, in the order of `Quartic`.
@@ -150,28 +151,29 @@ def max_feasible_scale(
         tolerance: The search stops once s is known to be within this of the largest.
 
     Returns:
-        The scale, its N, and whether the search ended.
+        The scale, its N, and whether the search converged.
     """
     start = _initial_scale(coefficients, n, reference)
     zero = 0 * start
     state = (start, n, zero + BARRIER_WEIGHTS[0], jnp.zeros((), jnp.int32), start >= enough)
 
-    def body(state):
+    def newton_round(state):
         s, n, weight, rounds, done = state
-        s_new, n_new, moved = _newton(coefficients, n, s, reference, weight)
-        centered = moved < 1
-        # Close to the border roundoff may make the result of a round not finite. Then keep the previous one.
-        lost = ~jnp.isfinite(s_new + sum(n_new))
-        done_now = lost | (s_new >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
+        s_new, n_new, decrement = _newton_step(coefficients, n, s, reference, weight)
+        centered = decrement < 1
+        # Close to the border of the feasible set, roundoff may make the result of a round NaN or infinite. Then the
+        # search ends with the previous one.
+        is_invalid = ~jnp.isfinite(s_new + sum(n_new))
+        done_new = is_invalid | (s_new >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
         weight_new = jnp.where(centered, BARRIER_WEIGHTS[1] * weight, weight)
 
-        def kept(new, old, held):
-            return jax.tree.map(lambda a, b: jnp.where(held, b, a), new, old)
+        def keep_if(new, old, condition):  # `old` where the condition holds, else `new`
+            return jax.tree.map(lambda a, b: jnp.where(condition, b, a), new, old)
 
-        s_new, n_new = kept((s_new, n_new), (s, n), lost)
-        return kept((s_new, n_new, weight_new, rounds + 1, done_now), state, done)
+        s_new, n_new = keep_if((s_new, n_new), (s, n), is_invalid)
+        return keep_if((s_new, n_new, weight_new, rounds + 1, done_new), state, done)
 
-    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MAX_ROUNDS), body, state)
+    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MAX_ROUNDS), newton_round, state)
     return Certificate(s, n, done)
 
 
@@ -182,10 +184,10 @@ def _initial_scale(coefficients: Column, n: Column, reference: Gram) -> Scalar:
     """
     gram = Gram.of(coefficients, n)
 
-    def nearer(start, scale):
-        return jnp.where(_barrier(gram.plus(-scale, reference)).positive, scale, start), None
+    def keep_feasible(largest, scale):
+        return jnp.where(_barrier(gram.plus(-scale, reference)).positive, scale, largest), None
 
-    return jax.lax.scan(nearer, 0 * n[0] + INITIAL_SCALES[0], jnp.asarray(INITIAL_SCALES, n[0].dtype))[0]
+    return jax.lax.scan(keep_feasible, 0 * n[0] + INITIAL_SCALES[0], jnp.asarray(INITIAL_SCALES, n[0].dtype))[0]
 
 
 class _Barrier(NamedTuple):
@@ -206,49 +208,51 @@ def _barrier(gram: Gram) -> _Barrier:
     return _Barrier(six.logdet() + three.logdet(), six.positive & three.positive)
 
 
-def _newton(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight: Scalar):
-    """Do one Newton round that maximizes weight * s + logdet of both blocks of Gram(N) - s * reference.
+def _newton_step(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight: Scalar):
+    """Take one Newton step toward the maximum of weight * s + logdet of both blocks of Gram(N) - s * reference.
+
+    The unknowns are the six entries of N, then s.
 
     Returns:
         The new s, the new N, and the Newton decrement.
     """
     gram = Gram.of(coefficients, n).plus(-s, reference)
-    slopes = [0 * s] * 6 + [weight]
-    bends = [[0 * s] * (i + 1) for i in range(7)]
+    gradient = [0 * s] * 6 + [weight]
+    hessian = [[0 * s] * (i + 1) for i in range(7)]
     value = weight * s
-    for block, ref, table in zip(gram, reference, (ADJUGATE_PLACES, ANTISYMMETRIC_PLACES), strict=True):
+    for block, reference_block, places in zip(gram, reference, (ADJUGATE_PLACES, ANTISYMMETRIC_PLACES), strict=True):
         factor = Cholesky.of(block)
         value = value + factor.logdet()
-        x = compute_once(factor.inverse(), s)
-        across = compute_once(congruence(x, ref), s)
-        for i, mine in enumerate(table):
-            slopes[i] = slopes[i] + _trace(x, mine)
+        inverse = compute_once(factor.inverse(), s)
+        inverse_reference = compute_once(congruence(inverse, reference_block), s)
+        for i, places_i in enumerate(places):
+            gradient[i] = gradient[i] + _trace(inverse, places_i)
             for j in range(i + 1):
-                bends[i][j] = bends[i][j] + _double_trace(x, mine, table[j])
-            bends[6][i] = bends[6][i] - _trace(across, mine)
-        slopes[6] = slopes[6] - _product_trace(x, ref)
-        bends[6][6] = bends[6][6] + _product_trace(across, ref)
-    slopes, bends = compute_once((tuple(slopes), tuple(tuple(row) for row in bends)), s)
-    step = compute_once(Cholesky.of(bends).solve(slopes), s)
-    squared = sum((a * b for a, b in zip(slopes, step, strict=True)), 0 * s)
-    decrement = jnp.sqrt(jnp.maximum(squared, 0))
+                hessian[i][j] = hessian[i][j] + _double_trace(inverse, places_i, places[j])
+            hessian[6][i] = hessian[6][i] - _trace(inverse_reference, places_i)
+        gradient[6] = gradient[6] - _product_trace(inverse, reference_block)
+        hessian[6][6] = hessian[6][6] + _product_trace(inverse_reference, reference_block)
+    gradient, hessian = compute_once((tuple(gradient), tuple(tuple(row) for row in hessian)), s)
+    step = compute_once(Cholesky.of(hessian).solve(gradient), s)
+    decrement_squared = sum((a * b for a, b in zip(gradient, step, strict=True)), 0 * s)
+    decrement = jnp.sqrt(jnp.maximum(decrement_squared, 0))
     step_lengths = jnp.stack([*(0 * s + step_length for step_length in STEP_LENGTHS), 1 / (1 + decrement)])
 
-    def longer(state, step_length):
-        best, most = state
-        at_s, at_n = _after_step(s, n, step, step_length)
-        reached = _barrier(Gram.of(coefficients, at_n).plus(-at_s, reference))
-        value = weight * at_s + reached.logdet
-        better = decide(reached.positive & (value > most), s)
-        return (jnp.where(better, step_length, best), jnp.where(better, value, most)), None
+    def try_length(state, step_length):
+        best_length, best_value = state
+        trial_s, trial_n = _after_step(s, n, step, step_length)
+        trial = _barrier(Gram.of(coefficients, trial_n).plus(-trial_s, reference))
+        value = weight * trial_s + trial.logdet
+        better = decide(trial.positive & (value > best_value), s)
+        return (jnp.where(better, step_length, best_length), jnp.where(better, value, best_value)), None
 
-    best = jax.lax.scan(longer, (0 * s, value), step_lengths)[0][0]
-    s, n = compute_once(_after_step(s, n, step, best), weight)
+    best_length = jax.lax.scan(try_length, (0 * s, value), step_lengths)[0][0]
+    s, n = compute_once(_after_step(s, n, step, best_length), weight)
     return s, n, decrement
 
 
 def _after_step(s: Scalar, n: Column, step: Column, step_length):
-    """Return s and N after a step of length `step_length`. The step holds six entries for N, then one for s."""
+    """Return s and N after a step of length `step_length`. `step` holds six entries for N, then one for s."""
     return s + step_length * step[6], tuple(a + step_length * b for a, b in zip(n, step, strict=False))
 
 
@@ -263,7 +267,7 @@ def _weighted_sum(size: int, parts) -> Lower:
     return tuple(tuple(zero if e is None else e for e in row) for row in rows)
 
 
-def _both(places):
+def _symmetric_entries(places):
     """Yield all entries (i, j, value) of the symmetric matrix whose lower triangle is `places`."""
     for (i, j), value in places.items():
         yield i, j, value
@@ -273,14 +277,14 @@ def _both(places):
 
 def _trace(x: Lower, places) -> Scalar:
     """Return trace(x E) for the symmetric matrix E whose lower triangle is `places`."""
-    return sum((value * entry(x, i, j) for i, j, value in _both(places)), 0 * x[0][0])
+    return sum((value * entry(x, i, j) for i, j, value in _symmetric_entries(places)), 0 * x[0][0])
 
 
 def _double_trace(x: Lower, first, second) -> Scalar:
     """Return trace(x E x E') for the symmetric matrices E and E' whose lower triangles are `first` and `second`."""
     total = 0 * x[0][0]
-    for i, j, a in _both(first):
-        for k, l, b in _both(second):
+    for i, j, a in _symmetric_entries(first):
+        for k, l, b in _symmetric_entries(second):
             total = total + a * b * entry(x, j, k) * entry(x, l, i)
     return total
 

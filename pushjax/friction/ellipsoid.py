@@ -19,7 +19,7 @@ class _EllipsoidFields(NamedTuple):
 
 
 class EllipsoidForm(_EllipsoidFields):
-    """H(F) = F' A F in scalars.
+    """The `Form` of an ellipsoid: H(F) = F' A F.
 
     Attributes:
         a: The matrix A, 1/N^2.
@@ -44,8 +44,8 @@ class EllipsoidForm(_EllipsoidFields):
         return Symmetric3(*(2 * entry for entry in self.a))
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        ga, gb = self.a.times(a), self.a.times(b)
-        return a.dot(ga), 2 * b.dot(ga), b.dot(gb)
+        product_a, product_b = self.a.times(a), self.a.times(b)
+        return a.dot(product_a), 2 * b.dot(product_a), b.dot(product_b)
 
 
 class Ellipsoid(LimitSurface):
@@ -64,7 +64,7 @@ class Ellipsoid(LimitSurface):
     degree: ClassVar[int] = 2
 
     def __init__(self, A: ArrayLike, length: ArrayLike):
-        matrix = as_float(A)
+        matrix = as_float(A, name="A")
         check_shape("A", matrix, (3, 3))
         check_finite("A", matrix)
         known = concrete(matrix)
@@ -94,12 +94,12 @@ class Ellipsoid(LimitSurface):
         form = self.form()
         f = compute_once(form.a.solve(v), v.x)
         for _ in range(2):
-            more = form.a.solve(v - form.a.times(f))
+            correction = form.a.solve(v - form.a.times(f))
             # Round it only once, so that the refinement, the check and the result use the same bits.
-            f = compute_once(f + more, v.x)
+            f = compute_once(f + correction, v.x)
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
-        solved = usable & (h > 0) & (angle <= angle_tolerance(angle))
-        scale = jnp.where(solved, 1 / jnp.sqrt(jnp.where(solved, h, 1.0)), 0.0)
-        wrench = jnp.where(solved, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
-        return InverseMap(wrench, solved, jnp.ones((), jnp.int32), angle)
+        converged = usable & (h > 0) & (angle <= angle_tolerance(angle))
+        scale = jnp.where(converged, 1 / jnp.sqrt(jnp.where(converged, h, 1.0)), 0.0)
+        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
+        return InverseMap(wrench, converged, jnp.ones((), jnp.int32), angle)

@@ -46,9 +46,10 @@ from pushjax.friction.sum_of_squares import TERMS, initial_factors, quadratic_fo
 
 VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
-CLIP_ROUNDS = 4
-MAX_STEPS = 500
+CLIP_ROUNDS = 4  # rounds of minimization, to find which s_i are clipped
+MAX_STEPS = 500  # of the optimizer, in each round
 
+# Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
 
 
@@ -89,6 +90,8 @@ class _Pairs(NamedTuple):
         gradient: Their gradients, shape (3, pairs, m).
         twist: Unit twists V_i, shape (3, pairs).
         share: Weights of the pairs, shape (pairs,). They sum to one.
+
+    The number of monomials is m.
     """
 
     value: Float[Array, "pairs m"]
@@ -98,7 +101,7 @@ class _Pairs(NamedTuple):
 
     @property
     def along(self) -> Float[Array, "pairs m"]:
-        """Rows with grad H(F_i) . V_i = along[i] . a."""
+        """Components of the gradients along the twists: grad H(F_i) . V_i = along[i] . a."""
         return jnp.sum(self.gradient * self.twist[:, :, None], axis=0)
 
 
@@ -170,26 +173,32 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
             neither 2 nor 4.
     """
     dtype = common_dtype(wrench, twist, length)
-    w, v, rho = as_float(wrench, dtype), as_float(twist, dtype), as_float(length, dtype)
-    check_shape("wrench", w, ("pairs", 3))
-    share = normalized_weights(weights, w.shape[0], dtype)
-    _check(w, v, rho, share, degree)
+    wrenches, twists, characteristic_length = (
+        as_float(wrench, dtype, "wrench"),
+        as_float(twist, dtype, "twist"),
+        as_float(length, dtype, "length"),
+    )
+    check_shape("wrench", wrenches, ("pairs", 3))
+    share = normalized_weights(weights, wrenches.shape[0], dtype)
+    _check_arguments(wrenches, twists, characteristic_length, share, degree)
     for name, value in (("value_weight", value_weight), ("ridge", ridge)):
         check_finite(name, value)
         check_positive(name, value)
     if terms < 1:
         raise ValueError(f"terms must be at least 1; got {terms}")
-    factors = as_float(value_weight, dtype), as_float(ridge, dtype)
-    coefficients, found = _fit(w, v, rho, share, *factors, degree=degree, terms=terms if degree == 4 else 1)
-    converged = concrete(found.converged)
+    factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
+    coefficients, fit_report = _fit(
+        wrenches, twists, characteristic_length, share, *factors, degree=degree, terms=terms if degree == 4 else 1
+    )
+    converged = concrete(fit_report.converged)
     if not report and converged is not None and not converged:
         warnings.warn("fit_limit_surface did not converge; see its report", RuntimeWarning, stacklevel=2)
     surface: LimitSurface
     if degree == 2:
-        surface = Ellipsoid(_symmetric(coefficients), rho)
+        surface = Ellipsoid(_symmetric(coefficients), characteristic_length)
     else:
-        surface = Quartic(coefficients, rho)
-    return (surface, found) if report else surface
+        surface = Quartic(coefficients, characteristic_length)
+    return (surface, fit_report) if report else surface
 
 
 def mean_twist_angle(surface: LimitSurface, wrench: ArrayLike, twist: ArrayLike) -> Float[Array, ""]:
@@ -206,18 +215,21 @@ def mean_twist_angle(surface: LimitSurface, wrench: ArrayLike, twist: ArrayLike)
     Raises:
         ValueError: If an array has the wrong shape.
     """
-    w, v = as_float(wrench, surface.length.dtype), as_float(twist, surface.length.dtype)
-    check_shape("wrench", w, ("pairs", 3))
-    check_shape("twist", v, (w.shape[0], 3))
-    form, rho = surface.form(), surface.length
+    wrenches, twists = as_float(wrench, surface.length.dtype, "wrench"), as_float(twist, surface.length.dtype, "twist")
+    check_shape("wrench", wrenches, ("pairs", 3))
+    check_shape("twist", twists, (wrenches.shape[0], 3))
+    form, length = surface.form(), surface.length
 
-    def angle(w: Array, v: Array) -> Array:
-        return angle_between(form.gradient(Vec3(w[0], w[1], w[2] / rho)), Vec3(v[0], v[1], v[2] * rho))
+    def angle(wrenches: Array, twists: Array) -> Array:
+        return angle_between(
+            form.gradient(Vec3(wrenches[0], wrenches[1], wrenches[2] / length)),
+            Vec3(twists[0], twists[1], twists[2] * length),
+        )
 
-    return jnp.mean(jax.vmap(angle)(w, v))
+    return jnp.mean(jax.vmap(angle)(wrenches, twists))
 
 
-def _check(wrench: Array, twist: Array, length: Array, weights: Array, degree: int) -> None:
+def _check_arguments(wrench: Array, twist: Array, length: Array, weights: Array, degree: int) -> None:
     """Raise ValueError for arguments that `fit_limit_surface` rejects."""
     if degree not in (2, 4):
         raise ValueError(f"degree must be 2 or 4; got {degree}")
@@ -229,54 +241,60 @@ def _check(wrench: Array, twist: Array, length: Array, weights: Array, degree: i
     for name, value in (("wrench", wrench), ("twist", twist), ("length", length)):
         check_finite(name, value)
     check_positive("length", length)
-    known, counts = concrete(twist), concrete(weights)
-    if known is not None and counts is not None:
-        zero = ~known.any(axis=1) & (counts > 0)
+    known, known_weights = concrete(twist), concrete(weights)
+    if known is not None and known_weights is not None:
+        zero = ~known.any(axis=1) & (known_weights > 0)
         if zero.any():
             raise ValueError(f"twist must not be zero; it is for pair {int(np.argmax(zero))}")
     known = concrete(wrench)
-    if known is not None and counts is not None and not known[counts > 0].any():
+    if known is not None and known_weights is not None and not known[known_weights > 0].any():
         raise ValueError("wrench: all pairs are zero")
 
 
 @quick_jit
 def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, terms: int):
-    """Return the coefficients in units of the given wrenches, and the report."""
+    """Return the coefficients of H for wrenches in N, 1/N^degree, and the report."""
     share = weights / jnp.sum(weights)
-    counts = share > 0  # pairs without weight may be padding with any values: replace them
+    has_weight = share > 0  # pairs without weight may be padding with any values: replace them
     f, v = wrench.at[:, 2].divide(length), twist.at[:, 2].multiply(length)
-    f, v = (jnp.where(counts[:, None], each, jnp.array([[1.0, 0.0, 0.0]], each.dtype)) for each in (f, v))
+    f, v = (jnp.where(has_weight[:, None], each, jnp.array([[1.0, 0.0, 0.0]], each.dtype)) for each in (f, v))
     v = v / jnp.linalg.norm(v, axis=1, keepdims=True)
     scale = share @ jnp.linalg.norm(f, axis=1)
-    pairs = _in_monomials(f / scale, v, share, degree)
+    pairs = _evaluate_monomials(f / scale, v, share, degree)
     start = initial_factors(degree, terms, pairs.value.dtype)
 
-    def again(state):
-        _, _, _, good, rounds = state
-        return ~good & (rounds < CLIP_ROUNDS)
+    def is_unfinished(state):
+        _, _, _, converged, rounds = state
+        return ~converged & (rounds < CLIP_ROUNDS)
 
-    def solve(state):
-        parameters, along, steps, _, rounds = state
-        parameters, taken, solved = _minimize(_loss(pairs, along, value_weight, ridge), parameters, degree)
-        after = (pairs.along @ _coefficients(parameters, degree) > 0) | ~counts
-        return parameters, after, steps + taken, solved & jnp.all(after == along), rounds + 1
+    def solve_round(state):
+        parameters, unclipped, steps, _, rounds = state
+        parameters, round_steps, solved = _minimize(_loss(pairs, unclipped, value_weight, ridge), parameters, degree)
+        unclipped_after = (pairs.along @ _coefficients(parameters, degree) > 0) | ~has_weight
+        return (
+            parameters,
+            unclipped_after,
+            steps + round_steps,
+            solved & jnp.all(unclipped_after == unclipped),
+            rounds + 1,
+        )
 
     zero = jnp.zeros((), jnp.int32)
-    begin = (start, jnp.ones(f.shape[0], bool), zero, jnp.zeros((), bool), zero)
-    parameters, along, steps, good, _ = jax.lax.while_loop(again, solve, begin)
+    initial_state = (start, jnp.ones(f.shape[0], bool), zero, jnp.zeros((), bool), zero)
+    parameters, unclipped, steps, converged, _ = jax.lax.while_loop(is_unfinished, solve_round, initial_state)
     a = _coefficients(parameters, degree)
-    angles = angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist))
+    angle = angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist))
     report = FitReport(
-        angle=share @ angles,
-        loss=_loss(pairs, along, value_weight, ridge).value(a),
-        clipped=jnp.sum(~along),
-        converged=good,
+        angle=share @ angle,
+        loss=_loss(pairs, unclipped, value_weight, ridge).value(a),
+        clipped=jnp.sum(~unclipped),
+        converged=converged,
         steps=steps,
     )
     return a / scale**degree, report
 
 
-def _in_monomials(f: Array, v: Array, share: Array, degree: int) -> _Pairs:
+def _evaluate_monomials(f: Array, v: Array, share: Array, degree: int) -> _Pairs:
     """Evaluate the monomials and their gradients at the normalized wrenches `f`."""
     exponents = MONOMIALS if degree == 4 else QUADRATIC_MONOMIALS
     powers = []  # for each component: 1, f, f^2, ...
@@ -285,24 +303,26 @@ def _in_monomials(f: Array, v: Array, share: Array, degree: int) -> _Pairs:
         for _ in range(degree):
             powers[-1].append(powers[-1][-1] * column)
 
-    def product(e) -> Array:
-        return powers[0][e[0]] * powers[1][e[1]] * powers[2][e[2]]
+    def product(exponent) -> Array:
+        return powers[0][exponent[0]] * powers[1][exponent[1]] * powers[2][exponent[2]]
 
-    def derivative(e, k: int) -> Array:
-        lowered = [max(e[j] - (j == k), 0) for j in range(3)]
-        return e[k] * product(lowered)
+    def derivative(exponent, k: int) -> Array:
+        lowered = [max(exponent[j] - (j == k), 0) for j in range(3)]
+        return exponent[k] * product(lowered)
 
-    value = jnp.stack([product(e) for e in exponents.tolist()], axis=1)
-    gradient = jnp.stack([jnp.stack([derivative(e, k) for e in exponents.tolist()], axis=1) for k in range(3)])
+    value = jnp.stack([product(exponent) for exponent in exponents.tolist()], axis=1)
+    gradient = jnp.stack(
+        [jnp.stack([derivative(exponent, k) for exponent in exponents.tolist()], axis=1) for k in range(3)]
+    )
     return _Pairs(value, gradient, v.T, share)
 
 
-def _loss(pairs: _Pairs, along: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> _Quadratic:
-    """Return the loss, given which pairs are not clipped (`along`).
+def _loss(pairs: _Pairs, unclipped: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> _Quadratic:
+    """Return the loss as a quadratic in the coefficients a, given which pairs are not clipped.
 
     For these |g - s V| is the norm of the component of the gradient g perpendicular to V.
     """
-    across = pairs.gradient - (pairs.twist * along[None])[:, :, None] * pairs.along[None]
+    across = pairs.gradient - (pairs.twist * unclipped[None])[:, :, None] * pairs.along[None]
     rows = jnp.concatenate([across, jnp.sqrt(value_weight) * pairs.value[None]])
     rows = (rows * jnp.sqrt(pairs.share)[None, :, None]).reshape(-1, pairs.value.shape[1])
     q = rows.T @ rows + ridge * jnp.eye(rows.shape[1], dtype=rows.dtype)

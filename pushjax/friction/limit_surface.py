@@ -1,4 +1,4 @@
-"""The interface that limit surfaces of all degrees share: `LimitSurface`, and its scalar `Form`.
+"""The interface that limit surfaces of all degrees share: `LimitSurface`, and its `Form` for inner loops.
 
 A limit surface is the level set H(F) = 1 of a convex polynomial H. H is homogeneous of even degree d in the normalized
 wrench F = (fx, fy, tau / length). While the slider slides, its normalized twist (vx, vy, length * omega) is a positive
@@ -26,9 +26,11 @@ FORMAT, VERSION = "pushjax limit surface", 1
 
 
 class Form(Protocol):
-    """H as a function of the normalized wrench, in scalars. The contact solvers and rollouts compute with it.
+    """H as a function of the normalized wrench, without the checks and arrays of `LimitSurface`.
 
-    Forms are pytrees. `value`, `gradient` and `hessian` are H and its derivatives by the normalized wrench.
+    The contact solvers and rollouts compute with it. Its methods take and return `Vec3` and scalars instead of arrays;
+    `pushjax._math.vec` says why. Forms are pytrees. `value`, `gradient` and `hessian` are H and its derivatives by the
+    normalized wrench.
 
     Attributes:
         degree: Degree d of H.
@@ -50,13 +52,13 @@ class Form(Protocol):
     def gradient(self, f: Vec3) -> Vec3: ...
 
     def spin(self, f: Vec3) -> Scalar:
-        """Return the third component of the gradient."""
+        """Return the third component of the gradient, which is proportional to the angular velocity."""
         ...
 
     def hessian(self, f: Vec3) -> Symmetric3: ...
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        """Return the degree + 1 coefficients c_k of H(a + s b) = sum_k c_k s^k."""
+        """Restrict H to a line: return the degree + 1 coefficients c_k of H(a + s b) = sum_k c_k s^k."""
         ...
 
 
@@ -89,7 +91,7 @@ class LimitSurface(eqx.Module):
 
     @abstractmethod
     def form(self) -> Form:
-        """Return H in scalars."""
+        """Return H as a `Form`, for computations below the public interface."""
 
     @abstractmethod
     def is_convex(self) -> bool:
@@ -111,8 +113,9 @@ class LimitSurface(eqx.Module):
             ValueError: If the twist is zero or not finite, unless it is traced.
         """
 
-    def _normalized(self, wrench: ArrayLike) -> Vec3:
-        w = as_float(wrench, self.length.dtype)
+    def _normalized_wrench(self, wrench: ArrayLike) -> Vec3:
+        """Return (fx, fy, tau / length), N; raise ValueError unless `wrench` has shape (3,) and is finite."""
+        w = as_float(wrench, self.length.dtype, "wrench")
         check_shape("wrench", w, (3,))
         check_finite("wrench", w)
         return Vec3(w[0], w[1], w[2] / self.length)
@@ -126,7 +129,7 @@ class LimitSurface(eqx.Module):
         Returns:
             H, a scalar.
         """
-        return self.form().value(self._normalized(wrench))
+        return self.form().value(self._normalized_wrench(wrench))
 
     def twist(self, wrench: ArrayLike) -> Float[Array, "3"]:
         """Return the direction of the body twist under a wrench, from grad H.
@@ -137,7 +140,7 @@ class LimitSurface(eqx.Module):
         Returns:
             Twist (vx, vy, omega), shape (3,). Its norm has no meaning. Zero for a zero wrench.
         """
-        g = self.form().gradient(self._normalized(wrench))
+        g = self.form().gradient(self._normalized_wrench(wrench))
         return jnp.stack([g.x, g.y, g.z / self.length])
 
     def hessian(self, wrench: ArrayLike) -> Float[Array, "3 3"]:
@@ -150,7 +153,7 @@ class LimitSurface(eqx.Module):
             Hessian, shape (3, 3). It is positive semi-definite if the surface is convex.
         """
         scale = jnp.stack([jnp.ones_like(self.length), jnp.ones_like(self.length), 1 / self.length])
-        return self.form().hessian(self._normalized(wrench)).array() * (scale[:, None] * scale[None])
+        return self.form().hessian(self._normalized_wrench(wrench)).array() * (scale[:, None] * scale[None])
 
     def wrench(self, twist: ArrayLike) -> Float[Array, "3"]:
         """Return the wrench on H = 1 whose twist has the direction of `twist`.
@@ -177,7 +180,7 @@ class LimitSurface(eqx.Module):
         Returns:
             The scaled wrench, shape (3,). A zero wrench stays zero.
         """
-        w = as_float(wrench, self.length.dtype)
+        w = as_float(wrench, self.length.dtype, "wrench")
         check_shape("wrench", w, (3,))
         # Scale the wrench to order one first, because powers of a small wrench underflow. Neither the result nor its
         # derivative depends on this scale.
@@ -208,28 +211,33 @@ class LimitSurface(eqx.Module):
         Raises:
             ValueError: If the file does not contain a surface of this class.
         """
-        surface = load_json(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface)
+        surface = load_json(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface_from_record)
         if not isinstance(surface, cls):
             raise ValueError(f"{path} holds a {type(surface).__name__}, not a {cls.__name__}")
         return surface
 
     def _normalized_twist(self, twist: ArrayLike) -> tuple[Vec3, Array]:
-        """Return the normalized twist as a unit vector, and whether it exists (if not, +x avoids NaN downstream)."""
-        v = as_float(twist, self.length.dtype)
+        """Return the normalized twist, scaled to norm one, and whether the twist is finite and not zero.
+
+        If it is not, the vector is +x, to avoid NaN downstream.
+        """
+        v = as_float(twist, self.length.dtype, "twist")
         check_shape("twist", v, (3,))
         check_finite("twist", v)
         known = concrete(v)
         if known is not None and not known.any():
             raise ValueError("twist is zero: every wrench inside the limit surface has it, none is singled out")
-        n = jnp.stack([v[0], v[1], v[2] * self.length])
-        size = jnp.max(jnp.abs(n))  # scale to order one first, so that squares neither underflow nor overflow
+        normalized = jnp.stack([v[0], v[1], v[2] * self.length])
+        size = jnp.max(jnp.abs(normalized))  # scale to order one first, so that squares neither underflow nor overflow
         usable = jnp.isfinite(size) & (size > 0)
-        n = jnp.where(usable, n / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], n.dtype))
-        return Vec3.of(n / jnp.sqrt(jnp.sum(n * n))), usable
+        normalized = jnp.where(
+            usable, normalized / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], normalized.dtype)
+        )
+        return Vec3.of(normalized / jnp.sqrt(jnp.sum(normalized * normalized))), usable
 
 
-def _surface(record: dict[str, Any], dtype: Any) -> LimitSurface:
-    """Build the surface that a record describes."""
+def _surface_from_record(record: dict[str, Any], dtype: Any) -> LimitSurface:
+    """Return the limit surface that the record of a JSON file describes."""
     kinds = {kind.__name__.lower(): kind for kind in LimitSurface.__subclasses__()}
     if record["kind"] not in kinds:
         raise ValueError(f"{record['kind']!r} is no kind of surface; there are {', '.join(sorted(kinds))}")
@@ -239,7 +247,7 @@ def _surface(record: dict[str, Any], dtype: Any) -> LimitSurface:
 
 def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
     """Return `length` as a scalar array, or raise ValueError unless it is finite and positive."""
-    value = as_float(length, dtype)
+    value = as_float(length, dtype, "length")
     check_shape("length", value, ())
     check_finite("length", value)
     check_positive("length", value)

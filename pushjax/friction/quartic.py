@@ -36,7 +36,7 @@ class _QuarticFields(NamedTuple):
 
 
 class QuarticForm(_QuarticFields):
-    """The quartic H in scalars.
+    """The `Form` of a quartic H.
 
     Attributes:
         c: The 15 coefficients, in the order of `MONOMIALS`, 1/N^4.
@@ -94,26 +94,26 @@ class QuarticForm(_QuarticFields):
         each of these products is quadratic in s. This needs two thirds of the arithmetic of the alternative: gradients
         and a Hessian at both ends.
         """
-        ends = (_products(a, a), _products(a, b, twice=True), _products(b, b))
-        rows = compute_once(tuple((m[:3], self._factors(m)) for m in ends), a.x)
-        squares, factors = ([row[k] for row in rows] for k in range(2))
+        product_terms = (_products(a, a), _products(a, b, twice=True), _products(b, b))
+        pairs = compute_once(tuple((products[:3], self._square_factors(products)) for products in product_terms), a.x)
+        squares, factors = ([row[k] for row in pairs] for k in range(2))
         return tuple(
             sum(
                 (
-                    q * f
+                    square * factor
                     for k in range(3)
-                    for n in range(3)
-                    if k + n == power
-                    for q, f in zip(squares[k], factors[n], strict=True)
+                    for j in range(3)
+                    if k + j == power
+                    for square, factor in zip(squares[k], factors[j], strict=True)
                 ),
                 jnp.zeros_like(a.x),
             )
             for power in range(5)
         )
 
-    def _factors(self, m: tuple[Scalar, ...]) -> tuple[Scalar, Scalar, Scalar]:
-        """Return A, B and C of H = xx A + yy B + zz C, for the six products `m`."""
-        c, (xx, yy, zz, xy, xz, yz) = self.c, m
+    def _square_factors(self, products: tuple[Scalar, ...]) -> tuple[Scalar, Scalar, Scalar]:
+        """Return A, B and C of H = xx A + yy B + zz C, for the six products (xx, yy, zz, xy, xz, yz)."""
+        c, (xx, yy, zz, xy, xz, yz) = self.c, products
         return (
             c[0] * xx + c[3] * xy + c[4] * xz + c[9] * yy + c[10] * zz + c[12] * yz,
             c[1] * yy + c[5] * xy + c[6] * yz + c[11] * zz + c[13] * xz,
@@ -154,7 +154,7 @@ class Quartic(LimitSurface):
     degree: ClassVar[int] = 4
 
     def __init__(self, coefficients: ArrayLike, length: ArrayLike):
-        array = as_float(coefficients)
+        array = as_float(coefficients, name="coefficients")
         check_shape("coefficients", array, (15,))
         check_finite("coefficients", array)
         known = concrete(array)
@@ -186,15 +186,15 @@ class Quartic(LimitSurface):
         f, rounds = _inverse(form.c, v)
         h = form.value(f)
         angle = angle_between(form.gradient(f), v)
-        good = usable & (h > 0) & (angle <= angle_tolerance(angle))
-        scale = jnp.where(good, jnp.where(good, h, 1.0) ** -0.25, 0.0)
-        wrench = jnp.where(good, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
-        return InverseMap(wrench, good, rounds, angle)
+        converged = usable & (h > 0) & (angle <= angle_tolerance(angle))
+        scale = jnp.where(converged, jnp.where(converged, h, 1.0) ** -0.25, 0.0)
+        wrench = jnp.where(converged, jnp.stack([f.x, f.y, f.z * self.length]) * scale, 0.0)
+        return InverseMap(wrench, converged, rounds, angle)
 
 
 @jax.custom_jvp
 def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
-    """Return F with grad H(F) = v, and the number of Newton rounds.
+    """Return F with grad H(F) = v, and the number of Newton rounds. `c` holds the 15 coefficients.
 
     Each round minimizes the convex function H(F) - v . F further:
 
@@ -213,25 +213,27 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
     def residual(f: Vec3) -> Vec3:
         return v - form.gradient(f)
 
-    def size(r: Vec3) -> Scalar:
+    def largest_entry(r: Vec3) -> Scalar:
         return jnp.maximum(jnp.maximum(jnp.abs(r.x), jnp.abs(r.y)), jnp.abs(r.z))
 
     halvings = 0.5 ** jnp.arange(10, dtype=v.x.dtype)
 
-    def body(state):
+    def newton_round(state):
         f, _, rounds = state
         step = form.hessian(f).solve(residual(f))
-        along = form.restrict(f, step)
+        coefficients = form.restrict(f, step)
         power = v.dot(step)
-        cost = sum(a * halvings**k for k, a in enumerate(along[1:], start=1)) - power * halvings
-        t = halvings[jnp.argmin(cost)]
-        new = rescaled(f + step.scale(t))
-        return new, size(residual(new)), rounds + 1
+        objective = sum(a * halvings**k for k, a in enumerate(coefficients[1:], start=1)) - power * halvings
+        t = halvings[jnp.argmin(objective)]
+        f_new = rescaled(f + step.scale(t))
+        return f_new, largest_entry(residual(f_new)), rounds + 1
 
     tolerance = 32 * jnp.finfo(v.x.dtype).eps
     start = rescaled(v)
-    begin = (start, size(residual(start)), jnp.zeros((), jnp.int32))
-    f, _, rounds = jax.lax.while_loop(lambda s: (s[1] > tolerance) & (s[2] < MAX_NEWTON_ROUNDS), body, begin)
+    initial_state = (start, largest_entry(residual(start)), jnp.zeros((), jnp.int32))
+    f, _, rounds = jax.lax.while_loop(
+        lambda s: (s[1] > tolerance) & (s[2] < MAX_NEWTON_ROUNDS), newton_round, initial_state
+    )
     return f, rounds
 
 
@@ -240,18 +242,19 @@ def _inverse_jvp(primals, tangents) -> Any:
     """Solve hess H dF = dv - d(grad H) at the solution: one linear solve."""
     (c, v), (dc, dv) = primals, tangents
     f, rounds = _inverse(c, v)
-    one = jnp.ones_like(v.x)
-    g = QuarticForm(dc, one).gradient(f)  # grad H is linear in the coefficients
-    df = QuarticForm(c, one).hessian(f).solve(dv - g)
+    unit_length = jnp.ones_like(v.x)
+    gradient_change = QuarticForm(dc, unit_length).gradient(f)  # grad H is linear in the coefficients
+    df = QuarticForm(c, unit_length).hessian(f).solve(dv - gradient_change)
     return (f, rounds), (df, np.zeros(rounds.shape, jax.dtypes.float0))
 
 
 def least_curvature(coefficients: np.ndarray) -> float:
     """Return the smallest eigenvalue of the Hessian over the unit sphere, relative to the largest one found.
 
-    z' hess H(F) z is 12 times a symmetric form T(F, F, z, z). So the search alternates, starting at the worst
-    directions F of a sweep: z becomes the eigenvector of the smallest eigenvalue of the Hessian at F, then F becomes
-    that of the Hessian at z. Each half step can only lower the eigenvalue.
+    z' hess H(F) z is 12 times a symmetric form T(F, F, z, z). So the search alternates. It starts at the directions F
+    with the smallest eigenvalues out of 2000 that cover the half sphere. z becomes the eigenvector of the smallest
+    eigenvalue of the Hessian at F, then F becomes that of the Hessian at z. Each half step can only lower the
+    eigenvalue.
 
     Args:
         coefficients: Coefficients of the quartic, shape (15,).
@@ -276,6 +279,6 @@ def _curvature_tensor(coefficients: np.ndarray) -> np.ndarray:
     for index in np.ndindex(3, 3, 3, 3):
         exponent = np.bincount(index, minlength=3)
         k = int(np.argmax((MONOMIALS == exponent).all(axis=1)))
-        count = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
-        tensor[index] = 12 * coefficients[k] / count
+        permutations = 24 / np.prod([[1, 1, 2, 6, 24][e] for e in exponent])
+        tensor[index] = 12 * coefficients[k] / permutations
     return tensor

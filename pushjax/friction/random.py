@@ -2,7 +2,8 @@
 
 There are three distributions of limit surfaces, for n degrees of freedom:
 
-Ellipsoid         A ~ W(A_mean, n) / n, the Wishart distribution: mean A_mean, variance (A_ij^2 + A_ii A_jj) / n.
+Ellipsoid         A ~ W(A_mean, n) / n, the Wishart distribution: mean A_mean. The variance of A_ij is
+                  (A_ij^2 + A_ii A_jj) / n, with the entries of A_mean.
 Quartic, "gram"   The Gram matrix ~ W(G, n) / n, where G is the Gram matrix of the mean. Along every ray H varies as for
                   an ellipsoid of the same n: its relative variance is 2 / n. Not all samples are convex. Each is
                   certified (`convexity`); one that is not convex is pulled toward the mean, by as little as the
@@ -15,8 +16,9 @@ A traced `dof` (under `jit`, `grad` or `vmap`) is not checked. If it is so small
 exist, the sampled surface is NaN, and every step of a rollout with it has the status INVALID.
 
 All samples are smooth functions of standard draws (Bartlett's decomposition). So they can be differentiated by `dof`,
-by the range of the contact friction and by the mean. The shrinkage of a repaired sample is held fixed, and so are the N
-of the Gram matrix of a mean and its loading. The terms of a mean change with it as described in `decompose`.
+by the range of the contact friction and by the mean. Three results of searches have no derivative: the shrinkage of a
+repaired sample, the block N of a mean's Gram matrix, and its diagonal loading. The derivative of the terms P_k of a
+mean is described in `decompose`.
 
 Zhou et al. 2017 leave three choices open, which are made as follows:
 
@@ -138,11 +140,11 @@ class FrictionModel(eqx.Module):
         self.sampler, self.resample_every = sampler, None if resample_every is None else int(resample_every)
         self.dof = None
         if dof is not None:
-            self.dof = as_float(dof, dtype)
+            self.dof = as_float(dof, dtype, "dof")
             check_shape("dof", self.dof, ())
             check_finite("dof", self.dof)
-            _at_least(self.dof, 3, "an ellipsoid's matrix")
-        mu = as_float(friction, dtype)
+            _check_dof(self.dof, 3, "an ellipsoid's matrix")
+        mu = as_float(friction, dtype, "friction")
         if mu.shape not in ((), (2,)):
             raise ValueError(f"friction has shape {mu.shape}; expected a scalar or (2,), lowest and highest")
         check_finite("friction", mu)
@@ -174,7 +176,7 @@ class FrictionModel(eqx.Module):
             return _WishartEllipsoid.of(surface, dof)
         if not isinstance(surface, Quartic):
             raise TypeError(f"surface: expected an Ellipsoid or a Quartic; got a {type(surface).__name__}")
-        _at_least(dof, 9, "a quartic's Gram matrix")
+        _check_dof(dof, 9, "a quartic's Gram matrix")
         return (_GramQuartic if self.sampler == "gram" else SumOfSquaresQuartic).of(surface, dof)
 
     def sample(self, key: PRNGKeyArray, surface: LimitSurface) -> tuple[LimitSurface, Float[Array, ""]]:
@@ -209,7 +211,7 @@ class FrictionModel(eqx.Module):
         return low + (high - low) * jax.random.uniform(key, (), self.friction.dtype)
 
 
-def _at_least(dof: Array, least: int, what: str) -> None:
+def _check_dof(dof: Array, least: int, what: str) -> None:
     """Raise ValueError if `dof` is less than `least`, the size of the matrix that `what` names."""
     known = concrete(dof)
     if known is not None and not known >= least:
@@ -279,15 +281,15 @@ class _GramQuartic(SurfaceDistribution):
     @quick_jit
     def of(mean: Quartic, dof: Array) -> "_GramQuartic":
         form = mean.form()
-        size = jax.lax.stop_gradient(form.c[0] + form.c[1] + form.c[2])
-        scaled = tuple(c / size for c in form.c)
-        canonical = without_derivatives(_canonical, scaled)
-        gram = Gram.of(form.c, tuple(size * n for n in canonical.n))
-        least = canonical.scale
+        scale = jax.lax.stop_gradient(form.c[0] + form.c[1] + form.c[2])
+        scaled = tuple(c / scale for c in form.c)
+        best = without_derivatives(_best_gram, scaled)
+        gram = Gram.of(form.c, tuple(scale * n for n in best.n))
+        least = best.scale
         # For a mean on the border of convexity the least eigenvalue is zero, up to the tolerance of the search.
-        loading = size * jnp.where(least > 0, LOADING * least, least)
-        within = gram.plus(-loading, Gram.identity(loading)).symmetric
-        return _GramQuartic(mean, gram, loading, Cholesky.of(within).lower, dof)
+        loading = scale * jnp.where(least > 0, LOADING * least, least)
+        unloaded = gram.plus(-loading, Gram.identity(loading)).symmetric
+        return _GramQuartic(mean, gram, loading, Cholesky.of(unloaded).lower, dof)
 
     def with_dof(self, dof: Array) -> "_GramQuartic":
         return eqx.tree_at(lambda s: s.dof, self, dof)
@@ -300,23 +302,27 @@ class _GramQuartic(SurfaceDistribution):
         # does not help in every direction. Add a very small multiple of the identity to it.
         reference = self.gram.plus(jnp.maximum(-2 * self.loading, 0), identity)
         mean = coefficients_of(reference.symmetric)
-        found = without_derivatives(_certified, coefficients, antisymmetric_of(drawn), reference)
-        shrinkage = jnp.where(found.scale < 0, -found.scale / (1 - found.scale), 0.0)
-        shrinkage = jnp.where(jnp.isfinite(found.scale), shrinkage, 1.0)  # never observed: samples that are not finite
-        moved = [c + shrinkage * (m - c) for c, m in zip(coefficients, mean, strict=True)]
-        return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, jnp.stack(moved)), shrinkage)
+        certificate = without_derivatives(_certify, coefficients, antisymmetric_of(drawn), reference)
+        shrinkage = jnp.where(certificate.scale < 0, -certificate.scale / (1 - certificate.scale), 0.0)
+        # Never observed: a search that ends at a scale that is not finite. The sample is then replaced by the mean.
+        shrinkage = jnp.where(jnp.isfinite(certificate.scale), shrinkage, 1.0)
+        repaired = [c + shrinkage * (m - c) for c, m in zip(coefficients, mean, strict=True)]
+        return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, jnp.stack(repaired)), shrinkage)
 
 
-def _canonical(coefficients):
-    """Find the Gram matrix of a quartic whose least eigenvalue is as large as possible; `scale` is that eigenvalue."""
+def _best_gram(coefficients):
+    """Find the Gram matrix of a quartic whose least eigenvalue is largest; `scale` of the result is that eigenvalue."""
     one = jnp.ones_like(coefficients[0])
-    ball = (0.2 * one,) * 3 + (0 * one,) * 3
+    start_n = (0.2 * one,) * 3 + (0 * one,) * 3
     tolerance = 1e-6 if one.dtype == jnp.float64 else 1e-4
-    return max_feasible_scale(coefficients, ball, Gram.identity(one), enough=np.inf, tolerance=tolerance)
+    return max_feasible_scale(coefficients, start_n, Gram.identity(one), enough=np.inf, tolerance=tolerance)
 
 
-def _certified(coefficients, n, reference):
-    """Certify that a quartic is convex (`scale` >= 0), or find how much of the reference makes it so (-`scale`)."""
+def _certify(coefficients, n, reference):
+    """Certify that a quartic is convex, or find how much of the Gram matrix `reference` must be added to make it so.
+
+    `scale` of the result is not negative if the quartic is convex. Otherwise -`scale` is the multiple to add.
+    """
     return max_feasible_scale(coefficients, n, reference, enough=0.0, tolerance=1e-3)
 
 
@@ -381,7 +387,8 @@ def dof_of_terms(lower: Array, dof: Array) -> Array:
     """
     forms = lower @ jnp.swapaxes(lower, 1, 2)
     rays = jnp.asarray(fibonacci_hemisphere(NUM_RAYS), dof.dtype)
-    each = jnp.einsum("fi,kij,fj->fk", rays, forms, rays) ** 2
-    share = each / jnp.sum(each, axis=1, keepdims=True)
+    value = jnp.einsum("fi,kij,fj->fk", rays, forms, rays) ** 2
+    share = value / jnp.sum(value, axis=1, keepdims=True)
+    # With s the mean sum of squared shares: s (8 m + 24) / (m (m + 2)) = 2 / n, so m^2 - b m - 3 (b + 2) = 0.
     b = 4 * jnp.mean(jnp.sum(share**2, axis=1)) * dof - 2
     return (b + jnp.sqrt(b**2 + 12 * (b + 2))) / 2

@@ -18,14 +18,14 @@ from pushjax.friction.quartic import MONOMIALS
 
 # With this many terms, a fit reaches the optimum over all convex quartics. `pushjax.friction.fit` says how closely.
 TERMS = 5
-MAX_STEPS = 100
-_LOWER = np.tril_indices(3)
+MAX_STEPS = 100  # of the Levenberg-Marquardt method
+_LOWER_INDICES = np.tril_indices(3)
 
 
 def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
-    """Return the coefficients of sum_k (F' P_k F)^2 in the order of `Quartic`, for symmetric P_k, (terms, 3, 3)."""
+    """Return the coefficients of sum_k (F' P_k F)^2 in the order of `Quartic`, for symmetric P_k, `p[k]`."""
     products = jnp.einsum("kij,klm->ijlm", p, p)
-    return jnp.asarray(_COLLECT, p.dtype) @ products.reshape(81)
+    return jnp.asarray(_MONOMIAL_SUMS, p.dtype) @ products.reshape(81)
 
 
 def quadratic_forms(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
@@ -36,7 +36,7 @@ def quadratic_forms(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]
 
 def unpack_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
     """Return the matrices L_k, given their lower triangles, row by row."""
-    return jnp.zeros((lower.shape[0], 3, 3), lower.dtype).at[:, *_LOWER].set(lower)
+    return jnp.zeros((lower.shape[0], 3, 3), lower.dtype).at[:, *_LOWER_INDICES].set(lower)
 
 
 def initial_factors(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 6"]:
@@ -45,11 +45,11 @@ def initial_factors(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 
     Each P_k is a multiple of the identity, stretched along a direction of its own. Equal terms would stay equal
     throughout the search. A single term is not stretched.
     """
-    u = fibonacci_hemisphere(terms)
-    spread = 0.5 if terms > 1 else 0.0
-    lower = np.linalg.cholesky(np.eye(3) + spread * (3 * u[:, :, None] * u[:, None] - np.eye(3)))
-    size = terms ** (-1 / degree)
-    return jnp.asarray(size * lower[:, *_LOWER], dtype)
+    directions = fibonacci_hemisphere(terms)
+    stretch = 0.5 if terms > 1 else 0.0
+    lower = np.linalg.cholesky(np.eye(3) + stretch * (3 * directions[:, :, None] * directions[:, None] - np.eye(3)))
+    scale = terms ** (-1 / degree)
+    return jnp.asarray(scale * lower[:, *_LOWER_INDICES], dtype)
 
 
 class SumOfSquares(NamedTuple):
@@ -80,21 +80,23 @@ def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> SumOfSqua
     Returns:
         The factors of the terms, and the error of their sum.
     """
-    size = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
-    target = coefficients / size
-    found = without_derivatives(_search_factors, target, initial_factors(4, terms, coefficients.dtype))
-    slope = jax.lax.stop_gradient(jax.jacobian(_coefficients)(found).reshape(len(MONOMIALS), -1))
-    off = target - jax.lax.stop_gradient(target)
-    found = found + (jnp.linalg.pinv(slope) @ off).reshape(found.shape)
-    return SumOfSquares(unpack_lower(found) * size**0.25, jnp.max(jnp.abs(_coefficients(found) - target)))
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
+    target = coefficients / scale
+    factors = without_derivatives(_search_factors, target, initial_factors(4, terms, coefficients.dtype))
+    jacobian = jax.lax.stop_gradient(jax.jacobian(_coefficients)(factors).reshape(len(MONOMIALS), -1))
+    change = target - jax.lax.stop_gradient(target)
+    factors = factors + (jnp.linalg.pinv(jacobian) @ change).reshape(factors.shape)
+    return SumOfSquares(unpack_lower(factors) * scale**0.25, jnp.max(jnp.abs(_coefficients(factors) - target)))
 
 
 def _coefficients(lower: Float[Array, "terms 6"]) -> Float[Array, "15"]:
+    """Return the coefficients of the quartic whose factors L_k have these lower triangles, row by row."""
     return squared_quadratics(quadratic_forms(lower))
 
 
 def _search_factors(target: Float[Array, "15"], start: Float[Array, "terms 6"]) -> Float[Array, "terms 6"]:
-    # The solver keeps its own numbers in the widest float type that is enabled, and it does not mix two types.
+    """Return the lower triangles of the L_k whose quartic is nearest to the coefficients `target`."""
+    # Optimistix keeps its own state in the widest float type that is enabled, and it does not mix two types.
     wide = jnp.result_type(float)
     tolerance = 1e-12 if wide == jnp.float64 else 1e-6
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
@@ -103,16 +105,16 @@ def _search_factors(target: Float[Array, "15"], start: Float[Array, "terms 6"]) 
     return found.value.astype(start.dtype)
 
 
-def _collect() -> np.ndarray:
+def _monomial_sums() -> np.ndarray:
     """Return the matrix (15, 81) that turns a flattened 3 x 3 x 3 x 3 array into the coefficients of a quartic.
 
     The entry (i, j, l, m) of the array is a factor of F_i F_j F_l F_m. For each monomial, its entries are summed.
     """
-    table = np.zeros((len(MONOMIALS), 81))
+    sums = np.zeros((len(MONOMIALS), 81))
     for flat, index in enumerate(np.ndindex(3, 3, 3, 3)):
         exponent = np.bincount(index, minlength=3)
-        table[int(np.argmax((MONOMIALS == exponent).all(axis=1))), flat] = 1
-    return table
+        sums[int(np.argmax((MONOMIALS == exponent).all(axis=1))), flat] = 1
+    return sums
 
 
-_COLLECT = _collect()
+_MONOMIAL_SUMS = _monomial_sums()

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Key
 from pushjax._internal.checks import (
     ArrayLike,
     as_float,
+    check_count,
     check_finite,
     check_non_negative,
     check_positive,
@@ -36,6 +37,7 @@ from pushjax._internal.jit import quick_jit
 from pushjax.geometry.shape import Shape
 
 FACET_FRACTION = 0.1  # fraction of the wrench-twist pairs that lie on a facet
+SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
 
 
 class WrenchTwistPairs(NamedTuple):
@@ -68,7 +70,7 @@ class Support(eqx.Module):
 
     def __init__(self, point: ArrayLike, limit: ArrayLike):
         dtype = common_dtype(point, limit)
-        self.point, self.limit = as_float(point, dtype), as_float(limit, dtype)
+        self.point, self.limit = as_float(point, dtype, "point"), as_float(limit, dtype, "limit")
         check_shape("point", self.point, ("points", 2))
         check_shape("limit", self.limit, (self.point.shape[0],))
         check_finite("point", self.point)
@@ -95,13 +97,13 @@ class Support(eqx.Module):
                 load is not positive.
         """
         dtype = common_dtype(point, weights, load)
-        array, total = as_float(point, dtype), as_float(load, dtype)
+        array, total = as_float(point, dtype, "point"), as_float(load, dtype, "load")
         check_shape("point", array, ("points", 2))
         share = normalized_weights(weights, array.shape[0], dtype)
         check_shape("load", total, ())
         check_finite("load", total)
         check_positive("load", total)
-        return Support(array, in_numpy(_distributed)(total, share))
+        return Support(array, in_numpy(_distribute)(total, share))
 
     @staticmethod
     def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
@@ -120,20 +122,23 @@ class Support(eqx.Module):
                 line. Not checked for traced arguments.
         """
         dtype = common_dtype(point, load, center)
-        array, c = as_float(point, dtype), as_float(center, dtype)
+        array, center_point = as_float(point, dtype, "point"), as_float(center, dtype, "center")
         check_shape("point", array, (3, 2))
-        check_shape("center", c, (2,))
+        check_shape("center", center_point, (2,))
         check_finite("point", array)
-        check_finite("center", c)
+        check_finite("center", center_point)
         # The share of a point is proportional to the area of the triangle of the center and the other two points.
-        one, two = jnp.roll(array, -1, axis=0) - c[None], jnp.roll(array, -2, axis=0) - c[None]
-        opposite = one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]
-        total = jnp.sum(opposite)
+        to_next, to_previous = (
+            jnp.roll(array, -1, axis=0) - center_point[None],
+            jnp.roll(array, -2, axis=0) - center_point[None],
+        )
+        double_area = to_next[:, 0] * to_previous[:, 1] - to_next[:, 1] * to_previous[:, 0]
+        total = jnp.sum(double_area)
         known = concrete(total)
         side = array - jnp.roll(array, 1, axis=0)
         if known is not None and abs(known) <= 1e-6 * float(jnp.max(jnp.sum(side**2, axis=1))):
             raise ValueError("point: the three support points lie on a line")
-        share = opposite / total
+        share = double_area / total
         known = concrete(share)
         if known is not None and not np.all(known >= -1e-6):
             raise ValueError(f"center must lie inside the three support points; it asks for shares {known.tolist()}")
@@ -159,8 +164,7 @@ class Support(eqx.Module):
         Raises:
             ValueError: If `points` is less than one, or the shape is traced.
         """
-        if points < 1:
-            raise ValueError(f"points must be at least 1; got {points}")
+        check_count("points", points)
         low, high = (concrete(corner) for corner in shape.bounds)
         if low is None or high is None:
             raise ValueError("shape must be known to lay a grid over it; build the Support outside jit")
@@ -170,12 +174,12 @@ class Support(eqx.Module):
         around = np.linspace(-0.1, 0.4, 26)
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
         grids = [_cells(low, high, spacing) for spacing in spacings]
-        most = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
+        max_samples = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
         best: tuple[np.ndarray, np.ndarray] | None = None
         for samples, middles in grids:
-            padded = np.concatenate([samples, np.broadcast_to(low, (most - len(samples), 2))])
+            padded = np.concatenate([samples, np.broadcast_to(low, (max_samples - len(samples), 2))])
             inside = np.asarray(_inside(shape, on_device(padded.astype(dtype))))[: len(samples)]
-            found = _covered(samples, middles, inside)
+            found = _covered_parts(samples, middles, inside)
             if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
                 best = found
             if len(best[0]) == points:
@@ -198,8 +202,7 @@ class Support(eqx.Module):
         Raises:
             ValueError: If `points` is less than one.
         """
-        if points < 1:
-            raise ValueError(f"points must be at least 1; got {points}")
+        check_count("points", points)
         return Support.points(shape.boundary(points), load=load)
 
     @property
@@ -234,19 +237,19 @@ class Support(eqx.Module):
         Raises:
             ValueError: If the twist has the wrong shape or is not finite.
         """
-        v = as_float(twist, self.point.dtype)
+        v = as_float(twist, self.point.dtype, "twist")
         check_shape("twist", v, (3,))
         check_finite("twist", v)
         moved = jnp.any(v != 0)
         v = v / jnp.where(moved, jnp.max(jnp.abs(v)), 1.0)  # so that squares neither underflow nor overflow
         velocity = jnp.stack([v[0] - v[2] * self.point[:, 1], v[1] + v[2] * self.point[:, 0]], axis=1)
-        speed2 = jnp.sum(velocity**2, axis=1)
+        squared_speed = jnp.sum(velocity**2, axis=1)
         # A point does not slide if its speed is within the roundoff of the products above.
-        reach = jnp.abs(v[2]) * jnp.max(jnp.abs(self.point)) + jnp.max(jnp.abs(v[:2]))
-        still = speed2 <= (8 * jnp.finfo(speed2.dtype).eps * reach) ** 2
-        force = jnp.where(still[:, None], 0.0, velocity / jnp.sqrt(jnp.where(still, 1.0, speed2))[:, None])
+        speed_scale = jnp.abs(v[2]) * jnp.max(jnp.abs(self.point)) + jnp.max(jnp.abs(v[:2]))
+        is_pivot = squared_speed <= (8 * jnp.finfo(squared_speed.dtype).eps * speed_scale) ** 2
+        force = jnp.where(is_pivot[:, None], 0.0, velocity / jnp.sqrt(jnp.where(is_pivot, 1.0, squared_speed))[:, None])
         if key is not None:
-            force = jnp.where((still & moved)[:, None], _in_unit_disk(key, len(self.point), v.dtype), force)
+            force = jnp.where((is_pivot & moved)[:, None], _in_unit_disk(key, len(self.point), v.dtype), force)
         f = self.limit[:, None] * force
         torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
         return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
@@ -273,26 +276,29 @@ class Support(eqx.Module):
         """
         if pairs < 1:
             raise ValueError(f"pairs must be at least 1; got {pairs}")
-        rho = (
+        characteristic_length = (
             in_numpy(_characteristic_length)(self.point, self.limit)
             if length is None
-            else as_float(length, self.point.dtype)
+            else as_float(length, self.point.dtype, "length")
         )
-        check_shape("length", rho, ())
-        check_finite("length", rho)
-        check_positive("length", rho)
-        return _pairs(self, key, pairs, rho)
+        check_shape("length", characteristic_length, ())
+        check_finite("length", characteristic_length)
+        check_positive("length", characteristic_length)
+        return _pairs(self, key, pairs, characteristic_length)
 
 
-def _distributed(xp, total, weights):
+def _distribute(xp, total, weights):
+    """Return the friction limit of each point, N, for a total limit and relative weights."""
     return total * weights / xp.sum(weights)
 
 
 def _center(xp, point, limit):
+    """Return the center of pressure, shape (2,), m."""
     return xp.sum(limit[:, None] * point, axis=0) / xp.sum(limit)
 
 
 def _radius_of_gyration(xp, point, limit):
+    """Return the root mean square distance of the pressure from its center, m."""
     squared = xp.sum((point - _center(xp, point, limit)[None]) ** 2, axis=1)
     return xp.sqrt(xp.sum(limit * squared) / xp.sum(limit))
 
@@ -305,32 +311,32 @@ def _characteristic_length(xp, point, limit):
 
 
 @quick_jit
-def _pairs(support: Support, key: Key[Array, ""], pairs: int, rho: Float[Array, ""]) -> WrenchTwistPairs:
-    """Draw the pairs of `Support.wrench_twist_pairs`, with `rho` as the length."""
+def _pairs(support: Support, key: Key[Array, ""], pairs: int, length: Float[Array, ""]) -> WrenchTwistPairs:
+    """Draw the pairs of `Support.wrench_twist_pairs`."""
     dtype = support.point.dtype
     k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
     free = jax.random.normal(k_free, (pairs, 3), dtype)
-    about = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
+    pivot_point = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
     # A rotation about r moves the origin with (r_y, -r_x) omega.
-    spin = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
-    pivot = spin[:, None] * jnp.stack([about[:, 1], -about[:, 0], jnp.broadcast_to(rho, (pairs,))], axis=1)
-    facets = round(FACET_FRACTION * pairs)
-    on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facets)
-    normalized = jnp.where(on_facet[:, None], pivot, free)
+    rotation_sign = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
+    pivot_twist = rotation_sign[:, None] * jnp.stack(
+        [pivot_point[:, 1], -pivot_point[:, 0], jnp.broadcast_to(length, (pairs,))], axis=1
+    )
+    facet_pairs = round(FACET_FRACTION * pairs)
+    on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facet_pairs)
+    normalized = jnp.where(on_facet[:, None], pivot_twist, free)
     normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
-    twist = normalized / jnp.stack([jnp.ones_like(rho), jnp.ones_like(rho), rho])[None]
+    twist = normalized / jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])[None]
     wrench = jax.vmap(support.wrench)(twist, jax.random.split(k_facet, pairs))
-    return WrenchTwistPairs(wrench, twist, rho)
-
-
-SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
+    return WrenchTwistPairs(wrench, twist, length)
 
 
 def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Divide a box into cells whose sides are as close to `spacing` as the box allows.
 
     Returns:
-        Sample points, shape (cells * SAMPLES^2, 2), and the centers of the cells, shape (cells, 2).
+        A tuple of the sample points, shape (cells * SAMPLES^2, 2), and the centers of the cells, shape
+        (cells, 2), both in m.
     """
     count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
     cell = (high - low) / count
@@ -341,33 +347,33 @@ def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarra
     return (middles[:, None] + offsets[None]).reshape(-1, 2), middles
 
 
-def _covered(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each cell with a sample inside, the mean of its inside samples and the fraction of it inside."""
     inside = inside.reshape(len(middles), -1)
-    share = inside.mean(axis=1)
+    fraction = inside.mean(axis=1)
     mean = (
         np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
         / np.maximum(inside.sum(axis=1), 0.5)[:, None]
     )
-    mean = np.where((share == 1)[:, None], middles, mean)
-    return mean[share > 0], share[share > 0]
+    mean = np.where((fraction == 1)[:, None], middles, mean)
+    return mean[fraction > 0], fraction[fraction > 0]
 
 
 @quick_jit
 def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
     """Return 1 for a point inside, 0 outside, and one half on the outline, where roundoff would decide."""
     low, high = shape.bounds
-    border = 64 * jnp.finfo(points.dtype).eps * jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)))
+    tolerance = 64 * jnp.finfo(points.dtype).eps * jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)))
 
-    def share(point):
+    def inside_fraction(point):
         distance = shape.signed_distance(point)
-        return jnp.where(distance < -border, 1.0, jnp.where(distance <= border, 0.5, 0.0))
+        return jnp.where(distance < -tolerance, 1.0, jnp.where(distance <= tolerance, 0.5, 0.0))
 
-    return jax.lax.map(share, points, batch_size=4096)  # in parts, because points times edges may be many
+    return jax.lax.map(inside_fraction, points, batch_size=4096)  # in parts, because points times edges may be many
 
 
 def _in_unit_disk(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
-    """Draw points uniformly from the unit disk."""
+    """Return `count` points drawn uniformly from the unit disk."""
     k_r, k_angle = jax.random.split(key)
     radius = jnp.sqrt(jax.random.uniform(k_r, (count, 1), dtype))
     angle = jax.random.uniform(k_angle, (count, 1), dtype, maxval=2 * jnp.pi)

@@ -15,6 +15,7 @@ from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3, cos_sin, unstack
 from pushjax.friction.limit_surface import Form
 
+# Number of entries of each attribute of `Table`.
 SIZES = {"anisotropy": 2, "log_gradient": 2, "log_hessian": 3, "origin": 2}
 NEAR_ZERO = 1e-3  # value of r^2 below which cosh(r) and sinh(r) / r are computed by their series
 
@@ -59,7 +60,7 @@ class _TransformedFields(NamedTuple):
 
 
 class TransformedForm(_TransformedFields):
-    """H(T F) in scalars.
+    """The `Form` H(T F) of a limit surface on a table.
 
     Attributes:
         base: The form H.
@@ -151,22 +152,26 @@ class Table(eqx.Module):
         Returns:
             The map T.
         """
-        angle = cos_sin(pose.z)
-        # The entries of a symmetric matrix of trace zero rotate by twice the angle.
+        heading = cos_sin(pose.z)
+        # The entries (a, b) of the symmetric matrix [[a, b], [b, -a]] rotate by twice the angle.
         a, b = unstack(self.anisotropy)
-        cos, sin = angle.x * angle.x - angle.y * angle.y, 2 * angle.x * angle.y
-        a, b = cos * a + sin * b, cos * b - sin * a
+        cos_2, sin_2 = heading.x * heading.x - heading.y * heading.y, 2 * heading.x * heading.y
+        a, b = cos_2 * a + sin_2 * b, cos_2 * b - sin_2 * a
         squared = a * a + b * b
         small = squared < NEAR_ZERO
         r = jnp.sqrt(jnp.where(small, 1.0, squared))
-        even = jnp.where(small, 1 + squared / 2 * (1 + squared / 12 * (1 + squared / 30)), jnp.cosh(r))
-        odd = jnp.where(small, 1 + squared / 6 * (1 + squared / 20 * (1 + squared / 42)), jnp.sinh(r) / r)
-        sx, sy = unstack(self.log_gradient)
-        xx, yy, xy = unstack(self.log_hessian)
-        ox, oy = unstack(self.origin)
-        x, y = pose.x - ox, pose.y - oy
-        rise_x, rise_y = sx + xx * x + xy * y, sy + xy * x + yy * y
-        half = length / 2  # length^2 / 2, divided by the length, because c is normalized
-        cx, cy = half * (angle.x * rise_x + angle.y * rise_y), half * (angle.x * rise_y - angle.y * rise_x)
-        # S = exp(-anisotropy): where friction is higher along x, S shrinks forces along x.
-        return WrenchTransform(even - odd * a, even + odd * a, -odd * b, cx, cy)
+        cosh_r = jnp.where(small, 1 + squared / 2 * (1 + squared / 12 * (1 + squared / 30)), jnp.cosh(r))
+        sinh_r_by_r = jnp.where(small, 1 + squared / 6 * (1 + squared / 20 * (1 + squared / 42)), jnp.sinh(r) / r)
+        gradient_x, gradient_y = unstack(self.log_gradient)
+        hessian_xx, hessian_yy, hessian_xy = unstack(self.log_hessian)
+        origin_x, origin_y = unstack(self.origin)
+        x, y = pose.x - origin_x, pose.y - origin_y
+        slope_x, slope_y = gradient_x + hessian_xx * x + hessian_xy * y, gradient_y + hessian_xy * x + hessian_yy * y
+        half_length = length / 2  # length^2 / 2, divided by the length, because c is normalized
+        cx, cy = (
+            half_length * (heading.x * slope_x + heading.y * slope_y),
+            half_length * (heading.x * slope_y - heading.y * slope_x),
+        )
+        # S = exp(-M) for the symmetric matrix M = [[a, b], [b, -a]] of the anisotropy in the body frame, and
+        # exp(-M) = cosh(r) I - sinh(r) / r M with r^2 = a^2 + b^2. Where friction is higher along x, S shrinks fx.
+        return WrenchTransform(cosh_r - sinh_r_by_r * a, cosh_r + sinh_r_by_r * a, -sinh_r_by_r * b, cx, cy)
