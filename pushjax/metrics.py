@@ -142,7 +142,7 @@ def log_density(
     """
     x, y, scale = _checked(samples, observed, length)
     check_positive("min_bandwidth", min_bandwidth)
-    return _log_density(x, y, scale, as_float(min_bandwidth, x.dtype))
+    return _log_density(x, y, scale, as_float(min_bandwidth, x.dtype, "min_bandwidth"))
 
 
 @jax.jit
@@ -188,7 +188,7 @@ def coverage(
     check_positive("min_bandwidth", min_bandwidth)
     if fractions.ndim != 1 or not np.all((fractions > 0) & (fractions < 1)):
         raise ValueError(f"levels must be numbers between 0 and 1; got {levels!r}")
-    return _coverage(x, y, scale, jnp.asarray(fractions, x.dtype), as_float(min_bandwidth, x.dtype))
+    return _coverage(x, y, scale, jnp.asarray(fractions, x.dtype), as_float(min_bandwidth, x.dtype, "min_bandwidth"))
 
 
 @jax.jit
@@ -197,19 +197,19 @@ def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Ar
     kernel = _Kernel(points, min_bandwidth, scale)
 
     def leave_one_out(index: Array) -> Array:
-        log = kernel.log_densities(points[index])
-        return jax.nn.logsumexp(jnp.where(jnp.arange(len(points)) == index, -jnp.inf, log))
+        log_densities = kernel.log_densities(points[index])
+        return jax.nn.logsumexp(jnp.where(jnp.arange(len(points)) == index, -jnp.inf, log_densities))
 
-    sample_densities = jax.lax.map(leave_one_out, jnp.arange(len(points)))
-    observed_densities = jax.lax.map(
+    sample_log_densities = jax.lax.map(leave_one_out, jnp.arange(len(points)))
+    observed_log_densities = jax.lax.map(
         lambda p: jax.nn.logsumexp(kernel.log_densities(p)), observed_points.reshape(-1, 3)
     )
-    thresholds = jnp.quantile(sample_densities, 1 - levels)
+    thresholds = jnp.quantile(sample_log_densities, 1 - levels)
     # leave-one-out densities sum n - 1 kernels, those of observations n: give both the same normalization
-    observed_densities = observed_densities - jnp.log(
-        jnp.asarray(len(points) / (len(points) - 1), sample_densities.dtype)
+    observed_log_densities = observed_log_densities - jnp.log(
+        jnp.asarray(len(points) / (len(points) - 1), sample_log_densities.dtype)
     )
-    return jnp.mean(observed_densities[None] >= thresholds[:, None], axis=1, dtype=sample_densities.dtype)
+    return jnp.mean(observed_log_densities[None] >= thresholds[:, None], axis=1, dtype=sample_log_densities.dtype)
 
 
 def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:

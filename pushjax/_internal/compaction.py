@@ -61,7 +61,7 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
     """
 
     def broadcast_unbatched(tree, is_batched):
-        """Give the leaves without a batch axis one, because the loop over tiles updates all of them by example."""
+        """Give each leaf a batch axis, because the loop over tiles writes the results of single examples."""
 
         def with_axis(x, has_axis):
             return x if has_axis else jnp.broadcast_to(x, (size, *jnp.shape(x)))
@@ -114,21 +114,20 @@ def _compute_in_tiles(compute: Callable[..., Any], args_batched: Any, needed, ot
     tile = min(tile_size(), batch)
     needed_count = jnp.sum(needed.astype(jnp.int32))
     # Indices of the examples that need the computation, then `batch`, which is out of range, as padding. A padded entry
-    # of a tile computes the last example again (`gathered`), and the scatter to `positions` drops its result.
+    # of a tile computes the last example again (`rows`), and the scatter to `positions` drops its result.
     indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
     axes = jax.tree.map(lambda batched_leaf: 0 if batched_leaf else None, args_batched)
 
     def next_tile(state):
         begin, results = state
         positions = jax.lax.dynamic_slice(indices, (begin,), (tile,))
-        gathered = jnp.minimum(positions, batch - 1)
-        tile_args = jax.tree.map(lambda x, batched_leaf: x[gathered] if batched_leaf else x, args, args_batched)
+        rows = jnp.minimum(positions, batch - 1)
+        tile_args = jax.tree.map(lambda x, batched_leaf: x[rows] if batched_leaf else x, args, args_batched)
         tile_results = jax.vmap(compute, in_axes=axes, axis_size=tile)(*tile_args)
         results = jax.tree.map(
             lambda all_rows, tile_rows: all_rows.at[positions].set(tile_rows, mode="drop"), results, tile_results
         )
         return begin + tile, results
 
-    return jax.lax.while_loop(lambda state: state[0] < needed_count, next_tile, (jnp.zeros((), jnp.int32), otherwise))[
-        1
-    ]
+    initial = jnp.zeros((), jnp.int32), otherwise
+    return jax.lax.while_loop(lambda state: state[0] < needed_count, next_tile, initial)[1]

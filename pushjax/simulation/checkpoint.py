@@ -25,7 +25,10 @@ class CheckpointError(ValueError):
 
 
 def digest(*trees: Any) -> str:
-    """Hash of pytrees: of their structure, static parts included, and of every bit of their arrays."""
+    """Return a hash of pytrees, 16 hexadecimal digits: of their structure, and of every bit of their arrays.
+
+    Static fields are part of the structure.
+    """
     hasher = hashlib.sha256()
     leaves, structure = jax.tree.flatten(trees)
     hasher.update(_without_addresses(structure).encode())
@@ -37,18 +40,19 @@ def digest(*trees: Any) -> str:
 
 
 def _without_addresses(structure: Any) -> str:
-    """Text of a tree structure without memory addresses of functions, which differ between processes.
+    """Return the text of a tree structure without memory addresses of functions, which differ between processes.
 
-    What a hand's function does shows in where it puts the fingers.
+    So two functions of one name have the same text. `monte_carlo` therefore also hashes the poses of the fingers, which
+    tell the kinematics of two hands apart.
     """
     pieces = str(structure).split(" at 0x")
     return pieces[0] + "".join(piece[piece.find(">") :] for piece in pieces[1:])
 
 
 class Checkpoint:
-    """Folder of a run.
+    """Folder of a run: a manifest, and one file for each block of pushes.
 
-    A block is a range (first, last + 1) of pushes. Blocks are in order, without gaps.
+    A block is a range of pushes, from index `first` up to but without index `last`. Blocks are in order, without gaps.
 
     Args:
         folder: The folder.
@@ -92,7 +96,7 @@ class Checkpoint:
         return sorted(path for path in self.folder.glob("pushes-*.npz") if BLOCK_FILE.fullmatch(path.name))
 
     def blocks(self) -> list[tuple[int, int, Path]]:
-        """The blocks that exist, in order, up to the first gap."""
+        """Return (first, last, path) of each block that exists, in order, up to the first gap."""
         blocks, end = [], 0
         for path in self._block_files():
             first, last = (int(word) for word in path.stem.split("-")[1:])

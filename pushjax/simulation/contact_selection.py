@@ -1,6 +1,7 @@
-"""Which of the places where a finger and the slider may touch are contacts, and the same places later in the step.
+"""Selection of a finger's contacts from its contact candidates, and the same contacts later in the step.
 
-A pad may touch in more places than constrain it. Of those, the nearest is a contact, and others in different places.
+A pad has more candidates than are needed to constrain it. The nearest of them is selected, and one or two others that
+constrain a different motion.
 """
 
 from typing import Any
@@ -16,25 +17,28 @@ from pushjax.geometry.shape import Outline
 from pushjax.simulation.detection import Candidate, Candidates, edges, is_nonconvex_polygon
 from pushjax.simulation.hand import Finger, Pad
 
-# Two places nearer to each other than this, in units of the length, are one. The first is for a polygon. The second is
-# for a smooth outline, where a corner of a pad and its edge both find the same bump.
+# Two candidates nearer to each other than this, in units of the limit surface's length, count as one. The first is for
+# a polygon. The second is for a smooth outline, where a corner of a pad and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
 
 
 def select_contacts(
     candidates: Candidates, length: Scalar, outline: Outline, path: Vec2
 ) -> tuple[Int[Array, ""] | int, ...]:
-    """Select which places are contacts, the likeliest first. The selection is not differentiated.
+    """Select which candidates are contacts, the likeliest first. The selection is not differentiated.
 
-    Of an array of places, it selects the nearest, and the nearest in a different place. If there is no second, its
-    index equals the first. On a polygon that is not convex, distances are compared after the displacement `path`, and a
-    third place is selected. Places that are not in an array are all selected.
+    Of the candidates of a pad, it selects the nearest, and the nearest of those that are at a different place. On a
+    polygon that is not convex, distances are compared after the displacement `path`, and a third candidate is selected.
+    A tuple of candidates (of a round finger, or on a disk) is selected as a whole.
 
     Args:
-        candidates: All places, as from `contact_candidates`.
+        candidates: All candidates, as from `contact_candidates`.
         length: Characteristic length of the limit surface, m.
         outline: The slider's outline.
         path: Displacement of the finger in the rest of the step, slider's frame, m.
+
+    Returns:
+        Indices of the selected candidates. If there is no second or third one, the first index is repeated.
     """
     if not isinstance(candidates, Candidate):
         return tuple(range(len(candidates)))
@@ -45,36 +49,36 @@ def select_contacts(
     distance = candidates.distance
     first = jnp.argmin(distance)
     nearest = _take(candidates, first)
-    apart = candidates.point - nearest.point
+    offset = candidates.point - nearest.point
     separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
-    elsewhere = apart.dot(apart) > (separation * length) ** 2
-    elsewhere = decide(elsewhere & (distance < nearest.distance + 1e3 * length), length)
-    second = jnp.where(jnp.any(elsewhere), jnp.argmin(jnp.where(elsewhere, distance, jnp.inf)), first)
+    is_other = offset.dot(offset) > (separation * length) ** 2
+    is_other = decide(is_other & (distance < nearest.distance + 1e3 * length), length)
+    second = jnp.where(jnp.any(is_other), jnp.argmin(jnp.where(is_other, distance, jnp.inf)), first)
     return first.astype(jnp.int32), second.astype(jnp.int32)
 
 
 def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""], ...]:
-    """The nearest place, and the two that constrain most of the motions that it leaves free.
+    """Return the indices of the nearest candidate, and of two that constrain most of the motions that it leaves free.
 
-    A pad that lies flat across two arms then rests on its outermost places. A pad in an inner corner then rests on both
-    edges. Neither rests on places side by side.
+    A pad that lies flat across two arms then rests on its outermost candidates. A pad in an inner corner then rests on
+    both edges. Neither rests on two candidates side by side.
     """
     chosen = [jnp.argmin(candidates.distance).astype(jnp.int32)]
     nearest = _take(candidates, chosen[0])
-    elsewhere, travel = candidates.distance < nearest.distance + 1e3 * length, jnp.zeros_like(candidates.distance)
+    eligible, travel = candidates.distance < nearest.distance + 1e3 * length, jnp.zeros_like(candidates.distance)
     previous = nearest
     for _ in range(2):
         differs, distance = _distances_in_other_directions(candidates, previous, length)
-        elsewhere, travel = compute_once((elsewhere & differs, jnp.maximum(travel, distance)), length)
-        best = jnp.argmin(jnp.where(elsewhere, travel, jnp.inf))
-        chosen.append(jnp.where(jnp.any(elsewhere), best, chosen[0]).astype(jnp.int32))
+        eligible, travel = compute_once((eligible & differs, jnp.maximum(travel, distance)), length)
+        best = jnp.argmin(jnp.where(eligible, travel, jnp.inf))
+        chosen.append(jnp.where(jnp.any(eligible), best, chosen[0]).astype(jnp.int32))
         previous = _take(candidates, chosen[-1])
     return tuple(chosen)
 
 
 def _distances_in_other_directions(
     candidates: Candidate, previous: Candidate, length: Scalar
-) -> tuple[Bool[Array, " places"], Scalar]:
+) -> tuple[Bool[Array, " candidates"], Scalar]:
     """Return which candidates constrain a different motion than `previous`, and the distance to each, m.
 
     The distance is how far a slider that stays in contact at `previous` has to move until it touches at the candidate.
@@ -87,7 +91,7 @@ def _distances_in_other_directions(
 
 
 def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tuple[Candidate, ...]:
-    """The selected places; a place that is selected a second time is moved out of reach."""
+    """Return the selected candidates; one that is selected a second time is moved 1 m away, which is out of reach."""
     if not isinstance(candidates, Candidate):
         return candidates
     first, *others = (_take(candidates, index) for index in chosen)
@@ -101,14 +105,14 @@ def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tupl
 def track_contacts(
     candidates: Candidates, chosen: tuple[Any, ...], at_start: tuple[Candidate, ...], finger: Finger, outline: Outline
 ) -> tuple[Any, ...]:
-    """Indices of the same places later in the step, when `contact_candidates` may return them in another order.
+    """Return the indices of the same contacts later in the step, where `contact_candidates` may order them differently.
 
     The order changes in an inner corner, where the edge that a pad's corner is nearest to changes.
 
     Args:
-        candidates: All places now.
+        candidates: All candidates now.
         chosen: Indices at the start of the step.
-        at_start: The selected places at the start of the step.
+        at_start: The selected candidates at the start of the step.
         finger: The finger.
         outline: The slider's outline.
     """

@@ -2,15 +2,15 @@
 
 The fraction of a step in which the hand moves freely is computed exactly, for straight relative paths of any length. So
 a finger can neither tunnel through the slider nor meet the extension of an edge past its corner. From there on, every
-place where a finger and the slider may touch is a contact with its own gap, closed or open. The contact problem finds
-which of them are made within the step.
+place where a finger and the slider may touch is a contact candidate with its own gap, closed or open. The contact
+problem finds which of them are closed within the step.
 
-A round finger has one such place, or two on an outline that is not convex. A pad has one on a disk, and two against a
-convex polygon: each corner of the pad and of the slider is compared with the outline of the other, and the two nearest
-in different places are taken. (An edge that lies flat on an edge rests on the two ends of their common part.) Against a
-smooth outline a pad also has two, selected from the places that `pad_on_curve` finds. Against a polygon that is not
-convex it has three: the nearest place, and the two that constrain most of the motions that the nearest leaves free. All
-are selected anew in each step and stay the same within the step.
+A round finger has one candidate, or two on an outline that is not convex. A pad has one on a disk. Otherwise it has
+many, of which `contact_selection` selects two or three. Against a polygon, each corner of the pad and of the slider is
+compared with the outline of the other. If the polygon is convex, the two nearest at different places are selected. (An
+edge that lies flat on an edge rests on the two ends of their common part.) If it is not convex, three are: the nearest,
+and the two that constrain most of the motions that the nearest leaves free. Against a smooth outline, two of the
+candidates that `pad_on_curve` finds are selected. The selection is new in each step and stays the same within the step.
 """
 
 import functools
@@ -44,7 +44,7 @@ END_TOLERANCE = {4: 2e-5, 8: 1e-6}
 # In units of the length. An edge is extended by this past an inner (reflex) corner, into the slider, so that what sinks
 # into one edge of that corner still projects onto the other.
 REFLEX_EXTENSION = 0.05
-OUT_OF_REACH = 1e3  # m, out of reach
+OUT_OF_REACH = 1e3  # m, distance of a candidate that does not exist; no finger moves so far
 
 
 class FingerPose(NamedTuple):
@@ -60,7 +60,7 @@ class FingerPose(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """A place where a finger and the slider may touch, in the slider's frame, or an array of such places.
+    """A place where a finger and the slider may touch, in the slider's frame; or several, as arrays.
 
     Attributes:
         distance: Signed distance, m; negative in penetration.
@@ -73,8 +73,8 @@ class Candidate(NamedTuple):
     normal: Vec2
 
 
-# A tuple of places, or, for a pad, one array of them. With the corners of a pad unrolled, the program for a jaw was
-# twice as large and took nearly twice as long to compile.
+# A tuple of candidates, or, for a pad, one `Candidate` of arrays. With the corners of a pad unrolled, the program for a
+# jaw was twice as large and took nearly twice as long to compile.
 Candidates = tuple[Candidate, ...] | Candidate
 
 
@@ -86,7 +86,7 @@ def contact_candidates(
     length: Scalar,
     supports: EdgeSupport | None = None,
 ) -> Candidates:
-    """Return every place where a finger and the slider may touch.
+    """Return the contact candidates of a finger: every place where it and the slider may touch.
 
     Args:
         finger: The finger.
@@ -158,14 +158,14 @@ def _vertex_edge_candidates(
     polygon, may be closest to the wrong edge. A corner that is past the end of an edge touches nothing, although it is
     near.
     """
-    found: tuple[tuple[Candidate, Scalar, Scalar, Array], tuple[Candidate, Scalar, Scalar, Array]] | None = None
-    # an inner (reflex) corner cannot touch a straight edge
+    two_nearest: tuple[tuple[Candidate, Scalar, Scalar, Array], tuple[Candidate, Scalar, Scalar, Array]] | None = None
+    # a reflex corner cannot touch a straight edge
     is_convex_corner = corner.onward.cross(corner.back) >= -roundoff(jnp.ones_like(corner.point.x))
     sides = edges(outline)
     inside = compute_once(_inside(sides, corner.point), corner.point.x)
     for k, edge in enumerate(sides):
-        rel = corner.point - edge.start
-        along, height = rel.dot(edge.along), edge.normal.dot(rel)
+        relative = corner.point - edge.start
+        along, height = relative.dot(edge.along), edge.normal.dot(relative)
         tolerance = END_TOLERANCE[edge.length.dtype.itemsize] * edge.length
         begin, end = -tolerance, edge.length + tolerance
         past = jnp.zeros(along.shape, bool)
@@ -184,27 +184,30 @@ def _vertex_edge_candidates(
         # A point that is behind an edge but not inside the polygon is on the far side of another edge. A point that is
         # deeper than twice the limit counts as on the far side, too.
         behind = (height >= -tolerance) | (inside & (height > -2 * MAX_PENETRATION * length))
-        beside = faces & (along >= begin) & (along <= end) & behind
+        touches = faces & (along >= begin) & (along <= end) & behind
         candidate = Candidate(
-            jnp.where(beside, height, OUT_OF_REACH), corner.point - edge.normal.scale(height), -edge.normal
+            jnp.where(touches, height, OUT_OF_REACH), corner.point - edge.normal.scale(height), -edge.normal
         )
         gap = jnp.maximum(jnp.abs(candidate.distance), tolerance)
         pressing = jnp.broadcast_to(-edge.normal.dot(path), gap.shape)
         entry = candidate, gap, pressing, past
-        if found is None:
+        if two_nearest is None:
             nothing = candidate._replace(distance=jnp.full_like(gap, OUT_OF_REACH))
-            found = entry, (nothing, jnp.full_like(gap, OUT_OF_REACH), pressing, past)
+            two_nearest = entry, (nothing, jnp.full_like(gap, OUT_OF_REACH), pressing, past)
             continue
-        first, second = found
+        first, second = two_nearest
         nearer = (gap < first[1]) | ((gap == tolerance) & (first[1] <= tolerance) & (pressing > first[2]))
         nearer, second_nearer = compute_once((nearer, gap < second[1]), corner.point.x)
-        found = tree_where(nearer, entry, first), tree_where(nearer, first, tree_where(second_nearer, entry, second))
-    assert found is not None
-    (nearest, *_, past), (second_nearest, *_, second_past) = found
+        two_nearest = (
+            tree_where(nearer, entry, first),
+            tree_where(nearer, first, tree_where(second_nearer, entry, second)),
+        )
+    assert two_nearest is not None
+    (nearest, *_, past), (second_nearest, *_, second_past) = two_nearest
     # next to a convex corner, a point inside is pushed out by the nearest edge alone
     outside = second_nearest.distance >= -END_TOLERANCE[length.dtype.itemsize] * length
-    both = decide(outside | past | second_past, corner.point.x)
-    return nearest, second_nearest._replace(distance=jnp.where(both, second_nearest.distance, OUT_OF_REACH))
+    keeps_second = decide(outside | past | second_past, corner.point.x)
+    return nearest, second_nearest._replace(distance=jnp.where(keeps_second, second_nearest.distance, OUT_OF_REACH))
 
 
 def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
@@ -218,7 +221,7 @@ def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
 
 
 def edge_supports(finger: Finger, outline: Outline, finger_pose: FingerPose) -> EdgeSupport | None:
-    """Return the places of a smooth outline that face a pad's edges; None for round fingers, polygons and disks.
+    """Return the points of a smooth outline that face a pad's edges; None for round fingers, polygons and disks.
 
     Several functions need the result, so it can be computed once and passed to them.
     """
@@ -232,7 +235,10 @@ def edge_supports(finger: Finger, outline: Outline, finger_pose: FingerPose) -> 
 def _smooth_candidates(
     pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, supports: EdgeSupport | None
 ) -> Candidate:
-    """For each corner of a pad, the closest point of a smooth outline; then the places that face the pad's edges."""
+    """Return the candidates of a pad and a smooth outline.
+
+    They are the closest point of the outline for each corner of the pad, and then the points that face the pad's edges.
+    """
     assert supports is not None
     too_deep, corner = -2 * MAX_PENETRATION * length, corners(pad).turned(angle, center)
     closest = jax.vmap(outline.closest)(corner.point)
@@ -241,14 +247,14 @@ def _smooth_candidates(
     )
     faces &= closest.distance > too_deep
     tolerance = END_TOLERANCE[supports.length.dtype.itemsize] * supports.length
-    beside = (
+    touches = (
         supports.valid
         & (supports.along >= -tolerance)
         & (supports.along <= supports.length + tolerance)
         & (supports.height > too_deep)
     )
     at_corners = Candidate(jnp.where(faces, closest.distance, OUT_OF_REACH), closest.point, -closest.normal)
-    at_edges = Candidate(jnp.where(beside, supports.height, OUT_OF_REACH), supports.point, supports.normal)
+    at_edges = Candidate(jnp.where(touches, supports.height, OUT_OF_REACH), supports.point, supports.normal)
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), at_corners, at_edges)
 
 
@@ -260,8 +266,8 @@ def num_contacts(finger: Finger, outline: Outline) -> int:
     """
     zero = jnp.zeros(())
     still = Vec2(zero, zero)
-    found = jax.eval_shape(lambda: contact_candidates(finger, outline, FingerPose(still, still), still, zero))
-    return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(found, Candidate) else len(found)
+    candidates = jax.eval_shape(lambda: contact_candidates(finger, outline, FingerPose(still, still), still, zero))
+    return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
 
 
 def is_nonconvex_polygon(outline: Outline) -> bool:
@@ -290,7 +296,7 @@ def penetration_depth(finger: Finger, outline: Outline, finger_pose: FingerPose)
 
     For a pad it is the depth of the deepest corner of either body in the other. Where edges cross and no corner is
     inside, it is at least half of how deep an edge of the slider is in the pad. For a pad and a smooth outline it is
-    the depth of the deepest corner, or of the deepest place of the outline that faces an edge.
+    the depth of the deepest corner, or of the deepest point of the outline that faces an edge.
     """
     if isinstance(finger, RoundFinger):
         return finger.radius - outline.closest(finger_pose.center).distance
@@ -347,12 +353,17 @@ def _sweep(
 
 
 def edges(outline: Outline) -> tuple[Edge, ...]:
-    """The edges of a polygon with few of them, which pads and the polygons that they touch must be."""
+    """Return the edges of a polygon with at most twelve; pads, and the polygons that they touch, must be such polygons.
+
+    Raises:
+        TypeError: If the outline is not that of a polygon.
+        ValueError: If the polygon has more edges.
+    """
     if not isinstance(outline, PolygonOutline):
         raise TypeError(f"not a polygon's outline: {type(outline).__name__}")
     if isinstance(outline.edges, Edge):
-        many = outline.edges.start_x.shape[0]
-        raise ValueError(f"hand: pads can touch a Polygon of up to twelve vertices; got {many}")
+        count = outline.edges.start_x.shape[0]
+        raise ValueError(f"hand: pads can touch a Polygon of up to twelve vertices; got {count}")
     return outline.edges
 
 
@@ -364,7 +375,7 @@ def corners(outline: Outline) -> Corner:
 
 
 def _pad_angle(finger_pose: FingerPose) -> Vec2:
-    """The angle of a pad; raises ValueError if the kinematics give none."""
+    """Return the angle of a pad as a unit vector; raise ValueError if the kinematics give none."""
     if finger_pose.angle is None:
         raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
     return finger_pose.angle

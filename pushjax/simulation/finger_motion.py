@@ -80,7 +80,7 @@ class FingerMotion(NamedTuple):
     turning: Scalar | None
 
     def pose_in_slider(self, slider: BodyFrame, fraction: Scalar) -> FingerPose:
-        """Pose of the finger in the slider's frame after the fraction `fraction` of the step."""
+        """Return the pose of the finger in the slider's frame when `fraction` of the step is done."""
         center = slider.local(self.center + self.path.scale(fraction))
         if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
             return FingerPose(center, None)
@@ -132,17 +132,20 @@ def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> 
 
 
 def _wrap_to_pi(angle: Scalar) -> Scalar:
-    """The same turn, reduced to at most half a revolution, because recorded angles may jump from pi to -pi."""
+    """Return the angle, rad, reduced to at most half a turn, because recorded angles may jump from pi to -pi."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
-    """Numbers of each finger's pose, as a tuple for each finger.
+    """Return the coordinates of each finger's pose, as a tuple of scalars for each finger.
 
     Args:
-        poses: Poses or centers, (fingers, width), or with an axis of steps in front.
+        poses: Poses (fingers, 3) or centers (fingers, 2), world, m and rad, or with an axis of steps in front.
     """
-    return tuple(tuple(poses[..., k, i] for i in range(poses.shape[-1])) for k in range(poses.shape[-2]))
+    return tuple(
+        tuple(poses[..., finger, coordinate] for coordinate in range(poses.shape[-1]))
+        for finger in range(poses.shape[-2])
+    )
 
 
 def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: Vec3, fraction: float) -> Scalar:

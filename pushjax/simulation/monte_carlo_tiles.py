@@ -52,7 +52,9 @@ class Setup(NamedTuple):
 
 
 class PushResults(NamedTuple):
-    """Results of pushes, fields as in `MonteCarlo`.
+    """Results of pushes, with the names and meanings of the fields of `MonteCarlo`.
+
+    The fields are also the names of the arrays in the files of a checkpoint.
 
     Attributes:
         trajectory: None, unless it is kept.
@@ -89,7 +91,10 @@ class Devices(NamedTuple):
 
     @staticmethod
     def of(devices: Sequence[Any] | None) -> "Devices":
-        """Devices of a run; None for all devices.
+        """Return the devices of a run.
+
+        Args:
+            devices: Devices to use, as JAX lists them; None for all devices of all processes.
 
         Raises:
             ValueError: For no devices, or unless they are this process's own or as many of each process.
@@ -123,7 +128,7 @@ def start_round(
     keep_trajectories: bool,
     pool: Executor,
 ) -> list[PushResults]:
-    """Start one round without waiting for it; reading its numbers waits.
+    """Start one round, and return its results on each device of this process without waiting for them.
 
     Args:
         setups: The setup on each device of this process.
@@ -137,9 +142,9 @@ def start_round(
     """
 
     def start_on(k: int) -> PushResults:
-        setup, position = setups[k], devices.first + k
-        path = paths if paths.ndim == 2 else paths[position]
-        index, pose, path = jax.device_put((indices[position], poses[position], path), devices.local[k])
+        setup, device_index = setups[k], devices.first + k
+        path = paths if paths.ndim == 2 else paths[device_index]
+        index, pose, path = jax.device_put((indices[device_index], poses[device_index], path), devices.local[k])
         draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index)
         shared = setup.shape, setup.hand, setup.solver, setup.table
         return _push(setup.model.resample_every, keep_trajectories, draws, shared, path, pose)
@@ -149,7 +154,7 @@ def start_round(
 
 
 def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
-    """Copy the results of a round, of all processes, to the host, in order."""
+    """Copy the results of a round to the host, in the order of the pushes; each process gets those of all processes."""
     local = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *results)
     if not devices.multiprocess:
         return local
@@ -169,9 +174,11 @@ def _push(
     resample_every: int | None, keep_trajectories: bool, draws, shared: tuple, paths: Array, poses: Array
 ) -> PushResults:
     axes = (0, None if paths.ndim == 2 else 0, 0)
-    return jax.vmap(
-        lambda draws, path, pose: _push_results(draws, shared, path, pose, resample_every, keep_trajectories), axes
-    )(draws, paths, poses)
+
+    def push_once(draws, path, pose) -> PushResults:
+        return _push_results(draws, shared, path, pose, resample_every, keep_trajectories)
+
+    return jax.vmap(push_once, axes)(draws, paths, poses)
 
 
 def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:

@@ -1,8 +1,8 @@
-"""Contact detection for a pad against a smooth outline: contact places, first contact and penetration depth.
+"""Contact detection for a pad against a smooth outline: contact candidates, first contact and penetration depth.
 
-An edge of the pad touches where the outward normal of the outline is opposite to the normal of the edge. These places
-(`Outline.facing`) depend on the direction only. A corner of the pad touches at the point of the outline nearest to it.
-Past the end of an edge the first kind of contact becomes the second, so no contact is missed and none jumps.
+An edge of the pad touches where the outward normal of the outline is opposite to the normal of the edge. These support
+points (`Outline.facing`) depend on the direction only. A corner of the pad touches at the point of the outline nearest
+to it. Past the end of an edge the first kind of contact becomes the second, so no contact is missed and none jumps.
 """
 
 from typing import NamedTuple
@@ -17,10 +17,10 @@ from pushjax.geometry.shape import Outline
 
 
 class EdgeSupport(NamedTuple):
-    """Places of an outline that face the edges of a pad, as arrays over the places of all edges.
+    """Support points: points of an outline that face the edges of a pad, as arrays over the points of all edges.
 
     Attributes:
-        valid: Whether the place exists.
+        valid: Whether the support point exists.
         point: Point of the outline, in the outline's frame, m.
         normal: Outward unit normal of the pad's edge, in the outline's frame.
         local: The point in the pad's frame, m.
@@ -29,7 +29,7 @@ class EdgeSupport(NamedTuple):
         height: Height of the point above the edge, m.
     """
 
-    valid: Bool[Array, "places"]
+    valid: Bool[Array, "points"]
     point: Vec2
     normal: Vec2
     local: Vec2
@@ -39,7 +39,7 @@ class EdgeSupport(NamedTuple):
 
 
 def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2, angle: Vec2) -> EdgeSupport:
-    """Find the places of an outline that face each edge of a pad.
+    """Find the support points of an outline: those that face each edge of a pad.
 
     Args:
         edges: Edges of the pad, in its own frame.
@@ -69,7 +69,7 @@ def sweep(
 
     Args:
         pad: Outline of the pad.
-        supports: Places that face the pad's edges at the start.
+        supports: Support points of the pad's edges at the start.
         outline: The smooth outline.
         corners: Corners of the pad, in the outline's frame, m.
         path: Displacement of the pad, in the outline's frame, m.
@@ -82,7 +82,7 @@ def sweep(
 
 
 def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
-    """Depth of the deepest corner in the outline, or of the deepest facing place in the pad, m; negative if apart."""
+    """Depth of the deepest corner in the outline, or of the deepest support point in the pad, m; negative if apart."""
     corner_depth = jnp.max(-jax.vmap(lambda corner: outline.closest(corner).distance)(corners))
     support_depths = -pad.closest(supports.local).distance
     return jnp.maximum(corner_depth, jnp.max(jnp.where(supports.valid, support_depths, -jnp.inf)))

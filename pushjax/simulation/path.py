@@ -30,7 +30,7 @@ def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+
     """
     _check_steps(steps)
     dtype = common_dtype(start, end)
-    a, b = as_float(start, dtype), as_float(end, dtype)
+    a, b = as_float(start, dtype, "start"), as_float(end, dtype, "end")
     check_shape("start", a, ("dof",))
     check_shape("end", b, (a.shape[0],))
     check_finite("start", a)
@@ -92,17 +92,17 @@ def _arc(xp: Any, start: Array, center: Array, angle: Array, *, steps: int) -> A
 
 
 def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Array, "points dof"]:
-    """Path that goes straight from each way point to the next and meets all of them exactly.
+    """Path that goes straight from each waypoint to the next and meets all of them exactly.
 
     Args:
-        configurations: Way points, (points, dof).
-        steps: Number of equal steps on each stretch between way points: one number for all stretches, or one for each.
+        configurations: Waypoints, (points, dof).
+        steps: Number of equal steps on each stretch between waypoints: one number for all stretches, or one for each.
 
     Returns:
         The path, with one row more than it has steps.
 
     Raises:
-        ValueError: For fewer than two way points, for fewer than one step on a stretch, for a wrong number of `steps`,
+        ValueError: For fewer than two waypoints, for fewer than one step on a stretch, for a wrong number of `steps`,
             or for values that are not finite.
     """
     waypoints = checked_path(configurations, None)
@@ -173,7 +173,7 @@ def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[A
     Raises:
         ValueError: For a wrong shape, fewer than two configurations, or values that are not finite.
     """
-    array = as_float(path, dtype)
+    array = as_float(path, dtype, "path")
     check_shape("path", array, ("steps + 1", "dof" if dof is None else dof))
     if array.shape[0] < 2:
         raise ValueError(f"path needs at least one step, two configurations; got {array.shape[0]}")

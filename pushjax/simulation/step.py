@@ -18,7 +18,7 @@ about it. With several contacts this point is the mean of the contact points, we
 finger sticks, its slip is zero to roundoff, not only to the order of the scheme. The same holds for a hand that pushes
 flat and straight.
 
-If the hand may touch in more places than are solved together (`working_set`), the most urgent places are solved.
+If the hand has more contacts than are solved together (`working_set`), the most urgent ones are solved.
 
 All this holds for contacts that were detected before the step, and for rotations that are small compared with the
 angles of the outline's corners. Whether the result is valid is judged afterwards, by the depth of every finger in the
@@ -92,7 +92,7 @@ class Stage(NamedTuple):
         angle: Unit vector of the angle of the frame in which the twist is given.
         status: `Status` so far.
         at_start: For each finger, its contacts as they were at the start of the step.
-        chosen: For each finger, the index of each of its contacts among the places where it may touch.
+        chosen: For each finger, the index of each of its contacts among its candidates.
         holds: Whether every finger is near enough to hold a jammed slider.
     """
 
@@ -124,15 +124,15 @@ class FingerContacts(NamedTuple):
 
     Attributes:
         contacts: The contacts as they are now, with the gaps of the start of the step.
-        chosen: Index of each among the places where the finger may touch.
+        chosen: Index of each among the candidates of the finger.
         at_start: Each as it was at the start of the step.
-        near: Whether one of them is near enough to hold a jammed slider.
+        is_near: Whether one of them is near enough to hold a jammed slider.
     """
 
     contacts: tuple[Contact, ...]
     chosen: tuple[Int[Array, ""], ...]
     at_start: tuple[Candidate, ...]
-    near: Bool[Array, ""]
+    is_near: Bool[Array, ""]
 
 
 class PushingPart(NamedTuple):
@@ -170,7 +170,7 @@ class PushingPart(NamedTuple):
             fraction: Fraction of the pushing part that is done in this stage.
             in_predictor: True in the predictor.
             finger_motion: Motion of the finger over the step.
-            chosen: Index of each contact among the places where the finger may touch; not used in the predictor.
+            chosen: Index of each contact among the candidates of the finger; not used in the predictor.
             at_start: The contacts as they were at the start of the step; not used in the predictor.
         """
         x = self.start.pose.x
@@ -206,7 +206,7 @@ def step_in_scalars(
     motions: tuple[FingerMotion, ...],
     solver: ContactSolver | StickingSolver | None,
     pose: Vec3,
-    before: Scalar,
+    overlap_before: Scalar,
     reach: Scalar,
     urgency: Urgency | None = None,
     ongoing: Bool[Array, ""] | bool = True,
@@ -219,7 +219,7 @@ def step_in_scalars(
         motions: Motion of each finger over the step.
         solver: Solver of contact problems; None for the default.
         pose: Pose of the slider at the start, world.
-        before: Depth of the deepest finger at the start, m.
+        overlap_before: Depth of the deepest finger at the start, m.
         reach: Distance within which a finger holds a jammed slider, m.
         urgency: Urgency of each contact (see `working_set`); None if all are solved together.
         ongoing: False where no result is needed; no contact problem is solved then.
@@ -235,15 +235,15 @@ def step_in_scalars(
     active = (jnp.asarray(ongoing),) * num_solved_together(counts)
 
     def stage(carry: Stage, fraction: Scalar):
-        """Solve the contacts as they are after the fraction `fraction` of the previous stage's motion."""
+        """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         frame = start.moved(carry.point, carry.twist.scale(fraction), carry.angle)
         in_predictor = fraction == 0
         finger_contacts = map_items(
             lambda item: part.contacts_of(frame, fraction, in_predictor, *item),
             tuple(zip(motions, carry.chosen, carry.at_start, strict=True)),
         )
-        contacts, chosen, at_start, near = zip(*finger_contacts, strict=True)
-        contacts, holds = sum(contacts, ()), jnp.ones((), bool)
+        by_finger, chosen, at_start, near = zip(*finger_contacts, strict=True)
+        contacts, holds = sum(by_finger, ()), jnp.ones((), bool)
         for finger_is_near in near:
             holds &= finger_is_near
         solution = solve_in_scalars(form, working.select(contacts), active, solver, margin=False)
@@ -256,11 +256,10 @@ def step_in_scalars(
         return next_stage, (solution, _points_and_normals(contacts), urgency_after)
 
     carry, outputs = jax.lax.scan(stage, Stage.before(start, counts), jnp.array([0.0, 0.5], pose.x.dtype))
-    solution, places, urgency_after = jax.tree.map(lambda leaf: leaf[-1], outputs)
+    solution, points_and_normals, urgency_after = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
-    return _keep_pose_unless_moving(
-        solution, places, moved_pose, pose, _status(carry, before, form.length)
-    ), urgency_after
+    status = _status(carry, overlap_before, form.length)
+    return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after
 
 
 def _status(last_stage: Stage, depth: Scalar, length: Scalar) -> Int[Array, ""]:
@@ -283,13 +282,8 @@ def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: B
     begin = jnp.ones_like(start.pose.x)
 
     def impact_of(finger_motion: FingerMotion) -> Scalar:
-        finger_pose, path = compute_once(
-            (
-                finger_motion.pose_in_slider(start, jnp.zeros_like(start.pose.x)),
-                finger_motion.path.unrotate(start.angle),
-            ),
-            start.pose.x,
-        )
+        finger_pose = finger_motion.pose_in_slider(start, jnp.zeros_like(start.pose.x))
+        finger_pose, path = compute_once((finger_pose, finger_motion.path.unrotate(start.angle)), start.pose.x)
         return time_of_impact(finger_motion.finger, outline, finger_pose, path, length)
 
     for impact in map_items(impact_of, motions):
@@ -308,18 +302,22 @@ def _force_weighted_point(contacts: tuple[Contact, ...], forces: tuple[Vec2, ...
     """Mean of the contact points, weighted by normal force: the point of the slider that moves in a straight line."""
     if len(contacts) == 1:
         return contacts[0].point
-    total, middle = jnp.zeros_like(forces[0].x), Vec2(*(0 * x for x in contacts[0].point))
+    total_force, weighted_sum = jnp.zeros_like(forces[0].x), Vec2(*(0 * x for x in contacts[0].point))
     for contact, force in zip(contacts, forces, strict=True):
-        total, middle = total + force.x, middle + contact.point.scale(force.x)
-    return middle.scale(1 / jnp.where(total > 0, total, 1.0))
+        total_force, weighted_sum = total_force + force.x, weighted_sum + contact.point.scale(force.x)
+    return weighted_sum.scale(1 / jnp.where(total_force > 0, total_force, 1.0))
 
 
 def _keep_pose_unless_moving(
-    solution: ScalarSolution, places: tuple[Array, Array], moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]
+    solution: ScalarSolution,
+    points_and_normals: tuple[Array, Array],
+    moved_pose: Vec3,
+    pose: Vec3,
+    status: Int[Array, ""],
 ) -> ScalarStep:
-    """The record of a step, where a slider that does not move keeps its pose bit for bit.
+    """Return the record of a step, in which a slider that does not move keeps its pose bit for bit.
 
-    Without motion the pose is not touched by arithmetic that might have failed.
+    A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
     """
     finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
     moves = decide((status == Status.MOVING) & finite_pose, pose.x)
@@ -333,8 +331,8 @@ def _keep_pose_unless_moving(
         zero_unless_moving(solution.twist),
         zero_unless_moving(solution.wrench),
         zero_unless_moving(solution.force),
-        zero_unless_moving(places[0]),
-        zero_unless_moving(places[1]),
+        zero_unless_moving(points_and_normals[0]),
+        zero_unless_moving(points_and_normals[1]),
         tuple(jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8) for mode in solution.mode),
         status,
         jnp.zeros_like(pose.x),

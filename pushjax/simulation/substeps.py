@@ -4,8 +4,8 @@ A step is too long if its result leaves a finger inside the slider. This happens
 another of its corners came to touch, or if it slid past the end of what a finger rests on; no contact that is detected
 at the start shows either. Such a step is undone and tried again with half the size, down to a part of `SMALLEST_PART`
 of the step. A part that succeeds is followed by one of twice the size. Right after a failure it is first followed by
-one of the same size. Before a part is halved, a candidate contact that the result violates and that was not in the
-contact problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
+one of the same size. Before a part is halved, a contact that the result violates and that was not in the contact
+problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
 NOT_CONVERGED, and the slider stays where the step began.
 
 Each push of a batch advances at its own pace: a round of the one loop is the next trial of every push, in whichever
@@ -40,20 +40,20 @@ from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
 JAM_PART = 1 / 16  # of a step that jams as a whole: size of the part that has to jam, too
-# A path of n steps has TRIALS_A_STEP * n + TRIALS trials. What is left of it after that is NOT_CONVERGED. A grasp of a
-# slider with many corners takes 1.1 trials per step.
+# A path of n steps has at most TRIALS_PER_STEP * n + EXTRA_TRIALS trials. The steps that are left after that are
+# NOT_CONVERGED. A grasp of a slider with many corners takes 1.1 trials per step.
 TRIALS_PER_STEP, EXTRA_TRIALS = 4, 64
 MAX_SWAPS = 3  # changes of the working set before a part is divided
-# A place that is not in the contact problem may be violated by this much, as a fraction of the tolerance for the whole.
+# A contact that is not in the contact problem may be violated by this fraction of the allowed penetration.
 MISSED_FRACTION = 0.01
 
 
 class PushState(NamedTuple):
-    """State of a push, and what is tried next.
+    """State of a push between two trials, and what is tried next.
 
     Attributes:
-        pose: Current pose.
-        origin: Pose at the start of the step.
+        pose: Current pose of the slider, world.
+        origin: Pose of the slider at the start of the step, world.
         step: Index of the step; past the last one once the push has ended.
         done: Fraction of the step that is done.
         part: Fraction of the step that is tried next.
@@ -65,7 +65,8 @@ class PushState(NamedTuple):
         stop_status: Status that stopped the hand, or zero.
         abandon_status: Status of a step that is given up, or zero.
         failed: Whether the previous step failed.
-        accepted_parts: Record of the parts of the step that are done.
+        accepted_parts: One record of the parts of the step that are done: the sum of their twists, and otherwise what
+            the last of them in which the slider moved left.
     """
 
     pose: Vec3
@@ -104,7 +105,7 @@ def simulate_in_substeps(
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
 
     Returns:
-        The stacked records of all steps, and the fraction of its last step that the hand did, if it was stopped.
+        The stacked records of all steps; and, if the hand was stopped, the fraction of its last step that it did.
     """
     first = jnp.zeros((), jnp.int32)
     form, mu = friction_at(first, pose)
@@ -128,10 +129,10 @@ def simulate_in_substeps(
         record, urgency_after = step_in_scalars(
             form, outline, part, solver, state.pose, state.overlap, reach, state.urgency, ongoing
         )
-        next_state, record_and_end = _next_state(state, record, urgency_after, outline, part, tolerance, steps)
+        next_state, end_of_step = _next_state(state, record, urgency_after, outline, part, tolerance, steps)
         if urgency_after is not None and urgency is not None:
             next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, urgency_after, urgency))
-        return next_state, record_and_end
+        return next_state, end_of_step
 
     def skipped(state: PushState):
         return state, (idle_record, jnp.zeros((), bool), state.step)
@@ -149,7 +150,7 @@ def simulate_in_substeps(
 
 def _records_of_steps(
     records: ScalarStep,
-    ends: Bool[Array, " rounds"],
+    ended: Bool[Array, " rounds"],
     step: Int[Array, " rounds"],
     steps: int,
     last: PushState,
@@ -159,17 +160,17 @@ def _records_of_steps(
 
     Args:
         records: Record of each round.
-        ends: Whether each round ended its step.
+        ended: Whether each round ended its step.
         step: Index of the step of each round.
         steps: Number of steps.
         last: State after the last round.
         idle_record: Record of a step in which nothing pushes.
     """
-    rounds = len(ends)
-    round_of_step = jnp.full(steps, rounds).at[jnp.where(ends, step, steps)].set(jnp.arange(rounds), mode="drop")
+    rounds = len(ended)
+    round_of_step = jnp.full(steps, rounds).at[jnp.where(ended, step, steps)].set(jnp.arange(rounds), mode="drop")
     status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
-    rest = idle_record._replace(pose=last.pose, status=status, overlap=last.overlap)
-    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[round_of_step], records, rest)
+    unfinished = idle_record._replace(pose=last.pose, status=status, overlap=last.overlap)
+    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[round_of_step], records, unfinished)
 
 
 class Decision(NamedTuple):
@@ -177,7 +178,7 @@ class Decision(NamedTuple):
 
     Attributes:
         accepted: The part is done.
-        joins: A place that the result violates joins the contact problem, and the same part is tried again.
+        joins: A contact that the result violates joins the contact problem, and the same part is tried again.
         stops: The hand stops where the part began.
         abandons: The step is given up. The next trial is of the whole step, to find the overlap of a slider that stays.
         fails: The step ends with the status `reason`.
@@ -206,8 +207,8 @@ def _decide(
     """
     fails = state.abandon_status != 0
     is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
-    # overlaps do not accumulate, for the next part pushes them out: so the smallest part may leave as much as a whole
-    # step
+    # overlaps do not accumulate, because the next part pushes them out: so the smallest part may leave as much as a
+    # whole step
     allowed_share = jnp.where(state.part < 2 * SMALLEST_PART, 1.0, state.part)
     clear = depth <= jnp.maximum(state.overlap, allowed_share * tolerance)
     # In a step that is divided for another reason, only the smallest part can confirm a jam, because a slider that
@@ -225,10 +226,12 @@ def _decide(
     abandons = hopeless & ~accepted & ~stops & ~fails & ~joins
     # If nothing moved and the trial took the hand to the end of the step, its overlap is known and no further trial is
     # needed.
-    at_once = abandons & ~is_solved & (state.part == 1)
+    ends_at_once = abandons & ~is_solved & (state.part == 1)
     reason = jnp.where(is_solved, Status.NOT_CONVERGED, record.status)
     reason = jnp.where(fails, state.abandon_status, reason).astype(jnp.int8)
-    return Decision(accepted, joins, stops, abandons & ~at_once, decide(fails | at_once, state.pose.x), reason)
+    return Decision(
+        accepted, joins, stops, abandons & ~ends_at_once, decide(fails | ends_at_once, state.pose.x), reason
+    )
 
 
 def _next_state(
@@ -240,7 +243,17 @@ def _next_state(
     tolerance: Scalar,
     steps: int,
 ):
-    """Return the next state; and, of the step, the record, whether it ended with this trial, and the index."""
+    """Return the state after a trial; and of the trial's step the record, whether it ended, and the index.
+
+    Args:
+        state: The state before the trial.
+        record: Result of the trial.
+        urgency_after: Urgency of each contact after the trial; None if all are solved together.
+        outline: The slider's outline.
+        part: Motion of each finger over the part of the step that was tried.
+        tolerance: How much deeper a finger may be after a whole step, m.
+        steps: Number of steps of the path.
+    """
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
@@ -286,14 +299,14 @@ def _next_state(
 
 
 def hand_stops(status: Array) -> Bool[Array, "..."]:
-    """Whether the hand stops for good."""
+    """Whether a step of this status stops the hand for good."""
     return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
 def _resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
     """Record of a slider that stays at `pose` while nothing pushes."""
-    rest = jax.tree.map(jnp.zeros_like, record)
-    return rest._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
+    blank = jax.tree.map(jnp.zeros_like, record)
+    return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
 def _idle_record(form, outline, motions, solver, pose, urgency) -> ScalarStep:

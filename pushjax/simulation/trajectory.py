@@ -31,8 +31,9 @@ class Step(eqx.Module):
 
     MOVING, FREE, JAMMED and GRASPED promise a bound on the overlap after the step. The bound is the overlap before the
     step or, if that is more, a tenth of the largest displacement of the fingers in the step, but at least 1e-5 of the
-    surface's length. The exception is one round finger on a convex outline. Its overlap is recorded, but is not
-    checked, and the step is not tried again. In all measurements it was below the bound.
+    surface's length. The exception is a hand with one contact: one round finger on a convex outline, or one pad on a
+    disk. Its overlap is recorded, but is not checked, and the step is not tried again. In all measurements, which were
+    made with a round finger, it was below the bound.
 
     Attributes:
         pose: Pose of the slider after the step, (3,), world, m and rad.
@@ -108,12 +109,17 @@ class Trajectory(eqx.Module):
 
 
 def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
-    """Index of the first step that is True, or -1."""
+    """Return the index of the first True along the last axis, or -1."""
     return jnp.where(jnp.any(mask, axis=-1), jnp.argmax(mask, axis=-1), -1)
 
 
 def to_arrays(record: ScalarStep, length: Scalar) -> Step:
-    """Convert a record to arrays; a stacked record, whose scalars have an axis of steps, too."""
+    """Convert the record of one step to arrays, or a stacked record, whose scalars have an axis of steps.
+
+    Args:
+        record: The record. The torque of its wrench is divided by `length`.
+        length: Characteristic length of the limit surface, m.
+    """
     wrench = (record.wrench.x, record.wrench.y, record.wrench.z * length)
     return Step(
         pose=jnp.stack(record.pose, axis=-1),

@@ -1,9 +1,9 @@
-"""The working set: which of the places that a hand may touch are solved together.
+"""The working set: which of a hand's contacts are solved together.
 
 The cost of a contact problem grows with the cube of its number of contacts. But a motion in the plane loads at most
-three contacts, and a proof that there is no motion takes four. So if there are more than `MAX_SOLVED` places, only the
-likeliest are solved, as in an active-set method, and the others are checked against the solution. A place that the
-solution violates joins the set in place of one without force, and the problem is solved again.
+three contacts, and a proof that there is no motion takes four. So if there are more than `MAX_SOLVED` contacts, only
+the likeliest are solved, as in an active-set method, and the others are checked against the solution. A contact that
+the solution violates joins the set in place of one without force, and the problem is solved again.
 """
 
 from typing import NamedTuple
@@ -27,7 +27,7 @@ def initial_urgency(counts: list[int], like: Scalar) -> Urgency | None:
     """The urgency before anything has been solved; None if all contacts are solved together.
 
     Args:
-        counts: Number of places of each finger. The places of a finger are sorted, the likeliest first.
+        counts: Number of contacts of each finger. The contacts of a finger are sorted, the likeliest first.
         like: A scalar of the floating dtype to use.
     """
     if num_solved_together(counts) == sum(counts):
@@ -36,7 +36,7 @@ def initial_urgency(counts: list[int], like: Scalar) -> Urgency | None:
 
 
 def num_solved_together(counts: list[int]) -> int:
-    """Number of contacts that are solved together, for fingers with `counts` places each."""
+    """Number of contacts that are solved together, for fingers with `counts` contacts each."""
     return min(sum(counts), MAX_SOLVED)
 
 
