@@ -31,7 +31,7 @@ from pushjax.simulation.slider import Slider
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
 ACCELERATOR_TILE = 1 << 18  # the same for an accelerator, whose kernels take long to start but compute many at once
 TILE_MULTIPLE = 64  # a tile for fewer pushes is a multiple of this
-# At most this is between two files of a checkpoint: pushes, and s; in both cases plus the rest of a round.
+# A file of a checkpoint is written after this many pushes, or after this time in s, at the end of the round.
 BLOCK_PUSHES, BLOCK_SECONDS = 16 * TILE, 20.0
 
 
@@ -108,16 +108,10 @@ def monte_carlo(
     if used.multiprocess:
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         multihost_utils.sync_global_devices("pushjax monte_carlo")
-    shared = (
-        key_data,
-        model.around(slider.surface),
-        model,
-        slider.shape,
-        hand,
-        solver,
-        checked_table(table, start.dtype),
-    )
-    run = _Run(n, tile, Setup(*shared), impl, used, np.asarray(start), np.asarray(path_array), trajectories)
+    surfaces = model.around(slider.surface)
+    cast_table = checked_table(table, start.dtype)
+    setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table)
+    run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
     saved: Checkpoint | None = None
     if checkpoint is not None:
         identity = {"n": n, "batch_size": tile, "trajectories": trajectories, "key": digest(key_data, impl)}
@@ -135,7 +129,7 @@ def monte_carlo(
 
 
 def _progress_report(progress: bool | ProgressCallback) -> Any:
-    """Context that gives the function to report progress to."""
+    """Return a context manager that yields the progress callback."""
     if progress is True:
         # drawing on terminals is not needed by those who only import this
         from pushjax._internal.progress_bar import progress_bar
@@ -159,7 +153,18 @@ def _key_data(key: Any) -> tuple[Any, Any]:
 
 
 class _Run:
-    """A run, and its state."""
+    """A Monte Carlo run.
+
+    Args:
+        n: Number of pushes.
+        tile: Number of pushes that a device computes at once.
+        setup: What all pushes share.
+        impl: Name of the PRNG implementation.
+        devices: Devices of the run.
+        start: Pose of the slider at the start, (3,) or (n, 3), world, m and rad.
+        path: Configurations of the hand, (steps + 1, dof) or (n, steps + 1, dof).
+        keep_trajectories: Whether to keep trajectories.
+    """
 
     def __init__(
         self,
@@ -204,7 +209,7 @@ class _Run:
         self, saved: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor
     ) -> PushResults:
         parts, done = self._saved_blocks(saved)
-        # block: pushes that are not in the checkpoint yet; begun: index of the first of them
+        # block: results that are not in the checkpoint yet; block_begin: index of their first push
         block, block_begin, block_time = [], done, time.perf_counter()
         running: tuple[int, int, list[PushResults]] | None = None
         report(done, self.n)
@@ -227,17 +232,20 @@ class _Run:
         return _concatenated(parts + block)
 
     def _start_round(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[PushResults]]:
-        """Start the round that begins with push `first`; the last round repeats its last push."""
+        """Start the round that begins with push `first`; the last round repeats its last push.
+
+        Returns:
+            Index of the first push, index after the last one, and the results on each device.
+        """
         last = min(first + self.round, self.n)
         indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
         poses = np.broadcast_to(self.start, (self.n, 3))[indices]
         # a path that all pushes share is sent once
         paths = self.path if self.path.ndim == 2 else self.path[indices]
-        return (
-            first,
-            last,
-            start_round(self.setups, self.impl, self.devices, indices, poses, paths, self.keep_trajectories, pool),
+        device_results = start_round(
+            self.setups, self.impl, self.devices, indices, poses, paths, self.keep_trajectories, pool
         )
+        return first, last, device_results
 
     def _saved_blocks(self, saved: Checkpoint | None) -> tuple[list[PushResults], int]:
         """Pushes that the checkpoint holds, in blocks, and their number."""
@@ -261,5 +269,5 @@ def _concatenated(parts: list[PushResults]) -> PushResults:
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-def _arrays_by_name(outcome: PushResults) -> dict[str, np.ndarray]:
-    return {name: leaf for name, leaf in outcome._asdict().items() if leaf is not None}
+def _arrays_by_name(results: PushResults) -> dict[str, np.ndarray]:
+    return {name: leaf for name, leaf in results._asdict().items() if leaf is not None}

@@ -48,7 +48,7 @@ class RandomRollout(NamedTuple):
     draws: Draws
 
 
-def draw(key: PRNGKeyArray, around: SurfaceDistribution, model: FrictionModel, steps: int) -> Draws:
+def draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel, steps: int) -> Draws:
     """Sample the friction of one push.
 
     A single draw equals that of `model.sample(key, surface)`. Of several draws, draw k equals that with the key
@@ -56,14 +56,14 @@ def draw(key: PRNGKeyArray, around: SurfaceDistribution, model: FrictionModel, s
 
     Args:
         key: PRNG key.
-        around: `model.around(surface)`.
+        surfaces: Distribution of limit surfaces, `model.around(surface)`.
         model: Distribution of friction.
         steps: Number of steps of the push.
     """
 
     def sample_once(key):
         surface_key, friction_key = jax.random.split(key)
-        sample = around.sample(surface_key)
+        sample = surfaces.sample(surface_key)
         return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
 
     if model.resample_every is None:
@@ -82,7 +82,18 @@ def rollout_under_draws(
     resample_every: int | None,
     table: Table | None,
 ) -> Trajectory:
-    """Roll out a push under friction that was sampled before; after `resample_every` steps, the next draw is used."""
+    """Roll out a push under friction that was sampled before.
+
+    Args:
+        draws: The sampled friction.
+        shape: Outline of the slider.
+        hand: The hand.
+        path: Configurations of the hand, (steps + 1, dof).
+        pose: Pose of the slider at the start, (3,), world, m and rad.
+        solver: Solver of contact problems; None for the default.
+        resample_every: Number of steps after which the next draw is used; None for one draw.
+        table: A table whose friction depends on direction or place; None for uniform friction.
+    """
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
     surfaces_and_frictions = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
 
@@ -142,8 +153,8 @@ def random_rollout(
 
 
 @quick_jit
-def _random_rollout(key, around, shape, hand, path, pose, model, solver, table) -> RandomRollout:
-    draws = draw(key, around, model, len(path) - 1)
+def _random_rollout(key, surfaces, shape, hand, path, pose, model, solver, table) -> RandomRollout:
+    draws = draw(key, surfaces, model, len(path) - 1)
     return RandomRollout(
         rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table), draws
     )

@@ -225,7 +225,7 @@ def simulate(
 
 
 def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at) -> ScalarStep:
-    """Return the records of all steps of a hand with one contact: a round finger on a convex outline, or a pad on a disk.
+    """Return the records of all steps of a hand with one contact: a round finger on a convex outline, a pad on a disk.
 
     Such steps are not divided: their overlap is recorded but not checked. Arguments as in `simulate_in_substeps`.
     """
@@ -233,7 +233,7 @@ def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at
     def body(pose: Vec3, step: Array):
         form, mu = friction_at(step, pose)
         motions = motions_at(step, mu)
-        # this is also the overlap after the previous step, and costs little: contact detection computes the same
+        # also the overlap after the previous step; it costs little, since contact detection starts with the same query
         depth = max_penetration(outline, motions, pose, 0.0)
         record, _ = step_in_scalars(form, outline, motions, solver, pose, depth, holding_distance(motions, form.length))
         return record.pose, record._replace(overlap=depth)
