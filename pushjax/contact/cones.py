@@ -30,7 +30,7 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
     dtype = common_dtype(normal, friction)
     contact = _checked_contact(jnp.zeros(2, dtype), normal, friction, dtype)
     n, mu = contact.normal, contact.friction
-    edges = jnp.stack([(n + n.perp().scale(s)).array() for s in (mu, -mu)])
+    edges = jnp.stack([(n + n.perp().scale(ratio)).array() for ratio in (mu, -mu)])
     return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
 
 
@@ -66,11 +66,13 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
     contact = _checked_contact(point, normal, friction, common_dtype(surface, point, normal, friction))
     curve = LimitCurve.of(surface.form(), contact)
     edges = []
-    for s in (contact.friction, -contact.friction):
-        g = curve.motion(s)
-        g = g.scale(1 / jnp.maximum(jnp.abs(g.x), jnp.abs(g.y)))  # first, because the squares below may underflow
-        g = g.scale(1 / jnp.sqrt(g.dot(g)))
-        edges.append((contact.normal.scale(g.x) + contact.normal.perp().scale(g.y)).array())
+    for ratio in (contact.friction, -contact.friction):
+        motion = curve.motion(ratio)
+        motion = motion.scale(
+            1 / jnp.maximum(jnp.abs(motion.x), jnp.abs(motion.y))
+        )  # first, because the squares below may underflow
+        motion = motion.scale(1 / jnp.sqrt(motion.dot(motion)))
+        edges.append((contact.normal.scale(motion.x) + contact.normal.perp().scale(motion.y)).array())
     return jnp.stack(edges)
 
 

@@ -60,8 +60,8 @@ class Contact(NamedTuple):
             The contact.
         """
         zero, one = jnp.zeros_like(self.gap), jnp.ones_like(self.gap)
-        still = Vec2(zero, zero)
-        return tree_where(condition, self, Contact(still, Vec2(one, zero), still, zero, one))
+        zero_vector = Vec2(zero, zero)
+        return tree_where(condition, self, Contact(zero_vector, Vec2(one, zero), zero_vector, zero, one))
 
     def approach(self) -> Vec2:
         """Displacement (n, t) of the slider's contact point that keeps it with the pusher, m."""
@@ -120,7 +120,7 @@ class LimitCurve(NamedTuple):
             _horner([k * c for k, c in enumerate(self.c)][1:], s),
         )
 
-    def bend(self, s: Scalar) -> Scalar:
+    def second_derivative(self, s: Scalar) -> Scalar:
         """h''(s)."""
         return _horner([k * (k - 1) * c for k, c in enumerate(self.c)][2:], s)
 

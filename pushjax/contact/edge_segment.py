@@ -15,7 +15,10 @@ from pushjax.friction.limit_surface import Form
 
 Cubic = tuple[Scalar, Scalar, Scalar, Scalar]  # coefficients, constant first
 
-ROUNDS = {4: 7, 8: 8}  # iterations of the search for a cubic's root, by bytes of the number
+ITERATIONS = {
+    4: 7,
+    8: 8,
+}  # iterations of the search for a cubic's root, by the size of the floating-point type in bytes
 
 
 class WrenchSegment(NamedTuple):
@@ -44,12 +47,12 @@ class WrenchSegment(NamedTuple):
         squared = along.dot(along)
         nearest = jnp.clip(-g1.dot(along) / jnp.where(squared > 0, squared, 1.0), 0, 1)
         center = g1.scale(1 - nearest) + g2.scale(nearest)
-        first, last = form.gradient(center), form.gradient(along)
+        constant, leading = form.gradient(center), form.gradient(along)
         if form.degree == 2:
-            none = Vec3(*(0 * x for x in first))
-            return WrenchSegment(center, along, nearest, (first, last, none, none))
+            zero_vector = Vec3(*(0 * x for x in constant))
+            return WrenchSegment(center, along, nearest, (constant, leading, zero_vector, zero_vector))
         middle = form.hessian(center).times(along), form.hessian(along).times(center)
-        return WrenchSegment(center, along, nearest, (first, *middle, last))
+        return WrenchSegment(center, along, nearest, (constant, *middle, leading))
 
     def at(self, u: Scalar) -> Vec3:
         """The wrench at u."""
@@ -86,44 +89,44 @@ def monotone_intervals(c: Cubic, low: Scalar, high: Scalar) -> tuple[tuple[Monot
         high: Upper end of the interval.
 
     Returns:
-        For each of the three pieces, the piece and whether it has a root.
+        The three intervals, some of which may be empty, each with whether the cubic has a root in it.
     """
     # turning points: the roots of c1 + 2 c2 u + 3 c3 u^2 = 0, in a form without cancellation
     discriminant = c[2] * c[2] - 3 * c[3] * c[1]
-    turns = discriminant > 0
-    q = -(c[2] + jnp.where(c[2] < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(turns, discriminant, 1.0)))
-    t1 = jnp.where(turns & (c[3] != 0), q / jnp.where(c[3] != 0, 3 * c[3], 1.0), low)
-    t2 = jnp.where(turns & (q != 0), c[1] / jnp.where(q != 0, q, 1.0), low)
-    t1, t2 = jnp.clip(jnp.minimum(t1, t2), low, high), jnp.clip(jnp.maximum(t1, t2), low, high)
-    marks = compute_once((low, t1, t2, high), c[0] + low)
-    values = compute_once(tuple(_value(c, mark) for mark in marks), c[0] + low)
-    found = []
+    has_turns = discriminant > 0
+    q = -(c[2] + jnp.where(c[2] < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(has_turns, discriminant, 1.0)))
+    turn1 = jnp.where(has_turns & (c[3] != 0), q / jnp.where(c[3] != 0, 3 * c[3], 1.0), low)
+    turn2 = jnp.where(has_turns & (q != 0), c[1] / jnp.where(q != 0, q, 1.0), low)
+    turn1, turn2 = jnp.clip(jnp.minimum(turn1, turn2), low, high), jnp.clip(jnp.maximum(turn1, turn2), low, high)
+    ends = compute_once((low, turn1, turn2, high), c[0] + low)
+    values = compute_once(tuple(_cubic_value(c, end) for end in ends), c[0] + low)
+    intervals = []
     for k in range(3):
-        piece = MonotoneInterval(marks[k], marks[k + 1], values[k], values[k + 1])
-        a, b = piece.value_low, piece.value_high
-        opposite = ((a <= 0) & (b >= 0)) | ((a >= 0) & (b <= 0))
-        found.append((piece, opposite & (piece.high > piece.low) & (a != b)))
-    return tuple(compute_once(found, c[0] + low))
+        interval = MonotoneInterval(ends[k], ends[k + 1], values[k], values[k + 1])
+        value_low, value_high = interval.value_low, interval.value_high
+        changes_sign = ((value_low <= 0) & (value_high >= 0)) | ((value_low >= 0) & (value_high <= 0))
+        intervals.append((interval, changes_sign & (interval.high > interval.low) & (value_low != value_high)))
+    return tuple(compute_once(intervals, c[0] + low))
 
 
-def cubic_root(c: Cubic, piece: MonotoneInterval) -> Scalar:
-    """Find the root of a cubic on a monotone piece.
+def cubic_root(c: Cubic, interval: MonotoneInterval) -> Scalar:
+    """Find the root of a cubic in an interval where it is monotone.
 
     The method is Laguerre's with a bracket, in a fixed number of iterations. Newton's method is not used: from afar
     each step reduces the distance by a third only, and near two complex roots a step leads far away again.
 
     Args:
         c: Coefficients of the cubic, the constant first.
-        piece: A piece that has a root.
+        interval: An interval that has a root.
 
     Returns:
         The root.
     """
-    search = _Search.of(c, piece)
-    return jax.lax.fori_loop(0, ROUNDS[search.s.dtype.itemsize], lambda _, search: search.next(c), search).s
+    search = _Search.of(c, interval)
+    return jax.lax.fori_loop(0, ITERATIONS[search.s.dtype.itemsize], lambda _, search: search.next(c), search).s
 
 
-def _value(c: Cubic, u: Scalar) -> Scalar:
+def _cubic_value(c: Cubic, u: Scalar) -> Scalar:
     """The value of a cubic."""
     return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
 
@@ -135,7 +138,7 @@ class _Search(NamedTuple):
         s: Estimate of the root, between `near` and `far`.
         near: One end of the bracket; at first `origin`.
         far: Other end of the bracket.
-        origin: Where the search began: the point where the cubic is smallest, an end of the piece or zero.
+        origin: Where the search began: the point where the cubic is smallest, an end of the interval or zero.
         sign: Sign of the cubic at `far`.
     """
 
@@ -146,53 +149,58 @@ class _Search(NamedTuple):
     sign: Scalar
 
     @staticmethod
-    def of(c: Cubic, piece: MonotoneInterval) -> "_Search":
+    def of(c: Cubic, interval: MonotoneInterval) -> "_Search":
         """Begin at the distance from `origin` that the cubic's derivatives there imply for the root.
 
         That distance is right to a factor of two. It is needed because roots may lie a millionth of the interval from a
         turning point or from u = 0, where the cubic has its scale.
         """
-        low, high, p_low, p_high = piece
-        between = (low < 0) & (high > 0)
-        p_zero = jnp.where(between, c[0], jnp.inf)
-        at_low = jnp.abs(p_low) < jnp.abs(p_high)
-        place, p = jnp.where(at_low, low, high), jnp.where(at_low, p_low, p_high)
-        at_zero = jnp.abs(p_zero) < jnp.abs(p)
-        place, p = jnp.where(at_zero, 0.0, place), jnp.where(at_zero, p_zero, p)
-        upward = (p > 0) != (p_high > p_low)  # the root lies above
-        far, p_far = jnp.where(upward, high, low), jnp.where(upward, p_high, p_low)
-        first = (3 * c[3] * place + 2 * c[2]) * place + c[1]
-        second = 3 * c[3] * place + c[2]
-        ratios = [jnp.abs(p) / jnp.where(d != 0, jnp.abs(d), jnp.finfo(p.dtype).tiny) for d in (first, second, c[3])]
-        reach = jnp.minimum(jnp.minimum(ratios[0], jnp.sqrt(ratios[1])), _about_cbrt(ratios[2]))
-        s = place + jnp.where(upward, 1.0, -1.0) * jnp.minimum(reach, jnp.abs(far - place))
-        return _Search(*compute_once((s, place, far, place, jnp.where(p_far > 0, 1.0, -1.0)), c[0] + low))
+        low, high, value_low, value_high = interval
+        contains_zero = (low < 0) & (high > 0)
+        value_zero = jnp.where(contains_zero, c[0], jnp.inf)
+        at_low = jnp.abs(value_low) < jnp.abs(value_high)
+        origin, value = jnp.where(at_low, low, high), jnp.where(at_low, value_low, value_high)
+        at_zero = jnp.abs(value_zero) < jnp.abs(value)
+        origin, value = jnp.where(at_zero, 0.0, origin), jnp.where(at_zero, value_zero, value)
+        root_above = (value > 0) != (value_high > value_low)
+        far, value_far = jnp.where(root_above, high, low), jnp.where(root_above, value_high, value_low)
+        slope = (3 * c[3] * origin + 2 * c[2]) * origin + c[1]
+        half_curvature = 3 * c[3] * origin + c[2]
+        ratios = [
+            jnp.abs(value) / jnp.where(d != 0, jnp.abs(d), jnp.finfo(value.dtype).tiny)
+            for d in (slope, half_curvature, c[3])
+        ]
+        distance = jnp.minimum(jnp.minimum(ratios[0], jnp.sqrt(ratios[1])), _approximate_cbrt(ratios[2]))
+        s = origin + jnp.where(root_above, 1.0, -1.0) * jnp.minimum(distance, jnp.abs(far - origin))
+        return _Search(*compute_once((s, origin, far, origin, jnp.where(value_far > 0, 1.0, -1.0)), c[0] + low))
 
     def next(self, c: Cubic) -> "_Search":
         """One iteration: a Laguerre step, or a bisection where the step leaves the bracket."""
         s = self.s
-        p = _value(c, s)
+        value = _cubic_value(c, s)
         slope = (3 * c[3] * s + 2 * c[2]) * s + c[1]
-        bend = 6 * c[3] * s + 2 * c[2]
-        beyond = (p > 0) == (self.sign > 0)  # the root lies between near and s
-        near, far = jnp.where(beyond, self.near, s), jnp.where(beyond, s, self.far)
-        root = jnp.sqrt(jnp.maximum(4 * slope * slope - 6 * p * bend, 0))
-        below = slope + jnp.where(slope < 0, -root, root)
-        laguerre = s - 3 * p / jnp.where(below != 0, below, 1.0)
-        inside = ((laguerre - near) * (laguerre - far) <= 0) & (below != 0)
+        curvature = 6 * c[3] * s + 2 * c[2]
+        root_before_s = (value > 0) == (self.sign > 0)  # the root lies between near and s
+        near, far = jnp.where(root_before_s, self.near, s), jnp.where(root_before_s, s, self.far)
+        square_root = jnp.sqrt(jnp.maximum(4 * slope * slope - 6 * value * curvature, 0))
+        denominator = slope + jnp.where(slope < 0, -square_root, square_root)
+        laguerre = s - 3 * value / jnp.where(denominator != 0, denominator, 1.0)
+        inside = ((laguerre - near) * (laguerre - far) <= 0) & (denominator != 0)
         # the middle by order of magnitude: the geometric mean of the ends' distances from the origin
-        a, b = near - self.origin, far - self.origin
-        a = jnp.where(jnp.abs(a) > 1e-3 * jnp.abs(b), a, 1e-3 * b)
-        middle = self.origin + jnp.where(b < 0, -1.0, 1.0) * jnp.sqrt(a * b)
+        near_distance, far_distance = near - self.origin, far - self.origin
+        near_distance = jnp.where(
+            jnp.abs(near_distance) > 1e-3 * jnp.abs(far_distance), near_distance, 1e-3 * far_distance
+        )
+        middle = self.origin + jnp.where(far_distance < 0, -1.0, 1.0) * jnp.sqrt(near_distance * far_distance)
         return _Search(jnp.where(inside, laguerre, middle), near, far, self.origin, self.sign)
 
 
-def _about_cbrt(x: Scalar) -> Scalar:
-    """The cube root of x >= 0 to 6 %, by a third of its exponent.
+def _approximate_cbrt(x: Scalar) -> Scalar:
+    """The cube root of x >= 0 with an error of at most 6 %, by dividing its exponent by three.
 
     An exact cube root takes as long as the iterations that follow.
     """
     bits = {4: jnp.int32, 8: jnp.int64}[x.dtype.itemsize]
-    one, this = (jax.lax.bitcast_convert_type(v, bits) for v in (jnp.ones_like(x), x))
-    three = jnp.full_like(this, 3)
-    return jax.lax.bitcast_convert_type(jax.lax.div(this, three) + 2 * jax.lax.div(one, three), x.dtype)
+    one, number = (jax.lax.bitcast_convert_type(v, bits) for v in (jnp.ones_like(x), x))
+    three = jnp.full_like(number, 3)
+    return jax.lax.bitcast_convert_type(jax.lax.div(number, three) + 2 * jax.lax.div(one, three), x.dtype)

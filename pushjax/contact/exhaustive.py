@@ -36,8 +36,8 @@ import jax
 import jax.numpy as jnp
 
 from pushjax._internal.autodiff import without_derivatives
-from pushjax.contact.answer import polish_and_check
 from pushjax.contact.edge_sets import Incumbent, no_incumbent, solve_one_edge, solve_three_edges, solve_two_edges
+from pushjax.contact.refinement import refine_and_check
 from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution, ScaledProblem
 
 
@@ -57,7 +57,7 @@ class Exhaustive(ContactSolver):
         Returns:
             The motion. Its derivatives are those of the solution, not of the search.
         """
-        return polish_and_check(problem, without_derivatives(enumerate_sets, problem), proves_jams=True)
+        return refine_and_check(problem, without_derivatives(enumerate_sets, problem), proves_jams=True)
 
 
 def enumerate_sets(problem: ScaledProblem) -> Incumbent:
@@ -70,23 +70,30 @@ def enumerate_sets(problem: ScaledProblem) -> Incumbent:
         problem: The dimensionless contact problem.
 
     Returns:
-        The set of cone edges of that solution.
+        The set of cone edges of that solution, with the solution; `found` is False if no set passes.
     """
-    found = no_incumbent(problem.speed)
+    incumbent = no_incumbent(problem.runtime_scalar)
     m = problem.count
-    found = _over(lambda found, e: solve_one_edge(problem, found, *e), found, [(e,) for e in range(2 * m)])
-    slides = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]
-    sticks = [(2 * i, 2 * i + 1) for i in range(m)]
-    found = _over(lambda found, e: solve_two_edges(problem, found, *e), found, sticks + slides)
+    singles = [(edge,) for edge in range(2 * m)]
+    incumbent = _try_sets(lambda best, edges: solve_one_edge(problem, best, *edges), incumbent, singles)
+    sliding = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]
+    sticking = [(2 * i, 2 * i + 1) for i in range(m)]
+    pairs = sticking + sliding
+    incumbent = _try_sets(lambda best, edges: solve_two_edges(problem, best, *edges), incumbent, pairs)
     # Each entry has the numbers of three contacts, then how many choices of edges to try. If the first two numbers are
     # the same, that contact sticks.
-    threes = [(i, i, j, 2) for i, j in permutations(range(m), 2)] + [(*c, 8) for c in combinations(range(m), 3)]
-    return _over(lambda found, c: solve_three_edges(problem, found, c[:3], c[3]), found, threes)
+    triples = [(i, i, j, 2) for i, j in permutations(range(m), 2)] + [(*c, 8) for c in combinations(range(m), 3)]
+    return _try_sets(lambda best, entry: solve_three_edges(problem, best, entry[:3], entry[3]), incumbent, triples)
 
 
-def _over(body: Callable[[Incumbent, tuple], Incumbent], found: Incumbent, sets: list[tuple[int, ...]]) -> Incumbent:
-    """Call `body` for each set in turn, in a compiled loop. Unrolled, the program would take minutes to compile."""
+def _try_sets(
+    try_set: Callable[[Incumbent, tuple], Incumbent], incumbent: Incumbent, sets: list[tuple[int, ...]]
+) -> Incumbent:
+    """Call `try_set` for each set in turn, in a compiled loop.
+
+    Unrolled, the program would take minutes to compile.
+    """
     if not sets:
-        return found
+        return incumbent
     columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*sets, strict=True))
-    return jax.lax.scan(lambda found, numbers: (body(found, numbers), None), found, columns)[0]
+    return jax.lax.scan(lambda incumbent, numbers: (try_set(incumbent, numbers), None), incumbent, columns)[0]

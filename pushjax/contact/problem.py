@@ -12,6 +12,7 @@ from pushjax._internal.checks import (
     check_finite,
     check_non_negative,
     check_shape,
+    check_type,
     common_dtype,
     concrete,
 )
@@ -63,14 +64,17 @@ class Contacts(eqx.Module):
         active: ArrayLike = True,
     ):
         dtype = common_dtype(point, normal, displacement, friction, gap)
-        self.point = as_float(point, dtype)
+        self.point = as_float(point, dtype, "point")
         check_shape("point", self.point, ("contacts", 2))
         m = self.point.shape[0]
-        self.normal, self.displacement = as_float(normal, dtype), as_float(displacement, dtype)
+        self.normal, self.displacement = (
+            as_float(normal, dtype, "normal"),
+            as_float(displacement, dtype, "displacement"),
+        )
         check_shape("normal", self.normal, (m, 2))
         check_shape("displacement", self.displacement, (m, 2))
-        self.friction = _each("friction", as_float(friction, dtype), m)
-        self.gap = _each("gap", as_float(gap, dtype), m)
+        self.friction = _each("friction", as_float(friction, dtype, "friction"), m)
+        self.gap = _each("gap", as_float(gap, dtype, "gap"), m)
         self.active = _each("active", jnp.asarray(active, bool), m)
         counts = concrete(self.active)
         # padding may hold anything; if `active` is traced, all contacts are checked
@@ -169,6 +173,10 @@ def solve_contacts(
 
     Reference: Zhou et al. 2017, sections IV.A and IV.B; the gap is that of Stewart & Trinkle 1996.
     """
+    check_type("surface", surface, LimitSurface)
+    check_type("contacts", contacts, Contacts)
+    if solver is not None:
+        check_type("solver", solver, ContactSolver, StickingSolver)
     _check_num_contacts(contacts.point.shape[0])
     return _solved(surface, contacts, solver)
 

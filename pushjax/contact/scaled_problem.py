@@ -5,8 +5,8 @@ The slider's contact point moves by (a_n . V, a_t . V) along normal and tangent,
 f_n a_n + f_t a_t. The friction cone has two edges. Their wrenches are the generators a_n + mu a_t (the pusher slides
 left) and a_n - mu a_t (right).
 
-Displacements are divided by that of the fastest pusher, and H by its size. So tolerances are relative, and powers of a
-stiff surface's coefficients stay within the range of float32.
+Displacements are divided by the longest displacement of a pusher, and H by the sum of its values at the three unit
+wrenches. So tolerances are relative, and powers of the coefficients of H stay within the range of float32.
 
 Generators are numbered 2 i for the left and 2 i + 1 for the right edge of contact i.
 """
@@ -54,15 +54,16 @@ class ScaledProblem(NamedTuple):
     """A contact problem in dimensionless numbers, with one tuple entry for each contact.
 
     Attributes:
-        form: H, divided by `size`.
+        form: H, divided by `form_scale`.
         normal: The rows a_n.
         tangent: The rows a_t.
         generators: Wrenches of the friction cones' edges with unit normal force, two for each contact.
         approach: Displacement (n, t) of the slider's contact point that keeps it with its pusher, the gap subtracted.
         friction: Coefficients of friction mu.
         active: Whether the contact takes part: False for padding, and for every contact if the problem is not valid.
-        speed: Unit of displacement, m: that of the fastest pusher or the largest penetration depth, if that is larger.
-        size: Number by which H was divided.
+        displacement_unit: Unit of displacement, m: the longest displacement of a pusher or the largest penetration
+            depth, whichever is larger; one if both are zero.
+        form_scale: Number by which H was divided.
         pushes: Whether any contact would be violated if the slider stayed.
         valid: Whether every number is finite and no friction negative. If not, nothing pushes.
         margin: Whether the margin is wanted also where there is a motion.
@@ -75,23 +76,46 @@ class ScaledProblem(NamedTuple):
     approach: tuple[Vec2, ...]
     friction: tuple[Scalar, ...]
     active: tuple[Bool[Array, ""], ...]
-    speed: Scalar
-    size: Scalar
+    displacement_unit: Scalar
+    form_scale: Scalar
     pushes: Bool[Array, ""]
     valid: Bool[Array, ""]
     margin: bool
+
+    @property
+    def runtime_scalar(self) -> Scalar:
+        """A finite scalar that is not a compile-time constant, for `compute_once` and `decide`."""
+        return self.displacement_unit
 
     @property
     def count(self) -> int:
         """Number of contacts."""
         return len(self.friction)
 
-    def beyond(self, contact: Index) -> Scalar:
-        """How far a contact's force is outside its cone if one of its edges has weight minus one."""
+    def violation_per_weight(self, contact: Index) -> Scalar:
+        """How far a contact's force is outside its friction cone if one of its edges has weight minus one.
+
+        The checks of an edge's weight multiply it by this number. So they allow the same error of the force, whatever
+        the coefficient of friction is.
+
+        Args:
+            contact: Number of the contact.
+
+        Returns:
+            The distance, in units of the normal force.
+        """
         return jnp.maximum(2 * dynamic_index(self.friction, contact), 1)
 
     def slips(self, twist: Vec3) -> tuple[Vec2, ...]:
-        """Motion of each contact point relative to its pusher, along normal (the gap added) and tangent."""
+        """Motion of each contact point relative to its pusher.
+
+        Args:
+            twist: Dimensionless twist.
+
+        Returns:
+            For each contact, the motion along the normal, with the gap added, and along the tangent (the slip). A
+            negative normal component violates the contact.
+        """
         rows = zip(self.normal, self.tangent, self.approach, strict=True)
         return tuple(Vec2(n.dot(twist), t.dot(twist)) - b for n, t, b in rows)
 
@@ -126,62 +150,90 @@ def nondimensionalize(
         The dimensionless problem. If a number of an active contact is not finite, or its friction is negative, `valid`
         is False and nothing pushes.
     """
-    known = jnp.isfinite(sum(jnp.where(a, sum(jax.tree.leaves(c)), 0.0) for c, a in zip(contacts, active, strict=True)))
-    for contact, counts in zip(contacts, active, strict=True):
-        known &= (contact.friction >= 0) | ~counts
+    sums = (jnp.where(a, sum(jax.tree.leaves(c)), 0.0) for c, a in zip(contacts, active, strict=True))
+    valid = jnp.isfinite(sum(sums))
+    for contact, is_active in zip(contacts, active, strict=True):
+        valid &= (contact.friction >= 0) | ~is_active
     zero, one = jnp.zeros_like(contacts[0].gap), jnp.ones_like(contacts[0].gap)
-    still = Vec2(zero, zero)
-    like = form.length + sum((c.point.x + c.displacement.x for c in contacts), zero)  # traced, if any input is
-    # computed once, or the sum over all inputs would be recomputed for every row below
-    known, like = compute_once((known, like), like)
-    counts = tuple(decide(known & a, like) for a in active)
-    contacts = tuple(contact.where(a) for a, contact in zip(counts, contacts, strict=True))
+    zero_vector = Vec2(zero, zero)
+    # This is not a compile-time constant if any input is traced.
+    runtime_scalar = form.length + sum((contact.point.x + contact.displacement.x for contact in contacts), zero)
+    # Without `compute_once`, the sum over all inputs would be recomputed for every row below.
+    valid, runtime_scalar = compute_once((valid, runtime_scalar), runtime_scalar)
+    takes_part = tuple(decide(valid & is_active, runtime_scalar) for is_active in active)
+    contacts = tuple(contact.where(used) for used, contact in zip(takes_part, contacts, strict=True))
 
-    # units are constants to every derivative: the answer does not depend on them
-    pushers = [tree_where(a, c.displacement, still) for a, c in zip(counts, contacts, strict=True)]
-    deepest = [jnp.where(a, -c.gap, 0.0) for a, c in zip(counts, contacts, strict=True)]
-    # divide by the largest component first: the square of a small displacement underflows
-    component = _largest([jnp.abs(x) for push in pushers for x in push])
-    component = jnp.where(component > 0, component, 1.0)
-    relative = _largest([push.scale(1 / component).dot(push.scale(1 / component)) for push in pushers])
-    speed = jnp.maximum(component * jnp.sqrt(relative), _largest(deepest))
-    speed = jax.lax.stop_gradient(jnp.where(speed > 0, speed, 1.0))
-    nothing, unit = jnp.zeros_like(form.length), jnp.ones_like(form.length)
-    axes = (Vec3(unit, nothing, nothing), Vec3(nothing, unit, nothing), Vec3(nothing, nothing, unit))
-    size = jax.lax.stop_gradient(sum((form.value(axis) for axis in axes), nothing))
-    # This depends on the surface alone. So a batch that shares one surface also shares the scaled one, which is not
-    # read again for each example.
-    size = compute_once(jnp.where(size > 0, size, 1.0), form.length)
-    like = jnp.where(known, like, 1.0)
-    speed = compute_once(speed, like)
+    displacements = [tree_where(a, c.displacement, zero_vector) for a, c in zip(takes_part, contacts, strict=True)]
+    depths = [jnp.where(a, -c.gap, 0.0) for a, c in zip(takes_part, contacts, strict=True)]
+    displacement_unit = _displacement_unit(displacements, depths)
+    form_scale = _form_scale(form)
+    runtime_scalar = jnp.where(valid, runtime_scalar, 1.0)
+    displacement_unit = compute_once(displacement_unit, runtime_scalar)
 
-    normals, moments, approaches = [], [], []
+    normals, tangential_moments, approaches = [], [], []
     for contact in contacts:
         normals.append(contact.wrench(Vec2(one, zero), form.length))
-        moments.append(contact.wrench(Vec2(zero, one), form.length).z)
-        approaches.append(contact.approach().scale(1 / speed))
-    normals, moments, approaches = compute_once((tuple(normals), tuple(moments), tuple(approaches)), like)
-    tangents = tuple(Vec3(-n.y, n.x, moment) for n, moment in zip(normals, moments, strict=True))
+        tangential_moments.append(contact.wrench(Vec2(zero, one), form.length).z)
+        approaches.append(contact.approach().scale(1 / displacement_unit))
+    normals, tangential_moments, approaches = compute_once(
+        (tuple(normals), tuple(tangential_moments), tuple(approaches)), runtime_scalar
+    )
+    tangents = tuple(Vec3(-n.y, n.x, moment) for n, moment in zip(normals, tangential_moments, strict=True))
     pushes = jnp.zeros((), bool)
-    for a, approach in zip(counts, approaches, strict=True):
-        pushes |= a & (approach.x > 0)
+    for used, approach in zip(takes_part, approaches, strict=True):
+        pushes |= used & (approach.x > 0)
     friction = tuple(contact.friction for contact in contacts)
     generators = []
     for n, t, mu in zip(normals, tangents, friction, strict=True):
         generators += [n + t.scale(mu), n - t.scale(mu)]
-    generators, pushes = compute_once((tuple(generators), pushes), like)
-    scaled = form.scaled(1 / size)
-    each = (normals, tangents, generators, approaches, friction, counts)
-    return ScaledProblem(scaled, *each, speed, size, pushes, known, margin)
+    generators, pushes = compute_once((tuple(generators), pushes), runtime_scalar)
+    scaled_form = form.scaled(1 / form_scale)
+    per_contact = (normals, tangents, generators, approaches, friction, takes_part)
+    return ScaledProblem(scaled_form, *per_contact, displacement_unit, form_scale, pushes, valid, margin)
+
+
+def _displacement_unit(displacements: list[Vec2], depths: list[Scalar]) -> Scalar:
+    """The longest of the displacements or the largest of the depths, if that is larger; one where all are zero.
+
+    Units are constants to every derivative, because the answer does not depend on them.
+    """
+    # Divide by the largest component first, because the square of a small displacement underflows.
+    component = _largest([jnp.abs(x) for displacement in displacements for x in displacement])
+    component = jnp.where(component > 0, component, 1.0)
+    squared = _largest([d.scale(1 / component).dot(d.scale(1 / component)) for d in displacements])
+    unit = jnp.maximum(component * jnp.sqrt(squared), _largest(depths))
+    return jax.lax.stop_gradient(jnp.where(unit > 0, unit, 1.0))
+
+
+def _form_scale(form: Form) -> Scalar:
+    """The sum of H at the three unit wrenches, a constant to every derivative.
+
+    It depends on the surface alone. So a batch that shares one surface also shares the scaled one, which is not read
+    again for each example.
+    """
+    zero, one = jnp.zeros_like(form.length), jnp.ones_like(form.length)
+    axes = (Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one))
+    scale = jax.lax.stop_gradient(sum((form.value(axis) for axis in axes), zero))
+    return compute_once(jnp.where(scale > 0, scale, 1.0), form.length)
 
 
 def _largest(values: list[Scalar]) -> Scalar:
-    """The largest of some values, a constant to every derivative; for units."""
+    """The largest of some values, as a constant to every derivative."""
     return functools.reduce(jnp.maximum, jax.lax.stop_gradient(values))
 
 
 def dynamic_index(values: tuple[Any, ...], index: Index) -> Any:
-    """`values[index]`, also for an index that a loop runs over: by selections, which cost a batch little."""
+    """Return `values[index]`, also for an index that a loop runs over.
+
+    A traced index selects by `where`, because a gather is slow in a batch.
+
+    Args:
+        values: Pytrees of the same structure.
+        index: Number of an entry, not negative.
+
+    Returns:
+        The entry.
+    """
     if isinstance(index, int):
         return values[index]
     chosen = values[0]

@@ -18,10 +18,10 @@ from pushjax._internal.autodiff import without_derivatives
 from pushjax._internal.compaction import only_where
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Vec2
-from pushjax.contact.answer import polish_and_check
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.edge_sets import Incumbent, no_incumbent
 from pushjax.contact.exhaustive import Exhaustive, enumerate_sets
+from pushjax.contact.refinement import refine_and_check
 from pushjax.contact.scaled_problem import ScalarSolution, nondimensionalize
 from pushjax.contact.single import solve_single
 from pushjax.contact.status import ContactMode, Status
@@ -78,7 +78,7 @@ def _differentiable(problem: Problem) -> ScalarSolution:
     """
     enough, one = _alone(problem)
     found = without_derivatives(_search, enough, problem)
-    return tree_where(enough, one, polish_and_check(nondimensionalize(*problem, margin=False), found, proves_jams=True))
+    return tree_where(enough, one, refine_and_check(nondimensionalize(*problem, margin=False), found, proves_jams=True))
 
 
 def _search(enough: Bool[Array, ""], problem: Problem) -> Incumbent:

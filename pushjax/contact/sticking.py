@@ -116,7 +116,7 @@ def _solve_jvp(primals, tangents):
 
 def _slope(curve: LimitCurve, v: Vec2, s: Scalar, g: Vec2) -> Scalar:
     """Derivative with respect to s of cross(v, motion(s)) = v_n h' - v_t (d h - s h')."""
-    bend = curve.bend(s)
+    bend = curve.second_derivative(s)
     return v.x * bend - v.y * ((curve.degree - 1) * g.y - s * bend)
 
 
