@@ -7,7 +7,6 @@ Run it in a clone of the repository. For the comparison with other programs, ins
 
 import ast
 import inspect
-import runpy
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -48,6 +47,7 @@ MODULES = {
     for name in (
         "accuracy",
         "contacts",
+        "cost_by_batch",
         "derivatives",
         "first_calls",
         "friction",
@@ -59,7 +59,6 @@ MODULES = {
         "solvers",
     )
 } | {"table1_causes": "robot.causes", "table1_spread": "robot.spread"}
-SCRIPTS = ("identification", "many_identifications")
 PICTURES = Path("pushjax-out")
 
 
@@ -156,10 +155,6 @@ def main(arguments: list[str]) -> None:
     """
     if not arguments:
         print(listing())
-        return
-    if arguments[0] in SCRIPTS:
-        sys.argv = [arguments[0], *arguments[1:]]
-        runpy.run_module(f"benchmarks.{arguments[0]}", run_name="__main__", alter_sys=True)
         return
     module: ModuleType = speed
     run, program, about = timed, "python -m benchmarks", None

@@ -1,7 +1,8 @@
 """Error and penetration depth of pushes as functions of the step.
 
 A 90 mm square is pushed 221 times by 50 mm. The pushes start every 5 mm across a side and go every 10 degrees up to 60
-degrees from its normal; mu is 0.25. Some slide off a corner. All is computed in float64; the reference has 6400 steps.
+degrees from its normal; the friction coefficient is 0.25. Some slide off a corner. All is computed in float64; the
+reference has 6400 steps.
 """
 
 from typing import Any
@@ -16,7 +17,7 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.geometry import se2
 
-LENGTH, FRICTION, GAP, REFERENCE = 0.05, 0.25, 0.0005, 6400
+TRAVEL, FRICTION, GAP, REFERENCE = 0.05, 0.25, 0.0005, 6400
 RADII, STEPS = (0.00475, 0.001, 0.0), (10, 25, 50, 100, 200)
 
 
@@ -35,7 +36,7 @@ def fan(slider: pj.Slider, radius: float, steps: int) -> tuple[np.ndarray, float
 
     def one(offset, angle):
         start = jnp.stack([-0.045 - radius - GAP, offset])
-        path = pj.line(start, start + LENGTH * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), steps)
+        path = pj.line(start, start + TRAVEL * jnp.stack([jnp.cos(angle), jnp.sin(angle)]), steps)
         push = pj.rollout(slider, pj.Hand.finger(radius), path, pose=jnp.zeros(3), friction=FRICTION)
         fingers = jax.vmap(lambda pose, q: se2.transform(se2.inverse(pose), q))(push.pose, path)
         gap = jax.vmap(slider.shape.signed_distance)(fingers) - radius
@@ -66,7 +67,7 @@ def run(progress: ProgressCallback = no_progress) -> dict[str, Any]:
                 pose, depth = fan(slider, radius, steps)
                 off = 1e3 * np.linalg.norm(pose[:, :2] - exact[:, :2], axis=1)
                 turn = np.degrees(np.abs(pose[:, 2] - exact[:, 2]).max())
-                row = {"radius_mm": 1e3 * radius, "step_mm": 1e3 * LENGTH / steps, "worst_mm": off.max()}
+                row = {"radius_mm": 1e3 * radius, "step_mm": 1e3 * TRAVEL / steps, "worst_mm": off.max()}
                 row |= {"worst_deg": turn, "median_mm": np.median(off), "penetration_mm": 1e3 * depth}
                 rows.append(row)
                 progress(len(rows), len(RADII) * len(STEPS))

@@ -112,7 +112,7 @@ def push_t(dtype: str, batch: int, where: str = "side") -> Work:
     if where == "corner":
         start = jnp.array([-tasks.SIDE / 4 + tasks.RADIUS, tasks.SIDE / 8 + tasks.RADIUS], dtype)
         diagonal = jnp.array([[-1, -1], [1, -1]], dtype) / 2**0.5  # from the normal of the side to that of the corner
-        path = start + (path - path[:, :1]) @ diagonal
+        path = start[None, None] + (path - path[:, :1]) @ diagonal
 
     def final(*args):
         return in_tiles(lambda *each: here.push(*each).pose[-1], args, batch)
@@ -143,14 +143,16 @@ def push_two_fingers(dtype: str, batch: int) -> Work:
 def grasp_jaw(dtype: str, batch: int) -> Work:
     """Make a program for the final poses of random grasps of the askew square by a parallel jaw.
 
-    The jaw closes as the two fingers of `grasp` do, by their distance between centers less a diameter.
+    Each grasp begins where the first pad touches. It ends 1 mm before the straight square would be held, as `grasp`.
 
     Args:
         dtype: Floating type.
         batch: Number of grasps.
     """
-    one, (pose, path) = each_grasp(tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype), dtype, batch, MANY_STEPS)
-    path = path.at[..., 3].add(-2 * tasks.RADIUS)
+    one, (pose, path) = each_grasp(grasps.jaw(dtype), dtype, batch, MANY_STEPS)
+    diameter, share = 2 * tasks.RADIUS, jnp.linspace(0, 1, MANY_STEPS + 1, dtype=dtype)
+    centers = grasps.opening_at(grasps.touching_jaw(pose)[:, None] + diameter, share[None])  # as of round fingers
+    path = path.at[..., 3].set(centers - diameter)
 
     def final(*args):
         return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
@@ -170,7 +172,7 @@ def solve(dtype: str, batch: int, contacts: int) -> Work:
 
 
 def sampling(dtype: str, batch: int) -> Work:
-    """Make a program for random quartics, certified convex, from the sampler of the paper."""
+    """Make a program for random quartics, certified convex, from the default sampler of `FrictionModel`."""
     surface = tasks.task("quartic", dtype).slider.surface
     random = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype).around(surface)
     keys = jax.random.split(jax.random.key(0), batch)
@@ -246,9 +248,9 @@ def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[
         return here._replace(slider=pj.Slider(here.slider.shape, surface)).push(path, friction)
 
     surface = _surfaces(here.slider.surface, keys[0], batch)
-    path = tasks.paths(
-        uniform(keys[1], -tasks.REACH, tasks.REACH), uniform(keys[2], -tasks.STEEPEST, tasks.STEEPEST), steps
-    )
+    offset = uniform(keys[1], -tasks.MAX_OFFSET, tasks.MAX_OFFSET)
+    angle = uniform(keys[2], -tasks.MAX_ANGLE, tasks.MAX_ANGLE)
+    path = tasks.paths(offset, angle, steps)
     return one, (surface, path, uniform(keys[3], 0.15, 0.35))
 
 

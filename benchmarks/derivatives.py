@@ -1,17 +1,17 @@
 """Cost of the derivatives of pushes and their agreement with finite differences.
 
-cost       Time of reverse and forward mode beside the push alone: 200 steps, float32, timed in turns in one run.
-memory     Memory that reverse mode needs, as counted by the compiler, and ways to need less.
-agreement  Relative error |derivative - difference| / max(1, |difference|) of random pushes against central differences,
-           in float64, with lengths in units of the surface's. Differences of two widths, H and H / 4, are extrapolated,
-           so that neither the truncation error (1e-20 times the fifth derivative) nor roundoff (1e-10) matters.
-           A push is compared where the modes, the status and, for one finger, the touched edge or vertex are the same
-           in every step on both sides, because elsewhere there may be no derivative. Where the error is still large, it
-           is computed once more with differences of width FINE.
-grasps     The same for random grasps.
-random     Derivatives of E[f] by `dof` and by the range of friction through `random_rollout`, against differences of
-           means.
-picture    The final angle and its derivative along three lines: friction, start of a push, start angle in a jaw.
+- `cost`: time of reverse and forward mode beside the push alone: 200 steps, float32, timed in turns in one run.
+- `memory`: memory that reverse mode needs, as counted by the compiler, and ways to need less.
+- `agreement`: relative error |derivative - difference| / max(1, |difference|) of random pushes against central
+  differences, in float64, with lengths in units of the surface's. Differences of two widths, H and H / 4, are
+  extrapolated, so that neither the truncation error (1e-20 times the fifth derivative) nor roundoff (1e-10) matters. A
+  push is compared where the modes, the status and, for one finger, the touched edge or vertex are the same in every
+  step on both sides, because elsewhere there may be no derivative. Where the error is still large, it is computed once
+  more with differences of width FINE.
+- `grasps`: the same for random grasps.
+- `random`: derivatives of E[f] by `dof` and by the range of friction through `random_rollout`, against differences of
+  means.
+- `picture`: the final angle and its derivative along three lines: friction, start of a push, start angle in a jaw.
 """
 
 from collections.abc import Callable

@@ -27,7 +27,7 @@ import tyro
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 
-STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000
+STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000  # STEPS as in `cases.MANY_STEPS`
 Program = Literal["push", "gradient", "t", "two_fingers", "jaw"]
 Session = Literal["example", "random_l", "identify"]
 COLUMNS = (
@@ -234,31 +234,19 @@ def work(case: str, dtype: str, batch: int) -> tuple:
     import jax
     import jax.numpy as jnp
 
-    import pushjax as pj
-    from benchmarks import cases, grasps, tasks
+    from benchmarks import cases, grasps
 
-    if case in ("push", "gradient"):
-        one, args = cases.each_push("quartic", dtype, batch, STEPS)
-    elif case == "t":
-        one, (_, path, friction) = cases.each_push("quartic", dtype, batch, STEPS)
-        one, args = push_of_t(dtype), (path, friction)
+    if case in ("t", "jaw"):
+        made = {"t": cases.push_t, "jaw": cases.grasp_jaw}[case](dtype, batch)
+        return made.function, made.args
+    if case == "two_fingers":
+        one, args = cases.each_grasp(grasps.hand(dtype), dtype, batch, STEPS)
     else:
-        hand = grasps.hand(dtype) if case == "two_fingers" else tasks.cast(pj.Hand.parallel_jaw(0.05, 0.01), dtype)
-        one, args = cases.each_grasp(hand, dtype, batch, STEPS)
+        one, args = cases.each_push("quartic", dtype, batch, STEPS)
     final = jax.vmap(lambda *each: one(*each).pose[-1])
     if case == "gradient":
         return jax.grad(lambda *args: jnp.sum(final(*args)), argnums=(0, 1, 2)), args
     return final, args
-
-
-def push_of_t(dtype: str):
-    """Return the function of one push of a T, which is as large as the square, against its bar."""
-    import pushjax as pj
-    from benchmarks import tasks
-
-    task = tasks.task("quartic", dtype)
-    task = task._replace(slider=pj.Slider(tasks.cast(tasks.t_block(), dtype), task.slider.surface))
-    return lambda path, friction: task.push(path, friction)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from benchmarks.peers import fits
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.friction.quartic import MONOMIALS
@@ -61,10 +62,7 @@ def certified(coefficients: np.ndarray) -> int:
     Args:
         coefficients: Coefficients, (n, 15).
     """
-    import cvxpy as cp
-
-    rng = np.random.default_rng(0)
-    found = 0
+    cp, rng, found = fits.cvxpy(), np.random.default_rng(0), 0
     f, z = rng.normal(size=(2, 120, 3))
     y = np.einsum("ni,nj->nij", z, f).reshape(120, 9)
     q, slack = cp.Variable((9, 9), symmetric=True), cp.Variable()

@@ -18,15 +18,23 @@ from benchmarks import tasks
 
 FRICTION = 0.1
 # Start pose of the square: largest offset in x and y (m), least and largest |angle| (rad).
-ASIDE, LEAST_TURN, MOST_TURN = 5e-3, 0.2, 0.4
-FLAT = tasks.SIDE + 2 * tasks.RADIUS  # m, opening (between the fingers' centers) that touches the straight square
-LEFT = 1e-3  # m, by how much the opening at the end exceeds FLAT
-TURNED = float(np.arccos(FLAT / (FLAT + LEFT)))  # rad, angle at which the square fits the opening at the end
+MAX_OFFSET, MIN_ANGLE, MAX_ANGLE = 5e-3, 0.2, 0.4
+PAD = (0.05, 0.01)  # width and thickness of a pad of the parallel jaw, m
+# Opening (distance between the fingers' centers) at which both fingers touch the straight square, m.
+STRAIGHT_OPENING = tasks.SIDE + 2 * tasks.RADIUS
+CLEARANCE = 1e-3  # m, by how much the opening at the end exceeds STRAIGHT_OPENING
+# Angle at which the square fits the opening at the end, rad.
+END_ANGLE = float(np.arccos(STRAIGHT_OPENING / (STRAIGHT_OPENING + CLEARANCE)))
 
 
 def hand(dtype: str) -> pj.Hand:
     """Return the hand of two fingers, in `dtype`."""
     return tasks.cast(pj.Hand.two_fingers(tasks.RADIUS), dtype)
+
+
+def jaw(dtype: str) -> pj.Hand:
+    """Return the parallel jaw, in `dtype`."""
+    return tasks.cast(pj.Hand.parallel_jaw(*PAD), dtype)
 
 
 def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
@@ -40,15 +48,38 @@ def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
     """
     x, y, theta = pose.T
     cos, sin = jnp.cos(theta), jnp.sin(theta)
-    upper, lower = (sign * y + (FLAT / 2 - sign * x * sin) / cos for sign in (1, -1))
+    upper, lower = (sign * y + (STRAIGHT_OPENING / 2 - sign * x * sin) / cos for sign in (1, -1))
     return 2 * jnp.maximum(upper, lower)
+
+
+def touching_jaw(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
+    """Return the opening at which the first pad of the parallel jaw touches the square at `pose`.
+
+    Either a corner of the pad touches a side of the square, or a corner of the square touches the face of the pad.
+
+    Args:
+        pose: Poses of the square, turned by less than a quarter of a right angle.
+
+    Returns:
+        Distances between the faces of the pads, m.
+    """
+    x, y, theta = pose.T
+    cos, sin, turn = jnp.cos(theta), jnp.sin(theta), jnp.sign(theta)
+    half, edge = tasks.SIDE / 2, PAD[0] / 2
+
+    def height(side):  # of the highest point of the square above (1) or below (-1) the hand's middle, within the pad
+        corner = turn * (side * x - half * sin) + half * cos
+        at = turn * jnp.minimum(corner, edge)
+        return side * y + (half + (at - side * x) * sin) / cos
+
+    return 2 * jnp.maximum(height(1), height(-1))
 
 
 def openings(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1"]:
     """Return the openings of each grasp, from the first touch to the end, m.
 
-    The excess over FLAT shrinks by the same factor in every step. The angle of the square goes with the square root of
-    that excess, so the square turns faster the straighter it is.
+    The excess over STRAIGHT_OPENING shrinks by the same factor in every step. The angle of the square goes with the
+    square root of that excess, so the square turns faster the straighter it is.
 
     Args:
         pose: Start poses of the square.
@@ -67,7 +98,7 @@ def opening_at(first: Float[Array, "..."], share: Float[Array, "..."]) -> Float[
     Returns:
         Openings, m.
     """
-    return FLAT + (first - FLAT) * (LEFT / (first - FLAT)) ** share
+    return STRAIGHT_OPENING + (first - STRAIGHT_OPENING) * (CLEARANCE / (first - STRAIGHT_OPENING)) ** share
 
 
 def paths(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1 4"]:
@@ -85,14 +116,14 @@ def paths(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1 4"]:
 def random_poses(key: Array, n: int, dtype: str) -> Float[Array, "n 3"]:
     """Return `n` random start poses of the square."""
     at = jax.random.uniform(key, (n, 3), dtype, -1, 1)
-    turn = jnp.sign(at[:, 2]) * (LEAST_TURN + (MOST_TURN - LEAST_TURN) * jnp.abs(at[:, 2]))
-    return jnp.stack([ASIDE * at[:, 0], ASIDE * at[:, 1], turn], axis=-1)
+    turn = jnp.sign(at[:, 2]) * (MIN_ANGLE + (MAX_ANGLE - MIN_ANGLE) * jnp.abs(at[:, 2]))
+    return jnp.stack([MAX_OFFSET * at[:, 0], MAX_OFFSET * at[:, 1], turn], axis=-1)
 
 
 def fan() -> np.ndarray:
     """Return the 27 start poses of the square over which errors are maximized, (27, 3)."""
-    places, turns = (-1.0, 0.0, 1.0), (-MOST_TURN, LEAST_TURN, (LEAST_TURN + MOST_TURN) / 2)
-    return np.array([(ASIDE * x, ASIDE * y, turn) for x in places for y in places for turn in turns])
+    places, turns = (-1.0, 0.0, 1.0), (-MAX_ANGLE, MIN_ANGLE, (MIN_ANGLE + MAX_ANGLE) / 2)
+    return np.array([(MAX_OFFSET * x, MAX_OFFSET * y, turn) for x in places for y in places for turn in turns])
 
 
 def final_poses(steps: int, dtype: str) -> np.ndarray:

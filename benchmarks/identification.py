@@ -1,23 +1,21 @@
 """How often the confidence intervals of `identify` contain a known truth.
 
-    python -m benchmarks identification [--pushes 50] [--repetitions 200] [--noise 0.5]
-
 A 90 mm square is pushed 30 mm, in 30 steps, by a finger of 5 mm radius that starts anywhere on a side and moves up to
-34 degrees from its normal. Each repetition has its own truth. The limit surface (dof 50 around uniform pressure), the
-center of pressure (3 mm) and the inset of the outline (1 mm) are drawn from the prior of the identification, and the
-friction uniformly from 0.1 to 0.5. The final poses are measured with noise; `--noise 0` gives exact ones. All
-repetitions are one batch.
+34 degrees from its normal. Each repetition has its own truth. The limit surface (50 degrees of freedom, around that of
+uniform pressure), the center of pressure (standard deviation 3 mm) and the inset of the outline (1 mm) are drawn from
+the prior of the identification, and the friction uniformly from 0.1 to 0.5. The final poses are measured with noise.
+All repetitions are one batch.
 """
 
-import argparse
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from benchmarks._measure import header
+from pushjax._internal.record import result_record
 from pushjax.identification.model import Scene, predict_pushes
 from pushjax.identification.prior import Prior
 
@@ -47,20 +45,26 @@ def random_pushes(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax
     return jnp.asarray(pose, jnp.float32), jnp.asarray(begin[..., None, :] + way, jnp.float32)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--pushes", type=int, default=50)
-    parser.add_argument("--repetitions", type=int, default=200)
-    parser.add_argument("--noise", type=float, default=0.5, help="mm, of x, y and length * theta each")
-    arguments = parser.parse_args()
-    print(header())
+def run(pushes: int = 50, repetitions: int = 200, noise: float = 0.5) -> dict[str, Any]:
+    """Identify objects whose truth is known.
+
+    Args:
+        pushes: Number of pushes of each object.
+        repetitions: Number of objects.
+        noise: Standard deviation of x, y and length * theta of the final poses, mm. 0: exact poses.
+
+    Returns:
+        The record, with one row for each level of the intervals: by the name of each unknown, the fraction of its
+        intervals that contain the truth. It also has the times, the median of sigma, and the number of objects that did
+        not converge.
+    """
     rng = np.random.default_rng(1)
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
     surfaces = jax.tree.map(lambda leaf: leaf[None], mean)
     prior = Prior.of(UNKNOWNS, surfaces, jnp.asarray([0.25]), jnp.zeros(2))
-    layout, count = prior.layout, arguments.repetitions
-    starts, paths = random_pushes(rng, (count, arguments.pushes))
+    layout, count = prior.layout, repetitions
+    starts, paths = random_pushes(rng, (count, pushes))
     truth, mu = rng.normal(size=(count, layout.size)), rng.uniform(0.1, 0.5, count)
     position = int(layout.positions[0, layout.slices["friction"]][0])
     truth[:, position] = np.log(mu / (1 - mu))
@@ -69,11 +73,11 @@ def main() -> None:
     @jax.jit
     @jax.vmap
     def ends(z, start, path):
-        pushes = pj.Pushes(start[None], path[None], start[None])
-        return predict_pushes(prior.parameters(z), surfaces, Scene(square, hand, prior.origin), pushes).pose[0, :, -1]
+        given = pj.Pushes(start[None], path[None], start[None])
+        return predict_pushes(prior.parameters(z), surfaces, Scene(square, hand, prior.origin), given).pose[0, :, -1]
 
-    noise = 1e-3 * arguments.noise * rng.normal(size=starts.shape) / [1, 1, float(mean.length)]
-    seen = ends(truth, starts, paths) + jnp.asarray(noise, jnp.float32)
+    added = 1e-3 * noise * rng.normal(size=starts.shape) / [1, 1, float(mean.length)]
+    measured = ends(truth, starts, paths) + jnp.asarray(added, jnp.float32)
 
     @jax.jit
     @jax.vmap
@@ -81,21 +85,37 @@ def main() -> None:
         return pj.identify(pj.Pushes(start, path, end), pj.Slider(square, mean), hand, UNKNOWNS, robust=None)
 
     begin = time.perf_counter()
-    compiled = identified.lower(starts, paths, seen).compile()
+    compiled = identified.lower(starts, paths, measured).compile()
     middle = time.perf_counter()
-    found = jax.block_until_ready(compiled(starts, paths, seen))
+    found = jax.block_until_ready(compiled(starts, paths, measured))
     took = time.perf_counter() - middle
-    print(f"{count} x {arguments.pushes} pushes: compiled in {middle - begin:.0f} s, run in {took:.0f} s")
-    print(f"not converged: {int(np.sum(~np.asarray(found.converged)))}; sigma {1e3 * np.median(found.sigma):.3f} mm")
     deviation = np.sqrt(np.diagonal(np.linalg.inv(np.asarray(found.precision, float)), axis1=1, axis2=2))
     error = np.abs(np.asarray(found.z) - np.asarray(truth)) / deviation
+    rows = []
     for level, quantile in ((0.5, 0.6745), (0.9, 1.6449)):
         inside = (error < quantile).mean(axis=0)
-        parts = {name: inside[layout.positions[0, layout.slices[name]]] for name in layout.names}
-        print(
-            f"intervals of {100 * level:.0f} % hold", {name: f"{100 * np.mean(v):.1f} %" for name, v in parts.items()}
-        )
+        parts = {name: inside[layout.positions[0, layout.slices[name]]].mean() for name in layout.names}
+        rows.append({"level": level} | parts)
+    return result_record(
+        "identification",
+        {"pushes": pushes, "repetitions": repetitions, "noise_mm": noise},
+        rows=rows,
+        compile_s=middle - begin,
+        run_s=took,
+        not_converged=int(np.sum(~np.asarray(found.converged))),
+        sigma_mm=1e3 * np.median(found.sigma),
+    )
 
 
-if __name__ == "__main__":
-    main()
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    settings = record["settings"]
+    lines = [
+        f"{settings['repetitions']} x {settings['pushes']} pushes: compiled in {record['compile_s']:.0f} s, run in "
+        f"{record['run_s']:.0f} s",
+        f"not converged: {record['not_converged']}; sigma {record['sigma_mm']:.3f} mm",
+    ]
+    for row in record["rows"]:
+        parts = ", ".join(f"{name} {100 * share:.1f} %" for name, share in row.items() if name != "level")
+        lines.append(f"intervals of {100 * row['level']:.0f} % hold: {parts}")
+    return "\n".join(lines)

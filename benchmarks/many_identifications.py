@@ -1,31 +1,31 @@
 """A thousand identifications in one `vmap` beside as many semi-definite programs.
 
-    python -m benchmarks many_identifications [--objects 1000] [--pushes 20] [--programs 1000]
+The objects are squares of 90 mm. Each has its own ellipsoid (30 degrees of freedom, around that of uniform pressure)
+and friction (0.1 to 0.5), and is pushed 30 mm, in 20 steps, by a finger of 5 mm radius. Two things are measured in each
+push: the final pose, with noise of 0.3 mm in x, y and length * theta, and the mean directions of wrench and motion in
+each half of the push, with noise of 3 degrees.
 
-The objects are squares of 90 mm. Each has its own ellipsoid (dof 30 around uniform pressure) and friction (0.1 to 0.5),
-and is pushed 30 mm, in 20 steps, by a finger of 5 mm radius. Two things are measured in each push: the final pose, with
-noise of 0.3 mm in x, y and length * theta, and the mean directions of wrench and motion in each half of the push, with
-noise of 3 degrees.
+- `identify` finds friction and surface from poses and wrenches together, with all objects in one `vmap`.
+- `convex` finds the surface from the wrench-twist pairs by a semi-definite program (cvxpy, with the loss of
+  `fit_limit_surface`), one object after another. It then finds the friction from the final poses on a grid of 21
+  values, with all objects in one batch.
+- `expected` is no identification, but the mean surface and a friction of 0.25 for all objects.
 
-identify  Friction and surface from poses and wrenches together, with all objects in one `vmap`.
-convex    The surface from the pairs by a semi-definite program (cvxpy, the loss of `fit_limit_surface`), one object
-          after another; then the friction from the final poses on a grid of 21 values, with all objects in one batch.
-
-Both use the same data. They are compared by the final poses of other pushes of the same objects, without noise, by the
-friction, and by the wrenches of random twists.
+They are compared by the final poses of other pushes of the same objects, without noise, by the friction, and by the
+wrenches of random twists.
 """
 
-import argparse
 import time
+from typing import Any
 
-import cvxpy as cp
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from benchmarks._measure import header
 from benchmarks.identification import HALF, RADIUS, random_pushes
+from benchmarks.peers import fits
+from pushjax._internal.record import result_record
 
 PATH_STEPS, GRID, TEST = 20, np.linspace(0.05, 0.65, 21), 10
 POSE_NOISE, ANGLE_NOISE = 3e-4, np.radians(3.0)
@@ -102,7 +102,7 @@ def _with_direction_noise(rng: np.random.Generator, vectors: np.ndarray) -> np.n
     return vectors + ANGLE_NOISE / np.sqrt(2) * size * rng.normal(size=vectors.shape)
 
 
-def ellipsoid_by_sdp(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
+def ellipsoid_by_semidefinite_program(wrench: np.ndarray, twist: np.ndarray, length: float) -> np.ndarray:
     """Fit an ellipsoid by a semi-definite program, with the loss of `fit_limit_surface`.
 
     Args:
@@ -113,6 +113,7 @@ def ellipsoid_by_sdp(wrench: np.ndarray, twist: np.ndarray, length: float) -> np
     Returns:
         The matrix of the ellipsoid, (3, 3).
     """
+    cp = fits.cvxpy()
     metric = np.array([1, 1, length])
     valid = np.any(wrench != 0, axis=1) & np.any(twist != 0, axis=1)
     force, motion = wrench[valid] / metric, twist[valid] * metric
@@ -147,8 +148,8 @@ def friction_on_grid(surface, pushes: pj.Pushes, length) -> jax.Array:
     return jnp.asarray(GRID, jnp.float32)[jnp.argmin(losses, axis=0)]
 
 
-def report(name: str, surface, friction, truth, tested: Arrays, length: float) -> None:
-    """Print the errors of identified objects.
+def errors(name: str, surface, friction, truth, tested: Arrays, length: float) -> dict[str, Any]:
+    """Compare identified objects with the truth.
 
     Args:
         name: Name of the method.
@@ -157,17 +158,18 @@ def report(name: str, surface, friction, truth, tested: Arrays, length: float) -
         truth: True surfaces, true friction coefficients, and true final poses of the tested pushes.
         tested: Start poses and paths of the tested pushes.
         length: Characteristic length, m.
+
+    Returns:
+        The row: mean deviation of the final poses over objects, the deviation that one of twenty objects exceeds, mean
+        error of the friction, and mean angle between true and identified wrenches.
     """
     real, mu, ends = truth
     done = simulate(surface, friction, *tested)
     off = 1e3 * np.asarray(pj.deviation(done.pose[:, :, -1], ends, length)).mean(axis=1)
     angles = np.degrees(np.asarray(wrench_angle(surface, real)))
     wrong = np.abs(np.asarray(friction - mu))
-    print(
-        f"{name}: final poses off by {off.mean():.3f} mm in the mean over objects, {np.quantile(off, 0.95):.3f} in one "
-        f"of twenty; friction by {wrong.mean():.4f}; wrenches by {angles.mean():.2f} degrees",
-        flush=True,
-    )
+    figures = {"mean_mm": off.mean(), "q95_mm": np.quantile(off, 0.95)}
+    return {"method": name} | figures | {"friction": wrong.mean(), "wrench_deg": angles.mean()}
 
 
 @jax.jit
@@ -188,54 +190,77 @@ def wrench_angle(one, other) -> jax.Array:
     return jax.vmap(of)(one, other)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--objects", type=int, default=1000)
-    parser.add_argument("--pushes", type=int, default=20)
-    parser.add_argument("--programs", type=int, default=1000, help="how many of the objects cvxpy fits")
-    given = parser.parse_args()
-    print(header())
+def run(objects: int = 1000, pushes: int = 20, programs: int = 1000) -> dict[str, Any]:
+    """Identify random objects, all at once, and some of them one after another by semi-definite programs.
+
+    Args:
+        objects: Number of objects.
+        pushes: Number of pushes of each.
+        programs: Number of objects that cvxpy fits, at most all.
+
+    Returns:
+        The record, with a row of errors for the expected object, for `identify` and for `convex`, and the times.
+
+    Raises:
+        ValueError: If cvxpy is not installed.
+    """
     rng = np.random.default_rng(0)
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400), degree=2)
     length = float(mean.length)
-    real, mu = random_objects(rng, mean, given.objects)
-    pushes = measured_pushes(rng, real, mu, length, given.objects, given.pushes)
-    tested = coarse_random_pushes(rng, given.objects, TEST)
+    real, mu = random_objects(rng, mean, objects)
+    measured = measured_pushes(rng, real, mu, length, objects, pushes)
+    tested = coarse_random_pushes(rng, objects, TEST)
     truth = (real, mu, simulate(real, mu, *tested).pose[:, :, -1])
-    middle_friction = jnp.full(given.objects, 0.25)
-    same = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (given.objects, *leaf.shape)), mean)
-    report("expected, friction 0.25", same, middle_friction, truth, tested, length)
+    expected = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (objects, *leaf.shape)), mean)
+    rows = [errors("expected, friction 0.25", expected, jnp.full(objects, 0.25), truth, tested, length)]
 
     def identified(pushes):
         return pj.identify(pushes, pj.Slider(square, mean), hand, UNKNOWNS, robust=None)
 
     begin = time.perf_counter()
-    program = jax.jit(jax.vmap(identified)).lower(pushes).compile()
+    program = jax.jit(jax.vmap(identified)).lower(measured).compile()
     middle = time.perf_counter()
-    found = jax.block_until_ready(program(pushes))
+    found = jax.block_until_ready(program(measured))
     took = time.perf_counter() - middle
-    print(f"identify: {given.objects} objects in {took:.1f} s, {1e3 * took / given.objects:.1f} ms each; compiled in "
-          f"{middle - begin:.0f} s; {int(np.sum(~np.asarray(found.converged)))} not converged")  # fmt: skip
+    times = {"identify_compile_s": middle - begin, "identify_s": took}
+    not_converged = int(np.sum(~np.asarray(found.converged)))
     surface = jax.vmap(lambda one: one.surface)(found)
     friction = jax.vmap(lambda one: one.friction)(found)
-    report("identify", surface, friction, truth, tested, length)
+    rows.append(errors("identify", surface, friction, truth, tested, length))
 
-    count = min(given.programs, given.objects)
-    part = jax.tree.map(lambda leaf: leaf[:count], (pushes, truth, tested))
+    count = min(programs, objects)
+    part = jax.tree.map(lambda leaf: leaf[:count], (measured, truth, tested))
     wrench, twist = (np.asarray(x, float).reshape(count, -1, 3) for x in (part[0].wrench, part[0].twist))
+    fits.cvxpy()  # importing it is not timed
     begin = time.perf_counter()
-    matrices = np.stack([ellipsoid_by_sdp(w, v, length) for w, v in zip(wrench, twist, strict=True)])
+    matrices = np.stack([ellipsoid_by_semidefinite_program(w, v, length) for w, v in zip(wrench, twist, strict=True)])
     middle = time.perf_counter()
     convex = jax.vmap(pj.Ellipsoid, in_axes=(0, None))(jnp.asarray(matrices, jnp.float32), mean.length)
     grid = friction_on_grid.lower(convex, part[0], length).compile()
     start = time.perf_counter()
     friction = jax.block_until_ready(grid(convex, part[0], length))
     took = time.perf_counter() - start
-    print(f"convex: {count} objects in {middle - begin:.1f} s of programs and {took:.1f} s of grid, "
-          f"{1e3 * (middle - begin + took) / count:.1f} ms each")  # fmt: skip
-    report("convex", convex, friction, part[1], part[2], length)
+    times |= {"programs_s": middle - begin, "grid_s": took}
+    rows.append(errors("convex", convex, friction, part[1], part[2], length))
+    settings = {"objects": objects, "pushes": pushes, "programs": count}
+    return result_record("many_identifications", settings, rows=rows, not_converged=not_converged, **times)
 
 
-if __name__ == "__main__":
-    main()
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    objects, programs = record["settings"]["objects"], record["settings"]["programs"]
+    took = record["programs_s"] + record["grid_s"]
+    lines = [
+        f"identify: {objects} objects in {record['identify_s']:.1f} s, {1e3 * record['identify_s'] / objects:.1f} ms "
+        f"each; compiled in {record['identify_compile_s']:.0f} s; {record['not_converged']} not converged",
+        f"convex: {programs} objects in {record['programs_s']:.1f} s of programs and {record['grid_s']:.1f} s of grid, "
+        f"{1e3 * took / programs:.1f} ms each",
+    ]
+    for row in record["rows"]:
+        lines.append(
+            f"{row['method']}: final poses off by {row['mean_mm']:.3f} mm in the mean over objects, "
+            f"{row['q95_mm']:.3f} in one of twenty; friction by {row['friction']:.4f}; wrenches by "
+            f"{row['wrench_deg']:.2f} degrees"
+        )
+    return "\n".join(lines)

@@ -68,8 +68,8 @@ def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
     kinds = {dtype: tasks.task(model, dtype) for dtype in ("float32", "float64")}
     for chunk in range(-(-pushes // CHUNK)):
         rng = np.random.default_rng((seed, steps, chunk))
-        offset = rng.uniform(-tasks.REACH, tasks.REACH, CHUNK).astype(np.float32)
-        angle = rng.uniform(-tasks.STEEPEST, tasks.STEEPEST, CHUNK).astype(np.float32)
+        offset = rng.uniform(-tasks.MAX_OFFSET, tasks.MAX_OFFSET, CHUNK).astype(np.float32)
+        angle = rng.uniform(-tasks.MAX_ANGLE, tasks.MAX_ANGLE, CHUNK).astype(np.float32)
         friction = rng.uniform(0.15, 0.35, CHUNK).astype(np.float32)
         # The paths and frictions in float64 are exactly those in float32, so that only the arithmetic differs.
         path = tasks.paths(jnp.asarray(offset), jnp.asarray(angle), steps)

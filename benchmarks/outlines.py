@@ -24,7 +24,7 @@ OFFSET, TRAVEL, STEPS = 2e-3, 0.02, 8  # offset and travel in m; with these the 
 
 
 # Name, number of vertices or control points, and number of vertices of the outline that a curve is fitted to.
-EACH = (
+OUTLINES = (
     *(("polygon", n, 0) for n in VERTICES),
     ("disk", 0, 0),
     ("ellipse", 0, 0),
@@ -52,7 +52,7 @@ def outline(name: str, count: int = 0, traced: int = 0) -> Shape:
 
 
 def task(dtype: str, which: tuple[str, int, int]) -> tasks.Task:
-    """Return the push of `tasks` with the outline `which` of `EACH`."""
+    """Return the push of `tasks` with the outline `which` of `OUTLINES`."""
     here = tasks.task("quartic", dtype)
     return here._replace(slider=pj.Slider(tasks.cast(outline(*which), dtype), here.slider.surface))
 
@@ -63,7 +63,7 @@ def push(dtype: str, batch: int, which: tuple[str, int, int]) -> Work:
     Args:
         dtype: Floating type.
         batch: Number of pushes.
-        which: One of `EACH`.
+        which: One of `OUTLINES`.
     """
     here = task(dtype, which)
     keys = jax.random.split(jax.random.key(0), 3)
@@ -71,7 +71,7 @@ def push(dtype: str, batch: int, which: tuple[str, int, int]) -> Work:
     def uniform(key, low, high):
         return jax.random.uniform(key, (batch,), dtype, low, high)
 
-    ends = tasks.paths(uniform(keys[0], -OFFSET, OFFSET), uniform(keys[1], -tasks.STEEPEST, tasks.STEEPEST), 1)
+    ends = tasks.paths(uniform(keys[0], -OFFSET, OFFSET), uniform(keys[1], -tasks.MAX_ANGLE, tasks.MAX_ANGLE), 1)
     start, along = ends[:, :1], (ends[:, 1:] - ends[:, :1]) * (TRAVEL / tasks.TRAVEL)
     path = start + jnp.linspace(0, 1, STEPS + 1, dtype=dtype)[None, :, None] * along
 

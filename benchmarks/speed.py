@@ -24,7 +24,7 @@ CASES: dict[str, tuple[Make, ...]] = {
     "sampling": (cases.sampling,),
     "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),
     "monte_carlo": (cases.monte_carlo,),
-    "outline": tuple(partial(outlines.push, which=each) for each in outlines.EACH),
+    "outline": tuple(partial(outlines.push, which=each) for each in outlines.OUTLINES),
 }
 BATCH = 2000
 BATCHES = {"fit": (200,), "monte_carlo": (2000, 100_000)}  # for cases with other batches
@@ -77,7 +77,7 @@ def run(
     for number in batch or ():
         if number < 1:
             raise ValueError(f"batch must be positive; got {number}")
-    before = None if baseline is None else kept(baseline, cores)
+    before = None if baseline is None else read_baseline(baseline, cores)
     if cores is not None:
         _use(cores)
     if peers:
@@ -133,9 +133,9 @@ def _row(work: cases.Work) -> tuple[dict[str, Any], dict[str, float]]:
     """Return the row of one program, and the machine's ceilings, timed in turns with it."""
     program = (called if work.host else compiled)(work.function, *work.args)
     top = ceiling(work.dtype)
-    timings = alternate({"it": program.run} | top.runs(), most_s=MOST_S)
+    timings = alternate({"case": program.run} | top.runs(), most_s=MOST_S)
     peaks = rates(top, work.dtype, timings)
-    return _figures(work, program, timings["it"], peaks), peaks
+    return _figures(work, program, timings["case"], peaks), peaks
 
 
 def _figures(work: cases.Work, program: Program, mine: Timing, top: dict[str, float]) -> dict[str, Any]:
@@ -167,8 +167,8 @@ def _figures(work: cases.Work, program: Program, mine: Timing, top: dict[str, fl
     }
 
 
-def kept(path: Path, cores: int | None) -> dict[str, Any]:
-    """Read a record of this suite.
+def read_baseline(path: Path, cores: int | None) -> dict[str, Any]:
+    """Read an earlier record of `run`.
 
     Args:
         path: File of the record.

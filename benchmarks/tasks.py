@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 import pushjax as pj
 
 SIDE, RADIUS, TRAVEL, FRICTION = 0.09, 0.00475, 0.05, 0.25
-REACH, STEEPEST = 0.03, np.radians(30)  # largest distance (m) from the middle of the side, and angle from its normal
+# Largest distance of a start from the middle of the side, m, and largest angle of a path from its normal, rad.
+MAX_OFFSET, MAX_ANGLE = 0.03, np.radians(30)
 REFERENCE_STEPS = 3200
 ALLOWED_MM = 0.1
 LENGTH = 0.0367  # m, radius of gyration of the square, which makes angles commensurate with positions
@@ -85,7 +86,7 @@ def paths(offset: Float[Array, "n"], angle: Float[Array, "n"], steps: int) -> Fl
 
 def fan() -> tuple[np.ndarray, np.ndarray]:
     """Return offsets and angles of 63 pushes: every 7.5 mm, every 10 degrees; they stick, slide, or change between."""
-    offset, angle = np.meshgrid(np.linspace(-REACH, REACH, 9), np.linspace(-STEEPEST, STEEPEST, 7))
+    offset, angle = np.meshgrid(np.linspace(-MAX_OFFSET, MAX_OFFSET, 9), np.linspace(-MAX_ANGLE, MAX_ANGLE, 7))
     return offset.ravel(), angle.ravel()
 
 

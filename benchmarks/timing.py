@@ -21,9 +21,31 @@ from benchmarks.hlo import Traffic, traffic
 REPEATS = 7
 LEAST_S = 0.03  # shortest time of a program in one turn; a shorter program runs several times
 CHAINS, LINKS, ROUNDS = 8, 16, 200  # size of the FMA kernel, which is compute-bound
-LANES, MANY_LANES = 4096, 1 << 22  # on a CPU, in the first-level cache; on an accelerator, which has many threads
-COPIED, PASSES = 1 << 24, 4  # count of numbers that exceeds any cache of a CPU, and how often they are copied
-NEAR, NEAR_PASSES = 1 << 16, 1000  # the same for the second-level cache, which also holds the data of a tile of pushes
+
+
+class Sizes(NamedTuple):
+    """Sizes of the kernels of `Ceiling`.
+
+    Attributes:
+        lanes: Number of lanes of the FMA kernel.
+        copied: Count of numbers that exceeds every cache.
+        passes: How often they are copied.
+        near: Count of numbers that fits the second-level cache.
+        near_passes: How often these are copied.
+    """
+
+    lanes: int
+    copied: int
+    passes: int
+    near: int
+    near_passes: int
+
+
+# On a CPU the lanes fit the first-level cache, and the second-level cache also holds the data of a tile of pushes.
+CPU = Sizes(lanes=4096, copied=1 << 24, passes=4, near=1 << 16, near_passes=1000)
+# An accelerator has many threads and larger caches. Copies of fewer numbers would take less time than their kernels
+# take to start.
+ACCELERATOR = Sizes(lanes=1 << 22, copied=1 << 28, passes=20, near=1 << 22, near_passes=1000)
 
 
 class Program(NamedTuple):
@@ -157,6 +179,11 @@ def both_dtypes() -> Iterator[None]:
         jax.config.update("jax_enable_x64", before)
 
 
+def sizes() -> Sizes:
+    """Return the sizes of the kernels for the device on which JAX computes."""
+    return CPU if on_cpu() else ACCELERATOR
+
+
 class Ceiling(NamedTuple):
     """Kernels that compute and move data as fast as the machine can.
 
@@ -180,7 +207,7 @@ class Ceiling(NamedTuple):
 @cache
 def ceiling(dtype: str) -> Ceiling:
     """Return the kernels in `dtype`, written in the same way as the library: JAX on batches, compiled by XLA."""
-    kind = jnp.dtype(dtype)
+    kind, size = jnp.dtype(dtype), sizes()
 
     def multiply_add(x):
         def round_(_, chains):
@@ -198,10 +225,10 @@ def ceiling(dtype: str) -> Ceiling:
         # The copy is made in place again and again, because the process would have to wait for new memory.
         return compiled(lambda x: jax.lax.fori_loop(0, passes, lambda _, x: x * 1.000001, x), jnp.ones(count, kind))
 
-    many = LANES if on_cpu() else MANY_LANES
-    lanes = jnp.linspace(0.5, 1.5, many, dtype=kind)
-    flops = many * ROUNDS * CHAINS * (2.0 * LINKS + 2)
-    return Ceiling(compiled(multiply_add, lanes), flops, moved(COPIED, PASSES), moved(NEAR, NEAR_PASSES))
+    lanes = jnp.linspace(0.5, 1.5, size.lanes, dtype=kind)
+    flops = size.lanes * ROUNDS * CHAINS * (2.0 * LINKS + 2)
+    copies = moved(size.copied, size.passes), moved(size.near, size.near_passes)
+    return Ceiling(compiled(multiply_add, lanes), flops, *copies)
 
 
 def rates(top: Ceiling, dtype: str, timings: dict[str, Timing]) -> dict[str, float]:
@@ -212,9 +239,9 @@ def rates(top: Ceiling, dtype: str, timings: dict[str, Timing]) -> dict[str, flo
         dtype: Their floating type.
         timings: Timings of `Ceiling.runs`.
     """
-    each = 2e-9 * jnp.dtype(dtype).itemsize
+    each, size = 2e-9 * jnp.dtype(dtype).itemsize, sizes()
     return {
         "multiply_add_gflops": top.flops / timings["multiply_add"].processor / 1e9,
-        "copy_gbytes": each * COPIED * PASSES / timings["copied"].processor,
-        "near_copy_gbytes": each * NEAR * NEAR_PASSES / timings["near"].processor,
+        "copy_gbytes": each * size.copied * size.passes / timings["copied"].processor,
+        "near_copy_gbytes": each * size.near * size.near_passes / timings["near"].processor,
     }

@@ -70,7 +70,7 @@ def cvxpy() -> Any:
     try:
         import cvxpy
     except ImportError as missing:
-        raise ValueError("--peers of fit needs cvxpy: pip install '.[bench]'") from missing
+        raise ValueError("this needs the package cvxpy: pip install '.[bench]'") from missing
     return cvxpy
 
 

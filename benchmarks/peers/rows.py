@@ -320,7 +320,7 @@ def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str
     """
     lines = ["", f"the same by others; simulators within {tasks.ALLOWED_MM} mm of their own converged answer:"]
     for peer in peers:
-        each = f"{1e3 * peer['processor_s_each']:.2f} ms of a processor"
+        each = f"{1e3 * peer['processor_s_each']:.2f} ms of CPU time"
         lines.append(f"  {peer['of']}, {peer['peer']}: {each}{_more(peer)}")
     for row in rows:
         if row["peer_ratio"] is not None:
@@ -330,7 +330,7 @@ def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str
             if "same_fan_error_mm" in row:
                 slip += f"; {row['same_fan_error_mm']:.3f} mm over the pushes of MuJoCo's"
             lines.append(
-                f"  {row['case']}, pushjax, {row['dtype']}, batch {row['batch']}: {each:.2f} us of a processor{more}, "
+                f"  {row['case']}, pushjax, {row['dtype']}, batch {row['batch']}: {each:.2f} us of CPU time{more}, "
                 f"1/{row['peer_ratio']:.0f} of {row['peer']}'s{slip}"
             )
     return lines

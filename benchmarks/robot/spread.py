@@ -1,16 +1,16 @@
 """Study of predicted distributions: the identified noise on the test pushes of table 1, compared with three others.
 
-noise       The noise found by `identify_noise`. It is fitted by cross-validation on the training pushes: each part is
-            predicted with the physics identified from the other parts. For the test pushes it is put about the physics
-            identified from all training pushes.
-calibrated  The same distribution, with regions whose levels are calibrated by cross-validation on the training pushes,
-            each predicted from nearly all others. This is needed because observations are nearer to the center than
-            the noise says, with the same tails, and most so where a push goes far. The predicted motions of the test
-            pushes have another distribution than those of the training pushes. Each training push is therefore weighted
-            by how frequent its kind is among the test pushes.
-normal      The same point prediction, with a normal distribution of its errors in the cross-validation.
-process     A Gaussian process fitted to the same pushes. It does not know how far a push goes, so it predicts whole
-            pushes only, which are what it is trained on.
+- `noise`: the noise found by `identify_noise`. It is fitted by cross-validation on the training pushes: each part is
+  predicted with the physics identified from the other parts. For the test pushes it is put about the physics identified
+  from all training pushes.
+- `calibrated`: the same distribution, with regions whose levels are calibrated by cross-validation on the training
+  pushes, each predicted from nearly all others. This is needed because observations are nearer to the center than the
+  noise says, with the same tails, and most so where a push goes far. The predicted motions of the test pushes have
+  another distribution than those of the training pushes. Each training push is therefore weighted by how frequent its
+  kind is among the test pushes.
+- `normal`: the same point prediction, with a normal distribution of its errors in the cross-validation.
+- `process`: a Gaussian process fitted to the same pushes. It does not know how far a push goes, so it predicts whole
+  pushes only, which are what it is trained on.
 
 `curve` shows how many pushes are needed, for point predictions and for one normal distribution about them.
 """

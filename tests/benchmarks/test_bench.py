@@ -9,7 +9,7 @@ import pytest
 
 import pushjax as pj
 from benchmarks import cases, contacts, grasps, numerics, outlines, speed, tasks, timing
-from benchmarks.__main__ import MODULES, SCRIPTS, listing, main
+from benchmarks.__main__ import MODULES, listing, main
 from benchmarks.hlo import traffic
 from benchmarks.peers import rows
 from benchmarks.peers.figure import speed_figure
@@ -70,9 +70,9 @@ def test_rows(tmp_path):
     with pytest.raises(ValueError, match="no row of what was measured"):
         speed.slower(rows, {"rows": []})
     (tmp_path / "half.json").write_text(json.dumps({"experiment": "bench", "rows": half, "settings": {"cores": 1}}))
-    assert speed.kept(tmp_path / "half.json", 1)["rows"] == half
+    assert speed.read_baseline(tmp_path / "half.json", 1)["rows"] == half
     with pytest.raises(ValueError, match="is of --cores 1; got all"):
-        speed.kept(tmp_path / "half.json", None)
+        speed.read_baseline(tmp_path / "half.json", None)
 
 
 def test_traffic_counts_rounds():
@@ -123,7 +123,7 @@ def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
         centers = away @ np.array([[cos, -sin], [sin, cos]])
         nearest = min(float(square.signed_distance(center)) for center in centers)
         assert nearest == pytest.approx(tasks.RADIUS, abs=1e-12)
-        assert opening[-1] == pytest.approx(grasps.FLAT + grasps.LEFT)
+        assert opening[-1] == pytest.approx(grasps.STRAIGHT_OPENING + grasps.CLEARANCE)
         assert np.all(np.diff(opening) < 0)
     by_steps = grasps.errors("float64")
     assert by_steps[4] < tasks.ALLOWED_MM < by_steps[3]
@@ -132,8 +132,67 @@ def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
     turned = np.abs(grasps.reference()[:, 2])
     # If both fingers touch, the angle is geometry. If one finger arrives far before the other, it turns the square
     # more.
-    assert turned.max() == pytest.approx(grasps.TURNED, abs=1e-9)
-    assert np.median(turned) == pytest.approx(grasps.TURNED, abs=1e-9)
+    assert turned.max() == pytest.approx(grasps.END_ANGLE, abs=1e-9)
+    assert np.median(turned) == pytest.approx(grasps.END_ANGLE, abs=1e-9)
+
+
+def distances_from_edges(block, points):
+    """Return the distances of points, (n, 2), from the edges of a polygon, (n, edges), m."""
+    begin = np.asarray(block.vertices)
+    edge = np.roll(begin, -1, axis=0) - begin
+    away = np.asarray(points)[:, None] - begin
+    share = np.clip(np.sum(away * edge, axis=-1) / np.sum(edge**2, axis=-1), 0, 1)
+    return np.linalg.norm(away - share[..., None] * edge, axis=-1)
+
+
+@pytest.mark.parametrize(("where", "edges"), [("side", 1), ("hull", 1), ("corner", 2)])
+def test_pushes_of_a_t_begin_at_the_touch(where, edges):
+    """The finger touches the T outside, on two edges where it is pushed into the inner corner, and then presses."""
+    block = tasks.t_block(hull=where == "hull")
+    path, _ = cases.push_t("float64", 5, where).args
+    first, second = path[:, 0], path[:, 1]
+    np.testing.assert_allclose(jax.vmap(block.signed_distance)(first), tasks.RADIUS, atol=1e-12)
+    touched = np.abs(distances_from_edges(block, first) - tasks.RADIUS) < 1e-12
+    np.testing.assert_array_equal(touched.sum(axis=1), edges)
+    pressed = touched & (distances_from_edges(block, second) < tasks.RADIUS - 1e-3)
+    np.testing.assert_array_equal(pressed, touched)
+
+
+def test_two_fingers_begin_at_the_touch():
+    """Both fingers touch the side of the square that they push, away from its corners, and then press."""
+    square = pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)
+    path, _ = cases.push_two_fingers("float64", 5).args
+    centers = np.asarray(grasps.hand("float64").poses(path))[..., :2]
+    np.testing.assert_allclose(centers[:, 0, :, 0], -tasks.SIDE / 2 - tasks.RADIUS, atol=1e-12)
+    assert np.abs(centers[:, 0, :, 1]).max() < tasks.SIDE / 2
+    np.testing.assert_allclose(centers[:, 0, 0, 1] - centers[:, 0, 1, 1], cases.SPACING, atol=1e-12)
+    gap = jax.vmap(jax.vmap(square.signed_distance))(centers[:, 1])
+    assert np.asarray(gap).max() < tasks.RADIUS - 1e-3
+
+
+def distances_outside(polygon, points):
+    """Return the largest signed distances of points from the lines of a convex polygon's edges."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return np.max(np.sum((points[:, None] - polygon) * outward, axis=-1), axis=1)
+
+
+def test_a_jaw_begins_at_the_touch():
+    """One pad touches the square, at a corner of either, and none overlaps it; at the end the jaw nearly holds it."""
+    hand, half = grasps.jaw("float64"), tasks.SIDE / 2
+    poses, path = cases.grasp_jaw("float64", 12).args
+    # in the first of these a corner of the square touches the pad's face, in the second a corner of the pad the side
+    more = jnp.array([[-0.005, 0.005, 0.4], [0.005, 0.005, 0.4]])
+    openings = np.concatenate([path[:, 0, 3], grasps.touching_jaw(more)])
+    for (x, y, theta), opening in zip(np.concatenate([poses, more]), openings, strict=True):
+        turn = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
+        square = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ turn + [x, y]
+        pads = [np.asarray(finger.shape.vertices) for finger in hand.fingers]
+        placed = [pad + np.array([0, sign * opening / 2]) for pad, sign in zip(pads, (1, -1), strict=True)]
+        gaps = [(distances_outside(pad, square), distances_outside(square, pad)) for pad in placed]
+        assert np.min(gaps) == pytest.approx(0, abs=1e-12)
+    np.testing.assert_allclose(path[:, -1, 3], tasks.SIDE + grasps.CLEARANCE, atol=1e-12)
+    assert np.all(np.diff(path[..., 3]) < 0)
 
 
 def needed_by(which):
@@ -225,9 +284,10 @@ def test_turns():
     assert values.dtype == np.float32
     assert np.isfinite(values).all()
     assert top.multiply_add.traffic.flops == pytest.approx(top.flops, rel=0.1)
-    copied = 2 * 4 * timing.NEAR * timing.NEAR_PASSES
+    size = timing.sizes()
+    copied = 2 * 4 * size.near * size.near_passes
     assert top.near.traffic.bytes == pytest.approx(copied, rel=0.01)
-    np.testing.assert_allclose(np.asarray(top.near.run()), 1.000001**timing.NEAR_PASSES, rtol=1e-3)
+    np.testing.assert_allclose(np.asarray(top.near.run()), 1.000001**size.near_passes, rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -255,7 +315,7 @@ def test_every_case_is_listed_with_a_line(capsys):
     assert all(len(line.split()) > 2 for line in lines)
 
 
-@pytest.mark.parametrize("case", ["", *sorted(set(MODULES) - set(SCRIPTS))])
+@pytest.mark.parametrize("case", ["", *MODULES])
 def test_every_case_describes_its_options_and_writes_a_record(case, capsys):
     with pytest.raises(SystemExit) as end:
         main([*case.split(), "--help"])

@@ -141,11 +141,11 @@ def test_grasps_turn_the_square_as_far_as_it_must():
     """At the end both fingers touch, and the angle is geometry; it amplifies the penetration depth 2.6 times."""
     scene, poses = Scene(FOUR, friction_tip=grasps.FRICTION), grasps.fan()[[0, 10, 17, 26]]
     fine, coarse = (grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), h, poses).pose for h in (FINE, 0.01))
-    assert np.abs(np.abs(fine[:, 2]) - grasps.TURNED).max() * tasks.LENGTH < 3e-4
+    assert np.abs(np.abs(fine[:, 2]) - grasps.END_ANGLE).max() * tasks.LENGTH < 3e-4
     np.testing.assert_array_equal(np.sign(fine[:, 2]), np.sign(poses[:, 2]))
     assert 0 < error_mm(fine, coarse).max() < 0.2
     soft = grasp.Fingers(normal=0.02, impedance=(0.7, 0.7))
-    assert np.abs(grasp.grasp(scene, grasp.SUPPORTED, soft, FINE, poses).pose[:, 2]).min() > grasps.TURNED + 0.03
+    assert np.abs(grasp.grasp(scene, grasp.SUPPORTED, soft, FINE, poses).pose[:, 2]).min() > grasps.END_ANGLE + 0.03
 
 
 def test_rows_are_compared_with_their_own():
@@ -188,7 +188,7 @@ def test_slip_and_errors_are_of_the_steps_of_the_row(monkeypatch, tmp_path):
 
     printed = "\n".join(rows.summary(theirs, [push_row, other]))
     assert "slip 0.006 and 0.09 um; 0.024 mm over the pushes of MuJoCo's" in printed
-    assert "mjx: 9.00 ms of a processor, four supports, 10 ms steps (0.050 mm), 0.15 mm from exact friction" in printed
+    assert "mjx: 9.00 ms of CPU time, four supports, 10 ms steps (0.050 mm), 0.15 mm from exact friction" in printed
     assert "grasp" not in printed
 
     by_steps = [push_row | {"steps": float(n)} for n in (4, 8)]
