@@ -26,10 +26,10 @@ STARTS = 60
 @pytest.mark.parametrize(
     ("hand", "shape", "steps", "dtype"),
     [
-        ("jaw", "T", 300, np.float64),
+        pytest.param("jaw", "T", 300, np.float64, marks=pytest.mark.long),
         ("jaw", "U", 60, np.float32),
         ("two", "T", 60, np.float32),
-        ("two", "bean", 300, np.float32),
+        pytest.param("two", "bean", 300, np.float32, marks=pytest.mark.long),
     ],
 )
 def test_no_finger_is_inside(hand, shape, steps, dtype):
