@@ -29,18 +29,30 @@ def concrete(value: Any) -> np.ndarray | None:
     return np.asarray(value)
 
 
-def as_float(value: Any, dtype: Any = None) -> jax.Array:
+def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array:
     """Return `value` as a floating array.
 
     Args:
         value: Array, number, or nested sequence of numbers.
         dtype: Dtype of the result. Default: the value's own dtype if that is floating, else the default floating dtype
             (float32 unless x64 is enabled).
+        name: Name of the argument, for messages.
+
+    Raises:
+        TypeError: If the value does not consist of real numbers.
+        ValueError: If the rows of a nested sequence differ in length.
     """
     array = value
     if not isinstance(value, jax.Array):
         holds_jax_arrays = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
-        array = jnp.asarray(value) if holds_jax_arrays else np.asarray(value)
+        try:
+            array = jnp.asarray(value) if holds_jax_arrays else np.asarray(value)
+        except ValueError as error:
+            raise ValueError(f"{name}: expected an array of numbers; got rows that differ: {error}") from None
+    if not (jnp.issubdtype(array.dtype, jnp.bool_) or jnp.issubdtype(array.dtype, jnp.integer)) and not jnp.issubdtype(
+        array.dtype, jnp.floating
+    ):
+        raise TypeError(f"{name}: expected real numbers; got {value!r}")
     if dtype is None:
         is_floating = jnp.issubdtype(array.dtype, jnp.floating)
         dtype = jax.dtypes.canonicalize_dtype(array.dtype) if is_floating else jnp.result_type(float)
@@ -97,6 +109,18 @@ def check_shape(name: str, value: jax.Array, shape: tuple[int | str, ...]) -> No
     if not ok:
         wanted = "(" + ", ".join(str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
         raise ValueError(f"{name} has shape {value.shape}; expected {wanted}")
+
+
+def check_key(key: Any) -> None:
+    """Raise TypeError unless `key` is an array, as a PRNG key is."""
+    if not isinstance(key, (jax.Array, np.ndarray)):
+        raise TypeError(f"key: expected a PRNG key, of jax.random.key or PRNGKey; got {key!r}")
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise ValueError unless `value` is a whole number of at least one."""
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
 
 
 def check_type(name: str, value: Any, *kinds: type) -> None:

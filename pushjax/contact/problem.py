@@ -66,28 +66,30 @@ class Contacts(eqx.Module):
         dtype = common_dtype(point, normal, displacement, friction, gap)
         self.point = as_float(point, dtype, "point")
         check_shape("point", self.point, ("contacts", 2))
-        m = self.point.shape[0]
+        num_contacts = self.point.shape[0]
         self.normal, self.displacement = (
             as_float(normal, dtype, "normal"),
             as_float(displacement, dtype, "displacement"),
         )
-        check_shape("normal", self.normal, (m, 2))
-        check_shape("displacement", self.displacement, (m, 2))
-        self.friction = _each("friction", as_float(friction, dtype, "friction"), m)
-        self.gap = _each("gap", as_float(gap, dtype, "gap"), m)
-        self.active = _each("active", jnp.asarray(active, bool), m)
-        counts = concrete(self.active)
+        check_shape("normal", self.normal, (num_contacts, 2))
+        check_shape("displacement", self.displacement, (num_contacts, 2))
+        self.friction = _per_contact("friction", as_float(friction, dtype, "friction"), num_contacts)
+        self.gap = _per_contact("gap", as_float(gap, dtype, "gap"), num_contacts)
+        self.active = _per_contact("active", jnp.asarray(active, bool), num_contacts)
+        known_active = concrete(self.active)
         # padding may hold anything; if `active` is traced, all contacts are checked
-        used = slice(None) if counts is None or counts.all() else np.flatnonzero(counts)
+        used = slice(None) if known_active is None or known_active.all() else np.flatnonzero(known_active)
         for name in ("point", "normal", "displacement", "friction", "gap"):
             check_finite(name, getattr(self, name)[used])
         check_non_negative("friction", self.friction[used])
-        known = concrete(self.normal)
-        if known is not None and np.any(np.abs(np.linalg.norm(known[used], axis=1) - 1) > UNIT_TOLERANCE):
-            raise ValueError(f"normal must have unit length; got lengths {np.linalg.norm(known, axis=1).tolist()}")
+        known_normal = concrete(self.normal)
+        if known_normal is not None and np.any(np.abs(np.linalg.norm(known_normal[used], axis=1) - 1) > UNIT_TOLERANCE):
+            raise ValueError(
+                f"normal must have unit length; got lengths {np.linalg.norm(known_normal, axis=1).tolist()}"
+            )
 
 
-def _each(name: str, value: Array, contacts: int) -> Array:
+def _per_contact(name: str, value: Array, contacts: int) -> Array:
     """The value for each contact, given one for each or one for all."""
     if value.ndim and value.shape != (contacts,):
         raise ValueError(f"{name} has shape {value.shape}; expected a scalar or ({contacts},), one per contact")
@@ -191,8 +193,8 @@ def _check_num_contacts(contacts: int) -> None:
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     """`solve_contacts`, compiled."""
     form, friction = to_scalars(surface, contacts.friction)
-    each = contacts_in_scalars(contacts, friction)
-    result = solve_in_scalars(form, each, unstack(contacts.active), solver, margin=True)
+    scalar_contacts = contacts_in_scalars(contacts, friction)
+    result = solve_in_scalars(form, scalar_contacts, unstack(contacts.active), solver, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
         twist=result.twist.array(),
@@ -238,9 +240,11 @@ def solve_in_scalars(
         return solver.solve(nondimensionalize(form, contacts, active, margin=margin))
     if len(contacts) != 1:
         raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {len(contacts)}")
-    one = solve_single(form, contacts[0], solver)
-    far = jnp.full_like(one.twist.x, jnp.inf)
-    return ScalarSolution(one.twist, one.wrench, (one.force,), (one.mode,), one.status, far, one.unique)
+    single = solve_single(form, contacts[0], solver)
+    infinite_margin = jnp.full_like(single.twist.x, jnp.inf)
+    return ScalarSolution(
+        single.twist, single.wrench, (single.force,), (single.mode,), single.status, infinite_margin, single.unique
+    )
 
 
 def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
@@ -271,13 +275,14 @@ def contacts_in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, .
     Returns:
         One `Contact` for each contact. Its friction is NaN where the normal is not of unit length.
     """
-    rows = (contacts.point, contacts.normal, contacts.displacement)
-    found = []
+    vectors = (contacts.point, contacts.normal, contacts.displacement)
+    converted = []
     for point, normal, displacement, mu, gap, active in zip(
-        *(unstack(row) for row in (*rows, friction, contacts.gap, contacts.active)), strict=True
+        *(unstack(array) for array in (*vectors, friction, contacts.gap, contacts.active)), strict=True
     ):
-        n = Vec2.of(normal)
-        unit = jnp.abs(n.dot(n) - 1) <= 2 * UNIT_TOLERANCE  # a traced normal has not been checked before
-        mu = jnp.where(unit, mu, jnp.nan)
-        found.append(Contact(Vec2.of(point), n, Vec2.of(displacement), mu, gap).where(active))
-    return tuple(found)
+        normal_vector = Vec2.of(normal)
+        # `Contacts` could not check a traced normal.
+        is_unit = jnp.abs(normal_vector.dot(normal_vector) - 1) <= 2 * UNIT_TOLERANCE
+        mu = jnp.where(is_unit, mu, jnp.nan)
+        converted.append(Contact(Vec2.of(point), normal_vector, Vec2.of(displacement), mu, gap).where(active))
+    return tuple(converted)

@@ -20,6 +20,8 @@ from pushjax._internal.checks import (
     concrete,
     traced,
 )
+from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
@@ -42,6 +44,12 @@ def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
     check_type("hand", hand, Hand)
 
 
+def check_solver(solver: Any) -> None:
+    """Raise TypeError unless `solver` is a solver of contact problems or None."""
+    if solver is not None:
+        check_type("solver", solver, ContactSolver, StickingSolver)
+
+
 def checked_arguments(
     slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike, *paths: ArrayLike, pushes: int | None = None
 ):
@@ -60,7 +68,7 @@ def checked_arguments(
     """
     check_slider_and_hand(slider, hand)
     dtype = common_dtype(slider, hand, pose, friction, *paths)
-    start, mu = as_float(pose, dtype), as_float(friction, dtype)
+    start, mu = as_float(pose, dtype, "pose"), as_float(friction, dtype, "friction")
     if pushes is None or start.ndim == 1:
         check_shape("pose", start, (3,))
     elif start.shape != (pushes, 3):
@@ -115,7 +123,7 @@ def checked_rollout_arguments(
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
     if pushes is not None and np.ndim(path) == 3:
-        path_array = as_float(path, dtype)
+        path_array = as_float(path, dtype, "path")
         check_shape("path", path_array, (pushes, "steps + 1", hand.dof))
         check_finite("path", path_array)
         if path_array.shape[1] < 2:

@@ -27,7 +27,7 @@ class RoundFinger(eqx.Module):
     radius: Float[Array, ""]
 
     def __init__(self, radius: ArrayLike):
-        r = as_float(radius)
+        r = as_float(radius, name="radius")
         check_shape("radius", r, ())
         check_finite("radius", r)
         check_non_negative("radius", r)
@@ -80,7 +80,7 @@ class Hand(eqx.Module):
             raise ValueError("fingers: a hand needs at least one; got none")
         self.fingers = tuple(_finger(finger) for finger in fingers)
         self.kinematics, self.dof = kinematics, dof
-        self.least = None if least is None else as_float(least)
+        self.least = None if least is None else as_float(least, name="least")
         shape = jax.eval_shape(kinematics, jax.ShapeDtypeStruct((dof,), jnp.result_type(float))).shape
         widths = (3,) if any(isinstance(f, Pad) for f in self.fingers) else (2, 3)
         if len(shape) != 2 or shape[0] != len(self.fingers) or shape[1] not in widths:
@@ -113,7 +113,7 @@ class Hand(eqx.Module):
         Args:
             radius: Radius of both fingers, m.
         """
-        return Hand((radius, radius), _two, 4, least=2 * as_float(radius))
+        return Hand((radius, radius), _two, 4, least=2 * as_float(radius, name="radius"))
 
     @staticmethod
     def three_fingers(radius: ArrayLike = 0.0) -> "Hand":
@@ -124,7 +124,7 @@ class Hand(eqx.Module):
         Args:
             radius: Radius of all fingers, m.
         """
-        return Hand((radius, radius, radius), _three, 4, least=2 / 3**0.5 * as_float(radius))
+        return Hand((radius, radius, radius), _three, 4, least=2 / 3**0.5 * as_float(radius, name="radius"))
 
     @staticmethod
     def parallel_jaw(width: ArrayLike, thickness: ArrayLike) -> "Hand":

@@ -15,13 +15,13 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, traced
+from pushjax._internal.checks import ArrayLike, check_type, traced
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.random import FrictionModel
 from pushjax.friction.table import Table
-from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import check_solver, checked_rollout_arguments, checked_table
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
@@ -100,6 +100,8 @@ def monte_carlo(
         if not isinstance(value, (int, np.integer)) or value < 1:
             raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
     n = int(n)
+    check_solver(solver)
+    check_type("model", model, FrictionModel)
     slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
     key_data, impl = _key_data(key)
     used = Devices.of(devices)

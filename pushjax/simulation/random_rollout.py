@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike
+from pushjax._internal.checks import ArrayLike, check_key, check_type
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.problem import to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
@@ -15,7 +15,7 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import check_solver, checked_rollout_arguments, checked_table
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
 from pushjax.simulation.slider import Slider
@@ -145,6 +145,9 @@ def random_rollout(
 
     Reference: Zhou et al. 2017, section V.
     """
+    check_key(key)
+    check_solver(solver)
+    check_type("model", model, FrictionModel)
     slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
     table = checked_table(table, start.dtype)
     return _random_rollout(

@@ -24,6 +24,7 @@ from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import (
     check_opening,
+    check_solver,
     checked_arguments,
     checked_rollout_arguments,
     checked_table,
@@ -72,11 +73,12 @@ def step(
             traced, also for values that are not finite, a negative friction, or a hand that is closed on itself.
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, q0, q1)
-    ends = as_float(q0, dtype), as_float(q1, dtype)
+    ends = as_float(q0, dtype, "q0"), as_float(q1, dtype, "q1")
     for name, q in zip(("q0", "q1"), ends, strict=True):
         check_shape(name, q, (hand.dof,))
         check_finite(name, q)
         check_opening(hand, q)
+    check_solver(solver)
     warn_about_units(slider, start, *ends)
     return _step(slider, hand, *ends, start, mu, solver, checked_table(table, dtype))
 
@@ -143,6 +145,7 @@ def rollout(
     Reference: Zhou et al. 2017, section IV.A, and open problem 2 of section VII. The header of
     `pushjax.simulation.step` has the scheme.
     """
+    check_solver(solver)
     slider, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
     return _rollout(slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype))
 
