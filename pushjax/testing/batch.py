@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pushjax.contact.problem import Contacts
 
 MONOMIALS = "xxxx yyyy zzzz xxxy xxxz xyyy yyyz xzzz yzzz xxyy xxzz yyzz xxyz xyyz xyzz".split()
-SECOND = "xx yy zz xy xz yz".split()
+PRODUCTS = "xx yy zz xy xz yz".split()
 
 
 def _second_derivatives() -> np.ndarray:
@@ -21,14 +21,15 @@ def _second_derivatives() -> np.ndarray:
     table = np.zeros((15, 3, 3, 6))
     for k, monomial in enumerate(MONOMIALS):
         for i, j in np.ndindex(3, 3):
-            first = monomial.count("xyz"[i])
+            power = monomial.count("xyz"[i])
             rest = monomial.replace("xyz"[i], "", 1)
-            factor = first * rest.count("xyz"[j])
+            factor = power * rest.count("xyz"[j])
             if factor:
-                table[k, i, j, SECOND.index(rest.replace("xyz"[j], "", 1))] = factor
+                table[k, i, j, PRODUCTS.index(rest.replace("xyz"[j], "", 1))] = factor
     return table
 
 
+# Shape (15, 3, 3, 6): of each monomial, the Hessian as coefficients of the six `PRODUCTS`.
 HESSIANS = _second_derivatives()
 
 
@@ -76,16 +77,16 @@ class ProblemBatch:
             coefficients = np.asarray(surface.coefficients, np.float64)
         else:
             raise TypeError(f"surface must be an Ellipsoid or a Quartic; got {type(surface).__name__}")
-        own = {2: 2, 4: 1}[surface.degree]
+        surface_ndim = {2: 2, 4: 1}[surface.degree]
         names = ("point", "normal", "displacement", "friction", "gap")
         arrays = {name: np.asarray(getattr(contacts, name), np.float64) for name in names}
         active = np.asarray(contacts.active, bool)
         n = len(active)
-        # padding may hold any numbers, and NaN
+        # Padding may hold any numbers, NaN included.
         arrays = {k: np.where(active.reshape(*active.shape, *[1] * (a.ndim - 2)), a, 0.0) for k, a in arrays.items()}
         return ProblemBatch(
             surface.degree,
-            np.broadcast_to(coefficients, (n, *coefficients.shape[coefficients.ndim - own :])),
+            np.broadcast_to(coefficients, (n, *coefficients.shape[coefficients.ndim - surface_ndim :])),
             np.broadcast_to(np.asarray(surface.length, np.float64), (n,)),
             **arrays,
             active=active,
@@ -105,17 +106,18 @@ class ProblemBatch:
             batch: The problems, with as many contacts as the problem with the most active contacts (at least one).
             order: Indices of these contacts in this batch, (N, contacts).
         """
-        most = max(int(self.active.sum(axis=1).max(initial=0)), 1)
-        order = np.argsort(~self.active, axis=1, kind="stable")[:, :most]
+        max_active = max(int(self.active.sum(axis=1).max(initial=0)), 1)
+        order = np.argsort(~self.active, axis=1, kind="stable")[:, :max_active]
         row = np.arange(len(self))[:, None]
-        parts = {f.name: getattr(self, f.name)[row, order] for f in fields(self)[3:]}
-        return ProblemBatch(self.degree, self.coefficients, self.length, **parts), order
+        gathered_fields = {f.name: getattr(self, f.name)[row, order] for f in fields(self)[3:]}
+        return ProblemBatch(self.degree, self.coefficients, self.length, **gathered_fields), order
 
     def speed(self) -> np.ndarray:
         """Return the unit of displacement of each problem, max(|displacement| + |gap|) over the active contacts.
 
-        A displacement and a gap of the same size shift a contact's condition equally. If all of them are zero, nothing
-        moves, and the unit is one.
+        It is a length, because displacements are those of one time step, whose duration does not matter. A displacement
+        and a gap of the same size shift a contact's condition equally. If all of them are zero, nothing moves, and the
+        unit is one.
 
         Returns:
             The unit, (N,), in m.
@@ -125,12 +127,12 @@ class ProblemBatch:
         return np.where(largest > 0, largest, 1.0)
 
     def rows(self) -> np.ndarray:
-        """Return the rows a_n and a_t of every contact, (N, m, 2, 3)."""
+        """Return the contact Jacobian: the rows a_n and a_t of every contact, (N, m, 2, 3); see `pushjax.testing`."""
         tangent = np.stack([-self.normal[..., 1], self.normal[..., 0]], axis=2)
         direction = np.stack([self.normal, tangent], axis=2)
         x, y = self.point[..., None, 0], self.point[..., None, 1]
-        arm = (x * direction[..., 1] - y * direction[..., 0]) / self.length[:, None, None]
-        return np.concatenate([direction, arm[..., None]], axis=3)
+        torque = (x * direction[..., 1] - y * direction[..., 0]) / self.length[:, None, None]
+        return np.concatenate([direction, torque[..., None]], axis=3)
 
     def approach(self) -> np.ndarray:
         """Return the motion along (n, t) that keeps each contact point with its pusher, less the gap along n.

@@ -61,35 +61,35 @@ def violations(
     twist, force = np.asarray(twist, np.float64), np.asarray(force, np.float64)
     one = np.ones_like(batch.length)
     scale = np.stack([one, one, batch.length], axis=1)
-    v, rows, on = twist * scale, batch.rows(), batch.active
+    v, rows, active = twist * scale, batch.rows(), batch.active
     slip = (np.einsum("nmij,nj->nmi", rows, v) - batch.approach()) / batch.speed()[:, None, None]
-    total = np.where(on, np.abs(force[..., 0]), 0.0).sum(axis=1)
+    total = np.where(active, np.abs(force[..., 0]), 0.0).sum(axis=1)
     total = np.where(total > 0, total, np.abs(force).max(axis=(1, 2), initial=0.0))
-    f = force / np.where(total > 0, total, 1.0)[:, None, None]
-    limit = batch.friction * np.maximum(f[..., 0], 0.0)
+    relative_force = force / np.where(total > 0, total, 1.0)[:, None, None]
+    limit = batch.friction * np.maximum(relative_force[..., 0], 0.0)
     opposing = np.where(slip[..., 1] < 0, limit, -limit)
-    applied = np.where(on[..., None], f, 0.0)
-    summed = np.einsum("nmi,nmij->nj", applied, rows)
+    active_force = np.where(active[..., None], relative_force, 0.0)
+    summed = np.einsum("nmi,nmij->nj", active_force, rows)
 
-    def largest(each: np.ndarray, where: np.ndarray = on) -> np.ndarray:
+    def largest(each: np.ndarray, where: np.ndarray = active) -> np.ndarray:
         return np.where(where, each, 0.0).max(axis=1, initial=0.0)
 
-    wrong, off, given = np.zeros(len(batch)), np.zeros(len(batch)), summed
+    wrench_error, level_error, relative_wrench = np.zeros(len(batch)), np.zeros(len(batch)), summed
     if wrench is not None:
-        given = np.asarray(wrench, np.float64) / scale
-        moving = (total > 0) | given.any(axis=1)
-        wrong = np.linalg.norm(given / np.where(total > 0, total, 1.0)[:, None] - summed, axis=1)
-        off = np.where(moving, np.abs(level(batch, given) - 1), 0.0)
+        relative_wrench = np.asarray(wrench, np.float64) / scale
+        moving = (total > 0) | relative_wrench.any(axis=1)
+        wrench_error = np.linalg.norm(relative_wrench / np.where(total > 0, total, 1.0)[:, None] - summed, axis=1)
+        level_error = np.where(moving, np.abs(level(batch, relative_wrench) - 1), 0.0)
     parts = Violations(
         penetration=largest(np.maximum(-slip[..., 0], 0.0)),
-        complementarity=largest(np.minimum(np.maximum(slip[..., 0], 0.0), np.abs(f[..., 0]))),
-        negative=largest(np.maximum(-f[..., 0], 0.0)),
-        cone=largest(np.maximum(np.abs(f[..., 1]) - limit, 0.0)),
-        friction=largest(np.minimum(np.abs(slip[..., 1]), np.abs(f[..., 1] - opposing))),
-        inactive=largest(np.abs(f).max(axis=2), ~on),
-        flow=_flow_error(batch, v, given),
-        wrench=wrong,
-        level=off,
+        complementarity=largest(np.minimum(np.maximum(slip[..., 0], 0.0), np.abs(relative_force[..., 0]))),
+        negative=largest(np.maximum(-relative_force[..., 0], 0.0)),
+        cone=largest(np.maximum(np.abs(relative_force[..., 1]) - limit, 0.0)),
+        friction=largest(np.minimum(np.abs(slip[..., 1]), np.abs(relative_force[..., 1] - opposing))),
+        inactive=largest(np.abs(relative_force).max(axis=2), ~active),
+        flow=_flow_error(batch, v, relative_wrench),
+        wrench=wrench_error,
+        level=level_error,
     )
     finite = np.isfinite(twist).all(axis=1) & np.isfinite(force).all(axis=(1, 2))
     return Violations(*(np.where(finite & np.isfinite(part), part, np.inf) for part in parts))

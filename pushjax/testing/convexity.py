@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax.friction.quartic import MONOMIALS
 
+# Directions of the sweep over the half sphere, how many of them are refined, and the rounds of refinement.
 RAYS, REFINED, ROUNDS = 200, 4, 12
-BATCH = 20_000
+BATCH = 20_000  # quartics that are checked at once, to bound the memory
 
 
 def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
@@ -32,13 +33,15 @@ def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
     Returns:
         The smallest curvatures, (n,), each divided by the largest |coefficient| of its quartic.
     """
-    c = np.asarray(coefficients, np.float64)
+    array = np.asarray(coefficients, np.float64)
     found = []
-    for first in range(0, len(c), BATCH):
-        part = c[first : first + BATCH]
-        padded = np.concatenate([part, np.repeat(part[-1:], BATCH - len(part), axis=0)]) if len(c) > BATCH else part
+    for begin in range(0, len(array), BATCH):
+        chunk = array[begin : begin + BATCH]
+        padded = (
+            np.concatenate([chunk, np.repeat(chunk[-1:], BATCH - len(chunk), axis=0)]) if len(array) > BATCH else chunk
+        )
         with _float64():
-            found.append(np.asarray(_sweep(jnp.asarray(padded)))[: len(part)])
+            found.append(np.asarray(_sweep(jnp.asarray(padded)))[: len(chunk)])
     return np.concatenate(found)
 
 
@@ -50,6 +53,7 @@ def _float64() -> Any:
 
 @jax.jit
 def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
+    """Return the smallest curvature of each quartic; see `least_curvatures`."""
     c = c / jnp.max(jnp.abs(c), axis=1, keepdims=True)
     rays = jnp.asarray(fibonacci_hemisphere(RAYS), c.dtype)
     table = jnp.asarray(_HESSIAN, c.dtype)  # (6, 6, 15): Hessian entry, product of two coordinates of F, coefficient
@@ -61,18 +65,21 @@ def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
 
 
 def _refined(table: Array, f: Float[Array, "3"], c: Float[Array, "15"]) -> Array:
-    def half(carry, _):
-        at, least = carry
-        entries = jnp.einsum("epm,p,m->e", table, _products(at[None])[0], c)
-        z = _eigenvector(entries, _least_eigenvalue(*entries))
-        # at a double eigenvalue the root of the cubic has only half of the digits, so take the value at z
-        value = _products(z[None])[0] @ (entries * jnp.asarray([1.0, 1, 1, 2, 2, 2], c.dtype))
-        return (z, jnp.minimum(least, value)), None
+    """Return the smallest curvature of the quartic `c` that alternating eigenvectors reach from the direction `f`."""
 
-    return jax.lax.scan(half, (f, jnp.asarray(jnp.inf, c.dtype)), None, length=2 * ROUNDS)[0][1]
+    def half_step(carry, _):
+        direction, lowest = carry
+        entries = jnp.einsum("epm,p,m->e", table, _products(direction[None])[0], c)
+        z = _eigenvector(entries, _least_eigenvalue(*entries))
+        # At a double eigenvalue the root of the cubic has only half of the digits, so take the value at z.
+        value = _products(z[None])[0] @ (entries * jnp.asarray([1.0, 1, 1, 2, 2, 2], c.dtype))
+        return (z, jnp.minimum(lowest, value)), None
+
+    return jax.lax.scan(half_step, (f, jnp.asarray(jnp.inf, c.dtype)), None, length=2 * ROUNDS)[0][1]
 
 
 def _products(f: Float[Array, "n 3"]) -> Float[Array, "n 6"]:
+    """Return the products xx, yy, zz, xy, xz, yz of the coordinates of each vector."""
     x, y, z = f[:, 0], f[:, 1], f[:, 2]
     return jnp.stack([x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
 
@@ -104,18 +111,19 @@ def _eigenvector(entries, value):
 
 
 def _hessian_table() -> np.ndarray:
+    """Return the Hessian of each monomial: (entry of the Hessian, product of two coordinates, monomial)."""
     pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     products = [np.bincount(pair, minlength=3) for pair in pairs]
     table = np.zeros((6, 6, len(MONOMIALS)))
     for m, exponent in enumerate(MONOMIALS):
         for e, (i, j) in enumerate(pairs):
-            left = exponent.copy()
-            factor = left[i]
-            left[i] -= 1
-            factor *= left[j]
+            remaining = exponent.copy()
+            factor = remaining[i]
+            remaining[i] -= 1
+            factor *= remaining[j]
             if factor > 0:
-                left[j] -= 1
-                table[e, [tuple(p) for p in products].index(tuple(left)), m] = factor
+                remaining[j] -= 1
+                table[e, [tuple(p) for p in products].index(tuple(remaining)), m] = factor
     return table
 
 

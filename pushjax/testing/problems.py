@@ -92,27 +92,30 @@ def random_surface(
         ValueError: If the degree is neither 2 nor 4.
     """
     k_shape, k_rank, k_scale, k_condition = jax.random.split(key, 4)
-    worst = 10 ** jax.random.uniform(k_condition, minval=0.0, maxval=jnp.log10(condition))
+    drawn_condition = 10 ** jax.random.uniform(k_condition, minval=0.0, maxval=jnp.log10(condition))
     if degree == 2:
         q, _ = jnp.linalg.qr(jax.random.normal(k_shape, (3, 3)))
-        # the ends of the spectrum are one and 1 / worst; the middle eigenvalue is log-uniform between them
+        # The middle eigenvalue is log-uniform between the ends of the spectrum.
         middle = jax.random.uniform(k_scale)
-        eigenvalues = jnp.stack([jnp.ones_like(worst), worst**-middle, 1 / worst])
+        eigenvalues = jnp.stack([jnp.ones_like(drawn_condition), drawn_condition**-middle, 1 / drawn_condition])
         return Ellipsoid(q @ jnp.diag(eigenvalues) @ q.T, length)
     if degree != 4:
         raise ValueError(f"degree must be 2 or 4; got {degree}")
     factors = jax.random.normal(k_shape, (5, 3, 3))
-    thin = jax.random.bernoulli(k_rank, 0.5, (5,))
-    kept = ~thin[:, None, None] | (jnp.arange(3) == 0)[None, None, :]  # a thin factor keeps its first column: rank one
+    is_rank_one = jax.random.bernoulli(k_rank, 0.5, (5,))
+    kept = (
+        ~is_rank_one[:, None, None] | (jnp.arange(3) == 0)[None, None, :]
+    )  # a thin factor keeps its first column: rank one
     factors = jnp.where(kept, factors, 0.0)
     weights = jax.random.exponential(k_scale, (5,))
     c = squared_quadratics(jnp.sqrt(weights)[:, None, None] * factors @ jnp.swapaxes(factors, 1, 2))
     low, high = _spectrum(c)
-    worst = jnp.maximum(worst, 3.5)
-    # (high + 12 e) / (low + 4 e) = worst
-    round_part = jnp.maximum(0.0, (high - worst * low) / (4 * worst - 12))
-    ball = squared_quadratics(jnp.eye(3)[None])
-    c = c + round_part * ball
+    drawn_condition = jnp.maximum(drawn_condition, 3.5)
+    # The Hessian of |F|^4 has eigenvalues 4 and 12 on the unit sphere. With the weight e of |F|^4, the condition number
+    # is at most (high + 12 e) / (low + 4 e), which is set to the drawn one.
+    round_weight = jnp.maximum(0.0, (high - drawn_condition * low) / (4 * drawn_condition - 12))
+    round_quartic = squared_quadratics(jnp.eye(3)[None])
+    c = c + round_weight * round_quartic
     return Quartic(c / _spectrum(c)[1], length)
 
 
@@ -194,20 +197,20 @@ def random_contacts_problem(
         The problem.
     """
     k_surface, k_uniform, k_normal = jax.random.split(key, 3)
-    m = int(contacts) if slots is None else slots
-    # all numbers of a kind are drawn in one call, because each call takes a quarter of a second to compile
-    uniform = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * m,)))
-    gauss = _Numbers(jax.random.normal(k_normal, (3 + 2 * m,)))
-    length = 0.02 + 0.08 * uniform.take()
+    num_slots = int(contacts) if slots is None else slots
+    # All numbers of a kind are drawn in one call, because each call takes a quarter of a second to compile.
+    uniform_numbers = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * num_slots,)))
+    normal_numbers = _Numbers(jax.random.normal(k_normal, (3 + 2 * num_slots,)))
+    length = 0.02 + 0.08 * uniform_numbers.take()
     surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
-    mu = _random_friction(uniform, m, friction)
-    point, normal, middle = _random_places(uniform, mu, contacts)
-    size = 10 ** (2 * uniform.take() - 4)
-    gap = _random_gaps(uniform, m, gaps)
-    push, dragged = _random_pushes(uniform, gauss, surface, mu, point, normal, middle)
+    mu = _random_friction(uniform_numbers, num_slots, friction)
+    point, normal, middle = _random_points_and_normals(uniform_numbers, mu, contacts)
+    size = 10 ** (2 * uniform_numbers.take() - 4)
+    gap = _random_gaps(uniform_numbers, num_slots, gaps)
+    push, dragged = _random_pushes(uniform_numbers, normal_numbers, surface, mu, point, normal, middle)
     push = size * push + jnp.where(dragged, gap, 0.0)[:, None] * normal
-    order = jnp.argsort(uniform.take(m))
-    active = jnp.arange(m) < contacts
+    order = jnp.argsort(uniform_numbers.take(num_slots))
+    active = jnp.arange(num_slots) < contacts
     return ContactsProblem(surface, Contacts(*(a[order] for a in (point, normal, push, mu, gap, active))))
 
 
@@ -218,21 +221,23 @@ class _Numbers:
         self.values, self.taken = values, 0
 
     def take(self, *shape: int) -> Array:
+        """Return the next numbers that were not taken yet, in the given shape."""
         begin, self.taken = self.taken, self.taken + math.prod(shape)
         assert self.taken <= self.values.size
         return self.values[begin : self.taken].reshape(shape)
 
 
-def _unit(angle: Array) -> Array:
+def _unit_vector(angle: Array) -> Array:
+    """Return the unit vectors (cos, sin) of angles in rad, stacked along a new last axis."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def _aside(v: Array) -> Array:
+def _perpendicular(v: Array) -> Array:
     """Return the vectors rotated by +90 degrees."""
     return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
 
 
-def _random_places(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple[Array, Array, Array]:
+def _random_points_and_normals(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple[Array, Array, Array]:
     """Draw the points and normals of `random_contacts_problem`.
 
     Returns:
@@ -241,35 +246,39 @@ def _random_places(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple
         middle: Middle of the slider, (1, 2), in m.
     """
     m = mu.size
-    all_ = uniform.take(12)
+    shared = uniform.take(12)
     phase, x, y, angle, along = uniform.take(5, m)
-    middle = 0.04 * all_[None, :2] - 0.02
-    axes = 0.02 + 0.06 * all_[None, 2:4]
-    ahead = _unit(2 * jnp.pi * all_[4:5])
-    turned = jnp.concatenate([ahead, _aside(ahead)])  # (a, b) @ turned: a along `ahead`, b orthogonal to it
+    middle = 0.04 * shared[None, :2] - 0.02
+    axes = 0.02 + 0.06 * shared[None, 2:4]
+    ahead = _unit_vector(2 * jnp.pi * shared[4:5])
+    axes_directions = jnp.concatenate(
+        [ahead, _perpendicular(ahead)]
+    )  # (a, b) @ turned: a along `ahead`, b orthogonal to it
 
-    on_circle = _unit(2 * jnp.pi * phase)
-    on_ellipse = middle + (on_circle * axes) @ turned
-    outward = (on_circle / axes) @ turned
+    on_circle = _unit_vector(2 * jnp.pi * phase)
+    on_ellipse = middle + (on_circle * axes) @ axes_directions
+    outward = (on_circle / axes) @ axes_directions
     inward = -outward / jnp.linalg.norm(outward, axis=1, keepdims=True)
 
     anywhere = 0.2 * jnp.stack([x, y], axis=1) - 0.1
 
     index, along = jnp.arange(m)[:, None], 2 * along[:, None] - 1
-    on_edge = index < 2 + jnp.floor(all_[5] * (jnp.maximum(contacts, 2) - 1))
-    edge_point = middle + jnp.concatenate([jnp.full_like(along, -axes[0, 0]), axes[0, 1] * along], axis=1) @ turned
+    on_edge = index < 2 + jnp.floor(shared[5] * (jnp.maximum(contacts, 2) - 1))
+    edge_point = (
+        middle + jnp.concatenate([jnp.full_like(along, -axes[0, 0]), axes[0, 1] * along], axis=1) @ axes_directions
+    )
 
     side = jnp.where(index % 2 == 0, 1.0, -1.0)
-    place = jnp.where(all_[6] < 0.5, along[2 * (index[:, 0] // 2)], along)
-    jaw_point = middle + jnp.concatenate([-axes[0, 0] * side, axes[0, 1] * place], axis=1) @ turned
+    place = jnp.where(shared[6] < 0.5, along[2 * (index[:, 0] // 2)], along)
+    jaw_point = middle + jnp.concatenate([-axes[0, 0] * side, axes[0, 1] * place], axis=1) @ axes_directions
 
     in_wedge = index < 2
-    miss = jnp.where(all_[8] < 0.5, 1.0, -1.0) * 10 ** (-1 - 4 * all_[9])
-    lean = jnp.where(all_[10:12] < 0.5, 1.0, -1.0)[jnp.minimum(index[:, 0], 1)] * (jnp.arctan(mu) + miss)
-    wedge_normal = side * _unit(lean) @ turned
+    miss = jnp.where(shared[8] < 0.5, 1.0, -1.0) * 10 ** (-1 - 4 * shared[9])
+    lean = jnp.where(shared[10:12] < 0.5, 1.0, -1.0)[jnp.minimum(index[:, 0], 1)] * (jnp.arctan(mu) + miss)
+    wedge_normal = side * _unit_vector(lean) @ axes_directions
     wedge_point = middle - axes[0, 0] * side * ahead
 
-    which = jnp.floor(5 * all_[7]).astype(int)
+    which = jnp.floor(5 * shared[7]).astype(int)
     points = jnp.stack(
         [
             on_ellipse,
@@ -282,7 +291,7 @@ def _random_places(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple
     normals = jnp.stack(
         [
             inward,
-            _unit(2 * jnp.pi * angle),
+            _unit_vector(2 * jnp.pi * angle),
             jnp.where(on_edge, ahead, inward),
             side * ahead,
             jnp.where(in_wedge, wedge_normal, inward),
@@ -301,40 +310,44 @@ def _random_pushes(
         dragged: Whether they are of the last kind, to which the gaps have to be added.
     """
     m = point.shape[0]
-    all_, (fast, into) = uniform.take(6), uniform.take(2, m, 1)
-    spin_, drift, free = gauss.take(), gauss.take(1, 2), gauss.take(m, 2)
-    # the rotation moves contacts at a distance of some 0.05 m about as far as the translation does
-    spin = jnp.where(all_[0] < 0.5, 20 * spin_, 0.0)
-    rigid = _unit(2 * jnp.pi * all_[1:2]) + spin * _aside(point)
+    shared, (fast, into) = uniform.take(6), uniform.take(2, m, 1)
+    spin_rate, drift, free = gauss.take(), gauss.take(1, 2), gauss.take(m, 2)
+    # The rotation moves contacts at a distance of some 0.05 m about as far as the translation does.
+    spin = jnp.where(shared[0] < 0.5, 20 * spin_rate, 0.0)
+    rigid = _unit_vector(2 * jnp.pi * shared[1:2]) + spin * _perpendicular(point)
     to_middle = middle - point
     to_middle /= jnp.maximum(jnp.linalg.norm(to_middle, axis=1, keepdims=True), 1e-3)
     uneven = (0.3 + 0.7 * fast) * to_middle + 0.5 * drift
-    close = jnp.where(all_[2] < 0.5, to_middle, uneven)
+    closing = jnp.where(shared[2] < 0.5, to_middle, uneven)
     leaving = jnp.sum(free * normal, axis=1, keepdims=True) < 0
     independent = jnp.where(leaving & (into < 0.5), -free, free)
 
-    # the force of the first contact is on the edge of its friction cone, and this force alone moves the slider
-    side, mover = jnp.where(all_[4] < 0.5, 1.0, -1.0), jnp.arange(m)[:, None] == 0
-    force = normal[0] + side * mu[0] * _aside(normal[0])
+    # The force of the first contact is on the edge of its friction cone, and this force alone moves the slider.
+    side, mover = jnp.where(shared[4] < 0.5, 1.0, -1.0), jnp.arange(m)[:, None] == 0
+    force = normal[0] + side * mu[0] * _perpendicular(normal[0])
     torque = point[0, 0] * force[1] - point[0, 1] * force[0]
     twist = surface.form().gradient(Vec3(force[0], force[1], torque / surface.length))
-    moved = jnp.stack([twist.x, twist.y])[None] + twist.z / surface.length * _aside(point)
+    moved = jnp.stack([twist.x, twist.y])[None] + twist.z / surface.length * _perpendicular(point)
     moved /= jnp.max(jnp.linalg.norm(moved, axis=1))
     behind = jnp.where(into < 0.3, 0.0, into)
-    drag = moved + jnp.where(mover, side * 2 * all_[5] * _aside(normal), free[:, :1] * _aside(normal) - behind * normal)
+    drag = moved + jnp.where(
+        mover, side * 2 * shared[5] * _perpendicular(normal), free[:, :1] * _perpendicular(normal) - behind * normal
+    )
 
-    kind = jnp.floor(4 * all_[3]).astype(int)
-    push = jnp.stack([rigid, close, independent, drag])[kind]
+    kind = jnp.floor(4 * shared[3]).astype(int)
+    push = jnp.stack([rigid, closing, independent, drag])[kind]
     return push / jnp.max(jnp.linalg.norm(push, axis=1)), kind == 3
 
 
 def _random_friction(uniform: _Numbers, m: int, most: float | Array) -> Array:
+    """Draw the friction coefficients of `random_contacts_problem`, shape (m,)."""
     same, (mu, kind) = uniform.take(), uniform.take(2, m)
     mu = most * jnp.where(kind < 0.1, 0.0, jnp.where(kind < 0.2, 4 * mu, mu))
     return jnp.where(same < 0.5, mu[0], mu)
 
 
 def _random_gaps(uniform: _Numbers, m: int, share: float | Array) -> Array:
-    some, (kind, size) = uniform.take(), uniform.take(2, m)
+    """Draw the gaps of `random_contacts_problem`, shape (m,), m; a fraction `share` of the problems has gaps."""
+    has_gaps, (kind, size) = uniform.take(), uniform.take(2, m)
     gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
-    return jnp.where(some < share, gap, 0.0)
+    return jnp.where(has_gaps < share, gap, 0.0)

@@ -13,7 +13,8 @@ CHUNK = 4000
 # |residual|^2 below this factor of its value. DAMPING: range of the initial damping, as powers of ten. RHO_SPREAD:
 # standard deviation of log(rho) between starts. MODE_SHARE: fraction of starts that begin with a guess of the modes.
 MOST_STEPS, STALLED, DAMPING, RHO_SPREAD, MODE_SHARE = 120, 0.97, (-8.0, -2.0), 1.0, 0.8
-# The six entries of a symmetric 3 x 3 matrix, and their places in it.
+# UPPER: the (row, column) of each of the six distinct entries of a symmetric 3 x 3 matrix. FULL: for each entry of the
+# matrix, its index in UPPER.
 UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
@@ -62,38 +63,38 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     still = violations(batch, twist, force).worst() <= CLEAN
     result = Searched(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
     done = 0
-    for portion in (*portions, starts):
-        portion = min(portion, starts - done)
-        done += portion
+    for group_size in (*portions, starts):
+        group_size = min(group_size, starts - done)
+        done += group_size
         left = np.flatnonzero(~result.found)
-        size = max(CHUNK // max(portion, 1), 1)
-        for begin in range(0, len(left) if portion else 0, size):
+        size = max(CHUNK // max(group_size, 1), 1)
+        for begin in range(0, len(left) if group_size else 0, size):
             where = left[begin : begin + size]
             with np.errstate(all="ignore"):  # a start may diverge to infinity; `violations` then rejects it
-                answers = _follow(batch.take(where), portion, rng)
+                answers = _follow(batch.take(where), group_size, rng)
             for field, values in zip(result, answers, strict=True):
                 field[where] += values
-    every = np.zeros((n, m, 2))
-    every[np.arange(n)[:, None], order] = result.force
-    return result._replace(force=every)
+    all_forces = np.zeros((n, m, 2))
+    all_forces[np.arange(n)[:, None], order] = result.force
+    return result._replace(force=all_forces)
 
 
 def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searched:
-    """Follow `starts` starts of each problem, and return the first solution of each."""
+    """Return the first solution of each problem that a number of random starts reaches."""
     n = len(batch)
     equations = _Equations(batch, np.repeat(np.arange(n), starts), rng)
     y = equations.start(rng)
     y = equations.follow_modes(y, rng)
     y = equations.descend(y, 10 ** rng.uniform(*DAMPING, y.shape[1]))
     twist, force, wrench = equations.answer(y, batch)
-    clean = violations(batch.take(equations.problem), twist, force, wrench).worst() <= CLEAN
-    clean = clean.reshape(n, starts)
-    first = np.arange(n) * starts + clean.argmax(axis=1)
-    found = np.asarray(clean.any(axis=1))
+    is_solution = violations(batch.take(equations.problem), twist, force, wrench).worst() <= CLEAN
+    is_solution = is_solution.reshape(n, starts)
+    first = np.arange(n) * starts + is_solution.argmax(axis=1)
+    found = np.asarray(is_solution.any(axis=1))
     twist, force, wrench = (
         np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a[first], 0.0) for a in (twist, force, wrench)
     )
-    return Searched(found, twist, force, wrench, np.full(n, starts), clean.sum(axis=1))
+    return Searched(found, twist, force, wrench, np.full(n, starts), is_solution.sum(axis=1))
 
 
 class _Equations:
@@ -108,36 +109,38 @@ class _Equations:
 
     The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
     where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
+    B is the number of starts.
     """
 
     def __init__(self, batch: ProblemBatch, problem: np.ndarray, rng: np.random.Generator):
         n, m = batch.friction.shape
-        on = batch.active
+        active = batch.active
         table = batch.hessian_table()
         mean = table.mean(axis=3) if batch.degree == 2 else table[..., :3].mean(axis=3)
         size = np.trace(mean, axis1=1, axis2=2) / 3
         mean = mean / size[:, None, None]
-        rows = np.where(on[..., None, None], batch.rows(), 0.0)
-        ahead = np.where(on[..., None], batch.approach() / batch.speed()[:, None, None], -1.0)
-        rho = np.where(on, np.einsum("nmi,nij,nmj->nm", rows[:, :, 0], mean, rows[:, :, 0]), 1.0)
+        rows = np.where(active[..., None, None], batch.rows(), 0.0)
+        approach = np.where(active[..., None], batch.approach() / batch.speed()[:, None, None], -1.0)
+        rho = np.where(active, np.einsum("nmi,nij,nmj->nm", rows[:, :, 0], mean, rows[:, :, 0]), 1.0)
         upper = np.stack([table[:, i, j] for i, j in UPPER], axis=1) / size[:, None, None]
         flat = rows.reshape(n, 2 * m, 3)
 
-        def each(array: np.ndarray) -> np.ndarray:
+        def per_start(array: np.ndarray) -> np.ndarray:
             return np.moveaxis(array, 0, -1)[..., problem]
 
         self.degree, self.problem = batch.degree, problem
-        self.table = each(upper)  # (6, q, B)
-        self.rows = each(flat)  # (2 m, 3, B)
-        self.ahead = each(ahead.reshape(n, 2 * m))  # (2 m, B)
-        self.friction = each(np.where(on, batch.friction, 0.0))  # (m, B)
-        self.active = each(on)  # (m, B)
-        spread = np.exp(RHO_SPREAD * rng.normal(size=len(problem)))
-        self.rho = np.repeat(each(rho), 2, axis=0) * spread  # (2 m, B)
-        # maps a twist to forces whose wrench approximately causes it
+        self.table = per_start(upper)  # (6, q, B)
+        self.rows = per_start(flat)  # (2 m, 3, B)
+        self.ahead = per_start(approach.reshape(n, 2 * m))  # (2 m, B)
+        self.friction = per_start(np.where(active, batch.friction, 0.0))  # (m, B)
+        self.active = per_start(active)  # (m, B)
+        rho_factor = np.exp(RHO_SPREAD * rng.normal(size=len(problem)))
+        self.rho = np.repeat(per_start(rho), 2, axis=0) * rho_factor  # (2 m, B)
+        # Maps a twist to forces whose wrench approximately causes it.
         self.resisting = np.linalg.pinv(np.swapaxes(flat, 1, 2)) @ np.linalg.inv(mean)
 
     def take(self, keep: np.ndarray) -> "_Equations":
+        """Return the equations of some of the starts, for `descend`; `keep` is a mask over the last axis."""
         part = object.__new__(_Equations)
         part.degree = self.degree
         for name in ("problem", "table", "rows", "ahead", "friction", "active", "rho"):
@@ -152,14 +155,14 @@ class _Equations:
         return wrench, hessian, np.einsum("ijb,jb->ib", hessian, wrench) / (self.degree - 1)
 
     def slips(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return w (2 m, B), with the gap added to its normal part, and its derivative by y (2 m, 2 m, B)."""
+        """Return w (2 m, B), with the gap added to its normal part, and its Jacobian by y (2 m, 2 m, B)."""
         _, hessian, twist = self.flow(y)
         slip = np.einsum("ijb,jb->ib", self.rows, twist) - self.ahead
-        through = np.einsum("ijb,kjb->ikb", hessian, self.rows)
-        return slip, np.einsum("kjb,jib->kib", self.rows, through) / self.rho
+        twist_change = np.einsum("ijb,kjb->ikb", hessian, self.rows)
+        return slip, np.einsum("kjb,jib->kib", self.rows, twist_change) / self.rho
 
     def residual(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the left sides of the equations (2 m, B) and their derivative by y (2 m, 2 m, B)."""
+        """Return the residual of the equations (2 m, B) and its Jacobian by y (2 m, 2 m, B)."""
         slip, by_y = self.slips(y)
         normal, tangent, limit = y[0::2], y[1::2], self.friction * y[0::2]
         value = np.empty_like(y)
@@ -181,20 +184,25 @@ class _Equations:
         random twist, because on an ill-conditioned surface random forces hardly ever do.
         """
         m, count = self.friction.shape
-        pushes = np.where((rng.random((m, count)) < 0.6) & self.active, rng.exponential(size=(m, count)), 0.0)
+        normal_force = np.where((rng.random((m, count)) < 0.6) & self.active, rng.exponential(size=(m, count)), 0.0)
         side = rng.uniform(-1, 1, (m, count))
         side = np.where(rng.random((m, count)) < 0.5, np.sign(side), side)
-        force = _interleave(pushes, side * self.friction * pushes)
+        force = _interleave(normal_force, side * self.friction * normal_force)
         twist = self.flow(force * self.rho)[2]
         motion = np.einsum("ijb,jb->ib", self.rows[0::2], twist)
-        wanted, given = (motion * self.ahead[0::2] * pushes).sum(axis=0), (motion**2 * pushes).sum(axis=0)
-        unit = 1 / np.maximum(np.linalg.norm(twist, axis=0), 1e-6)  # the factor that scales the twist to length one
-        factor = wanted / np.where(given > 0, given, 1.0)
-        force *= np.where(factor > 1e-3 * unit, np.minimum(factor, 10 * unit), unit) ** (1 / (self.degree - 1))
+        numerator, denominator = (
+            (motion * self.ahead[0::2] * normal_force).sum(axis=0),
+            (motion**2 * normal_force).sum(axis=0),
+        )
+        unit_factor = 1 / np.maximum(np.linalg.norm(twist, axis=0), 1e-6)  # scales the twist to norm one
+        factor = numerator / np.where(denominator > 0, denominator, 1.0)
+        force *= np.where(factor > 1e-3 * unit_factor, np.minimum(factor, 10 * unit_factor), unit_factor) ** (
+            1 / (self.degree - 1)
+        )
 
-        other = np.einsum("bij,jb->ib", self.resisting[self.problem], rng.normal(size=(3, count)))
-        other *= np.where(other[0::2].sum(axis=0) < 0, -1.0, 1.0)
-        force = np.where(rng.random(count) < 0.5, self.in_cone(other), force)
+        resisting_force = np.einsum("bij,jb->ib", self.resisting[self.problem], rng.normal(size=(3, count)))
+        resisting_force *= np.where(resisting_force[0::2].sum(axis=0) < 0, -1.0, 1.0)
+        force = np.where(rng.random(count) < 0.5, self.in_cone(resisting_force), force)
         return force * self.rho * 10 ** (0.3 * rng.normal(size=count))
 
     def in_cone(self, force: np.ndarray) -> np.ndarray:
@@ -210,36 +218,36 @@ class _Equations:
         a solution because wrenches have three dimensions. A contact sticks if both of its edges are chosen.
         """
         count = y.shape[1]
-        drawn = rng.random(y.shape) + np.repeat(2.0 * ~self.active, 2, axis=0)
-        rank = drawn.argsort(axis=0).argsort(axis=0)
+        order_key = rng.random(y.shape) + np.repeat(2.0 * ~self.active, 2, axis=0)
+        rank = order_key.argsort(axis=0).argsort(axis=0)
         chosen = rank < rng.choice([1, 2, 3], p=[0.1, 0.3, 0.6], size=count)
         left, right = chosen[0::2] & self.active, chosen[1::2] & self.active
-        apart, stick = ~(left | right), left & right
+        separates, sticks = ~(left | right), left & right
         slope = self.friction * np.where(left, 1.0, -1.0)
         damping = 10 ** rng.uniform(-13, -6, count)
         n = np.arange(0, len(y), 2)
-        end = y
+        y_end = y
         for _ in range(4 if self.degree == 2 else 8):
-            slip, by_y = self.slips(end)
-            normal, tangent = end[0::2], end[1::2]
+            slip, by_y = self.slips(y_end)
+            normal, tangent = y_end[0::2], y_end[1::2]
             value = _interleave(
-                np.where(apart, normal, slip[0::2]),
-                np.where(stick, slip[1::2], tangent - np.where(apart, 0.0, slope) * normal),
+                np.where(separates, normal, slip[0::2]),
+                np.where(sticks, slip[1::2], tangent - np.where(separates, 0.0, slope) * normal),
             )
-            by_y *= _interleave(~apart, stick)[:, None]
-            by_y[n, n] += apart
-            by_y[n + 1, n] -= np.where(apart | stick, 0.0, slope)
-            by_y[n + 1, n + 1] += ~stick
-            end = end - _damped_step(value, by_y, damping)
-        taken = (rng.random(count) < MODE_SHARE) & np.isfinite(end).all(axis=0)
-        return np.where(taken, end, y)
+            by_y *= _interleave(~separates, sticks)[:, None]
+            by_y[n, n] += separates
+            by_y[n + 1, n] -= np.where(separates | sticks, 0.0, slope)
+            by_y[n + 1, n + 1] += ~sticks
+            y_end = y_end - _damped_step(value, by_y, damping)
+        accepted = (rng.random(count) < MODE_SHARE) & np.isfinite(y_end).all(axis=0)
+        return np.where(accepted, y_end, y)
 
     def descend(self, y: np.ndarray, damping: np.ndarray) -> np.ndarray:
         """Minimize |residual|^2 by the Levenberg-Marquardt method, until it is zero or hardly decreases any more."""
         equations, end, index = self, y.copy(), np.arange(y.shape[1])
         value, by_y = equations.residual(y)
         merit = (value**2).sum(axis=0)
-        earlier = merit
+        earlier_merit = merit
         for k in range(1, MOST_STEPS + 1):
             trial = y - _damped_step(value, by_y, damping)
             trial_value, trial_by_y = equations.residual(trial)
@@ -254,14 +262,14 @@ class _Equations:
                 continue
             finished = ~(merit > 1e-26)
             if k % 9 == 0:
-                finished |= ~(merit < STALLED * earlier)
-                earlier = merit
+                finished |= ~(merit < STALLED * earlier_merit)
+                earlier_merit = merit
             if k < MOST_STEPS and finished.mean() < 0.1:
                 continue
             end[:, index] = y
             index, equations = index[~finished], equations.take(~finished)
-            y, value, by_y, merit, damping, earlier = (
-                a[..., ~finished] for a in (y, value, by_y, merit, damping, earlier)
+            y, value, by_y, merit, damping, earlier_merit = (
+                a[..., ~finished] for a in (y, value, by_y, merit, damping, earlier_merit)
             )
             if not len(index):
                 break
@@ -271,15 +279,15 @@ class _Equations:
         """Return twist (B, 3), force (B, m, 2) and wrench (B, 3) in the units of `batch`, with the wrench on H = 1."""
         force = self.in_cone(y / self.rho)
         wrench, _, twist = self.flow(force * self.rho)
-        part = batch.take(self.problem)
-        size = level(part, wrench.T)
+        repeated = batch.take(self.problem)
+        size = level(repeated, wrench.T)
         size = np.where(size > 0, size, 1.0)[:, None]
-        one = np.ones_like(part.length)
-        arms = np.stack([one, one, part.length], axis=1)
+        one = np.ones_like(repeated.length)
+        scale = np.stack([one, one, repeated.length], axis=1)
         return (
-            twist.T * part.speed()[:, None] / arms,
-            force.T.reshape(*part.friction.shape, 2) / size[..., None],
-            wrench.T * arms / size,
+            twist.T * repeated.speed()[:, None] / scale,
+            force.T.reshape(*repeated.friction.shape, 2) / size[..., None],
+            wrench.T * scale / size,
         )
 
 
@@ -294,21 +302,21 @@ def _interleave(normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     return np.stack([normal, tangent], axis=1).reshape(-1, *normal.shape[1:])
 
 
-def _damped_step(value: np.ndarray, by_y: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return (J'J + damping)^-1 J' value for each entry of the last axis, by Gaussian elimination."""
-    r = np.einsum("kib,kb->ib", by_y, value)
-    n, a = len(r), np.empty_like(by_y)
+def _damped_step(residual: np.ndarray, jacobian: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Return the step (J'J + damping)^-1 J' residual for each entry of the last axis, by Gaussian elimination."""
+    right_side = np.einsum("kib,kb->ib", jacobian, residual)
+    n, matrix = len(right_side), np.empty_like(jacobian)
     for i in range(n):
-        a[i, i:] = np.einsum("kb,kjb->jb", by_y[:, i], by_y[:, i:])
-        a[i:, i] = a[i, i:]
-    a[np.arange(n), np.arange(n)] += damping
+        matrix[i, i:] = np.einsum("kb,kjb->jb", jacobian[:, i], jacobian[:, i:])
+        matrix[i:, i] = matrix[i, i:]
+    matrix[np.arange(n), np.arange(n)] += damping
     for k in range(n):
-        inverse = 1 / a[k, k]
-        below = a[k + 1 :, k] * inverse
-        a[k + 1 :, k + 1 :] -= below[:, None] * a[k, k + 1 :]
-        r[k + 1 :] -= below * r[k]
-        a[k, k + 1 :] *= inverse
-        r[k] *= inverse
+        inverse = 1 / matrix[k, k]
+        below = matrix[k + 1 :, k] * inverse
+        matrix[k + 1 :, k + 1 :] -= below[:, None] * matrix[k, k + 1 :]
+        right_side[k + 1 :] -= below * right_side[k]
+        matrix[k, k + 1 :] *= inverse
+        right_side[k] *= inverse
     for k in range(n - 2, -1, -1):
-        r[k] -= (a[k, k + 1 :] * r[k + 1 :]).sum(axis=0)
-    return r
+        right_side[k] -= (matrix[k, k + 1 :] * right_side[k + 1 :]).sum(axis=0)
+    return right_side

@@ -7,8 +7,8 @@ from scipy.optimize import linprog
 
 from pushjax.testing.batch import ProblemBatch
 
-# A determinant of unit wrenches is zero up to roundoff if it is at most SINGULAR. If it exceeds REGULAR, the weights of
-# balanced forces are exact to SHARE.
+# The determinant of three unit wrenches is zero up to roundoff if it is at most SINGULAR. If it exceeds REGULAR, the
+# relative weights of balanced forces are exact to SHARE.
 SINGULAR, REGULAR = 1e-13, 1e-6
 SHARE = 1e-10
 
@@ -20,10 +20,10 @@ def _edges(batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray]:
         wrench: Normalized wrenches (N, 2 m, 3).
         power: f . displacement - f_n gap, (N, 2 m), in m.
     """
-    rows, b = batch.rows(), batch.approach()
-    slope = batch.friction[..., None] * np.array([1.0, -1.0])
-    wrench = rows[:, :, None, 0] + slope[..., None] * rows[:, :, None, 1]
-    power = b[..., None, 0] + slope * b[..., None, 1]
+    rows, motion = batch.rows(), batch.approach()
+    signed_friction = batch.friction[..., None] * np.array([1.0, -1.0])
+    wrench = rows[:, :, None, 0] + signed_friction[..., None] * rows[:, :, None, 1]
+    power = motion[..., None, 0] + signed_friction * motion[..., None, 1]
     n = len(batch)
     return wrench.reshape(n, -1, 3), power.reshape(n, -1)
 
@@ -53,7 +53,7 @@ def squeeze_power(batch: ProblemBatch) -> np.ndarray:
         if not on.any():
             continue
         unit = np.abs(powers[k, on]).max() or 1.0
-        # if forces barely balance, the simplex method may fail to decide whether they do
+        # If forces barely balance, the simplex method may fail to decide whether they do.
         for method in ("highs", "highs-ipm"):
             result = linprog(
                 -powers[k, on] / unit,
@@ -93,7 +93,8 @@ def squeeze_power_enumerated(batch: ProblemBatch) -> np.ndarray:
     best = np.full(n, -np.inf)
     lengths = np.linalg.norm(wrenches, axis=2, keepdims=True)
     lengths = np.where(lengths > 0, lengths, 1.0)
-    # of unit wrenches, a small determinant means degeneracy whatever the arms; the weights are scaled back below
+    # For unit wrenches, a small determinant means degeneracy whatever the moment arms. The weights are scaled back
+    # below.
     w = wrenches / lengths
     triple: dict[tuple[int, ...], np.ndarray] = {
         (i, j, k): np.einsum("ni,ni->n", w[:, i], np.cross(w[:, j], w[:, k]))
@@ -115,7 +116,7 @@ def squeeze_power_enumerated(batch: ProblemBatch) -> np.ndarray:
         total = np.where(balanced, share.sum(axis=1), 1.0)
         power = (share * powers[:, four]).sum(axis=1) / total
         best = np.where(balanced, np.maximum(best, power), best)
-    # the forces of a single contact cannot balance each other
+    # The forces of a single contact cannot balance each other.
     rest = (doubtful | ~spanning) & (batch.active.sum(axis=1) > 1)
     if rest.any():
         best[rest] = squeeze_power(batch.take(rest))
