@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from pushjax._internal.autodiff import without_derivatives
@@ -99,6 +98,8 @@ def _search_factors(target: Float[Array, "15"], start: Float[Array, "terms 6"]) 
     # Optimistix keeps its own state in the widest float type that is enabled, and it does not mix two types.
     wide = jnp.result_type(float)
     tolerance = 1e-12 if wide == jnp.float64 else 1e-6
+    import optimistix as optx  # here, because it takes half as long to import as JAX
+
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
     target, first = target.astype(wide), start.astype(wide)
     found = optx.least_squares(lambda x, _: _coefficients(x) - target, solver, first, max_steps=MAX_STEPS, throw=False)

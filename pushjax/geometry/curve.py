@@ -179,7 +179,7 @@ def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array
 
 def _check_points(name: str, points: ArrayLike, least: int) -> Array:
     """Return the argument `name` as an array; raise unless it holds at least `least` finite, distinct points."""
-    array = as_float(points)
+    array = as_float(points, name="points")
     check_shape(name, array, (name, 2))
     if len(array) < least:
         raise ValueError(f"{name}: a curve needs at least {least}; got {len(array)}")

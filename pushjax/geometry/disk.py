@@ -56,7 +56,7 @@ class Disk(Shape):
 
     def __init__(self, radius: ArrayLike, center: ArrayLike = (0.0, 0.0)):
         dtype = common_dtype(radius, center)
-        self.radius, self.center = as_float(radius, dtype), as_float(center, dtype)
+        self.radius, self.center = as_float(radius, dtype, "radius"), as_float(center, dtype, "center")
         check_shape("radius", self.radius, ())
         check_shape("center", self.center, (2,))
         for name, value in (("radius", self.radius), ("center", self.center)):

@@ -256,8 +256,8 @@ class Ellipse(Shape):
 
     def __init__(self, semi_x: ArrayLike, semi_y: ArrayLike, center: ArrayLike = (0.0, 0.0)):
         dtype = common_dtype(semi_x, semi_y, center)
-        self.semi_x, self.semi_y = as_float(semi_x, dtype), as_float(semi_y, dtype)
-        self.center = as_float(center, dtype)
+        self.semi_x, self.semi_y = as_float(semi_x, dtype, "semi_x"), as_float(semi_y, dtype, "semi_y")
+        self.center = as_float(center, dtype, "center")
         for name, value in (("semi_x", self.semi_x), ("semi_y", self.semi_y)):
             check_shape(name, value, ())
             check_finite(name, value)

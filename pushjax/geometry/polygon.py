@@ -46,7 +46,7 @@ class Polygon(Shape):
     convex: bool = eqx.field(static=True)
 
     def __init__(self, vertices: ArrayLike, *, convex: bool | None = None):
-        array = as_float(vertices)
+        array = as_float(vertices, name="vertices")
         check_shape("vertices", array, ("vertices", 2))
         if array.shape[0] < 3:
             raise ValueError(f"vertices: a polygon needs at least three; got {array.shape[0]}")
@@ -74,7 +74,7 @@ class Polygon(Shape):
             ValueError: If a side is not a positive finite scalar.
         """
         dtype = common_dtype(width, height)
-        w, h = as_float(width, dtype), as_float(height, dtype)
+        w, h = as_float(width, dtype, "width"), as_float(height, dtype, "height")
         for name, value in (("width", w), ("height", h)):
             check_shape(name, value, ())
             check_finite(name, value)
@@ -97,7 +97,7 @@ class Polygon(Shape):
         """
         if sides < 3:
             raise ValueError(f"sides must be at least 3; got {sides}")
-        radius = as_float(circumradius)
+        radius = as_float(circumradius, name="circumradius")
         check_shape("circumradius", radius, ())
         check_finite("circumradius", radius)
         check_positive("circumradius", radius)
@@ -141,7 +141,7 @@ class Polygon(Shape):
         Returns:
             The polygon between the moved edges.
         """
-        distance = as_float(depth, self.vertices.dtype)
+        distance = as_float(depth, self.vertices.dtype, "depth")
         edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
         normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
         previous_normal = jnp.roll(normal, 1, axis=0)

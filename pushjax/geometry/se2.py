@@ -21,7 +21,7 @@ Wrench = Float[Array, "*batch 3"]
 def _components(**named: ArrayLike) -> list[tuple[Array, ...]]:
     """Split each argument into its components along the last axis, in one dtype and broadcast over the other axes."""
     dtype = common_dtype(*named.values())
-    arrays = {name: as_float(value, dtype) for name, value in named.items()}
+    arrays = {name: as_float(value, dtype, name) for name, value in named.items()}
     for name, array in arrays.items():
         size = 2 if name == "point" else 3
         if array.ndim == 0 or array.shape[-1] != size:
