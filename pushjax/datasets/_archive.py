@@ -1,4 +1,4 @@
-"""Read curated `.npz` archives as a whole, with one clear error for any fault of the file."""
+"""Read `.npz` archives of recorded pushes, with one clear error for any fault of the file, and check their shapes."""
 
 import zipfile
 import zlib
@@ -75,9 +75,9 @@ def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -
         LogError: If an array has another number of rows or another row shape.
     """
     count = len(data["push_index"]) if data["push_index"].ndim else -1
-    for name, tail in shapes.items():
-        if data[name].shape != (count, *tail):
-            raise LogError(path, f"expected {name} of shape (n, *{tail}) for n pushes, found {data[name].shape}")
+    for name, row_shape in shapes.items():
+        if data[name].shape != (count, *row_shape):
+            raise LogError(path, f"expected {name} of shape (n, *{row_shape}) for n pushes, found {data[name].shape}")
     return count
 
 

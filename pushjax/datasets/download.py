@@ -79,25 +79,25 @@ def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: P
     import pooch  # imported here, because only those who fetch need it
     import requests
 
-    total, done = sum(each.bytes for each in files), 0
+    total, done = sum(remote.bytes for remote in files), 0
     pooch.get_logger().setLevel("WARNING")  # it prints a line for each file
-    get: Any = pooch.HTTPDownloader(timeout=TIMEOUT)
+    downloader: Any = pooch.HTTPDownloader(timeout=TIMEOUT)
     progress(done, total)
-    for each in files:
-        target, address = folder / each.file, source + quote(each.source)
+    for remote in files:
+        target, address = folder / remote.file, source + quote(remote.source)
         try:
-            pooch.retrieve(address, f"sha256:{each.sha256}", target.name, target.parent, downloader=get)
+            pooch.retrieve(address, f"sha256:{remote.sha256}", target.name, target.parent, downloader=downloader)
         except requests.RequestException as error:
-            raise OSError(f"cannot fetch {address}: {_reason(error)}") from error
+            raise OSError(f"cannot fetch {address}: {_describe_failure(error)}") from error
         except ValueError as error:  # a wrong checksum
             raise OSError(
-                f"cannot use {address}: it is not the file of {each.bytes} bytes that was published"
+                f"cannot use {address}: it is not the file of {remote.bytes} bytes that was published"
             ) from error
-        done += each.bytes
+        done += remote.bytes
         progress(done, total)
 
 
-def _reason(error: Exception) -> str:
+def _describe_failure(error: Exception) -> str:
     """Return one line on what went wrong with a request."""
     response = getattr(error, "response", None)
     if response is not None:

@@ -41,7 +41,7 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
         LogError: If the file is of no known kind, or if no push of it is usable.
     """
     file = Path(path)
-    return _loader(file)(file)
+    return _select_loader(file)(file)
 
 
 def _load_triangle(path: Path) -> Recordings:
@@ -58,9 +58,9 @@ def _load_npz(path: Path) -> Recordings:
         return Recordings.of_log(load_push_npz(path))
     if {"tip_t", "object_t"} <= names:
         return load_mit_npz(path, names)
-    there = ", ".join(sorted(names)[:10]) or "none"
+    found_names = ", ".join(sorted(names)[:10]) or "none"
     known = "or the arrays of the folders three_point_push or mit_push_full"
-    raise LogError(path, f"expected arrays of pushes: {LAYOUT}; {known}; found the arrays {there}")
+    raise LogError(path, f"expected arrays of pushes: {LAYOUT}; {known}; found the arrays {found_names}")
 
 
 Loader = Callable[[Path], Recordings]
@@ -80,7 +80,7 @@ _SUFFIXES: dict[str, Loader] = {
 }
 
 
-def _loader(path: Path) -> Loader:
+def _select_loader(path: Path) -> Loader:
     """Select the loader by the first bytes of the file or else by its suffix.
 
     Raises:

@@ -32,7 +32,7 @@ from pushjax.datasets.recordings import interpolated
 
 MIN_PUSHES = 10  # smallest number of pushes, of which a few are used for training
 SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
-# Fractions of the duration between which pushes are tested and wrenches are taken. Before the first, the finger may not
+# Fractions of the duration between which pushes are tested and wrenches are taken. Before the first, the tip may not
 # touch the object yet. After the second, the tip may have stopped.
 MIDDLE_PART = (0.1, 0.9)
 NUM_PARTS = 6  # parts of that time, each of which gives one pair of wrench and twist
@@ -115,19 +115,26 @@ def load_mit_folder(
     if abs(speed - fast_speed) < SAME_SPEED:
         raise ValueError(f"speed and fast_speed must differ; got {speed} and {fast_speed}")
     found, misnamed = _find_files(Path(folder), surface, shape)
-    steady = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
-    read: dict[float, list[_Push]] = {speed: [], fast_speed: []}
+    constant_speed = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
+    by_speed: dict[float, list[_Push]] = {speed: [], fast_speed: []}
     problems = list(misnamed)
-    wanted = [(at, *each) for each in steady for at in read if abs(each[1].speed - at) < SAME_SPEED]
-    for done, (at, index, name, path) in enumerate(wanted):
+    wanted = [
+        (wanted_speed, *each)
+        for each in constant_speed
+        for wanted_speed in by_speed
+        if abs(each[1].speed - wanted_speed) < SAME_SPEED
+    ]
+    for done, (wanted_speed, index, name, path) in enumerate(wanted):
         try:
-            read[at].append(_read(index, name, path))
+            by_speed[wanted_speed].append(_read_push(index, name, path))
         except LogError as error:
             problems.append(error)
         progress(done + 1, len(wanted))
-    whole, fast = read[speed], read[fast_speed]
+    whole, fast = by_speed[speed], by_speed[fast_speed]
     if len(whole) < MIN_PUSHES:
-        raise _too_few(Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), steady, problems)
+        raise _too_few_error(
+            Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), constant_speed, problems
+        )
     is_training = np.zeros(len(whole), bool)
     count = int(np.clip(round(train_share * len(whole)), 1, len(whole) - 1))
     is_training[np.random.default_rng(seed).permutation(len(whole))[:count]] = True
@@ -141,7 +148,7 @@ def load_mit_folder(
         fast=_push_group(fast, (0.0, 1.0), body),
         is_training=is_training,
         middle_of=test_rows.astype(np.int64),
-        repeats=_repeats(fast, whole),
+        repeats=_repeat_rows(fast, whole),
         wrench=pairs[:, 0],
         twist=pairs[:, 1],
         vertices=body.vertices,
@@ -173,15 +180,15 @@ class _Push(NamedTuple):
     pose: Floats
     force: Floats
 
-    def when(self, shares: Sequence[float] | Floats) -> Floats:
+    def times_at(self, fractions: Sequence[float] | Floats) -> Floats:
         """Return the times (k,), in s, at these fractions (k,) of the duration."""
         begin, end = self.time[0], self.time[-1]
-        return np.clip(begin + np.asarray(shares) * (end - begin), begin, end)  # roundoff might exceed the end
+        return np.clip(begin + np.asarray(fractions) * (end - begin), begin, end)  # roundoff might exceed the end
 
-    def at(self, shares: Sequence[float] | Floats) -> tuple[Floats, Floats]:
+    def states_at(self, fractions: Sequence[float] | Floats) -> tuple[Floats, Floats]:
         """Return the poses (k, 3) and the centers of the tip (k, 2) at these fractions (k,) of the duration."""
-        when = self.when(shares)
-        return interpolated(when, self.time, self.pose), interpolated(when, self.time, self.tip)
+        times = self.times_at(fractions)
+        return interpolated(times, self.time, self.pose), interpolated(times, self.time, self.tip)
 
 
 def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushParameters, Path]], list[LogError]]:
@@ -190,24 +197,25 @@ def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[Push
         raise LogError(folder, "expected a folder of the MIT pushing data set, found none")
     files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (*SUFFIXES, ".zip"))
     logs = [path for path in files if path.suffix.lower() in SUFFIXES and path.name.startswith(PREFIX)]
-    wrong: list[LogError] = []
-    there: dict[tuple[str, str], set[str]] = {}
+    misnamed: list[LogError] = []
+    stems_found: dict[tuple[str, str], set[str]] = {}
     found: dict[str, tuple[PushParameters, Path]] = {}
     for path in sorted(logs, key=lambda path: SUFFIXES.index(path.suffix.lower())):
         try:
             name = parse_push_name(path)
         except LogError as error:
             if path.name.startswith(f"{PREFIX}{surface}_shape={shape}_"):
-                wrong.append(error)
+                misnamed.append(error)
             continue
-        there.setdefault((name.surface, name.shape), set()).add(path.stem)
+        stems_found.setdefault((name.surface, name.shape), set()).add(path.stem)
         if (name.surface, name.shape) == (surface, shape):
             found.setdefault(path.stem, (name, path))
     if not found:
         raise LogError(
-            folder, _describe_missing(surface, shape, there, [path for path in files if path.suffix.lower() == ".zip"])
+            folder,
+            _describe_missing(surface, shape, stems_found, [path for path in files if path.suffix.lower() == ".zip"]),
         )
-    return sorted(found.values(), key=_sort_key), wrong
+    return sorted(found.values(), key=_sort_key), misnamed
 
 
 def _sort_key(named: tuple[PushParameters, Path]) -> tuple[float, ...]:
@@ -216,29 +224,33 @@ def _sort_key(named: tuple[PushParameters, Path]) -> tuple[float, ...]:
     return (*numbers, -1 if repetition is None else repetition)
 
 
-def _describe_missing(surface: str, shape: str, there: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
+def _describe_missing(surface: str, shape: str, stems_found: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
     """Describe what was found in place of the wanted files."""
     wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
-    if there:
-        counts = (f"{len(stems)} of {other} on {on}" for (on, other), stems in sorted(there.items()))
+    if stems_found:
+        counts = (f"{len(stems)} of {other} on {on}" for (on, other), stems in sorted(stems_found.items()))
         return f"{wanted}, found {', '.join(counts)}"
     if zips:
         return f"{wanted}, found only .zip files ({zips[0].name}, say): unpack them first"
     return f"{wanted}, found none of the data set"
 
 
-def _too_few(
-    folder: Path, what: str, count: int, steady: list[tuple[int, PushParameters, Path]], problems: list[LogError]
+def _too_few_error(
+    folder: Path,
+    what: str,
+    count: int,
+    constant_speed: list[tuple[int, PushParameters, Path]],
+    problems: list[LogError],
 ) -> LogError:
     """Make the error for a folder with too few usable pushes."""
-    speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in steady})) or "none"
+    speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in constant_speed})) or "none"
     message = f"expected at least {MIN_PUSHES} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
     if problems:
         message += f"; {len(problems)} files cannot be used: {Path(problems[0].path).name}: {problems[0].message}"
     return LogError(folder, message)
 
 
-def _read(index: int, name: PushParameters, path: Path) -> _Push:
+def _read_push(index: int, name: PushParameters, path: Path) -> _Push:
     """Read the push of a file.
 
     Raises:
@@ -280,21 +292,21 @@ def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
     """
     travel = float(np.linalg.norm(tip[-1] - tip[0]))
     window = len(time) if travel <= JUMP_WINDOW else max(2, round(len(time) * JUMP_WINDOW / travel))
-    ranges = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
-    distance, turn = np.hypot(ranges[:, 0], ranges[:, 1]), ranges[:, 2]
-    worst = np.maximum(distance / MAX_WINDOW_MOTION, turn / MAX_WINDOW_TURN)
-    row = int(np.argmax(worst))
-    if worst[row] > 1:
+    extent = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
+    distance, turn = np.hypot(extent[:, 0], extent[:, 1]), extent[:, 2]
+    excess = np.maximum(distance / MAX_WINDOW_MOTION, turn / MAX_WINDOW_TURN)
+    row = int(np.argmax(excess))
+    if excess[row] > 1:
         found = f"{1e3 * distance[row]:.0f} mm and {np.rad2deg(turn[row]):.0f} deg"
         limits = f"{1e3 * MAX_WINDOW_MOTION:g} mm and {np.rad2deg(MAX_WINDOW_TURN):.0f} deg"
-        where = f"while the tip goes {1e3 * JUMP_WINDOW:g} mm"
-        message = f"expected an object that moves by less than {limits} {where}, found {found} from {time[row]:.2f} s"
+        during = f"while the tip goes {1e3 * JUMP_WINDOW:g} mm"
+        message = f"expected an object that moves by less than {limits} {during}, found {found} from {time[row]:.2f} s"
         raise LogError(path, f"{message}: the tracker jumps")
 
 
-def _push_group(pushes: Sequence[_Push], shares: tuple[float, float], body: MitShape) -> StraightPushes:
-    """Make a group of pushes from the states at two fractions of the duration."""
-    ends = [push.at(shares) for push in pushes]
+def _push_group(pushes: Sequence[_Push], fractions: tuple[float, float], body: MitShape) -> StraightPushes:
+    """Return a group of pushes, each from its state at the first to that at the second fraction of its duration."""
+    ends = [push.states_at(fractions) for push in pushes]
     pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
     tip = np.array([tip for _, tip in ends]).reshape(-1, 2, 2)
     start, end = pose[:, 0], pose[:, 1]
@@ -339,19 +351,19 @@ def _training_pairs(push: _Push, body: MitShape) -> Iterator[tuple[Floats, Float
     distance, contact = nearest_on_outline(body.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
     torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
-    shares = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
-    poses, _ = push.at(shares)
-    rows = np.searchsorted(push.time, push.when(shares))
+    fractions = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
+    poses, _ = push.states_at(fractions)
+    row_at = np.searchsorted(push.time, push.times_at(fractions))
     for part in range(0, 2 * NUM_PARTS, 2):
-        within = slice(rows[part], rows[part + 2])
-        if within.start == within.stop:
+        rows_of_part = slice(row_at[part], row_at[part + 2])
+        if rows_of_part.start == rows_of_part.stop:
             continue
         to_body = rotation(poses[part + 1, 2]).T
-        moved = poses[part + 2] - poses[part]
-        wrench = np.append(to_body @ push.force[within].mean(axis=0), torque[within].mean())
-        twist = np.append(to_body @ moved[:2], moved[2])
+        displacement = poses[part + 2] - poses[part]
+        wrench = np.append(to_body @ push.force[rows_of_part].mean(axis=0), torque[rows_of_part].mean())
+        twist = np.append(to_body @ displacement[:2], displacement[2])
         motion = np.linalg.norm(twist[:2]) + body.length * abs(twist[2])
-        presses = np.abs(np.arctan2(across[within].mean(), along[within].mean())) < MAX_FORCE_ANGLE
+        presses = np.abs(np.arctan2(across[rows_of_part].mean(), along[rows_of_part].mean())) < MAX_FORCE_ANGLE
         strong = np.linalg.norm(wrench[:2]) >= MIN_FORCE
         if presses and strong and motion >= MIN_MOTION and wrench @ twist > 0:
             yield wrench, twist
@@ -362,17 +374,17 @@ def _cross(a: Floats, b: Floats) -> Floats:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def _repeats(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]:
+def _repeat_rows(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]:
     """Return the rows (r, 2) in `fast` and `whole` of the same nominal push with the nearest repetition."""
-    rows: dict[tuple[float, ...], list[int]] = {}
+    rows_by_nominal: dict[tuple[float, ...], list[int]] = {}
     for row, push in enumerate(whole):
-        rows.setdefault(_nominal_push(push), []).append(row)
-    found = []
+        rows_by_nominal.setdefault(_nominal_push(push), []).append(row)
+    pairs = []
     for row, push in enumerate(fast):
-        same = rows.get(_nominal_push(push), [])
+        same = rows_by_nominal.get(_nominal_push(push), [])
         if same:
-            found.append((row, min(same, key=lambda at: abs(_repetition(whole[at]) - _repetition(push)))))
-    return np.array(found, np.int64).reshape(-1, 2)
+            pairs.append((row, min(same, key=lambda at: abs(_repetition(whole[at]) - _repetition(push)))))
+    return np.array(pairs, np.int64).reshape(-1, 2)
 
 
 def _nominal_push(push: _Push) -> tuple[float, ...]:

@@ -52,7 +52,7 @@ def load_mit_json(path: Path) -> Recordings:
         raise LogError(path, f"expected a JSON log of a push, found something else: {error}") from error
     if not isinstance(record, dict):
         raise LogError(path, f"expected a JSON object with {', '.join(STREAMS)}, found a {type(record).__name__}")
-    return _one_push(path, _tables(path, record, _numbers))
+    return _recording_of_streams(path, _stream_tables(path, record, _rows_to_array))
 
 
 def load_mit_hdf5(path: Path) -> Recordings:
@@ -77,7 +77,9 @@ def load_mit_hdf5(path: Path) -> Recordings:
         with library.File(path, "r") as file:
             # Nothing is read here, because a file may hold much else, camera images for instance.
             record = {name: file[name] for name in file if isinstance(file[name], library.Dataset)}
-            return _one_push(path, _tables(path, record, lambda rows: np.asarray(rows[()], dtype=np.float64)))
+            return _recording_of_streams(
+                path, _stream_tables(path, record, lambda rows: np.asarray(rows[()], dtype=np.float64))
+            )
     except LogError:
         raise
     except (OSError, RuntimeError, KeyError) as error:
@@ -105,7 +107,7 @@ def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
     tables = [np.column_stack([numbers[time], numbers[name]]) for time, (name, _) in ARCHIVE_ARRAYS.items()]
     vertices, length, radius = (numbers.get(name) for name in _OBJECT_ARRAYS)
     return replace(
-        _one_push(path, tables),
+        _recording_of_streams(path, tables),
         vertices=vertices,
         length=None if length is None else float(length),
         tip_radius=None if radius is None else float(radius),
@@ -122,17 +124,17 @@ def _check_arrays(path: Path, data: Arrays) -> None:
     for time, (values, columns) in ARCHIVE_ARRAYS.items():
         count = data[time].size
         shapes |= {time: (count,), values: (count, columns)}
-    corners = len(data["vertices_body"]) if "vertices_body" in data and data["vertices_body"].ndim else 0
-    about: dict[str, tuple[int, ...]] = {"vertices_body": (corners, 2), "rho": (), "tip_radius": ()}
-    check_shapes(path, data, shapes | {name: shape for name, shape in about.items() if name in data})
+    vertex_count = len(data["vertices_body"]) if "vertices_body" in data and data["vertices_body"].ndim else 0
+    object_shapes: dict[str, tuple[int, ...]] = {"vertices_body": (vertex_count, 2), "rho": (), "tip_radius": ()}
+    check_shapes(path, data, shapes | {name: shape for name, shape in object_shapes.items() if name in data})
     for name, array in data.items():
         if array.dtype.kind not in "fiu":
             raise LogError(path, f"expected numbers in {name}, found {array.dtype}")
-        if name in about and not np.isfinite(array).all():
+        if name in object_shapes and not np.isfinite(array).all():
             raise LogError(path, f"expected finite numbers in {name}, found NaN or infinity")
 
 
-def _numbers(rows: Any) -> Floats:
+def _rows_to_array(rows: Any) -> Floats:
     """Convert the rows of a JSON stream to an array (n, 4).
 
     Raises:
@@ -141,32 +143,32 @@ def _numbers(rows: Any) -> Floats:
     """
     if not isinstance(rows, list):
         raise ValueError(f"a {type(rows).__name__}")
-    for at, row in enumerate(rows):
+    for index, row in enumerate(rows):
         if not isinstance(row, list) or len(row) != COLUMNS:
-            raise ValueError(f"row {at} is {str(row)[:60]}")
+            raise ValueError(f"row {index} is {str(row)[:60]}")
     return np.array(rows, dtype=np.float64).reshape(-1, COLUMNS)
 
 
-def _tables(path: Path, record: Mapping[str, Any], numbers: Callable[[Any], Floats]) -> list[Floats]:
+def _stream_tables(path: Path, record: Mapping[str, Any], to_array: Callable[[Any], Floats]) -> list[Floats]:
     """Return the streams of a record in the order of STREAMS, each (n, 4).
 
     Args:
         path: The file, for error messages.
         record: The streams by name.
-        numbers: Function that converts a stream to an array.
+        to_array: Function that converts a stream to an array.
 
     Raises:
         LogError: If a stream is missing or is something else.
     """
     missing = [name for name in STREAMS if name not in record]
     if missing:
-        there = ", ".join(list(record)[:10]) or "nothing"
-        raise LogError(path, f"expected {', '.join(STREAMS)}; found no {', '.join(missing)}, but {there}")
+        found = ", ".join(list(record)[:10]) or "nothing"
+        raise LogError(path, f"expected {', '.join(STREAMS)}; found no {', '.join(missing)}, but {found}")
     tables = []
     for name in STREAMS:
         wanted = f"expected {name} to have rows of {COLUMNS} numbers, a time and three values"
         try:
-            table = numbers(record[name])
+            table = to_array(record[name])
         except (ValueError, TypeError, OverflowError) as error:
             raise LogError(path, f"{wanted}; found something else: {error}") from error
         if table.ndim != 2 or table.shape[1] != COLUMNS:
@@ -175,8 +177,8 @@ def _tables(path: Path, record: Mapping[str, Any], numbers: Callable[[Any], Floa
     return tables
 
 
-def _one_push(path: Path, tables: list[Floats]) -> Recordings:
-    """Make a recording from the streams tip, object and wrench, each with its times in the first column."""
+def _recording_of_streams(path: Path, tables: list[Floats]) -> Recordings:
+    """Return the one recording of the streams tip, object and wrench (n, 4), with times in the first column."""
     tip, body, wrench = tables
     hand = Stream(STREAMS[0], HAND[:2], tip[:, 0], tip[:, 1:3])
     pose = Stream(STREAMS[1], OBJECT, body[:, 0], body[:, 1:])

@@ -22,8 +22,8 @@ from pushjax.datasets.pushes import LogError
 
 SUFFIXES = (".json", ".h5", ".hdf5")  # the first is preferred, because it needs no other package
 PREFIX = "motion_surface="
-_WORDS = ("surface", "shape")
-_NUMBERS = ("a", "v", "i", "s", "t")
+_TEXT_KEYS = ("surface", "shape")
+_NUMBER_KEYS = ("a", "v", "i", "s", "t")
 # A value ends at the next "_key=" or at the end of the name, so it may contain underscores.
 _FIELD = re.compile(r"_([a-z]+)=(.*?)(?=_[a-z]+=|$)")
 
@@ -69,11 +69,11 @@ def parse_push_name(path: str | PathLike[str]) -> PushParameters:
     name = Path(path).name
     stem = Path(name).stem if Path(name).suffix.lower() in SUFFIXES else name
     fields = dict(_FIELD.findall(stem))
-    missing = [key for key in (*_WORDS, *_NUMBERS) if not fields.get(key)]
+    missing = [key for key in (*_TEXT_KEYS, *_NUMBER_KEYS) if not fields.get(key)]
     if missing:
         wanted = f"expected a name like {PREFIX}abs_shape=rect1_a=0_v=10_i=0.000_s=0.500_t=0.000"
         raise LogError(path, f"{wanted}; found none of {', '.join(missing)}")
-    acceleration, speed, side, fraction, angle = (_number(path, fields, key) for key in _NUMBERS)
+    acceleration, speed, side, fraction, angle = (_number(path, fields, key) for key in _NUMBER_KEYS)
     return PushParameters(
         surface=fields["surface"],
         shape=fields["shape"],

@@ -24,8 +24,8 @@ from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.records import LARGEST_NUMBER
 
 GROUP_PREFIXES = {"whole": "full", "middle": "eval", "fast": "v20"}
-_POSES = ("object_pose_start", "object_pose_end")
-_TIPS = ("tip_start", "tip_end")
+_POSE_ARRAYS = ("object_pose_start", "object_pose_end")
+_TIP_ARRAYS = ("tip_start", "tip_end")
 _TRAINING_ARRAYS = ("train_wrench", "train_twist", "train_valid", "eval_to_full", "full_in_eval")
 _OBJECT_ARRAYS = ("vertices_body", "rho", "tip_radius", "surface", "shape")
 TOOLBOX_SUFFIXES = {"quartic": "poly4", "ellipsoid": "quadratic"}
@@ -68,7 +68,7 @@ class MitPushes(NamedTuple):
         fast: The same pushes at higher speed; no pushes if none was recorded.
         is_training: (whole,) whether a push of `whole` is a training push.
         middle_of: (middle,) row in `whole` of the same push.
-        repeats: (r, 2) row in `fast`, and row in `whole` of the same nominal push.
+        repeats: (r, 2) rows of the same nominal push in `fast` and in `whole`.
         wrench: (m, 3) wrenches on the object, in the body frame about the body origin, of any scale. Each row, with the
             same row of `twist`, is a training pair.
         twist: (m, 3) twists of the object, in the body frame about the body origin, of any scale.
@@ -116,31 +116,33 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
     with_fast = "v20_index" in archive_names(file, "straight pushes")
     groups = {name: prefix for name, prefix in GROUP_PREFIXES.items() if name != "fast" or with_fast}
     for prefix in groups.values():
-        names += [f"{prefix}_{part}" for part in ("index", *_POSES, *_TIPS, "valid")]
+        names += [f"{prefix}_{part}" for part in ("index", *_POSE_ARRAYS, *_TIP_ARRAYS, "valid")]
         names += [f"{prefix}_sim_pose_end_{kind}" for kind in TOOLBOX_SUFFIXES.values()]
     if with_fast:
         names.append("v20_to_full_action")
     data = read_archive(file, names, "straight pushes")
-    found = {name: _group(file, data, prefix) for name, prefix in groups.items()}
-    whole, middle = found["whole"], found["middle"]
-    none = whole.index[:0], whole.start[:0], whole.end[:0], whole.tip_start[:0], whole.tip_end[:0], whole.valid[:0]
-    fast = found.get("fast", StraightPushes(*none, toolbox={}))
-    pairs, corners = (len(data[name]) if data[name].ndim else -1 for name in ("train_wrench", "vertices_body"))
-    expected = {"train_wrench": (pairs, 3), "train_twist": (pairs, 3), "train_valid": (pairs,)}
-    expected |= {"vertices_body": (corners, 2), "rho": (), "tip_radius": ()}
+    by_group = {name: _read_group(file, data, prefix) for name, prefix in groups.items()}
+    whole, middle = by_group["whole"], by_group["middle"]
+    no_rows = whole.index[:0], whole.start[:0], whole.end[:0], whole.tip_start[:0], whole.tip_end[:0], whole.valid[:0]
+    fast = by_group.get("fast", StraightPushes(*no_rows, toolbox={}))
+    pair_count, vertex_count = (
+        len(data[name]) if data[name].ndim else -1 for name in ("train_wrench", "vertices_body")
+    )
+    expected = {"train_wrench": (pair_count, 3), "train_twist": (pair_count, 3), "train_valid": (pair_count,)}
+    expected |= {"vertices_body": (vertex_count, 2), "rho": (), "tip_radius": ()}
     expected |= {"eval_to_full": (len(middle),), "full_in_eval": (len(whole),)}
     check_shapes(file, data, expected)
-    _finite(file, data, ("train_wrench", "train_twist", "vertices_body", "rho", "tip_radius"))
-    used = data["train_valid"].astype(bool)
+    _check_finite(file, data, ("train_wrench", "train_twist", "vertices_body", "rho", "tip_radius"))
+    valid = data["train_valid"].astype(bool)
     rows = {int(index): row for row, index in enumerate(whole.index)}
-    lost = [int(index) for index in data["eval_to_full"] if int(index) not in rows]
-    if lost:
-        raise LogError(file, f"expected eval_to_full to name rows of full_index, found {lost[0]}")
+    unmatched = [int(index) for index in data["eval_to_full"] if int(index) not in rows]
+    if unmatched:
+        raise LogError(file, f"expected eval_to_full to name rows of full_index, found {unmatched[0]}")
     repeats = []
     if with_fast:
         check_shapes(file, data, {"v20_to_full_action": (len(fast),)})
-        same = data["v20_to_full_action"]
-        repeats = [(row, rows[int(index)]) for row, index in enumerate(same) if int(index) in rows]
+        whole_index = data["v20_to_full_action"]
+        repeats = [(row, rows[int(index)]) for row, index in enumerate(whole_index) if int(index) in rows]
     return MitPushes(
         whole=whole,
         middle=middle,
@@ -148,8 +150,8 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
         is_training=~data["full_in_eval"].astype(bool),
         middle_of=np.array([rows[int(index)] for index in data["eval_to_full"]], np.int64),
         repeats=np.array(repeats, np.int64).reshape(-1, 2),
-        wrench=floats(data["train_wrench"])[used],
-        twist=floats(data["train_twist"])[used],
+        wrench=floats(data["train_wrench"])[valid],
+        twist=floats(data["train_twist"])[valid],
         vertices=floats(data["vertices_body"]),
         length=float(floats(data["rho"])),
         tip_radius=float(floats(data["tip_radius"])),
@@ -159,20 +161,20 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
     )
 
 
-def _group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
+def _read_group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
     """Read the group of pushes whose arrays have this prefix.
 
     Raises:
         LogError: If an array has the wrong shape, or if a number is not finite or is too large.
     """
     count = len(data[f"{prefix}_index"]) if data[f"{prefix}_index"].ndim else -1
-    shapes: dict[str, tuple[int, ...]] = {f"{prefix}_{name}": (count, 3) for name in _POSES}
+    shapes: dict[str, tuple[int, ...]] = {f"{prefix}_{name}": (count, 3) for name in _POSE_ARRAYS}
     shapes |= {f"{prefix}_sim_pose_end_{kind}": (count, 3) for kind in TOOLBOX_SUFFIXES.values()}
-    shapes |= {f"{prefix}_{name}": (count, 2) for name in _TIPS}
+    shapes |= {f"{prefix}_{name}": (count, 2) for name in _TIP_ARRAYS}
     check_shapes(path, data, shapes | {f"{prefix}_index": (count,), f"{prefix}_valid": (count,)})
-    _finite(path, data, tuple(shapes))
-    start, end = (floats(data[f"{prefix}_{name}"]) for name in _POSES)
-    tip_start, tip_end = (floats(data[f"{prefix}_{name}"]) for name in _TIPS)
+    _check_finite(path, data, tuple(shapes))
+    start, end = (floats(data[f"{prefix}_{name}"]) for name in _POSE_ARRAYS)
+    tip_start, tip_end = (floats(data[f"{prefix}_{name}"]) for name in _TIP_ARRAYS)
     toolbox = {name: floats(data[f"{prefix}_sim_pose_end_{kind}"]) for name, kind in TOOLBOX_SUFFIXES.items()}
     for pose in (end, *toolbox.values()):
         pose[:, 2] = start[:, 2] + wrap_to_pi(pose[:, 2] - start[:, 2])
@@ -180,8 +182,8 @@ def _group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
     return StraightPushes(index, start, end, tip_start, tip_end, valid, toolbox)
 
 
-def _finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
-    """Check that all numbers of the arrays are finite, with magnitudes below LARGEST_NUMBER.
+def _check_finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
+    """Check that the named arrays have only finite numbers, with magnitudes below LARGEST_NUMBER.
 
     Raises:
         LogError: For the first array that fails.

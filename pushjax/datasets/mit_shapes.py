@@ -16,15 +16,16 @@ TIP_RADIUS = 0.00475  # radius of the pusher's tip, m
 # Dimensions in m: half sides of rectangles, legs of triangles, distance of the origin from each leg.
 _RECTANGLES = {"rect1": (0.045, 0.045), "rect2": (0.044955, 0.05629), "rect3": (0.067505, 0.04497)}
 _LEGS = {"tri1": (0.1259, 0.12587), "tri2": (0.151, 0.12587), "tri3": (0.1765, 0.12561)}
-_RIGHT_ANGLE = 0.045
+_LEG_DISTANCE = 0.045
 _SEMI_AXES = {"ellip1": (0.0525, 0.0525), "ellip2": (0.0525, 0.065445), "ellip3": (0.0525, 0.0785)}
 _ELLIPSE_CORNERS = 99
-_HEXAGON = 0.0605  # distance of the vertices from the center, m
+_HEXAGON_RADIUS = 0.0605  # distance of the vertices from the center, m
 MIT_SHAPES = (*_RECTANGLES, *_LEGS, *_SEMI_AXES, "hex", "butter")
 
-# The lower wing of the butterfly is a cubic spline x(u), y(u). The tip of the wing is at u = 0, with one knot on each
-# side of it, at |u| = _KNOT. One unit of u is a step of about 5 mm. x is odd in u, y is even. Coefficients are in m per
-# power of u. The last coefficient of each belongs to (|u| - _KNOT)^3, which counts only beyond the knots.
+# The lower wing of the butterfly is a cubic spline x(u), y(u) of a parameter u. The tip of the wing is at u = 0, with
+# one knot on each side of it, at |u| = _KNOT. One unit of u is a step of about 5 mm. x is odd in u, y is even.
+# Coefficients are in m per power of u. The last coefficient of each belongs to (|u| - _KNOT)^3, which counts only
+# beyond the knots.
 _KNOT = 10.8359
 _X = (6.77379e-3, -2.016559e-5, 6.916228e-5)  # u, u^3
 _Y = (-0.0780175, 4.187392e-4, -1.220402e-5, 1.140326e-5)  # 1, u^2, |u|^3
@@ -83,18 +84,21 @@ def nearest_on_outline(vertices: Floats, points: Floats) -> tuple[Floats, Floats
             on it.
     """
     edge = np.roll(vertices, -1, axis=0) - vertices
-    to = points[:, None] - vertices
-    share = np.clip(np.sum(to * edge, axis=2) / np.sum(edge**2, axis=1), 0, 1)
-    apart = np.linalg.norm(to - share[..., None] * edge, axis=2)
-    each, nearest = np.arange(len(points)), np.argmin(apart, axis=1)
-    place = vertices[nearest] + share[each, nearest][:, None] * edge[nearest]
+    offset = points[:, None] - vertices
+    fraction = np.clip(np.sum(offset * edge, axis=2) / np.sum(edge**2, axis=1), 0, 1)
+    distance = np.linalg.norm(offset - fraction[..., None] * edge, axis=2)
+    rows, edge_index = np.arange(len(points)), np.argmin(distance, axis=1)
+    nearest_point = vertices[edge_index] + fraction[rows, edge_index][:, None] * edge[edge_index]
     # Winding number of the outline about each point. It counts the edges that cross the ray from the point along +x.
     # Rising edges add one, falling edges subtract one. It is not zero for a point inside.
-    above = to[..., 1] < 0
-    left = edge[:, 0] * to[..., 1] > edge[:, 1] * to[..., 0]
-    rising, falling = ~above & np.roll(above, -1, axis=1), above & ~np.roll(above, -1, axis=1)
-    turns = np.sum(rising & left, axis=1) - np.sum(falling & ~left, axis=1)
-    return np.where(turns == 0, 1, -1) * apart[each, nearest], place
+    vertex_above = offset[..., 1] < 0
+    left = edge[:, 0] * offset[..., 1] > edge[:, 1] * offset[..., 0]
+    rising, falling = (
+        ~vertex_above & np.roll(vertex_above, -1, axis=1),
+        vertex_above & ~np.roll(vertex_above, -1, axis=1),
+    )
+    winding = np.sum(rising & left, axis=1) - np.sum(falling & ~left, axis=1)
+    return np.where(winding == 0, 1, -1) * distance[rows, edge_index], nearest_point
 
 
 def _vertices(name: str) -> Floats:
@@ -103,15 +107,15 @@ def _vertices(name: str) -> Floats:
         return np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.array(_RECTANGLES[name])
     if name in _LEGS:
         along_x, along_y = _LEGS[name]
-        return _RIGHT_ANGLE - np.array([[0, 0], [along_x, 0], [0, along_y]])
+        return _LEG_DISTANCE - np.array([[0, 0], [along_x, 0], [0, along_y]])
     if name in _SEMI_AXES:
-        return _around(_ELLIPSE_CORNERS, 0) * np.array(_SEMI_AXES[name])
-    return _HEXAGON * _around(6, 1) if name == "hex" else _butterfly()
+        return _on_unit_circle(_ELLIPSE_CORNERS, 0) * np.array(_SEMI_AXES[name])
+    return _HEXAGON_RADIUS * _on_unit_circle(6, 1) if name == "hex" else _butterfly()
 
 
-def _around(corners: int, first: int) -> Floats:
+def _on_unit_circle(count: int, first: int) -> Floats:
     """Return points (corners, 2) at equal angles on the unit circle, the first at `first` steps from the x axis."""
-    angle = 2 * np.pi * (np.arange(corners) + first) / corners
+    angle = 2 * np.pi * (np.arange(count) + first) / count
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
@@ -126,7 +130,7 @@ def _butterfly() -> Floats:
     y = _Y[0] + _Y[1] * u**2 + _Y[2] * np.abs(u) ** 3 + _Y[3] * beyond
     step = _POINTS * (u + _STEPS) + _POINTS - 1
     end = step[-1] + _POINTS - 1
-    at = np.arange(end)
-    lower_x = np.interp(at, [0, *(step - 1), end], [-_WAIST, *x, _WAIST])
-    lower = np.stack([lower_x, np.interp(at, [0, *step, end], [0, *y, 0])], axis=1)
+    point = np.arange(end)
+    lower_x = np.interp(point, [0, *(step - 1), end], [-_WAIST, *x, _WAIST])
+    lower = np.stack([lower_x, np.interp(point, [0, *step, end], [0, *y, 0])], axis=1)
     return np.concatenate([lower, -lower])

@@ -17,18 +17,18 @@ from pushjax.datasets.pushes import Floats, LogError
 from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, check_recording, collect
 from pushjax.datasets.records import ParseError, quoted
 
-# Columns of a table: all of _REQUIRED, and each group of _FURTHER either as a whole or not at all.
+# Columns of a table: all of _REQUIRED, and each group of _OPTIONAL_GROUPS either as a whole or not at all.
 _PUSH = "push"
 _REQUIRED = (_PUSH, *HAND[:2], *OBJECT)
-_FURTHER = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)
+_OPTIONAL_GROUPS = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)
 COLUMNS = (_PUSH, *HAND, *OBJECT, "time", *FORCE)
 # A row may lack all numbers of the object's pose, if the object was not seen, or of the force, if none was measured.
-_MAY_LACK = (*OBJECT, *FORCE)
+_MAY_BE_BLANK = (*OBJECT, *FORCE)
 
 # Arrays of an archive with n pushes of k samples: `path`, and either `start` and `end` or `pose`.
-_BOTH_ENDS, _ALL_ALONG = ("start", "end"), ("pose",)
-_OPTIONAL = ("force", "time")
-ARRAYS = ("path", *_BOTH_ENDS, *_ALL_ALONG, *_OPTIONAL)
+_POSES_AT_ENDS, _POSES_ALL_ALONG = ("start", "end"), ("pose",)
+_OPTIONAL_ARRAYS = ("force", "time")
+ARRAYS = ("path", *_POSES_AT_ENDS, *_POSES_ALL_ALONG, *_OPTIONAL_ARRAYS)
 LAYOUT = "path (n, k, dof) with start and end (n, 3) or pose (n, k, 3), if known force (n, k, 2) and time (n, k)"
 
 
@@ -59,18 +59,18 @@ def load_csv(path: Path) -> Recordings:
     Raises:
         LogError: If the file is no such table, if it has other columns, or if no push is usable.
     """
-    rows = _rows(path)
+    rows = _nonblank_rows(path)
     header = next(rows, None)
     if header is None:
         raise LogError(path, f"expected a header of columns ({', '.join(COLUMNS)}), found an empty file")
-    names = _header(path, header)
-    label = names.index(_PUSH)
+    names = _check_header(path, header)
+    label_column = names.index(_PUSH)
     # Rows that are too short to have a label form a push of their own, which becomes a problem.
-    pushes = groupby(rows, key=lambda row: row.cells[label].strip() if label < len(row.cells) else "")
-    return collect(path, (_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
+    pushes = groupby(rows, key=lambda row: row.cells[label_column].strip() if label_column < len(row.cells) else "")
+    return collect(path, (_read_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
 
 
-def _rows(path: Path) -> Iterator[_Row]:
+def _nonblank_rows(path: Path) -> Iterator[_Row]:
     """Iterate over the rows that are not blank."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -86,20 +86,20 @@ def _rows(path: Path) -> Iterator[_Row]:
         raise LogError(path, f"expected a table, but cannot read the file: {error.strerror or error}") from error
 
 
-def _header(path: Path, header: _Row) -> list[str]:
-    """Return the names of the columns.
+def _check_header(path: Path, header: _Row) -> list[str]:
+    """Check the names of the columns, and return them.
 
     Raises:
         LogError: If a column is unknown, required but missing, or present twice.
     """
     names = [cell.strip() for cell in header.cells]
     missing = [name for name in _REQUIRED if name not in names]
-    for group in _FURTHER:
+    for group in _OPTIONAL_GROUPS:
         if group[-1] in names or (group == FORCE and group[0] in names):
             missing += [name for name in group if name not in names and name not in missing]
     unknown = [name for name in names if name not in COLUMNS]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    kinds = (("no", missing), ("unknown", [quoted(name) for name in unknown]), ("more than one", twice))
+    duplicated = sorted({name for name in names if names.count(name) > 1})
+    kinds = (("no", missing), ("unknown", [quoted(name) for name in unknown]), ("more than one", duplicated))
     faults = [f"{what} {', '.join(found)}" for what, found in kinds if found]
     if faults:
         allowed = f"expected columns out of {', '.join(COLUMNS)}, separated by commas"
@@ -107,10 +107,10 @@ def _header(path: Path, header: _Row) -> list[str]:
     return names
 
 
-def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recording | LogError:
+def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recording | LogError:
     """Read the rows of one push, or return the error that describes its first fault."""
     try:
-        numbers = [_numbers(names, row) for row in rows]
+        numbers = [_read_row(names, row) for row in rows]
     except ParseError as fault:
         return LogError(path, str(fault), push=index, line=fault.line)
 
@@ -128,7 +128,7 @@ def _push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recordi
     )
 
 
-def _numbers(names: list[str], row: _Row) -> Mapping[str, float]:
+def _read_row(names: list[str], row: _Row) -> Mapping[str, float]:
     """Read the numbers of a row, by column; a blank cell gives NaN where blanks are allowed.
 
     Raises:
@@ -139,23 +139,23 @@ def _numbers(names: list[str], row: _Row) -> Mapping[str, float]:
     cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
     if not cells.pop(_PUSH):
         raise ParseError(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
-    return {name: _number(name, cell, row.line) for name, cell in cells.items()}
+    return {name: _read_cell(name, cell, row.line) for name, cell in cells.items()}
 
 
-def _number(name: str, cell: str, line: int) -> float:
+def _read_cell(name: str, cell: str, line: int) -> float:
     """Read the number in a cell; a blank cell gives NaN where blanks are allowed.
 
     Raises:
         ParseError: If the cell has no number or, where it must, no finite one.
     """
-    if not cell and name in _MAY_LACK:
+    if not cell and name in _MAY_BE_BLANK:
         return math.nan
     try:
         value = float(cell)
     except ValueError:
         found = quoted(cell) if cell else "a blank"
         raise ParseError(f"expected a number in column {name}, found {found}", line) from None
-    if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_LACK):
+    if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_BE_BLANK):
         raise ParseError(f"expected a finite number in column {name}, found {cell}", line)
     return value
 
@@ -176,7 +176,7 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
     Raises:
         LogError: If the archive has other arrays or other shapes, or if no push is usable.
     """
-    wanted = _wanted(path, names)
+    wanted = _arrays_to_read(path, names)
     data = read_archive(path, wanted, "pushes")
     _check_arrays(path, data)
     numbers = {name: floats(array) for name, array in data.items()}
@@ -186,19 +186,21 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
         pose = np.full((*numbers["path"].shape[:2], 3), np.nan)
         pose[:, 0], pose[:, -1] = numbers["start"], numbers["end"]
 
-    def row(name: str, index: int) -> Floats | None:
+    def optional_row(name: str, index: int) -> Floats | None:
         return numbers[name][index] if name in numbers else None
 
     return collect(
         path,
         (
-            check_recording(path, index, hand, pose[index], force=row("force", index), time=row("time", index))
+            check_recording(
+                path, index, hand, pose[index], force=optional_row("force", index), time=optional_row("time", index)
+            )
             for index, hand in enumerate(numbers["path"])
         ),
     )
 
 
-def _wanted(path: Path, names: frozenset[str]) -> list[str]:
+def _arrays_to_read(path: Path, names: frozenset[str]) -> list[str]:
     """Return the names of the arrays to read, which are all that the archive should have.
 
     Raises:
@@ -207,11 +209,11 @@ def _wanted(path: Path, names: frozenset[str]) -> list[str]:
     unknown = sorted(names - set(ARRAYS))
     if unknown:
         raise LogError(path, f"expected {LAYOUT}; found unknown arrays {', '.join(unknown)}")
-    if set(_ALL_ALONG) & names and set(_BOTH_ENDS) & names:
+    if set(_POSES_ALL_ALONG) & names and set(_POSES_AT_ENDS) & names:
         raise LogError(path, "expected either start and end or pose, found both")
-    poses = _ALL_ALONG if set(_ALL_ALONG) & names else _BOTH_ENDS
+    poses = _POSES_ALL_ALONG if set(_POSES_ALL_ALONG) & names else _POSES_AT_ENDS
     # Required arrays are listed even if they are absent, because `read_archive` reports them as missing.
-    return ["path", *poses, *(name for name in _OPTIONAL if name in names)]
+    return ["path", *poses, *(name for name in _OPTIONAL_ARRAYS if name in names)]
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
@@ -223,12 +225,19 @@ def _check_arrays(path: Path, data: Arrays) -> None:
     for name, array in data.items():
         if array.dtype.kind not in "fiu":
             raise LogError(path, f"expected numbers in {name}, found {array.dtype}")
-    given = data["path"].shape
-    if len(given) != 3 or given[0] < 1 or given[1] < 2 or given[2] < 2:
+    path_shape = data["path"].shape
+    if len(path_shape) != 3 or path_shape[0] < 1 or path_shape[1] < 2 or path_shape[2] < 2:
         message = "expected path of shape (n, k, dof) for n pushes of k samples, dof and k at least 2"
-        raise LogError(path, f"{message}; found {given}")
-    tails = {"start": (3,), "end": (3,), "pose": (given[1], 3), "force": (given[1], 2), "time": (given[1],)}
+        raise LogError(path, f"{message}; found {path_shape}")
+    row_shapes = {
+        "start": (3,),
+        "end": (3,),
+        "pose": (path_shape[1], 3),
+        "force": (path_shape[1], 2),
+        "time": (path_shape[1],),
+    }
     for name in data.keys() - {"path"}:
-        shape = (given[0], *tails[name])
+        shape = (path_shape[0], *row_shapes[name])
         if data[name].shape != shape:
-            raise LogError(path, f"expected {name} of shape {shape} to go with path {given}; found {data[name].shape}")
+            expected = f"expected {name} of shape {shape} to go with path {path_shape}"
+            raise LogError(path, f"{expected}; found {data[name].shape}")

@@ -37,7 +37,7 @@ class LogError(ValueError):
     Attributes:
         path: The file, as given by the caller.
         message: What was expected, and what was found.
-        push: Number of the push in the file, from 0; None if unknown.
+        push: Index of the push in the file, from 0; None if unknown.
         line: Line in the file, from 1; None if unknown.
     """
 
@@ -91,7 +91,7 @@ class Onset:
 
     Attributes:
         time: Time in s, on the clock of the push.
-        tip: (2,) center of the finger at that time, in m, world frame, interpolated in the logged path.
+        tip: (2,) center of the finger at that time, interpolated in the logged path, in m, world frame.
     """
 
     time: float
@@ -103,7 +103,7 @@ class Push:
     """One push, with M finger samples and K force samples on one clock that starts at the first force sample.
 
     Attributes:
-        index: Number of the push in its log, from 0.
+        index: Index of the push in its log, from 0.
         pose_start: (3,) pose of the body frame in the world before the push, measured at rest: x, y (m), theta (rad).
             Theta is in (-pi, pi].
         pose_end: (3,) pose after the push, measured at rest. Its angle is the one nearest to the start angle and may
@@ -171,7 +171,7 @@ class PushLog:
         Reference: The toolbox of Zhou et al. 2017, except that the angle is interpolated the short way.
         """
         wrench = np.array([_mean_wrench(push) for push in self.pushes]).reshape(-1, 3)
-        displacement = np.array([_displacement(push) for push in self.pushes]).reshape(-1, 3)
+        displacement = np.array([_body_displacement(push) for push in self.pushes]).reshape(-1, 3)
         return wrench, displacement
 
     def commanded_tip_end(self, push: Push) -> Floats:
@@ -225,11 +225,11 @@ def contact_onset(force_time: Floats, force: Floats, tip_time: Floats, tip: Floa
     """
     strength = np.hypot(force[:, 0], force[:, 1])
     threshold = max(ONSET_FORCE, ONSET_FRACTION * float(np.median(strength[len(strength) // 2 :])))
-    above = np.flatnonzero(strength > threshold)
-    if len(above) == 0:
+    above_threshold = np.flatnonzero(strength > threshold)
+    if len(above_threshold) == 0:
         return None
-    time = force_time[above[0]]
-    return Onset(float(time), _path_at(np.array([time]), tip_time, tip)[0])
+    time = force_time[above_threshold[0]]
+    return Onset(float(time), _interpolate_path(np.array([time]), tip_time, tip)[0])
 
 
 def rotation(theta: Floats | float) -> Floats:
@@ -249,7 +249,7 @@ def continuous_angle(angle: Floats) -> Floats:
     return smooth - smooth[0] + wrap_angle(smooth[0])
 
 
-def _displacement(push: Push) -> Floats:
+def _body_displacement(push: Push) -> Floats:
     """Return the displacement dx, dy (m), dtheta (rad) of a push in the body frame at its start."""
     moved = push.pose_end - push.pose_start
     return np.append(rotation(push.pose_start[2]).T @ moved[:2], wrap_angle(moved[2]))
@@ -260,18 +260,18 @@ def _mean_wrench(push: Push) -> Floats:
     keep = force_filter(push.force)
     # The object is seen only before and after the push. Its displacement is spread evenly over the kept samples, by
     # sample number and not by time, because the paper's pairs were made in this way.
-    share = np.linspace(0.0, 1.0, int(keep.sum()))[:, None]
+    fraction = np.linspace(0.0, 1.0, int(keep.sum()))[:, None]
     moved = push.pose_end - push.pose_start
     moved[2] = wrap_angle(moved[2])
-    pose = push.pose_start + share * moved
+    pose = push.pose_start + fraction * moved
     body_from_world = rotation(pose[:, 2]).swapaxes(1, 2)
-    tip = _path_at(push.force_time[keep], push.tip_time, push.tip)
+    tip = _interpolate_path(push.force_time[keep], push.tip_time, push.tip)
     force = np.einsum("kij,kj->ki", body_from_world, push.force[keep])
     arm = np.einsum("kij,kj->ki", body_from_world, tip - pose[:, :2])
     torque = arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]
     return np.append(force.mean(axis=0), torque.mean())
 
 
-def _path_at(time: Floats, path_time: Floats, path: Floats) -> Floats:
-    """Interpolate a path (m, 2), known at the times (m,), at other times (k,)."""
-    return np.stack([np.interp(time, path_time, path[:, axis]) for axis in range(2)], axis=1)
+def _interpolate_path(query_time: Floats, path_time: Floats, path: Floats) -> Floats:
+    """Interpolate a path (m, 2), known at the times `path_time` (m,), at other times (k,); the result is (k, 2)."""
+    return np.stack([np.interp(query_time, path_time, path[:, axis]) for axis in range(2)], axis=1)

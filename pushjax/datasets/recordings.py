@@ -31,7 +31,7 @@ class Recording:
     """One push: m samples of the hand, and what is known of the object at each of them.
 
     Attributes:
-        index: Number of the push in its file, from 0.
+        index: Index of the push in its file, from 0.
         hand: (m, dof) configurations of the hand as `pushjax.Hand` takes them, in m and rad, world frame. With dof = 2
             they are the center (x, y) of a finger. With more they are x, y, theta (continuous), opening.
         pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one seen
@@ -88,7 +88,7 @@ class Recordings:
             The same pushes and problems.
         """
         return Recordings(
-            pushes=tuple(_of_push(push) for push in log.pushes),
+            pushes=tuple(_from_push(push) for push in log.pushes),
             problems=log.problems,
             source=log.source,
             vertices=log.vertices,
@@ -98,7 +98,7 @@ class Recordings:
         )
 
 
-def _of_push(push: Push) -> Recording:
+def _from_push(push: Push) -> Recording:
     """Convert a push of a triangle log."""
     count = len(push.tip)
     pose = np.full((count, 3), np.nan)
@@ -128,14 +128,14 @@ def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def collect(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
+def collect(path: Path, results: Iterable[Recording | LogError]) -> Recordings:
     """Collect the results of all pushes of a file.
 
     If more than a quarter of the results are `AnglesInDegrees`, all other pushes become such errors too.
 
     Args:
         path: The file.
-        found: The recording of each push, or its error.
+        results: The recording of each push, or its error.
 
     Returns:
         The usable pushes, and the problems of the others.
@@ -143,13 +143,16 @@ def collect(path: Path, found: Iterable[Recording | LogError]) -> Recordings:
     Raises:
         LogError: If no push is usable.
     """
-    each = list(found)
-    if 4 * sum(isinstance(one, AnglesInDegrees) for one in each) > len(each):
+    results = list(results)
+    if 4 * sum(isinstance(result, AnglesInDegrees) for result in results) > len(results):
         # The others only seem to be in rad, because their angles in degrees are small.
         message = "the angles of many other pushes of the file cannot be in rad: are all in degrees?"
-        each = [AnglesInDegrees(path, message, push=one.index) if isinstance(one, Recording) else one for one in each]
-    problems = tuple(one for one in each if isinstance(one, LogError))
-    pushes = tuple(one for one in each if isinstance(one, Recording))
+        results = [
+            AnglesInDegrees(path, message, push=result.index) if isinstance(result, Recording) else result
+            for result in results
+        ]
+    problems = tuple(result for result in results if isinstance(result, LogError))
+    pushes = tuple(result for result in results if isinstance(result, Recording))
     if not pushes:
         raise nothing_usable(path, problems)
     return Recordings(pushes, problems, str(path))
@@ -169,7 +172,7 @@ def check_recording(
 
     Args:
         path: The file, for error messages.
-        index: Number of the push in the file, from 0.
+        index: Index of the push in the file, from 0.
         hand: (m, dof) configurations of the hand, as in `Recording`.
         pose: (m, 3) poses of the object, NaN where it was not seen. Angles need not be continuous.
         force: (m, 2) forces on the object, NaN where there is none; None if not recorded.
@@ -180,7 +183,7 @@ def check_recording(
         The recording, with unwrapped angles, or the error that describes the first fault.
     """
 
-    def wrong(message: str, row: int) -> LogError:
+    def error_at(message: str, row: int) -> LogError:
         return LogError(
             path, f"{message} in row {row} of the push", push=index, line=None if lines is None else lines[row]
         )
@@ -189,7 +192,7 @@ def check_recording(
         return LogError(
             path, f"expected at least two rows, found {len(hand)}", push=index, line=lines[0] if lines else None
         )
-    problem = _first_problem(hand, pose, force, time, wrong)
+    problem = _find_problem(hand, pose, force, time, error_at)
     if problem is not None:
         return problem
     seen = np.isfinite(pose[:, 0])
@@ -204,30 +207,30 @@ def check_recording(
     return Recording(index, hand, pose, seen, force, time)
 
 
-def _first_problem(
-    hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, wrong: Callable[[str, int], LogError]
+def _find_problem(
+    hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, error_at: Callable[[str, int], LogError]
 ) -> LogError | None:
     """Find the first fault in the arrays of `check_recording`.
 
-    `wrong` makes an error of a message and a row of the push.
+    `error_at` makes an error of a message and a row of the push.
     """
     columns = [(hand_columns(hand.shape[1]), hand, False), (OBJECT, pose, True)]
     if force is not None:
         columns.append((FORCE, force, True))
     if time is not None:
         columns.append((("time",), time[:, None], False))
-    for names, values, may_lack in columns:
-        fault = find_bad_number(names, values, may_lack)
+    for names, values, may_be_missing in columns:
+        fault = find_bad_number(names, values, may_be_missing)
         if fault is not None:
-            return wrong(*fault)
+            return error_at(*fault)
     for row, where in ((0, "first"), (len(pose) - 1, "last")):
         if np.isnan(pose[row, 0]):
-            return wrong(f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row)
+            return error_at(f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row)
     back = np.flatnonzero(np.diff(time) < 0) if time is not None else []
     if time is not None and len(back):
         row = int(back[0]) + 1
         step = time[row] - time[row - 1]
-        return wrong(f"expected time stamps that do not go back, found a step of {step:.3g} s", row)
+        return error_at(f"expected time stamps that do not go back, found a step of {step:.3g} s", row)
     return None
 
 
@@ -236,19 +239,19 @@ def hand_columns(dof: int) -> tuple[str, ...]:
     return (*HAND[:dof], *(f"hand_{column}" for column in range(len(HAND), dof)))
 
 
-def find_bad_number(names: Sequence[str], values: Floats, may_lack: bool) -> tuple[str, int] | None:
+def find_bad_number(names: Sequence[str], values: Floats, may_be_missing: bool) -> tuple[str, int] | None:
     """Find the first row with a number that is not finite or too large.
 
     Args:
         names: (c,) names of the columns, for the message.
         values: (m, c) numbers.
-        may_lack: Whether all numbers of a row may be missing. They are NaN then.
+        may_be_missing: Whether all numbers of a row may be missing. They are NaN then.
 
     Returns:
         A message and the row; None if all rows are good.
     """
     bad = ~(np.abs(values) < LARGEST_NUMBER)
-    if may_lack:
+    if may_be_missing:
         bad[np.isnan(values).all(axis=1)] = False
     rows = np.flatnonzero(bad.any(axis=1))
     if not len(rows):
@@ -257,5 +260,5 @@ def find_bad_number(names: Sequence[str], values: Floats, may_lack: bool) -> tup
     column = int(np.argmax(bad[row]))
     value = values[row, column]
     limit, found = ("", "none") if np.isnan(value) else (f" below {LARGEST_NUMBER:g}", f"{value:g}")
-    lacks = f" (or none of {', '.join(names)})" if may_lack else ""
-    return f"expected a number{limit} for {names[column]}{lacks}, found {found}", row
+    alternative = f" (or none of {', '.join(names)})" if may_be_missing else ""
+    return f"expected a number{limit} for {names[column]}{alternative}, found {found}", row

@@ -4,10 +4,10 @@ The layout has one item per line. The first line is the number of pushes. Each p
 after (7 numbers each), the number of force samples, those samples (3 numbers each), the number of robot samples, and
 those samples (8 numbers each).
 
-A damaged record must not cost the records after it. If its sample counts are still consistent, the next record starts
-where they say. Otherwise the next record starts at the next place that looks like a start: poses and a count are the
-only consecutive lines of 7, 7 and 1 numbers. Two neighboring records whose starts are both unrecognizable count as one,
-and the numbers of the records after them are too low by one.
+A damaged record must not make the records after it unreadable. If its sample counts are still consistent, the next
+record starts where they say. Otherwise the next record starts at the next place that looks like a start: poses and a
+count are the only consecutive lines of 7, 7 and 1 numbers. Two neighboring records whose starts are both unrecognizable
+count as one, and the indices of the records after them are too low by one.
 """
 
 import gzip
@@ -85,25 +85,26 @@ def read_records(path: Path) -> Iterator[Record | LogError]:
         LogError: If the file is unreadable or empty.
     """
     lines, damage = _read_lines(path)
-    promised, fault = _header(lines)
+    promised, fault = _read_header(lines)
     if fault is not None:
         yield LogError(path, str(fault), line=1)
-    at = 0 if promised is None and _matching_start_lines(lines, 0) >= 2 else 1
+    index = 0 if promised is None and _matching_start_lines(lines, 0) >= 2 else 1
     number = 0
-    while at < len(lines):
+    while index < len(lines):
         if number == promised:
-            yield LogError(path, f"expected the end of the log after {promised} pushes, found more lines", line=at + 1)
-        if promised is not None and number >= promised and _matching_start_lines(lines, at) < 2:
+            message = f"expected the end of the log after {promised} pushes, found more lines"
+            yield LogError(path, message, line=index + 1)
+        if promised is not None and number >= promised and _matching_start_lines(lines, index) < 2:
             return
         try:
-            record, at = _record(lines, at, number)
+            record, index = _read_record(lines, index, number)
             yield record
         except ParseError as found:
             ending = _promised_count(promised) + damage if found.at_end else ""
             yield LogError(path, str(found) + ending, push=number, line=found.line)
             if found.at_end:
                 return
-            at = _next_record(lines, at, found.line - 1)
+            index = _find_next_record(lines, index, found.line - 1)
         number += 1
     if promised is not None and number < promised:
         message = f"expected {promised} pushes as in the header, found {number}: the log is truncated{damage}"
@@ -128,7 +129,7 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
             text = gzip.decompress(text)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             damage = f"; the gzip stream is damaged: {error}"
-            text = _readable_part(text)
+            text = _decompress_readable_part(text)
             # The stream may be cut inside a number, and the rest still looks like a number: drop the last line.
             text = text[: text.rfind(b"\n") + 1]
     lines = text.decode("ascii", errors="replace").rstrip().splitlines()
@@ -137,7 +138,7 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
     return lines, damage
 
 
-def _readable_part(zipped: bytes) -> bytes:
+def _decompress_readable_part(zipped: bytes) -> bytes:
     """Return what a gzip stream holds before its damage.
 
     The stream is decompressed byte by byte, because a call that fails returns nothing.
@@ -145,17 +146,17 @@ def _readable_part(zipped: bytes) -> bytes:
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     text = bytearray()
     try:
-        for at in range(len(zipped)):
-            text += stream.decompress(zipped[at : at + 1])
+        for position in range(len(zipped)):
+            text += stream.decompress(zipped[position : position + 1])
     except zlib.error:
         pass
     return bytes(text)
 
 
-def _header(lines: list[str]) -> tuple[int | None, ParseError | None]:
+def _read_header(lines: list[str]) -> tuple[int | None, ParseError | None]:
     """Read the promised number of pushes from the first line: the number, or None and the fault."""
     try:
-        promised = _count(lines, 0, "pushes")
+        promised = _read_count(lines, 0, "pushes")
     except ParseError as fault:
         return None, fault
     if promised == 0:
@@ -168,82 +169,83 @@ def _promised_count(promised: int | None) -> str:
     return "" if promised is None else f" (the header promises {promised} pushes)"
 
 
-def _record(lines: list[str], at: int, number: int) -> tuple[Record, int]:
-    """Read the record that starts at line index `at`, and return it with the line index after its end.
+def _read_record(lines: list[str], start: int, number: int) -> tuple[Record, int]:
+    """Read the record that starts at line index `start`, and return it with the line index after its end.
 
     Raises:
         ParseError: If the record is damaged.
     """
-    first = _table(lines, at, 1, POSE_COLUMNS, "object pose before the push")
-    last = _table(lines, at + 1, 1, POSE_COLUMNS, "object pose after the push")
-    force_count = _count(lines, at + 2, "force samples")
-    force = _table(lines, at + 3, force_count, FORCE_COLUMNS, "force sample")
-    robot_at = at + 3 + force_count
-    robot_count = _count(lines, robot_at, "robot samples")
-    robot = _table(lines, robot_at + 1, robot_count, ROBOT_COLUMNS, "robot sample")
+    pose_before = _read_table(lines, start, 1, POSE_COLUMNS, "object pose before the push")
+    pose_after = _read_table(lines, start + 1, 1, POSE_COLUMNS, "object pose after the push")
+    force_count = _read_count(lines, start + 2, "force samples")
+    force = _read_table(lines, start + 3, force_count, FORCE_COLUMNS, "force sample")
+    robot_at = start + 3 + force_count
+    robot_count = _read_count(lines, robot_at, "robot samples")
+    robot = _read_table(lines, robot_at + 1, robot_count, ROBOT_COLUMNS, "robot sample")
     end = robot_at + 1 + robot_count
-    if end < len(lines) and _matching_start_lines(lines, end) < 2 and _columns(lines, end) == ROBOT_COLUMNS:
+    if end < len(lines) and _matching_start_lines(lines, end) < 2 and _column_count(lines, end) == ROBOT_COLUMNS:
         raise ParseError(
             f"expected the next push after {robot_count} robot samples, found another robot sample", end + 1
         )
-    return Record(number, at + 1, np.concatenate([first, last]), force, robot), end
+    return Record(number, start + 1, np.concatenate([pose_before, pose_after]), force, robot), end
 
 
-def _count(lines: list[str], at: int, what: str) -> int:
-    """Read the number of samples or pushes at line index `at`.
+def _read_count(lines: list[str], index: int, what: str) -> int:
+    """Read the number of samples or pushes at line index `index`.
 
     Raises:
         ParseError: If the line is missing, is no integer, or is not between 0 and MAX_SAMPLES.
     """
-    if at >= len(lines):
+    if index >= len(lines):
         raise ParseError(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
     try:
-        count = int(lines[at])
+        count = int(lines[index])
     except ValueError:
-        raise ParseError(f"expected the number of {what}, found {quoted(lines[at])}", at + 1) from None
+        raise ParseError(f"expected the number of {what}, found {quoted(lines[index])}", index + 1) from None
     if not 0 <= count <= MAX_SAMPLES:
-        raise ParseError(f"expected the number of {what} (0 to {MAX_SAMPLES}), found {count}", at + 1)
+        raise ParseError(f"expected the number of {what} (0 to {MAX_SAMPLES}), found {count}", index + 1)
     return count
 
 
-def _table(lines: list[str], at: int, count: int, columns: int, what: str) -> Floats:
-    """Read a table of shape (count, columns) from `count` lines, starting at line index `at`.
+def _read_table(lines: list[str], first: int, count: int, columns: int, what: str) -> Floats:
+    """Read a table of shape (count, columns) from `count` lines, starting at line index `first`.
 
     Raises:
         ParseError: If a line is missing or has other numbers than expected.
     """
-    rows = [line.split() for line in lines[at : at + count]]
+    rows = [line.split() for line in lines[first : first + count]]
     try:
         table = np.array(rows, dtype=np.float64).reshape(-1, columns) if rows else np.empty((0, columns))
-        good = len(table) == count and len(rows) == count and bool(np.all(np.abs(table) < LARGEST_NUMBER))
+        valid = len(table) == count and len(rows) == count and bool(np.all(np.abs(table) < LARGEST_NUMBER))
     except ValueError:
-        good = False
-    if not good or any(len(row) != columns for row in rows):
-        raise _table_error(lines, at, count, columns, what)
+        valid = False
+    if not valid or any(len(row) != columns for row in rows):
+        raise _describe_table_error(lines, first, count, columns, what)
     return table
 
 
-def _table_error(lines: list[str], at: int, count: int, columns: int, what: str) -> ParseError:
-    """Find the first fault in the lines of a table that is known to be bad."""
-    for row, line in enumerate(lines[at : at + count]):
+def _describe_table_error(lines: list[str], first: int, count: int, columns: int, what: str) -> ParseError:
+    """Return the error for the first fault in the lines of a table that is known to be bad."""
+    for row, line in enumerate(lines[first : first + count]):
         where = what if count == 1 else f"{what} {row + 1} of {count}"
         tokens = line.split()
         if len(tokens) != columns:
             # If the last line of the file has too few numbers, it was cut off while it was written.
-            cut = at + row == len(lines) - 1 and len(tokens) < columns
+            cut = first + row == len(lines) - 1 and len(tokens) < columns
             found = "the log ends in the middle of a line" if cut else f"found {len(tokens)}: {quoted(line)}"
-            return ParseError(f"expected {columns} numbers ({where}), {found}", at + row + 1, at_end=cut)
+            return ParseError(f"expected {columns} numbers ({where}), {found}", first + row + 1, at_end=cut)
         for token in tokens:
             try:
                 value = float(token)
             except ValueError:
-                return ParseError(f"expected a number ({where}), found {quoted(token)}", at + row + 1)
+                return ParseError(f"expected a number ({where}), found {quoted(token)}", first + row + 1)
             if not np.isfinite(value):
-                return ParseError(f"expected finite numbers ({where}), found {token}", at + row + 1)
+                return ParseError(f"expected finite numbers ({where}), found {token}", first + row + 1)
             if abs(value) >= LARGEST_NUMBER:
-                return ParseError(f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}", at + row + 1)
-    have = max(len(lines) - at, 0)
-    return ParseError(f"expected {count} lines ({what}), the log ends after {have}", len(lines), at_end=True)
+                message = f"expected numbers below {LARGEST_NUMBER:g} ({where}), found {token}"
+                return ParseError(message, first + row + 1)
+    remaining = max(len(lines) - first, 0)
+    return ParseError(f"expected {count} lines ({what}), the log ends after {remaining}", len(lines), at_end=True)
 
 
 def quoted(text: str) -> str:
@@ -251,41 +253,41 @@ def quoted(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def _columns(lines: list[str], at: int) -> int:
-    """Count the numbers on the line at index `at`; -1 after the end of the file."""
-    return len(lines[at].split()) if at < len(lines) else -1
+def _column_count(lines: list[str], index: int) -> int:
+    """Count the numbers on the line at index `index`; -1 after the end of the file."""
+    return len(lines[index].split()) if index < len(lines) else -1
 
 
-def _matching_start_lines(lines: list[str], at: int) -> int:
-    """Count the lines, of the three from index `at`, whose number of columns fits the start of a record.
+def _matching_start_lines(lines: list[str], index: int) -> int:
+    """Count the lines, of the three from index `index`, whose number of columns fits the start of a record.
 
     An intact start scores 3. A start with one damaged line scores 2.
     """
-    shape = (POSE_COLUMNS, POSE_COLUMNS, COUNT_COLUMNS)
-    return sum(_columns(lines, at + row) == columns for row, columns in enumerate(shape))
+    start_columns = (POSE_COLUMNS, POSE_COLUMNS, COUNT_COLUMNS)
+    return sum(_column_count(lines, index + row) == columns for row, columns in enumerate(start_columns))
 
 
-def _next_record(lines: list[str], at: int, fault_at: int) -> int:
+def _find_next_record(lines: list[str], start: int, fault_at: int) -> int:
     """Find the line index at which to continue after a damaged record.
 
     Args:
         lines: Lines of the log.
-        at: Line index at which the damaged record starts.
+        candidate: Line index at which the damaged record starts.
         fault_at: Line index of the fault.
 
     Returns:
         Line index of the next record's start; the number of lines if there is no further start.
     """
     try:
-        robot_at = at + 3 + _count(lines, at + 2, "")
-        end = robot_at + 1 + _count(lines, robot_at, "")
+        robot_at = start + 3 + _read_count(lines, start + 2, "")
+        end = robot_at + 1 + _read_count(lines, robot_at, "")
         if end == len(lines) or _matching_start_lines(lines, end) >= 2:
             return end
     except ParseError:
         pass
     # The lines before the fault have been recognized as part of this record, so the search starts at the fault.
-    for start in range(max(fault_at, at + 1), len(lines)):
-        if _matching_start_lines(lines, start) >= 2:
+    for candidate in range(max(fault_at, start + 1), len(lines)):
+        if _matching_start_lines(lines, candidate) >= 2:
             # A damaged line just before an intact start (score 3) also scores 2: skip it.
-            return start + 1 if _matching_start_lines(lines, start + 1) == 3 else start
+            return candidate + 1 if _matching_start_lines(lines, candidate + 1) == 3 else candidate
     return len(lines)

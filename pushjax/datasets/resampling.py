@@ -1,4 +1,4 @@
-"""Resample separately recorded streams at the times of the hand's samples."""
+"""Resample separately recorded streams of hand, object and force at the times of the hand's samples."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,46 +54,55 @@ def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Reco
     Returns:
         The recording, or the error that describes the first fault.
     """
-    for stream, most_back, may_lack in ((hand, 0.0, False), (body, MAX_JITTER, True), (force, 0.0, False)):
-        fault = _fault(stream, most_back, may_lack)
+    for stream, max_backstep, may_be_missing in ((hand, 0.0, False), (body, MAX_JITTER, True), (force, 0.0, False)):
+        fault = _describe_fault(stream, max_backstep, may_be_missing)
         if fault is not None:
             return LogError(path, fault, push=0)
     # A tracker's time stamps jitter, so some are earlier than the one before. Interpolation needs them in order.
     body = body.rows(np.argsort(body.time, kind="stable"))
     for other in (body, force):
         if hand.time[0] > other.time[-1] or other.time[0] > hand.time[-1]:
-            return LogError(path, _apart(hand, other), push=0)
+            return LogError(path, _describe_disjoint_times(hand, other), push=0)
     body = body.rows(np.isfinite(body.values[:, 0]))
     # Unix times in s use most digits of a float64, so times are taken relative to the first one.
     time, seen_time, force_time = (stream.time - hand.time[0] for stream in (hand, body, force))
-    pose = _poses(time, seen_time, body.values)
+    pose = _interpolate_poses(time, seen_time, body.values)
     seen = np.flatnonzero(np.isfinite(pose[:, 0]))
     if len(seen) < 2:
         message = f"expected the object to be seen at two samples of {hand.name} at least, found {len(seen)}"
         return LogError(path, f"{message} that are not in a gap of {body.name} longer than {MAX_GAP:g} s", push=0)
-    kept = slice(seen[0], seen[-1] + 1)
-    on_object = interpolated(time[kept], force_time, force.values)
-    return check_recording(path, 0, hand.values[kept], pose[kept], force=on_object, time=time[kept])
+    span = slice(seen[0], seen[-1] + 1)
+    object_force = interpolated(time[span], force_time, force.values)
+    return check_recording(path, 0, hand.values[span], pose[span], force=object_force, time=time[span])
 
 
-def _fault(stream: Stream, most_back: float, may_lack: bool) -> str | None:
-    """Describe the first fault of a stream whose stamps may go back by `most_back` (s); None if there is none."""
+def _describe_fault(stream: Stream, max_backstep: float, may_be_missing: bool) -> str | None:
+    """Describe the first fault of a stream; None if there is none.
+
+    Args:
+        stream: The stream.
+        max_backstep: Largest step, in s, by which a time stamp may go back.
+        may_be_missing: Whether all values of a row may be NaN.
+    """
     if len(stream.time) < 2:
         return f"expected at least two samples in {stream.name}, found {len(stream.time)}"
-    for names, values, lacks in ((("time",), stream.time[:, None], False), (stream.columns, stream.values, may_lack)):
-        fault = find_bad_number(names, values, lacks)
+    for names, values, row_may_be_missing in (
+        (("time",), stream.time[:, None], False),
+        (stream.columns, stream.values, may_be_missing),
+    ):
+        fault = find_bad_number(names, values, row_may_be_missing)
         if fault is not None:
             return f"{fault[0]} in row {fault[1]} of {stream.name}"
     step = np.diff(stream.time)
     row = int(np.argmin(step))
-    if step[row] < -most_back:
-        back = f"by more than {most_back:g} s" if most_back else "at all"
+    if step[row] < -max_backstep:
+        back = f"by more than {max_backstep:g} s" if max_backstep else "at all"
         message = f"expected time stamps of {stream.name} that do not go back {back}"
         return f"{message}, found a step of {step[row]:.3g} s in row {row + 1}"
     return None
 
 
-def _apart(hand: Stream, other: Stream) -> str:
+def _describe_disjoint_times(hand: Stream, other: Stream) -> str:
     """Describe two streams that do not overlap in time."""
     # Times are given relative to the hand's first stamp, because unix times are hard to read.
     origin = hand.time[0]
@@ -104,8 +113,12 @@ def _apart(hand: Stream, other: Stream) -> str:
     return f"expected streams that overlap in time, found {first} and {second} (after a stamp of {origin:.3f} s)"
 
 
-def _poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """Interpolate poses `known` (k, 3) at times (m,): an array (m, 3), NaN outside of them and within their gaps."""
+def _interpolate_poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
+    """Interpolate poses (k, 3) known at times (k,), at other times (m,).
+
+    Returns:
+        (m, 3) poses, in m and rad; NaN outside the known times and within gaps longer than MAX_GAP.
+    """
     if len(known) == 0:
         return np.full((len(time), 3), np.nan)
     pose = interpolated(time, known_time, np.column_stack([known[:, :2], np.unwrap(known[:, 2])]))

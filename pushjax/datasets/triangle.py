@@ -1,8 +1,8 @@
 """Read original text logs of the aluminum triangle that one finger pushes.
 
-`_check` has the conditions under which a record counts as a push. `_push` interprets its numbers. Both follow the
-published toolbox, with two exceptions: quaternions are normalized here, because they have three to six digits, and
-angles never turn the long way.
+`_check_record` has the conditions under which a record counts as a push. `_convert_record` interprets its numbers. Both
+follow the published toolbox, with two exceptions: quaternions are normalized here, because they are logged with three
+to six digits, and angles never turn the long way.
 
 Reference: Zhou et al. 2017, Table 2.
 """
@@ -71,7 +71,7 @@ def load_triangle_log(
     Reference: Layout and processing are as in the toolbox of Zhou et al. 2017. The rule for jumps is our own.
     """
     file = Path(path)
-    name, points = _support(file, arrangement, support_points)
+    name, points = _select_support(file, arrangement, support_points)
     normal_force = triangle_setup.support_force(points)
     pushes: list[Push] = []
     problems: list[LogError] = []
@@ -96,15 +96,15 @@ def load_triangle_log(
         tip_radius=triangle_setup.TIP_RADIUS,
         support_points=points,
         support_force=normal_force,
-        surface=surface if surface is not None else triangle_setup.name_surface(file),
+        surface=surface if surface is not None else triangle_setup.surface_from_name(file),
         arrangement=name,
         source=str(file),
     )
 
 
-def _support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
+def _select_support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
     """Return the name of the arrangement and its support points (p, 2), from the arguments or else the names."""
-    name, known = triangle_setup.name_support(path) or (triangle_setup.UNKNOWN, np.empty((0, 2)))
+    name, known = triangle_setup.support_from_name(path) or (triangle_setup.UNKNOWN, np.empty((0, 2)))
     if arrangement is not None:
         name, known = arrangement, triangle_setup.support_points(arrangement)
     if points is not None:
@@ -119,8 +119,8 @@ def _usable_push(record: Record) -> Push:
     Raises:
         ParseError: If the record cannot be trusted.
     """
-    _check(record)
-    push = _push(record)
+    _check_record(record)
+    push = _convert_record(record)
     _check_motion(push, record.line + 1)
     if not force_filter(push.force).any():
         raise ParseError(
@@ -130,19 +130,19 @@ def _usable_push(record: Record) -> Push:
     return push
 
 
-def _check(record: Record) -> None:
+def _check_record(record: Record) -> None:
     """Check that a record has enough samples, unit quaternions, and clocks that do not go back and overlap in time.
 
     Raises:
         ParseError: If a condition is violated.
     """
     robot_count_line = record.robot_line - 1
-    for what, table, line in (
+    for what, samples, line in (
         ("force", record.force, record.line + 2),
         ("robot", record.robot, robot_count_line),
     ):
-        if len(table) < MIN_SAMPLES:
-            raise ParseError(f"expected at least {MIN_SAMPLES} {what} samples, found {len(table)}", line)
+        if len(samples) < MIN_SAMPLES:
+            raise ParseError(f"expected at least {MIN_SAMPLES} {what} samples, found {len(samples)}", line)
     _check_quaternions(record.poses[:, 3:], record.line, "object pose")
     _check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
     _check_clock(record.force[:, 0], record.force_line, "force")
@@ -217,8 +217,8 @@ def _edge_distances(pose: Floats, point: Floats) -> Floats:
     return np.sum((in_body - triangle_setup.VERTICES) * outward, axis=1)
 
 
-def _push(record: Record) -> Push:
-    """Convert a checked record to a push."""
+def _convert_record(record: Record) -> Push:
+    """Convert a checked record to a push, in SI units and the world frame."""
     start, end = (body_pose(row) for row in record.poses)
     end[2] = start[2] + wrap_angle(end[2] - start[2])
     # Unix times in s use most digits of a float64, so the clock of the push starts at its first force sample.

@@ -20,8 +20,8 @@ from pushjax.datasets.pushes import (
     wrap_angle,
 )
 
-_PER_PUSH = {"push_index": (), "valid": (), "object_pose_start": (3,), "object_pose_end": (3,)}
-_PER_FILE = (
+_PUSH_ARRAYS = {"push_index": (), "valid": (), "object_pose_start": (3,), "object_pose_end": (3,)}
+_FILE_ARRAYS = (
     "vertices_body",
     "rho",
     "tip_radius",
@@ -30,7 +30,7 @@ _PER_FILE = (
     "surface",
     "arrangement",
 )
-_STREAMS = {"tip_offsets": ("tip_t", "tip_xy", "tip_yaw"), "ft_offsets": ("ft_t", "force_world")}
+_STREAM_ARRAYS = {"tip_offsets": ("tip_t", "tip_xy", "tip_yaw"), "ft_offsets": ("ft_t", "force_world")}
 
 
 def load_push_npz(path: str | PathLike[str]) -> PushLog:
@@ -51,13 +51,18 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
             is usable.
     """
     file = Path(path)
-    wanted = [*_PER_PUSH, *_PER_FILE, *_STREAMS, *(name for names in _STREAMS.values() for name in names)]
+    wanted = [
+        *_PUSH_ARRAYS,
+        *_FILE_ARRAYS,
+        *_STREAM_ARRAYS,
+        *(name for names in _STREAM_ARRAYS.values() for name in names),
+    ]
     data = read_archive(file, wanted, "pushes")
     _check_sizes(file, data)
     pushes: list[Push] = []
     problems: list[LogError] = []
     for row in range(len(data["push_index"])):
-        found = _push(file, data, row)
+        found = _read_push(file, data, row)
         if isinstance(found, Push):
             pushes.append(found)
         else:
@@ -85,8 +90,8 @@ def _check_sizes(path: Path, data: Arrays) -> None:
     Raises:
         LogError: For the first array that fails.
     """
-    count = row_count(path, data, _PER_PUSH)
-    for offsets_name, names in _STREAMS.items():
+    count = row_count(path, data, _PUSH_ARRAYS)
+    for offsets_name, names in _STREAM_ARRAYS.items():
         offsets = data[offsets_name]
         if offsets.shape != (count + 1,) or offsets[0] != 0 or np.any(np.diff(floats(offsets)) < 1):
             raise LogError(path, f"expected {offsets_name} to rise from 0 in {count} steps, found another array")
@@ -95,13 +100,13 @@ def _check_sizes(path: Path, data: Arrays) -> None:
                 raise LogError(path, f"expected {offsets[-1]} rows of {name}, found {len(data[name])}")
 
 
-def _push(path: Path, data: Arrays, row: int) -> Push | LogError:
+def _read_push(path: Path, data: Arrays, row: int) -> Push | LogError:
     """Read the push of a row, or return the error that describes its first fault."""
     index = int(floats(data["push_index"])[row])
     if not data["valid"][row]:
         return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)
     streams: dict[str, Floats] = {}
-    for offsets, names in _STREAMS.items():
+    for offsets, names in _STREAM_ARRAYS.items():
         begin, end = (int(at) for at in floats(data[offsets])[row : row + 2])
         streams |= {name: floats(data[name][begin:end]) for name in names}
     start, end_pose = floats(data["object_pose_start"])[row], floats(data["object_pose_end"])[row]

@@ -76,23 +76,23 @@ def support_force(points: ArrayLike) -> Floats:
         ValueError: If there is another number of points, which would not determine the forces; if the points lie on one
             line; or if the center of mass lies outside their triangle, so that the object would tip over.
     """
-    where = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    if len(where) == 0:
+    vertices = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    if len(vertices) == 0:
         return np.empty(0)
-    if len(where) != 3 or not np.isfinite(where).all():
-        raise ValueError(f"support points must be three finite points, or none; got {where.tolist()}")
+    if len(vertices) != 3 or not np.isfinite(vertices).all():
+        raise ValueError(f"support points must be three finite points, or none; got {vertices.tolist()}")
     # The forces add up to the weight and have no moment about the body origin. Points divided by LENGTH are
     # dimensionless. So the condition number does not depend on the unit. It is large if the points lie on one line.
-    balance = np.vstack([np.ones(3), where.T / LENGTH])
+    balance = np.vstack([np.ones(3), vertices.T / LENGTH])
     if np.linalg.cond(balance) > 1e8:
-        raise ValueError(f"support points must not lie on one line; got {where.tolist()}")
+        raise ValueError(f"support points must not lie on one line; got {vertices.tolist()}")
     force = np.linalg.solve(balance, np.array([MASS * GRAVITY, 0.0, 0.0]))
     if np.any(force < 0):
-        raise ValueError(f"the center of mass must lie inside the support points; got {where.tolist()}")
+        raise ValueError(f"the center of mass must lie inside the support points; got {vertices.tolist()}")
     return force.astype(np.float64)
 
 
-def name_support(path: Path) -> tuple[str, Floats] | None:
+def support_from_name(path: Path) -> tuple[str, Floats] | None:
     """Determine the support arrangement from the names of a file and its folder.
 
     Recognized are `3pts1` ... `3pts4`, `patch`, and six numbers such as `30_90_30_30_30_90`: millimeters in the corner
@@ -118,7 +118,7 @@ def name_support(path: Path) -> tuple[str, Floats] | None:
     return None
 
 
-def name_surface(path: Path) -> str:
+def surface_from_name(path: Path) -> str:
     """Determine the surface from the names of a file and its folder.
 
     The original logs have `wood` in the folder's name for plywood, and only the arrangement for hardboard.
@@ -134,7 +134,7 @@ def name_surface(path: Path) -> str:
             return "plywood"
         if "hardboard" in name:
             return "hardboard"
-    return UNKNOWN if name_support(path) is None else "hardboard"
+    return UNKNOWN if support_from_name(path) is None else "hardboard"
 
 
 def _body_from_corner(points: ArrayLike) -> Floats:

@@ -16,7 +16,7 @@ from pushjax.datasets._archive import Arrays, check_shapes, read_archive, row_co
 from pushjax.datasets.pushes import Floats, LogError, rotation, wrap_angle
 
 # Arrays of the archive. Those of _PER_PUSH have one row of this shape per push, those of _PER_FILE have this shape.
-_PER_PUSH = {
+_PUSH_ARRAYS = {
     "push_index": (),
     "valid": (),
     "action_group": (),
@@ -31,8 +31,8 @@ _PER_PUSH = {
     "gap_end": (2,),
     "stick_deviation": (),
 }
-_PER_FILE = {"vertices_body": (3, 2), "rho": (), "finger_half_spacing": ()}
-_SUPPORT = ("support_points_body", "support_normal_force", "surface", "arrangement")
+_FILE_ARRAYS = {"vertices_body": (3, 2), "rho": (), "finger_half_spacing": ()}
+_SUPPORT_ARRAYS = ("support_points_body", "support_normal_force", "surface", "arrangement")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +104,15 @@ class TwoFingerLog:
         """
         if steps < 1:
             raise ValueError(f"steps must be at least 1; got {steps}")
-        share = np.linspace(0.0, 1.0, steps + 1)
-        angle = share * self.turn[:, None]
+        fraction = np.linspace(0.0, 1.0, steps + 1)
+        angle = fraction * self.turn[:, None]
         start, travel = self.hand_start[:, None, :2], (self.hand_end - self.hand_start)[:, None, :2]
         turning = self.turn != 0
         center = np.where(turning[:, None], self.center, 0.0)[:, None]
         turned = center + np.einsum("nsij,nj->nsi", rotation(angle), (start - center)[:, 0])
-        where = np.where(turning[:, None, None], turned, start + share[:, None] * travel)
+        position = np.where(turning[:, None, None], turned, start + fraction[:, None] * travel)
         theta = self.hand_start[:, 2, None] + angle
-        return np.concatenate([where, theta[..., None], np.full_like(theta, self.spacing)[..., None]], axis=-1)
+        return np.concatenate([position, theta[..., None], np.full_like(theta, self.spacing)[..., None]], axis=-1)
 
 
 def stick_deviation(
@@ -142,8 +142,8 @@ def stick_deviation(
 
 def _in_hand_frame(hand: NDArray, pose: NDArray) -> Floats:
     """Return the poses of the object in the frame of the hand."""
-    away = np.einsum("...ji,...j->...i", rotation(hand[..., 2]), pose[..., :2] - hand[..., :2])
-    return np.concatenate([away, (pose[..., 2] - hand[..., 2])[..., None]], axis=-1)
+    offset = np.einsum("...ji,...j->...i", rotation(hand[..., 2]), pose[..., :2] - hand[..., :2])
+    return np.concatenate([offset, (pose[..., 2] - hand[..., 2])[..., None]], axis=-1)
 
 
 def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
@@ -162,16 +162,16 @@ def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
             is usable.
     """
     file = Path(path)
-    data = read_archive(file, [*_PER_PUSH, *_PER_FILE, *_SUPPORT], "two-finger pushes")
+    data = read_archive(file, [*_PUSH_ARRAYS, *_FILE_ARRAYS, *_SUPPORT_ARRAYS], "two-finger pushes")
     count = _checked_count(file, data)
-    numbers = {name: np.array(data[name], np.float64) for name in (*_PER_PUSH, *_PER_FILE, *_SUPPORT[:2])}
-    found = [_problem(file, numbers, row) for row in range(count)]
-    problems = tuple(problem for problem in found if problem is not None)
-    keep = np.array([problem is None for problem in found], bool)
+    numbers = {name: np.array(data[name], np.float64) for name in (*_PUSH_ARRAYS, *_FILE_ARRAYS, *_SUPPORT_ARRAYS[:2])}
+    row_problems = [_row_problem(file, numbers, row) for row in range(count)]
+    problems = tuple(problem for problem in row_problems if problem is not None)
+    keep = np.array([problem is None for problem in row_problems], bool)
     if not keep.any():
         first = f", the first because: {problems[0].message}" if problems else ""
         raise LogError(file, f"expected usable pushes, found none among {count}{first}")
-    rows = {name: numbers[name][keep] for name in _PER_PUSH}
+    rows = {name: numbers[name][keep] for name in _PUSH_ARRAYS}
     start, end = rows["object_pose_start"], rows["object_pose_end"].copy()
     end[:, 2] = start[:, 2] + wrap_angle(end[:, 2] - start[:, 2])
     return TwoFingerLog(
@@ -205,24 +205,24 @@ def _checked_count(path: Path, data: Arrays) -> int:
     Raises:
         LogError: For the first array that fails.
     """
-    count = row_count(path, data, _PER_PUSH)
-    check_shapes(path, data, _PER_FILE)
+    count = row_count(path, data, _PUSH_ARRAYS)
+    check_shapes(path, data, _FILE_ARRAYS)
     points, force = data["support_points_body"], data["support_normal_force"]
     if points.size != 2 * force.size or points.ndim != 2:
         raise LogError(path, f"expected a force for each support point, found {points.shape} and {force.shape}")
-    for name in (*_PER_PUSH, *_PER_FILE, *_SUPPORT[:2]):
+    for name in (*_PUSH_ARRAYS, *_FILE_ARRAYS, *_SUPPORT_ARRAYS[:2]):
         if data[name].dtype.kind not in "fiub":
             raise LogError(path, f"expected numbers in {name}, found {data[name].dtype}")
     return count
 
 
-def _problem(path: Path, numbers: dict[str, Floats], row: int) -> LogError | None:
+def _row_problem(path: Path, numbers: dict[str, Floats], row: int) -> LogError | None:
     """Describe why a row is unusable; None if it is usable."""
     index = int(numbers["push_index"][row])
     if not numbers["valid"][row]:
         return LogError(path, "expected a valid push, found one marked invalid in the archive", push=index)
     straight = numbers["rotation_angle"][row] == 0
-    for name in _PER_PUSH:
+    for name in _PUSH_ARRAYS:
         if not np.isfinite(numbers[name][row]).all() and not (straight and name == "cor_world"):
             return LogError(path, f"expected finite numbers, found NaN or infinity in {name}", push=index)
     return None

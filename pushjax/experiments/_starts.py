@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
+def uniform_in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
     """Sample points uniformly in a circle about the origin.
 
     Args:
@@ -14,5 +14,5 @@ def in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
     Returns:
         The points (n, 2), m.
     """
-    away, angle = radius * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
-    return np.stack([away * np.cos(angle), away * np.sin(angle)], axis=1)
+    distance, angle = radius * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)

@@ -6,7 +6,7 @@ import numpy as np
 
 import pushjax as pj
 
-BOOTSTRAPS = 2000
+BOOTSTRAP_SAMPLES = 2000
 
 
 @jax.jit
@@ -23,20 +23,20 @@ def final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: 
         The final poses (frictions, pushes, 3), world, m and rad, and the number of failed steps (frictions, pushes).
     """
 
-    def one(path, start, friction):
+    def final_pose(path, start, friction):
         push = pj.rollout(slider, hand, path, pose=start, friction=friction)
         return push.pose[-1], jnp.sum(push.failed)
 
-    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
+    over_pushes = jax.vmap(final_pose, in_axes=(0, 0, None))
     return jax.vmap(over_pushes, in_axes=(None, None, 0))(pushes.path, pushes.start, frictions)
 
 
 def bootstrapped_ci95(values: np.ndarray, rng: np.random.Generator) -> float:
-    """Return half the width of the 95 % confidence interval of a mean, by bootstrap.
+    """Return half the width of the 95 % confidence interval of a mean, by bootstrap, in the unit of the values.
 
     Args:
         values: (n,), the values whose mean is taken.
         rng: Random generator of the bootstrap.
     """
-    resampled = rng.choice(values, (BOOTSTRAPS, len(values))).mean(axis=1)
+    resampled = rng.choice(values, (BOOTSTRAP_SAMPLES, len(values))).mean(axis=1)
     return float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2)

@@ -23,14 +23,17 @@ import scipy.stats
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
-from pushjax.experiments._starts import in_circle
+from pushjax.experiments._starts import uniform_in_circle
 
-DISK, FINGER, APART, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
-CIRCLE, AHEAD = 0.0788, 0.135  # m: radius of the circle of start centers, and its distance ahead of the fingers
-N, STEPS, DRAWN = 500, 525, 100
+DISK_RADIUS, FINGER_RADIUS, FINGER_SPACING, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
+START_RADIUS, START_DISTANCE = (
+    0.0788,
+    0.135,
+)  # m: radius of the circle of start centers, and its distance ahead of the fingers
+N, STEPS, MAX_DRAWN = 500, 525, 100
 DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the picture and the record's own figures are of the first friction
-NEAR = 1e-3  # m
-CELLS, PAIRS, GRID = 150, 400, 80
+CONVERGED_DISTANCE = 1e-3  # m
+SUPPORT_POINTS, PAIRS, GRID_POINTS = 150, 400, 80
 
 
 def run(
@@ -64,34 +67,54 @@ def run(
         raise ValueError(f"dof must be two different ones, to compare; got {', '.join(f'{d:g}' for d in dof)}")
     if not friction or len(set(friction)) != len(friction):
         raise ValueError(f"friction must be one or more, each once; got {', '.join(f'{mu:g}' for mu in friction)}")
-    disk = pj.Disk(DISK)
-    pairs = pj.Support.uniform(disk, points=CELLS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
+    disk = pj.Disk(DISK_RADIUS)
+    pairs = pj.Support.uniform(disk, points=SUPPORT_POINTS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
     slider = pj.Slider(disk, pj.fit_limit_surface(*pairs, degree=2))
-    hand = pj.Hand.two_fingers(FINGER)
-    path = pj.line((0, 0, np.pi / 2, APART), (0, TRAVEL, np.pi / 2, APART), steps)
+    hand = pj.Hand.two_fingers(FINGER_RADIUS)
+    path = pj.line((0, 0, np.pi / 2, FINGER_SPACING), (0, TRAVEL, np.pi / 2, FINGER_SPACING), steps)
     starts = start_poses(n, seed)
-    rows, shown = [], {}
+    rows, results = [], {}
     for mu in friction:
-        for degrees in dof:
-            model = pj.FrictionModel(dof=degrees, friction=mu)
+        for surface_dof in dof:
+            model = pj.FrictionModel(dof=surface_dof, friction=mu)
             # run twice with different samples, to find how many verdicts the sampling alone changes
-            for again in (False, True):
-                key = jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + again)
+            for second_draw in (False, True):
+                key = jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + second_draw)
                 pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True)
-                shown[mu, degrees, again] = pushes, converged(pushes)
-            (pushes, settled), (_, other) = (shown[mu, degrees, again] for again in (False, True))
-            row = {"friction": mu, "dof": degrees, "converged": float(settled.mean()), "outcomes": pushes.outcomes()}
-            row["changed_by_draw_percent"] = 100 * float(np.mean(settled != other))
-            rows.append(row | {"seconds": pushes.seconds, "settled": np.flatnonzero(settled)})
+                results[mu, surface_dof, second_draw] = pushes, converged(pushes)
+            (pushes, has_converged), (_, other_has_converged) = (
+                results[mu, surface_dof, second_draw] for second_draw in (False, True)
+            )
+            row = {
+                "friction": mu,
+                "dof": surface_dof,
+                "converged": float(has_converged.mean()),
+                "outcomes": pushes.outcomes(),
+            }
+            row["changed_by_draw_percent"] = 100 * float(np.mean(has_converged != other_has_converged))
+            rows.append(row | {"seconds": pushes.seconds, "settled": np.flatnonzero(has_converged)})
             progress(len(rows), len(friction) * len(dof))
-        less, more = (shown[mu, degrees, False][1] for degrees in dof)
+        with_less_noise, with_more_noise = (results[mu, surface_dof, False][1] for surface_dof in dof)
         for row in rows[-2:]:
-            row["difference_percent"] = 100 * abs(float(less.mean() - more.mean()))
-            row["changed_by_noise_percent"] = 100 * float(np.mean(less != more))
-    drawn = {degrees: shown[friction[0], degrees, False] for degrees in dof}
+            row["difference_percent"] = 100 * abs(float(with_less_noise.mean() - with_more_noise.mean()))
+            row["changed_by_noise_percent"] = 100 * float(np.mean(with_less_noise != with_more_noise))
+    drawn = {surface_dof: results[friction[0], surface_dof, False] for surface_dof in dof}
     pictures = [] if out is None else _draw(out, slider, hand, path, drawn)
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "disk_m": DISK, "finger_m": FINGER}
-    settings |= {"apart_m": APART, "travel_m": TRAVEL, "circle_m": CIRCLE, "ahead_m": AHEAD, "near_m": NEAR}
+    settings = {
+        "seed": seed,
+        "steps": steps,
+        "dof": dof,
+        "friction": friction,
+        "disk_m": DISK_RADIUS,
+        "finger_m": FINGER_RADIUS,
+    }
+    settings |= {
+        "apart_m": FINGER_SPACING,
+        "travel_m": TRAVEL,
+        "circle_m": START_RADIUS,
+        "ahead_m": START_DISTANCE,
+        "near_m": CONVERGED_DISTANCE,
+    }
     return result_record(
         "capture",
         settings,
@@ -114,27 +137,30 @@ def start_poses(n: int, seed: int) -> np.ndarray:
     Returns:
         The poses (n, 3), world, m and rad; all angles are zero.
     """
-    centers = in_circle(np.random.default_rng(seed), CIRCLE, n) + np.array([0, AHEAD])
+    centers = uniform_in_circle(np.random.default_rng(seed), START_RADIUS, n) + np.array([0, START_DISTANCE])
     return np.column_stack([centers, np.zeros(n)]).astype(jnp.result_type(float))
 
 
 def converged(pushes: pj.MonteCarlo) -> np.ndarray:
     """Return which disks end between both fingers, (n,)."""
-    rests = TRAVEL + np.sqrt((DISK + FINGER) ** 2 - (APART / 2) ** 2)
-    return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - rests) < NEAR
+    resting_y = TRAVEL + np.sqrt((DISK_RADIUS + FINGER_RADIUS) ** 2 - (FINGER_SPACING / 2) ** 2)
+    return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - resting_y) < CONVERGED_DISTANCE
 
 
-def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, shown: dict[float, tuple]) -> list[str]:
+def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, results: dict[float, tuple]) -> list[str]:
     """Draw the first friction into the folder `out` and return the path of the picture."""
     from pushjax import plot
 
     runs = {
-        f"dof {degrees:g}: {settled.mean():.1%} of {len(settled)} converge": (pushes.trajectory, settled)
-        for degrees, (pushes, settled) in shown.items()
+        f"dof {surface_dof:g}: {has_converged.mean():.1%} of {len(has_converged)} converge": (
+            pushes.trajectory,
+            has_converged,
+        )
+        for surface_dof, (pushes, has_converged) in results.items()
     }
-    pushes, settled = list(shown.values())[-1]
+    pushes, has_converged = list(results.values())[-1]
     figure = plot.capture_figure(
-        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[settled, :2]), max_paths=DRAWN
+        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[has_converged, :2]), max_paths=MAX_DRAWN
     )
     return [str(plot.save(figure, out / "capture.png"))]
 
@@ -143,9 +169,11 @@ def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.nda
     """Estimate the density of start centers (n, 2) over a grid, 1/mm^2; None if there are too few (two or less)."""
     if len(centers) <= 2:
         return None
-    x, y = (np.linspace(c - 1.1 * CIRCLE, c + 1.1 * CIRCLE, GRID) for c in (0.0, AHEAD))
-    at = np.stack(np.meshgrid(x, y))
-    return (at[0], at[1]), scipy.stats.gaussian_kde(centers.T)(at.reshape(2, -1)).reshape(GRID, GRID) / 1e6
+    x, y = (np.linspace(c - 1.1 * START_RADIUS, c + 1.1 * START_RADIUS, GRID_POINTS) for c in (0.0, START_DISTANCE))
+    grid = np.stack(np.meshgrid(x, y))
+    return (grid[0], grid[1]), scipy.stats.gaussian_kde(centers.T)(grid.reshape(2, -1)).reshape(
+        GRID_POINTS, GRID_POINTS
+    ) / 1e6
 
 
 def summary(record: dict[str, Any]) -> str:

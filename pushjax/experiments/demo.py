@@ -43,7 +43,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
                 "fit_angle_deg": float(np.degrees(fit.angle)),
                 "fit_converged": bool(fit.converged),
                 "pose": push.pose[-1],
-                "modes": _counts(push),
+                "modes": _steps_by_mode(push),
                 "first_failure": int(push.first_failure),
             }
         )
@@ -53,8 +53,8 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     return result_record("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
 
 
-def _counts(push: pj.Trajectory) -> dict[str, int]:
-    """Count the steps in each contact mode."""
+def _steps_by_mode(push: pj.Trajectory) -> dict[str, int]:
+    """Return the number of steps in each contact mode, by the mode's name."""
     values, counts = np.unique(np.asarray(push.mode), return_counts=True)
     return {pj.ContactMode(int(v)).name: int(c) for v, c in zip(values, counts, strict=True)}
 

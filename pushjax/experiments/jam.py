@@ -24,7 +24,7 @@ from pushjax._internal.record import result_record
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
 CLOSING = 0.001  # displacement of each finger, m
 BELOW, ABOVE = 0.25, 0.55  # frictions that are drawn
-NEAR = 1e-3  # relative distance from the threshold to the nearest friction on either side of it
+THRESHOLD_DISTANCE = 1e-3  # relative distance from the threshold to the nearest friction on either side of it
 
 
 def contacts(friction) -> pj.Contacts:
@@ -73,25 +73,25 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
         The record. It has one row per surface: the smallest friction that jams, the largest that moves, the threshold
         by statics, and all statuses. `verdicts` holds the status at the two drawn frictions.
     """
-    block, both = surfaces(seed)
-    close = threshold() * (1 + NEAR * jnp.array([-1.0, 1.0]))
-    scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), close))
+    block, surface_by_name = surfaces(seed)
+    near_threshold = threshold() * (1 + THRESHOLD_DISTANCE * jnp.array([-1.0, 1.0]))
+    scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), near_threshold))
     frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program solves all
     rows, motions = [], {}
-    for name, surface in both.items():
-        solved = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
-        status = np.asarray(solved.status)[: len(scanned)]
-        jammed, moves = status == pj.Status.JAMMED, status == pj.Status.MOVING
+    for name, surface in surface_by_name.items():
+        motion_by_friction = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)
+        status = np.asarray(motion_by_friction.status)[: len(scanned)]
+        jammed, moving = status == pj.Status.JAMMED, status == pj.Status.MOVING
         rows.append(
             {
                 "model": name,
                 "jams_from": float(scanned[np.argmax(jammed)]) if jammed.any() else None,
-                "last_moving": float(scanned[np.flatnonzero(moves)[-1]]),
+                "last_moving": float(scanned[np.flatnonzero(moving)[-1]]),
                 "threshold": threshold(),
                 "statuses": sorted({pj.Status(int(s)).name for s in status}),
             }
         )
-        motions[name] = solved
+        motions[name] = motion_by_friction
     drawn = [jax.tree.map(lambda leaf, k=k: leaf[k], motions["quartic"]) for k in (-2, -1)]
     verdicts = {str(mu): pj.Status(int(m.status)).name for mu, m in zip((BELOW, ABOVE), drawn, strict=True)}
     pictures = [] if out is None else _draw(out, block, drawn)

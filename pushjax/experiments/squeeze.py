@@ -49,9 +49,9 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
     hand = pj.Hand.parallel_jaw(PAD, THICKNESS)
     closing = pj.line((0.0, 0.0, 0.0, OPENING), (0.0, 0.0, 0.0, CLOSED), steps)
     path = jnp.concatenate([closing, jnp.repeat(closing[-1:], HOLD, axis=0)])
-    poses = jnp.array([(x, y, np.radians(angle)) for x, y, angle in STARTS.values()])
-    close = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, hand, path, pose=pose, friction=FRICTION)))
-    grasps = close(poses)
+    starts = jnp.array([(x, y, np.radians(angle)) for x, y, angle in STARTS.values()])
+    simulate = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, hand, path, pose=pose, friction=FRICTION)))
+    grasps = simulate(starts)
     rows, drawn = [], {}
     for k, (name, start) in enumerate(STARTS.items()):
         grasp = jax.tree.map(lambda leaf, k=k: leaf[k], grasps)
@@ -74,11 +74,13 @@ def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
         rectangle and the nearest multiple of 90 degrees (degrees), and the number of failed steps.
     """
     status = pj.Status(int(grasp.status[-1]))
-    stopped = int(grasp.stopped)
+    stop_step = int(grasp.stopped)
     tilt = abs((float(grasp.pose[-1, 2]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-    words = "failed" if status.failed else "slipped out" if stopped < 0 else "grasped" if tilt < FLAT else "jammed"
+    outcome_in_words = (
+        "failed" if status.failed else "slipped out" if stop_step < 0 else "grasped" if tilt < FLAT else "jammed"
+    )
     return {
-        "outcome": words,
+        "outcome": outcome_in_words,
         "status": status.name,
         "opening_mm": 1e3 * float(grasp.configuration[-1, 3]),
         "tilt_deg": float(np.degrees(tilt)),

@@ -27,10 +27,10 @@ SIDE, RADIUS = 0.09, 0.00475  # m
 ALONG, TRAVEL = 0.018, 0.05  # m: distance of the tip from the middle of the side, and its travel
 SUPPORT_POINTS, PAIRS = 64, 400
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
-BINS, MOST_PLOTTED, FEWEST = 40, 2000, 20
+HISTOGRAM_BINS, MAX_PLOTTED, MIN_PUSHES = 40, 2000, 20
 # A surface counts as convex if its least curvature, relative to its largest coefficient, is at least this. It is not
 # zero because the coefficients are rounded to float32.
-CONVEX = -3e-7
+MIN_CURVATURE = -3e-7
 LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi, "Δθ / °")}
 
 
@@ -84,21 +84,23 @@ def run(
     Raises:
         ValueError: If there are too few pushes for a test of normality.
     """
-    if n < FEWEST:
-        raise ValueError(f"n must be at least {FEWEST}, for a test of normality; got {n}")
+    if n < MIN_PUSHES:
+        raise ValueError(f"n must be at least {MIN_PUSHES}, for a test of normality; got {n}")
     slider, hand, path = setting(seed, steps)
     model = pj.FrictionModel(dof=dof, friction=friction)
     key = jax.random.key(seed + 1)
     arguments = (key, n, slider, hand, path)
-    few = n <= MOST_PLOTTED
-    rest: dict[str, Any] = {"pose": jnp.zeros(3), "model": model, "trajectories": few}
-    first = pj.monte_carlo(*arguments, **rest, progress=progress)  # includes compiling
-    pushes = pj.monte_carlo(*arguments, **rest)
+    all_plotted = n <= MAX_PLOTTED
+    options: dict[str, Any] = {"pose": jnp.zeros(3), "model": model, "trajectories": all_plotted}
+    first_run = pj.monte_carlo(*arguments, **options, progress=progress)  # includes compiling
+    pushes = pj.monte_carlo(*arguments, **options)
     delta = np.asarray(pushes.delta, np.float64)
     pictures = []
     if out is not None:
-        rest["trajectories"] = True
-        drawn = pushes if few else pj.monte_carlo(key, MOST_PLOTTED, slider, hand, path, **rest)  # the first pushes
+        options["trajectories"] = True
+        drawn = (
+            pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **options)
+        )  # the first pushes
         pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
     settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
@@ -106,26 +108,26 @@ def run(
         "stochastic-push",
         settings,
         n=n,
-        delta={name: _figures(delta[:, k]) for k, name in enumerate(COORDINATES)},
+        delta={name: _describe_coordinate(delta[:, k]) for k, name in enumerate(COORDINATES)},
         correlation=np.corrcoef(delta.T),
-        nonconvex=int(np.sum(~(_curvatures(key, model, slider.surface, n) >= CONVEX))),
+        nonconvex=int(np.sum(~(_curvatures(key, model, slider.surface, n) >= MIN_CURVATURE))),
         repaired=float(np.mean(pushes.shrinkage > 0)),
         mean_shrinkage=pushes.summary()["repaired"]["mean_shrinkage"],
         outcomes=pushes.outcomes(),
         run_s=pushes.seconds,
-        compile_s=first.seconds - pushes.seconds,
+        compile_s=first_run.seconds - pushes.seconds,
         pictures=pictures,
     )
 
 
-def _figures(values: np.ndarray) -> dict[str, Any]:
-    """Return the moments, the histogram and a test of normality of one coordinate."""
-    counts, edges = np.histogram(values, bins=BINS)
-    figures: dict[str, Any] = {"mean": values.mean(), "std": values.std(ddof=1), "edges": edges, "counts": counts}
+def _describe_coordinate(values: np.ndarray) -> dict[str, Any]:
+    """Return the moments, the histogram and a test of normality of one coordinate (n,) of the displacement."""
+    counts, edges = np.histogram(values, bins=HISTOGRAM_BINS)
+    description: dict[str, Any] = {"mean": values.mean(), "std": values.std(ddof=1), "edges": edges, "counts": counts}
     test = scipy.stats.normaltest(values)
     normality = {"skewness": scipy.stats.skew(values), "excess_kurtosis": scipy.stats.kurtosis(values)}
-    figures["normality"] = normality | {"statistic": test.statistic, "p_value": test.pvalue}
-    return {name: float(v) if np.ndim(v) == 0 and not isinstance(v, dict) else v for name, v in figures.items()}
+    description["normality"] = normality | {"statistic": test.statistic, "p_value": test.pvalue}
+    return {name: float(v) if np.ndim(v) == 0 and not isinstance(v, dict) else v for name, v in description.items()}
 
 
 def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -> np.ndarray:
@@ -133,16 +135,16 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
 
     The surfaces are sampled again, with the keys that `monte_carlo` used.
     """
-    around: Any = model.around(surface)
+    distribution: Any = model.around(surface)
 
-    def drawn(index):
-        return around.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
+    def sampled_coefficients(index):
+        return distribution.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
 
-    some, program, found = min(n, MOST_PLOTTED), jax.jit(jax.vmap(drawn)), []
-    for first in range(0, n, some):
-        indices = np.minimum(np.arange(first, first + some), n - 1).astype(np.uint32)
-        found.append(least_curvatures(np.asarray(program(indices)))[: n - first])
-    return np.concatenate(found)
+    chunk, program, curvatures = min(n, MAX_PLOTTED), jax.jit(jax.vmap(sampled_coefficients)), []
+    for begin in range(0, n, chunk):
+        indices = np.minimum(np.arange(begin, begin + chunk), n - 1).astype(np.uint32)
+        curvatures.append(least_curvatures(np.asarray(program(indices)))[: n - begin])
+    return np.concatenate(curvatures)
 
 
 def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: pj.MonteCarlo, trajectory) -> list[str]:
@@ -152,19 +154,19 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: 
     from pushjax import plot
 
     title = f"{len(trajectory)} of {len(pushes)} pushes"
-    ways = plot.cloud_figure(slider.shape, hand, np.asarray(path), trajectory, title)
+    cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), trajectory, title)
     with plt.rc_context(plot.STYLE):
-        counts, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
+        histograms, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
         for k, (axes, name) in enumerate(zip(panels, COORDINATES, strict=True)):
             scale, label = LABELS[name]
             values = scale * np.asarray(pushes.delta[:, k], np.float64)
             test = scipy.stats.normaltest(values)
             gaussian = values.mean(), values.std(ddof=1)
-            plot.histogram_panel(axes, pushes.histogram(values, BINS), label, gaussian=gaussian)
+            plot.histogram_panel(axes, pushes.histogram(values, HISTOGRAM_BINS), label, gaussian=gaussian)
             axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f}, normal: p = {test.pvalue:.1g}")
         panels[0].legend()
-        drawn = (ways, "stochastic_push.png"), (counts, "stochastic_push_histograms.png")
-        return [str(plot.save(figure, out / name)) for figure, name in drawn]
+        pictures = (cloud, "stochastic_push.png"), (histograms, "stochastic_push_histograms.png")
+        return [str(plot.save(figure, out / name)) for figure, name in pictures]
 
 
 def summary(record: dict[str, Any]) -> str:

@@ -21,13 +21,13 @@ MIN_SIGMA = 1e-6  # m, lower bound of sigma: no measurement is more exact
 GAP_SCALE = 3.0  # sigma: beyond this residual of a gap, the finger counts as having lost the slider
 
 
-class Kinds(NamedTuple):
+class PerKind(NamedTuple):
     """A quantity that exists once for each kind of residual.
 
     Attributes:
-        poses: That of the poses.
-        directions: That of the directions of motion under measured wrenches.
-        gap: That of the gap between finger and slider at the end.
+        poses: Its value for poses.
+        directions: Its value for directions of motion under measured wrenches.
+        gap: Its value for the gap between finger and slider at the end.
     """
 
     poses: Any
@@ -35,7 +35,8 @@ class Kinds(NamedTuple):
     gap: Any
 
 
-NUMBERS = Kinds(poses=3, directions=3, gap=1)  # measured numbers per push
+# Numbers that a push counts as having measured. All its poses together weigh as much as one, and so do its directions.
+NUMBERS_PER_KIND = PerKind(poses=3, directions=3, gap=1)
 
 
 class Fit(NamedTuple):
@@ -63,7 +64,7 @@ class Fit(NamedTuple):
 
 
 class FixedEntries(NamedTuple):
-    """Entries of z that are held fixed.
+    """Which entries of z are held fixed, and at which values.
 
     Attributes:
         mask: (size,) True for entries that are fixed.
@@ -75,7 +76,7 @@ class FixedEntries(NamedTuple):
 
     @staticmethod
     def none(start: Array) -> "FixedEntries":
-        """Fix no entry."""
+        """Return the value that fixes no entry of a vector like `start`."""
         return FixedEntries(jnp.zeros(start.shape, bool), start)
 
     def apply(self, z: Array) -> Array:
@@ -83,20 +84,20 @@ class FixedEntries(NamedTuple):
         return jnp.where(self.mask, self.value, z)
 
 
-def push_weights(pushes: Pushes) -> Kinds:
+def push_weights(pushes: Pushes) -> PerKind:
     """Return the weight (conditions, pushes) of each push for each kind of residual.
 
     Directions have weight zero in pushes that have no pair of wrench and motion.
     """
     directions = jnp.where(jnp.any(pushes.has_pair, axis=-1), pushes.weight, 0.0)
-    return Kinds(pushes.weight, directions, pushes.weight)
+    return PerKind(pushes.weight, directions, pushes.weight)
 
 
-def split_kinds(residual: Array, pushes: Pushes) -> Kinds:
+def split_kinds(residual: Array, pushes: Pushes) -> PerKind:
     """Split the last axis of residuals by their kind; a kind that was not measured has no entries."""
     poses = 3 * len(pushes.observed_steps)
     directions = poses + 3 * pushes.wrench.shape[-2]
-    return Kinds(residual[..., :poses], residual[..., poses:directions], residual[..., directions:])
+    return PerKind(residual[..., :poses], residual[..., poses:directions], residual[..., directions:])
 
 
 def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
@@ -107,7 +108,7 @@ def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: fl
     influence.
     """
     weighted = []
-    kinds = zip(Kinds._fields, split_kinds(residual, pushes), push_weights(pushes), strict=True)
+    kinds = zip(PerKind._fields, split_kinds(residual, pushes), push_weights(pushes), strict=True)
     for k, (kind, r, weight) in enumerate(kinds):
         r = r / sigma[k]
         squared = jnp.sum(r**2, axis=-1, keepdims=True)
@@ -119,8 +120,11 @@ def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: fl
     return jnp.concatenate(weighted, axis=-1)
 
 
-def _final_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
-    """Return the effective weight of each push in the information, given its residual of one kind."""
+def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
+    """Return the weight of each push, given its residual of one kind, in iteratively reweighted least squares.
+
+    It is the weight with which the Gauss-Newton approximation of the robust loss counts the push.
+    """
     squared = jnp.sum((residual / sigma) ** 2, axis=-1)
     if kind == "gap":
         return weight / (1 + squared / GAP_SCALE**2) ** 2
@@ -165,7 +169,9 @@ class _Evidence(NamedTuple):
     new_sigma: list[Array]
 
 
-def _evidence(residual: Array, jacobian: Array, pushes: Pushes, fit: Fit, robust: float | None, normal) -> _Evidence:
+def _evidence(
+    residual: Array, jacobian: Array, pushes: Pushes, fit: Fit, robust: float | None, has_normal_prior
+) -> _Evidence:
     """Return the precision of z, and sigma as the evidence procedure estimates it.
 
     Args:
@@ -174,32 +180,34 @@ def _evidence(residual: Array, jacobian: Array, pushes: Pushes, fit: Fit, robust
         pushes: Pushes with a leading axis of conditions.
         fit: The fit before, with the sigma with which the minimizer was found.
         robust: Number of sigma from which a push has less influence. None: least squares.
-        normal: (size,) 1 for entries of z that have a normal prior, else 0.
+        has_normal_prior: (size,) 1 for entries of z that have a normal prior, else 0.
     """
-    by_kind, each, counts_and_squares = [], jnp.zeros_like(fit.information), []
+    by_kind, information, counts_and_squares = [], jnp.zeros_like(fit.information), []
     kinds = zip(
-        Kinds._fields,
+        PerKind._fields,
         split_kinds(residual, pushes),
         split_kinds(jnp.moveaxis(jacobian, 3, 0), pushes),
         push_weights(pushes),
         strict=True,
     )
-    for k, (kind, r, slopes, weight) in enumerate(kinds):
-        count = _final_weights(kind, r, weight, fit.sigma[k], robust)
-        scaled = slopes * (jnp.sqrt(count) / fit.sigma[k])[None, ..., None]
+    for k, (kind, r, derivatives, weight) in enumerate(kinds):
+        robust_weight = _robust_weights(kind, r, weight, fit.sigma[k], robust)
+        scaled = derivatives * (jnp.sqrt(robust_weight) / fit.sigma[k])[None, ..., None]
         by_kind.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
-        each = each + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
-        counts_and_squares.append((jnp.sum(count), jnp.sum(count[..., None] * r**2)))
-    precision = sum(by_kind) + jnp.diag(jnp.maximum(normal, FRICTION_RIDGE))
-    # The trace of a share is the number of parameters that a kind of residual determines; it reduces the degrees of
-    # freedom of the variance. One solve serves all kinds: two batched solves of jaxlib that run at once deadlock
-    # (0.10.1, two cores).
-    shares = jnp.split(jnp.linalg.solve(precision, jnp.concatenate(by_kind, axis=1)), len(NUMBERS), axis=1)
+        information = information + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
+        counts_and_squares.append((jnp.sum(robust_weight), jnp.sum(robust_weight[..., None] * r**2)))
+    precision = sum(by_kind) + jnp.diag(jnp.maximum(has_normal_prior, FRICTION_RIDGE))
+    # The trace of a kind's resolution matrix is the number of parameters that this kind determines; it reduces the
+    # degrees of freedom of the variance. One solve serves all kinds: two batched solves of jaxlib that run at once
+    # deadlock (0.10.1, two cores).
+    resolutions = jnp.split(
+        jnp.linalg.solve(precision, jnp.concatenate(by_kind, axis=1)), len(NUMBERS_PER_KIND), axis=1
+    )
     new_sigma = [
-        jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(share), 3.0))
-        for numbers, share, (count, squares) in zip(NUMBERS, shares, counts_and_squares, strict=True)
+        jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(resolution), 3.0))
+        for numbers, resolution, (count, squares) in zip(NUMBERS_PER_KIND, resolutions, counts_and_squares, strict=True)
     ]
-    return _Evidence(precision, each, new_sigma)
+    return _Evidence(precision, information, new_sigma)
 
 
 def fit(
@@ -227,37 +235,40 @@ def fit(
     Returns:
         The result of the last round.
     """
-    normal = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
+    has_normal_prior = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
     rounds, last_tolerance = schedule
 
     def one_round(index, before: Fit) -> Fit:
         sigma = before.sigma
 
-        def loss(z):
+        def residuals(z):
+            """Return the residuals of pushes and prior, whose squares add up to the loss, and their linearization."""
             z = fixed.apply(z)
-            at = problem.linearize(z, pushes)
-            linear = problem.linear_residuals(z, at)
-            return (weighted_residuals(linear, pushes, sigma, robust), normal * z), at
+            linearized = problem.linearize(z, pushes)
+            linear_residuals = problem.linear_residuals(z, linearized)
+            return (weighted_residuals(linear_residuals, pushes, sigma, robust), has_normal_prior * z), linearized
 
         tolerance = jnp.where(index < rounds - 1, LOOSE_TOLERANCE, last_tolerance).astype(start.dtype)
-        found = least_squares(loss, before.z, MAX_STEPS, tolerance)
+        found = least_squares(residuals, before.z, MAX_STEPS, tolerance)
         z, residual = fixed.apply(found.z), found.auxiliary.value
-        evidence = _evidence(residual, problem.jacobian(z, found.auxiliary), pushes, before, robust, normal)
-        total = jnp.sum(weighted_residuals(residual, pushes, sigma, robust) ** 2) + jnp.sum((normal * z) ** 2)
+        evidence = _evidence(residual, problem.jacobian(z, found.auxiliary), pushes, before, robust, has_normal_prior)
+        minimum = jnp.sum(weighted_residuals(residual, pushes, sigma, robust) ** 2) + jnp.sum(
+            (has_normal_prior * z) ** 2
+        )
         steps = before.steps + found.steps
-        measured = jnp.where(sigma_is_given, sigma, jnp.maximum(jnp.stack(evidence.new_sigma), MIN_SIGMA))
-        # the last round keeps the sigma with which it fitted
-        sigma = jnp.where(index < rounds - 1, measured, sigma)
-        return Fit(z, sigma, evidence.precision, residual, evidence.information, total, steps, found.converged)
+        new_sigma = jnp.where(sigma_is_given, sigma, jnp.maximum(jnp.stack(evidence.new_sigma), MIN_SIGMA))
+        # The last round keeps the sigma with which it fitted.
+        sigma = jnp.where(index < rounds - 1, new_sigma, sigma)
+        return Fit(z, sigma, evidence.precision, residual, evidence.information, minimum, steps, found.converged)
 
-    many = pushes.weight.shape
+    leading = pushes.weight.shape
     rows = 3 * len(pushes.observed_steps) + 3 * pushes.wrench.shape[-2] + problem.contact_at_end
     size = len(start)
-    precision, residual, information, total = (
-        jnp.zeros(shape, start.dtype) for shape in ((size, size), (*many, rows), (*many, size), ())
+    precision, residual, information, minimum = (
+        jnp.zeros(shape, start.dtype) for shape in ((size, size), (*leading, rows), (*leading, size), ())
     )
-    no_steps, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    first = Fit(fixed.apply(start), sigma, precision, residual, information, total, no_steps, no)
+    no_steps, not_converged = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    first = Fit(fixed.apply(start), sigma, precision, residual, information, minimum, no_steps, not_converged)
     return jax.lax.fori_loop(0, rounds, one_round, first)
 
 
@@ -314,9 +325,9 @@ class _LevenbergMarquardt(optx.LevenbergMarquardt):
         return eqx.tree_at(lambda s: s.search_state.step_size, state, jnp.ones((), y.dtype))
 
     def terminate(self, fn, y, args, options, state, tags):
-        ends, result = super().terminate(fn, y, args, options, state, tags)
-        within = self.norm((state.y_eval - y) / (self.atol + self.rtol * jnp.abs(y))) < 1
-        return ends | (within & (state.num_steps_since_acceptance > 0)), result
+        converged, result = super().terminate(fn, y, args, options, state, tags)
+        next_step_is_small = self.norm((state.y_eval - y) / (self.atol + self.rtol * jnp.abs(y))) < 1
+        return converged | (next_step_is_small & (state.num_steps_since_acceptance > 0)), result
 
 
 def least_squares(

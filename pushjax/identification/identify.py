@@ -15,6 +15,7 @@ from pushjax._internal.checks import (
     common_dtype,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax.friction.limit_surface import LimitSurface
 from pushjax.identification.fit import SIGMA_ROUNDS, FixedEntries, Schedule, compiled_fit, weighted_residuals
 from pushjax.identification.model import Problem
 from pushjax.identification.prior import Prior
@@ -89,44 +90,38 @@ def identify(
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
     one_condition, pushes = pushes.weight.ndim == 1, pushes.as_conditions()
     conditions = pushes.weight.shape[0]
-    surface = slider.surface
-    if surface.length.ndim == 0:
-        surface = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (conditions, *leaf.shape)), surface)
-    check_shape("slider.surface.length", surface.length, (conditions,))
+    surface = _surface_per_condition(slider.surface, conditions)
     if pushes.path.shape[-1] != hand.dof:
         raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
-    mu = as_float(friction, dtype)
-    if mu.shape not in ((), (conditions,)):
-        raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({conditions},), one per condition")
-    check_finite("friction", mu)
-    check_non_negative("friction", mu)
-    metric = surface.length[0] if length is None else as_float(length, dtype)
+    known_friction = _known_friction(as_float(friction, dtype, "friction"), conditions)
+    metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
     pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
-    for name, value in (("length", metric), ("sigma", pose_sigma)):
+    for name, value in (("length", metric_length), ("sigma", pose_sigma)):
         check_shape(name, value, ())
         check_finite(name, value)
         check_positive(name, value)
     if robust is not None:
         check_positive("robust", robust)
-    for name, asked in (("overlap", unknowns.overlap is not None), ("contact_at_end", contact_at_end)):
-        if asked and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
+    for name, requested in (("overlap", unknowns.overlap is not None), ("contact_at_end", contact_at_end)):
+        if requested and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
             raise ValueError(f"{name} is for a single round finger; the hand has {len(hand.fingers)} fingers")
-    total = jnp.maximum(jnp.sum(pushes.weight), 1.0)
-    origin = jnp.einsum("cn,cni->i", pushes.weight, pushes.start[..., :2]) / total
-    prior = _prior(unknowns, surface, mu, origin)
-    problem = Problem(slider.shape, hand, surface, prior, metric, contact_at_end)
+    total_weight = jnp.maximum(jnp.sum(pushes.weight), 1.0)
+    origin = jnp.einsum("cn,cni->i", pushes.weight, pushes.start[..., :2]) / total_weight
+    prior = _prior(unknowns, surface, known_friction, origin)
+    problem = Problem(slider.shape, hand, surface, prior, metric_length, contact_at_end)
     has_pairs = pushes.wrench.shape[-2] > 0
-    given = jnp.array([sigma is not None, not has_pairs, not contact_at_end])
+    # A kind of residual that was not measured has no sigma to estimate.
+    sigma_is_given = jnp.array([sigma is not None, not has_pairs, not contact_at_end])
     rounds = 1 if sigma is not None and not (has_pairs or contact_at_end) else SIGMA_ROUNDS
     start_sigma = jnp.stack(
         [pose_sigma, *(jnp.asarray(value, dtype) for value in (START_DIRECTION_SIGMA, START_GAP_SIGMA))]
     )
     start = _best_start(problem, pushes, start_sigma, robust=robust)
     schedule = Schedule.of(dtype, rounds)
-    fitted = compiled_fit(problem, pushes, start, start_sigma, given, FixedEntries.none(start), schedule, robust=robust)
-    end_row = 3 * len(pushes.observed_steps)
-    residual = fitted.residual[..., end_row - 3 : end_row] * len(pushes.observed_steps) ** 0.5
-    per_push = (residual, fitted.information)
+    fitted = compiled_fit(
+        problem, pushes, start, start_sigma, sigma_is_given, FixedEntries.none(start), schedule, robust=robust
+    )
+    per_push = (_final_pose_residual(fitted.residual, pushes), fitted.information)
     residual, information = jax.tree.map(lambda leaf: leaf[0], per_push) if one_condition else per_push
     return Identified(
         z=fitted.z,
@@ -138,7 +133,7 @@ def identify(
         residual=residual,
         information=information,
         loss=fitted.loss,
-        length=metric,
+        length=metric_length,
         steps=fitted.steps,
         converged=fitted.converged,
         one_condition=one_condition,
@@ -148,6 +143,33 @@ def identify(
 
 
 _prior = quick_jit(Prior.of)
+
+
+def _surface_per_condition(surface: LimitSurface, conditions: int) -> LimitSurface:
+    """Return the surface with a leading axis of conditions; without one, all conditions have the same surface."""
+    if surface.length.ndim == 0:
+        surface = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (conditions, *leaf.shape)), surface)
+    check_shape("slider.surface.length", surface.length, (conditions,))
+    return surface
+
+
+def _known_friction(friction: Array, conditions: int) -> Array:
+    """Check the friction of all conditions, or of each, and return it."""
+    if friction.shape not in ((), (conditions,)):
+        expected = f"a scalar or ({conditions},), one per condition"
+        raise ValueError(f"friction has shape {friction.shape}; expected {expected}")
+    check_finite("friction", friction)
+    check_non_negative("friction", friction)
+    return friction
+
+
+def _final_pose_residual(residual: Array, pushes: Pushes) -> Array:
+    """Return the residuals (conditions, pushes, 3) of the final poses, m, among those of `Problem.residuals`.
+
+    There, the residuals of poses are divided by the root of the number of poses.
+    """
+    end_row = 3 * len(pushes.observed_steps)
+    return residual[..., end_row - 3 : end_row] * len(pushes.observed_steps) ** 0.5
 
 
 @quick_jit
@@ -163,12 +185,12 @@ def _best_start(problem: Problem, pushes: Pushes, sigma: Array, *, robust: float
     candidates = jnp.log(fraction / (1 - fraction))
     positions = layout.positions[:, layout.slices["friction"]][:, 0]
 
-    def losses(value: Array) -> Array:
+    def push_losses(value: Array) -> Array:
         residuals = problem.residuals(z.at[positions].set(value), pushes)
         weighted = weighted_residuals(residuals, pushes, sigma, robust)
         return jnp.sum(weighted**2, axis=(1, 2))
 
-    loss = jax.lax.map(losses, candidates)
+    loss = jax.lax.map(push_losses, candidates)
     if "friction" in layout.shared:
         loss = jnp.broadcast_to(jnp.sum(loss, axis=1, keepdims=True), loss.shape)
     return z.at[positions].set(candidates[jnp.argmin(loss, axis=0)])

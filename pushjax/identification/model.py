@@ -25,7 +25,8 @@ from pushjax.simulation.rollout import rollout
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
-STRAIGHT = 5  # beyond its end, a path goes on in the direction of this part (a fifth) of it
+# Beyond an end, a path goes on straight. Its direction there is that of the first or last of this many parts.
+DIRECTION_PARTS = 5
 
 
 class Problem(eqx.Module):
@@ -54,35 +55,38 @@ class Problem(eqx.Module):
         the directions of motion under the wrenches, divided by the root of the number of pairs; and, with
         `contact_at_end`, the gap in m between the finger and the slider as it was measured at the end.
         """
-        free, parameters = self._free(z)
+        free, parameters = self._free_and_all(z)
         blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
         return jnp.concatenate([block[0] for block in blocks], axis=-1)
 
     def linearize(self, z: Float[Array, "size"], pushes: Pushes) -> "Linearized":
         """Return residuals and their Jacobian with respect to the parameters of each push's own condition.
 
-        These are some twenty numbers, whatever the size of z. The result is constant in every derivative: gradients do
-        not flow through it.
+        A condition has some twenty parameters, however many entries z has. The result is constant in every derivative:
+        gradients do not flow through it.
 
         The Jacobian uses forward mode, also for the fifteen coefficients of a quartic. This takes half the run time and
         half the compilation time of three reverse sweeps.
         """
-        free, parameters = self._free(jax.lax.stop_gradient(z))
+        free, parameters = self._free_and_all(jax.lax.stop_gradient(z))
         blocks = self._residual_blocks(lambda f: jax.jacfwd(f, has_aux=True), free, parameters, pushes)
         jacobian, value = jax.tree.map(lambda *kinds: jnp.concatenate(kinds, axis=2), *blocks)
         return Linearized(value, jacobian, free)
 
     def _residual_blocks(
-        self, transform: Callable, free: dict[str, Array], parameters: Parameters, pushes: Pushes
+        self, transformation: Callable, free: dict[str, Array], parameters: Parameters, pushes: Pushes
     ) -> list:
         """Evaluate each kind of residual over all conditions and pushes.
 
         Args:
-            transform: Transformation (the identity or `jacfwd`) applied to functions that return the pair (residual,
-                residual).
-            free: Parameters to differentiate with respect to, with a leading axis of conditions.
+            transformation: Applied to the function of each kind: the identity, or `jacfwd`. The functions return their
+                residual twice, because `jacfwd` drops the value and keeps only an auxiliary output beside the Jacobian.
+            free: Parameters to differentiate with respect to, by name, with a leading axis of conditions.
             parameters: All parameters; `free` replaces some of them.
             pushes: Pushes with a leading axis of conditions.
+
+        Returns:
+            For each kind the pair of the residual, or its Jacobian by name of parameter, and the residual.
         """
         steps = tuple(pushes.observed_steps.tolist())
         constants = (Scene(self.shape, self.hand, self.prior.origin), self.length)
@@ -91,53 +95,60 @@ class Problem(eqx.Module):
         def pose_residual(free, parameters, data, constants):
             return _pose_residual(free, parameters, data, constants, steps)
 
-        blocks = [_over_pushes(transform(pose_residual), free, parameters, data, constants)]
+        blocks = [_over_conditions_and_pushes(transformation(pose_residual), free, parameters, data, constants)]
         if pushes.wrench.shape[-2]:
             pairs = _WrenchMotionPairs(self.surface, pushes.wrench, pushes.twist, pushes.has_pair)
-            blocks.append(_over_pushes(transform(_direction_residual), free, parameters, pairs, ()))
+            blocks.append(_over_conditions_and_pushes(transformation(_direction_residual), free, parameters, pairs, ()))
         if self.contact_at_end:
-            blocks.append(_over_pushes(transform(_gap_residual), free, parameters, data, constants))
+            blocks.append(_over_conditions_and_pushes(transformation(_gap_residual), free, parameters, data, constants))
         return blocks
 
-    def linear_residuals(self, z: Float[Array, "size"], at: "Linearized") -> Float[Array, "conditions pushes rows"]:
-        """Return the residuals to first order about the point where `at` was evaluated.
+    def linear_residuals(
+        self, z: Float[Array, "size"], linearized: "Linearized"
+    ) -> Float[Array, "conditions pushes rows"]:
+        """Return the residuals at z, to first order about the point of `linearized`.
 
         At that point the values and the derivatives with respect to z are exact, and they cost matrix products only.
         """
-        free, _ = self._free(z)
+        free, _ = self._free_and_all(z)
 
         def change(name: str) -> Array:
             """Return the change due to `name`.
 
             It is the product of the Jacobian (conditions, pushes, rows, ...) and the difference (conditions, ...).
             """
-            difference = free[name] - at.free[name]
+            difference = free[name] - linearized.free[name]
             return jnp.einsum(
                 "cnri,ci->cnr",
-                at.jacobian[name].reshape(*at.value.shape, -1),
+                linearized.jacobian[name].reshape(*linearized.value.shape, -1),
                 difference.reshape(len(difference), -1),
             )
 
-        return at.value + jnp.sum(jnp.stack([change(name) for name in free]), axis=0)
+        return linearized.value + jnp.sum(jnp.stack([change(name) for name in free]), axis=0)
 
-    def jacobian(self, z: Float[Array, "size"], at: "Linearized") -> Float[Array, "conditions pushes rows size"]:
+    def jacobian(
+        self, z: Float[Array, "size"], linearized: "Linearized"
+    ) -> Float[Array, "conditions pushes rows size"]:
         """Return the Jacobian of the residuals with respect to z."""
-        return jax.jacfwd(lambda z: self.linear_residuals(z, at))(z)
+        return jax.jacfwd(lambda z: self.linear_residuals(z, linearized))(z)
 
-    def _free(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
-        """Return the parameters that are estimated, by name, and all parameters that pushes depend on."""
+    def _free_and_all(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
+        """Return the free (estimated) parameters by name, and all parameters.
+
+        The center of pressure is not among the free ones, because pushes depend on it through the surface alone.
+        """
         parameters = self.prior.parameters(z)
         free = {"surface" if name == "pressure_center" else name for name in self.prior.layout.names}
         return {name: value for name, value in parameters._asdict().items() if name in free}, parameters
 
 
 class Linearized(NamedTuple):
-    """Residuals and their Jacobian at one point.
+    """Residuals and their Jacobian at one point z.
 
     Attributes:
         value: (conditions, pushes, rows) residuals.
         jacobian: Derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`.
-        free: Parameters (conditions, ...) by name, at that point.
+        free: Estimated parameters (conditions, ...) by name, at that point.
     """
 
     value: Float[Array, "conditions pushes rows"]
@@ -160,12 +171,12 @@ class Scene(NamedTuple):
 
 
 def predict_pushes(parameters: Parameters, surface: LimitSurface, scene: Scene, pushes: Pushes) -> Trajectory:
-    """Predict pushes.
+    """Predict the pushes of all conditions.
 
     Args:
         parameters: Parameters, with a leading axis of conditions.
-        surface: Limit surfaces, with a leading axis of conditions.
-        scene: Slider and hand.
+        surface: Limit surfaces, with a leading axis of conditions; `parameters` replaces their coefficients.
+        scene: Slider, hand and reference point of the table.
         pushes: Pushes with a leading axis of conditions.
 
     Returns:
@@ -200,7 +211,7 @@ def _pose_residual(
     constants: tuple[Scene, Array],
     steps: tuple[int, ...],
 ):
-    """Return the pose residuals of one push, twice (value and auxiliary)."""
+    """Return the pose residuals (3 * steps,) of one push, in m, as value and again as auxiliary output."""
     scene, length = constants
     predicted = predict_push(parameters._replace(**free), data.surface, scene, data.inputs)
     difference = predicted.pose[np.array(steps)] - data.poses
@@ -211,13 +222,13 @@ def _pose_residual(
 def _gap_residual(
     free: dict[str, Array], parameters: Parameters, data: _PushData, constants: tuple[Scene, Array]
 ) -> tuple[Array, Array]:
-    """Return the gap between the finger and the slider at its measured final pose, twice (value and auxiliary)."""
+    """Return the gap (1,) in m between finger and measured final pose, as value and again as auxiliary output."""
     parameters, scene = parameters._replace(**free), constants[0]
     shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
     offset, end = parameters.frame_offset, data.poses[-1]
     end = end if offset is None else compose(end, offset)
     path = correct_path(data.inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
-    distance, _, radius = finger_clearance(shape, hand, end, path[-1])
+    distance, _, radius = finger_distance(shape, hand, end, path[-1])
     residual = (distance - radius)[None]
     return residual, residual
 
@@ -225,9 +236,10 @@ def _gap_residual(
 def _direction_residual(
     free: dict[str, Array], parameters: Parameters, pairs: _WrenchMotionPairs, constants: tuple[()]
 ) -> tuple[Array, Array]:
-    """Return the direction residuals of one push, twice (value and auxiliary).
+    """Return the direction residuals (3 * pairs,) of one push, as value and again as auxiliary output.
 
-    Directions are unit vectors along (vx, vy, length * omega). So wrenches may have any scale, and motions any size.
+    Directions are unit vectors along (vx, vy, length * omega), so wrenches and motions may have any scale. `constants`
+    is empty, because the table's reference point and the hand do not matter here.
     """
     parameters = parameters._replace(**free)
     surface = with_coefficients(pairs.surface, parameters.surface)
@@ -246,26 +258,26 @@ def _direction_residual(
     return residual, residual
 
 
-def _over_pushes(
+def _over_conditions_and_pushes(
     function: Callable,
     free: dict[str, Array],
     parameters: Parameters,
     data: "_PushData | _WrenchMotionPairs",
     constants: tuple,
 ):
-    """Map `function` over conditions and pushes. The pushes of a condition share its surface."""
-    axes: Any = data._replace(**{name: None if name == "surface" else 0 for name in data._fields})
-    over_pushes = jax.vmap(function, in_axes=(None, None, axes, None))
+    """Map `function` over conditions and pushes. The pushes of a condition share its parameters and its surface."""
+    data_axes: Any = data._replace(**{name: None if name == "surface" else 0 for name in data._fields})
+    over_pushes = jax.vmap(function, in_axes=(None, None, data_axes, None))
     return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(free, parameters, data, constants)
 
 
 def coefficients_of(surface: LimitSurface) -> Array:
-    """Return the array of the surface that is identified: the coefficients of a quartic, A of an ellipsoid."""
+    """Return the array of the surface that is estimated: coefficients (15,) of a quartic, A (3, 3) of an ellipsoid."""
     return getattr(surface, "coefficients" if surface.degree == 4 else "A")
 
 
 def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurface:
-    """Return the surface with other coefficients."""
+    """Return the surface with other coefficients, in the form that `coefficients_of` returns."""
     return eqx.tree_at(coefficients_of, surface, coefficients)
 
 
@@ -275,7 +287,7 @@ def predict_push(parameters: Parameters, surface: LimitSurface, scene: Scene, in
     Args:
         parameters: Parameters of the push's condition.
         surface: Limit surface; `parameters` replaces its coefficients.
-        scene: Slider and hand.
+        scene: Slider, hand and reference point of the table.
         inputs: Recorded start, path, age and side of the push.
 
     Returns:
@@ -294,25 +306,29 @@ def predict_push(parameters: Parameters, surface: LimitSurface, scene: Scene, in
     by_side = parameters.friction_by_side
     if by_side is not None:
         mu = mu * jnp.exp(by_side[jnp.clip(inputs.side.astype(int), 0, len(by_side) - 1)])
-    uneven = {name: getattr(parameters, name) for name in TABLE if getattr(parameters, name) is not None}
-    table = Table(**uneven, origin=scene.origin) if uneven else None
-    pushed = rollout(slider, hand, path, pose=start, friction=mu, table=table)
+    table_parameters = {name: getattr(parameters, name) for name in TABLE if getattr(parameters, name) is not None}
+    table = Table(**table_parameters, origin=scene.origin) if table_parameters else None
+    trajectory = rollout(slider, hand, path, pose=start, friction=mu, table=table)
     if offset is None:
-        return pushed
-    return eqx.tree_at(lambda p: p.pose, pushed, compose(pushed.pose, inverse(offset)[None]))
+        return trajectory
+    return eqx.tree_at(lambda p: p.pose, trajectory, compose(trajectory.pose, inverse(offset)[None]))
 
 
 def overlap_vector(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
-    """Return the shortest displacement (world, m) that separates a round finger from the slider it penetrates."""
-    distance, normal, radius = finger_clearance(slider.shape, hand, start, configuration)
+    """Return the shortest displacement (2,) of a round finger, world, m, that moves it out of the slider.
+
+    Its length is the penetration depth; it is zero if finger and slider are apart.
+    """
+    distance, normal, radius = finger_distance(slider.shape, hand, start, configuration)
     return jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)
 
 
-def finger_clearance(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
-    """Find the place of the outline that is nearest to the center of a single round finger.
+def finger_distance(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
+    """Measure the distance of a single round finger from the outline.
 
     Returns:
-        Signed distance of the center in m, outward normal (2,) in the body frame, and radius of the finger in m.
+        Signed distance of the finger's center from the outline in m, outward normal (2,) at the nearest point in the
+            body frame, and radius of the finger in m.
     """
     finger = hand.fingers[0]
     assert isinstance(finger, RoundFinger)  # `identify` checks this
@@ -338,9 +354,9 @@ def apply_inset(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
 def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset: Array) -> Array:
     """Return the true path of the hand, from the logged one.
 
-    The configurations are those of the logged path at the arc lengths s (1 + overshoot / length) - lag_distance,
-    shifted by `hand_offset`. Beyond an end of the path it goes straight on. Its direction there is that of a fifth of
-    the path, because local directions of a recording are mostly roundoff.
+    The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
+    lag_distance, shifted by `hand_offset`. Beyond an end of the logged path it goes straight on. Its direction there is
+    that of a fifth of the path, because local directions of a recording are mostly roundoff.
 
     Args:
         path: (steps + 1, dof) logged path.
@@ -350,12 +366,12 @@ def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset
     """
     arc = arc_length(path[:, :2])
     length = arc[-1]
-    at = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
-    corrected = interpolate_arc_length(path, arc, jnp.clip(at, 0, length))
-    part = max(len(path) // STRAIGHT, 1)
-    beyond, before = jnp.maximum(at - length, 0), jnp.minimum(at, 0)
-    corrected = corrected + beyond[:, None] * _change_per_length(path, arc, -1 - part, -1)[None]
-    corrected = corrected + before[:, None] * _change_per_length(path, arc, 0, part)[None]
+    true_arc = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
+    corrected = interpolate_arc_length(path, arc, jnp.clip(true_arc, 0, length))
+    rows = max(len(path) // DIRECTION_PARTS, 1)
+    beyond, before = jnp.maximum(true_arc - length, 0), jnp.minimum(true_arc, 0)
+    corrected = corrected + beyond[:, None] * _change_per_length(path, arc, -1 - rows, -1)[None]
+    corrected = corrected + before[:, None] * _change_per_length(path, arc, 0, rows)[None]
     return corrected.at[:, :2].add(hand_offset[None])
 
 
@@ -367,5 +383,5 @@ def _change_per_length(path: Array, arc: Array, first: int, last: int) -> Float[
 
 def limit_surfaces(prior: Prior, parameters: Parameters) -> LimitSurface:
     """Return the limit surfaces of all conditions, with a leading axis of conditions."""
-    kind = Quartic if prior.mean_surface.factors.shape[1] > 1 else Ellipsoid
-    return jax.vmap(kind)(parameters.surface, prior.mean_surface.length)
+    surface_type = Quartic if prior.mean_surface.factors.shape[1] > 1 else Ellipsoid
+    return jax.vmap(surface_type)(parameters.surface, prior.mean_surface.length)

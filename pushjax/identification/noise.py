@@ -57,7 +57,7 @@ SAMPLES = 32  # samples of each push in each step of the search
 STEPS = 80
 CHUNK = 10  # steps between two calls of `progress`
 LEARNING_RATE = 0.1  # of the logarithms of the parameters
-FINAL_RATE = 0.1  # fraction of the learning rate that is left at the end
+FINAL_RATE_FRACTION = 0.1  # of the learning rate, left at the end
 AVERAGED = 30  # number of last steps whose parameters and scores are averaged
 START = {
     "surface_dof": 60.0,
@@ -122,7 +122,7 @@ class Noise(eqx.Module):
         Raises:
             ValueError: If the file holds something else.
         """
-        return load_json(path, "noise that pushjax identified", FORMAT, VERSION, _noise)
+        return load_json(path, "noise that pushjax identified", FORMAT, VERSION, _noise_from_record)
 
     def predict(
         self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
@@ -232,19 +232,21 @@ def identify_noise(
         raise ValueError(f"samples must be at least 2; got {samples}")
     check_positive("steps", steps)
     predictive = PredictiveModel.of(found, pushes, slider, hand, sampler)
-    log_noise = _first(found)
-    state, scores, visited = _optimizer(steps).init(log_noise), [], []
+    log_noise = _initial_log_noise(found)
+    state, scores, iterates_of_chunks = _optimizer(steps).init(log_noise), [], []
     keys = jax.random.split(key, steps)
-    for begin in range(0, steps, CHUNK):
-        part = keys[begin : begin + CHUNK]
-        log_noise, state, each, passed = _descend(log_noise, state, part, predictive, samples, steps, score)
-        scores.append(each)
-        visited.append(passed)
-        progress(begin + len(part), steps)
+    for first in range(0, steps, CHUNK):
+        chunk_keys = keys[first : first + CHUNK]
+        log_noise, state, chunk_scores, iterates = _descend(
+            log_noise, state, chunk_keys, predictive, samples, steps, score
+        )
+        scores.append(chunk_scores)
+        iterates_of_chunks.append(iterates)
+        progress(first + len(chunk_keys), steps)
     history = jnp.concatenate(scores)
-    passed = jax.tree.map(lambda *parts: jnp.concatenate(parts), *visited)
+    iterates = jax.tree.map(lambda *parts: jnp.concatenate(parts), *iterates_of_chunks)
     last = min(AVERAGED, steps)
-    mean = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), passed)
+    mean = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), iterates)
     best = mean.parameters(predictive.parameters.friction)
     if found.one_condition:
         best = best._replace(friction=best.friction[0])
@@ -253,7 +255,7 @@ def identify_noise(
 
 def _optimizer(steps: int) -> optax.GradientTransformation:
     """Return the optimizer: Adam with a cosine decay of the learning rate."""
-    return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps, FINAL_RATE))
+    return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps, FINAL_RATE_FRACTION))
 
 
 class _LogNoise(NamedTuple):
@@ -279,15 +281,19 @@ class _LogNoise(NamedTuple):
         )
 
 
-def _first(found: Identified) -> _LogNoise:
-    """Return the initial parameters."""
-    first = {name: jnp.asarray(value, found.z.dtype) - LOWER_BOUNDS.get(name, 0.0) for name, value in START.items()}
-    return _LogNoise(**jax.tree.map(jnp.log, first | {"sigma": found.sigma / 2}))
+def _initial_log_noise(found: Identified) -> _LogNoise:
+    """Return the parameters at which the search starts."""
+    initial = {name: jnp.asarray(value, found.z.dtype) - LOWER_BOUNDS.get(name, 0.0) for name, value in START.items()}
+    return _LogNoise(**jax.tree.map(jnp.log, initial | {"sigma": found.sigma / 2}))
 
 
 @jit
 def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
-    """Take one optimizer step per key; return the state, and the scores and parameters of all steps."""
+    """Take one optimizer step per key.
+
+    Returns:
+        The last parameters and optimizer state, the scores before each step, and the parameters after each step.
+    """
     optimizer = _optimizer(steps)
 
     def step(carry, key):
@@ -297,14 +303,14 @@ def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, 
         log_noise = optax.apply_updates(log_noise, updates)
         return (log_noise, state), (value, log_noise)
 
-    (log_noise, state), (scores, passed) = jax.lax.scan(step, (log_noise, state), keys)
-    return log_noise, state, scores, passed
+    (log_noise, state), (scores, iterates) = jax.lax.scan(step, (log_noise, state), keys)
+    return log_noise, state, scores, iterates
 
 
 def _score(
     log_noise: _LogNoise, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
 ) -> tuple[Array, _LogNoise]:
-    """Return the mean score and its derivative.
+    """Return the mean score and its gradient.
 
     A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
     forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
@@ -319,29 +325,29 @@ def _score(
     center, pushes = predictive.parameters.friction, predictive.pushes
     start = log_noise.parameters(center)
     inputs, (poses, jacobian) = predictive.over_conditions(linearize, key, start)
-    before = jax.lax.stop_gradient(start.per_sample(inputs))
+    linearized_at = jax.lax.stop_gradient(start.dof_and_friction(inputs))
 
-    def mean(log_noise: _LogNoise) -> Array:
+    def mean_score(log_noise: _LogNoise) -> Array:
         parameters = log_noise.parameters(center)
-        changes = zip(parameters.per_sample(inputs), before, strict=True)
+        changes = zip(parameters.dof_and_friction(inputs), linearized_at, strict=True)
         dof, mu = ((now - then)[..., None] for now, then in changes)
-        errors = inputs.errors(parameters.student_dof)
+        unit_errors = inputs.unit_errors(parameters.student_dof)
         unshifted = poses + jacobian.dof * dof + jacobian.mu * mu
-        shift = parameters.hand_offset * jnp.einsum("...ij,...j->...i", jacobian.hand_shift, errors[..., :2])
+        shift = parameters.hand_offset * jnp.einsum("...ij,...j->...i", jacobian.hand_shift, unit_errors[..., :2])
         if score == "density":
-            each = -predictive.log_density(unshifted + shift, pushes, parameters)
+            scores = -predictive.log_density(unshifted + shift, pushes, parameters)
         else:
             # `unshifted` does not include the hand's displacement: a relative error of that would be a product of two
             # heavy-tailed variables, whose mean may be infinite
-            error = predictive.error(unshifted, pushes, parameters)
-            off = predictive.measured(unshifted + shift, error, errors) - pushes.end[..., None, :]
-            each = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(off)
-        return jnp.sum(pushes.weight * each) / jnp.sum(pushes.weight)
+            error_scale = predictive.error_scale(unshifted, pushes, parameters)
+            difference = predictive.with_errors(unshifted + shift, error_scale, unit_errors) - pushes.end[..., None, :]
+            scores = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(difference)
+        return jnp.sum(pushes.weight * scores) / jnp.sum(pushes.weight)
 
-    return jax.value_and_grad(mean)(log_noise)
+    return jax.value_and_grad(mean_score)(log_noise)
 
 
-def _noise(record: dict[str, Any], dtype: Any) -> Noise:
-    """Return the noise of a record, in a floating dtype."""
+def _noise_from_record(record: dict[str, Any], dtype: Any) -> Noise:
+    """Return the noise that `Noise.save` wrote as a record, in a floating dtype."""
     arrays = {name: jnp.asarray(record[name], dtype) for name in ARRAYS}
     return Noise(identified=from_record(record["identified"], dtype), sampler=record["sampler"], **arrays)

@@ -23,7 +23,7 @@ from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
-PLACEHOLDER_DOF = 60.0  # placeholder: every sample sets its own dof
+PLACEHOLDER_DOF = 60.0  # never used to sample: every sample sets its own dof
 
 
 class NoiseParameters(NamedTuple):
@@ -46,8 +46,8 @@ class NoiseParameters(NamedTuple):
     relative_error: Float[Array, "2"]
     student_dof: Float[Array, ""]
 
-    def per_sample(self, inputs: "RandomInputs") -> tuple[Array, Array]:
-        """Return dof and mu of each sample, (..., pushes, samples), for one condition or for all."""
+    def dof_and_friction(self, inputs: "RandomInputs") -> tuple[Array, Array]:
+        """Return dof and friction mu of each sample, (..., pushes, samples), for one condition or for all."""
         low, high = self.friction[..., 0, None, None], self.friction[..., 1, None, None]
         mu = low + (high - low) * inputs.mu
         return jnp.broadcast_to(self.surface_dof, mu.shape), mu
@@ -58,7 +58,7 @@ class RandomInputs(NamedTuple):
 
     Attributes:
         surface: Keys of the limit surfaces.
-        error: Keys of the errors, which `errors` turns into numbers.
+        error: Keys of the errors, which `unit_errors` turns into numbers.
         mu: Position of mu in its range, from 0 to 1.
     """
 
@@ -66,23 +66,23 @@ class RandomInputs(NamedTuple):
     error: PRNGKeyArray
     mu: Float[Array, "*conditions pushes n"]
 
-    def errors(self, student_dof: Array) -> Float[Array, "*conditions pushes n 5"]:
-        """Sample the errors, in units of their scale: two of the hand and three of the final pose.
+    def unit_errors(self, student_dof: Array) -> Float[Array, "*conditions pushes n 5"]:
+        """Sample the errors in units of their scale: two of the hand's position and three of the final pose.
 
         The five numbers are normal with one common random factor, so that together they have Student's distribution
         with `student_dof` degrees of freedom.
         """
 
-        def student(key: PRNGKeyArray) -> Float[Array, "5"]:
+        def unit_error(key: PRNGKeyArray) -> Float[Array, "5"]:
             first, second = jax.random.split(key)
             normal = jax.random.normal(first, (5,), student_dof.dtype)
             half = student_dof / 2
             return normal * jnp.sqrt(half / jnp.maximum(jax.random.gamma(second, half, dtype=half.dtype), 1e-6))
 
-        each: Callable = student
+        unit_errors: Callable = unit_error
         for _ in self.mu.shape:
-            each = jax.vmap(each)
-        return each(self.error)
+            unit_errors = jax.vmap(unit_errors)
+        return unit_errors(self.error)
 
 
 class PoseJacobian(NamedTuple):
@@ -129,27 +129,27 @@ class ConditionSampler(eqx.Module):
             values: Parameters of the noise.
             hand_shift: Displacement of each hand, world, m.
         """
-        return self._each(self._pose, inputs, values, hand_shift)
+        return self._over_samples(self._final_pose, inputs, values, hand_shift)
 
     def linearize(self, inputs: RandomInputs, values: NoiseParameters) -> tuple[Array, PoseJacobian]:
         """Return the true final poses without displacement of the hands, and their derivatives."""
 
-        def value(sample, *rest):
-            pose = self._pose(sample, *rest)
+        def pose_twice(sample, *rest):
+            pose = self._final_pose(sample, *rest)
             return pose, pose
 
         no_shift = jnp.zeros((*inputs.mu.shape, 2), inputs.mu.dtype)
-        jacobian, poses = self._each(jax.jacfwd(value, has_aux=True), inputs, values, no_shift)
+        jacobian, poses = self._over_samples(jax.jacfwd(pose_twice, has_aux=True), inputs, values, no_shift)
         return poses, PoseJacobian(*jacobian)
 
-    def _each(self, function: Callable, inputs: RandomInputs, values: NoiseParameters, hand_shift: Array):
-        """Map `function` over pushes and samples."""
+    def _over_samples(self, function: Callable, inputs: RandomInputs, values: NoiseParameters, hand_shift: Array):
+        """Map `function` of (dof, mu, hand shift), key of the surface and push over pushes and samples."""
         over_samples = jax.vmap(function, in_axes=(0, 0, None))
-        samples = (*values.per_sample(inputs), hand_shift)
+        samples = (*values.dof_and_friction(inputs), hand_shift)
         return jax.vmap(over_samples)(samples, inputs.surface, self.pushes.inputs)
 
-    def _pose(self, sample: tuple[Array, Array, Array], key, push: PushInput) -> Float[Array, "3"]:
-        """Return the final pose for one dof, mu and displacement of the hand."""
+    def _final_pose(self, sample: tuple[Array, Array, Array], key, push: PushInput) -> Float[Array, "3"]:
+        """Return the true final pose (3,) for one sample (dof, mu, displacement of the hand)."""
         dof, mu, hand_shift = sample
         surface = self.distribution.with_dof(dof).sample(key).surface
         parameters = self.parameters._replace(
@@ -179,15 +179,15 @@ class PredictiveModel(eqx.Module):
     def of(found: Identified, pushes: Pushes, slider: Slider, hand: Hand, sampler: Sampler) -> "PredictiveModel":
         """Prepare the prediction of `pushes` from what was identified."""
         parameters = found.prior.parameters(found.z)
-        each = limit_surfaces(found.prior, parameters)
+        surfaces = limit_surfaces(found.prior, parameters)
         model, factors = FrictionModel(PLACEHOLDER_DOF, 0.0, sampler), found.prior.factors(found.z)
         dof = jnp.asarray(PLACEHOLDER_DOF, found.z.dtype)
         distributions: list[SurfaceDistribution] = []
         for k in range(len(parameters.friction)):
-            surface = jax.tree.map(lambda leaf, k=k: leaf[k], each)
-            # the factors of the sum of squares are known: skip the search for them
-            known = sampler == "sum_of_squares" and isinstance(surface, Quartic)
-            if known:
+            surface = jax.tree.map(lambda leaf, k=k: leaf[k], surfaces)
+            # The search for the factors of the sum of squares can be skipped, because they are known.
+            factors_are_known = sampler == "sum_of_squares" and isinstance(surface, Quartic)
+            if factors_are_known:
                 distributions.append(SumOfSquaresQuartic.of_terms(surface, factors[k], dof))
             else:
                 distributions.append(model.around(surface))
@@ -206,7 +206,7 @@ class PredictiveModel(eqx.Module):
         keys = jax.random.split(key, len(self.parameters.friction))
         return jax.vmap(one_condition)(keys, self.distribution, self.parameters, self.pushes, values.friction)
 
-    def error(
+    def error_scale(
         self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: NoiseParameters
     ) -> Float[Array, "*pushes n"]:
         """Return the scale in m of the error of each final pose, in x, y and length * theta."""
@@ -215,11 +215,14 @@ class PredictiveModel(eqx.Module):
         of_distance, of_turn = values.relative_error**2
         return jnp.sqrt(values.sigma**2 + of_distance * distance + of_turn * turn)
 
-    def measured(
-        self, poses: Float[Array, "*pushes n 3"], error: Float[Array, "*pushes n"], errors: Float[Array, "*pushes n 5"]
+    def with_errors(
+        self,
+        poses: Float[Array, "*pushes n 3"],
+        error_scale: Float[Array, "*pushes n"],
+        unit_errors: Float[Array, "*pushes n 5"],
     ) -> Float[Array, "*pushes n 3"]:
-        """Return measured final poses: the true ones plus `errors` times their scale `error`."""
-        return poses + (error[..., None] * errors[..., 2:]).at[..., 2].divide(self.length)
+        """Return measured final poses: the true ones plus `unit_errors` times their scale in m."""
+        return poses + (error_scale[..., None] * unit_errors[..., 2:]).at[..., 2].divide(self.length)
 
     def log_density(
         self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: NoiseParameters
@@ -228,8 +231,8 @@ class PredictiveModel(eqx.Module):
 
         The density is the mean of Student's densities about `poses`.
         """
-        off = poses - pushes.end[..., None, :]
-        return student_density(off, self.error(poses, pushes, values), values.student_dof, self.length)
+        difference = poses - pushes.end[..., None, :]
+        return log_student_density(difference, self.error_scale(poses, pushes, values), values.student_dof, self.length)
 
 
 @jit
@@ -240,9 +243,9 @@ def predict(
 
     def measured(condition: ConditionSampler, key, values: NoiseParameters):
         inputs = condition.draw_inputs(key, n)
-        errors = inputs.errors(values.student_dof)
-        poses = condition.poses(inputs, values, values.hand_offset * errors[..., :2])
-        return predictive.measured(poses, predictive.error(poses, condition.pushes, values), errors)
+        unit_errors = inputs.unit_errors(values.student_dof)
+        poses = condition.poses(inputs, values, values.hand_offset * unit_errors[..., :2])
+        return predictive.with_errors(poses, predictive.error_scale(poses, condition.pushes, values), unit_errors)
 
     return predictive.over_conditions(measured, key, values)
 
@@ -258,19 +261,22 @@ def log_density(
 
     def density(condition: ConditionSampler, key, values: NoiseParameters):
         inputs = condition.draw_inputs(key, n)
-        poses = condition.poses(inputs, values, values.hand_offset * inputs.errors(values.student_dof)[..., :2])
+        poses = condition.poses(inputs, values, values.hand_offset * inputs.unit_errors(values.student_dof)[..., :2])
         return predictive.log_density(poses, condition.pushes, values)
 
     return predictive.over_conditions(density, key, values)
 
 
-def student_density(
-    off: Float[Array, "*pushes n 3"], sigma: Float[Array, "*pushes n"], student_dof: Array, length: Float[Array, ""]
+def log_student_density(
+    difference: Float[Array, "*pushes n 3"],
+    sigma: Float[Array, "*pushes n"],
+    student_dof: Array,
+    length: Float[Array, ""],
 ) -> Float[Array, "*pushes"]:
     """Return the logarithm of the mean of Student's densities about several poses.
 
     Args:
-        off: (..., n, 3) differences between the poses and the recorded pose: x, y (m), theta (rad).
+        difference: (..., n, 3) differences between the poses and the recorded pose: x, y (m), theta (rad).
         sigma: (..., n) scale of the error of each pose, m.
         student_dof: Degrees of freedom.
         length: Length in m that makes angles commensurate with positions.
@@ -279,9 +285,9 @@ def student_density(
         Log density per cubic meter of (x, y, length * theta).
     """
     turn = 2 * jnp.pi
-    angle = off[..., 2] - turn * jax.lax.stop_gradient(jnp.round(off[..., 2] / turn))
-    squared = (off[..., 0] ** 2 + off[..., 1] ** 2 + (length * angle) ** 2) / sigma**2
+    angle = difference[..., 2] - turn * jax.lax.stop_gradient(jnp.round(difference[..., 2] / turn))
+    squared = (difference[..., 0] ** 2 + difference[..., 1] ** 2 + (length * angle) ** 2) / sigma**2
     nu = student_dof
     scale = gammaln((nu + 3) / 2) - gammaln(nu / 2) - 1.5 * jnp.log(nu * jnp.pi) - 3 * jnp.log(sigma)
-    each = scale - (nu + 3) / 2 * jnp.log1p(squared / nu)
-    return jax.nn.logsumexp(each, axis=-1) - jnp.log(jnp.asarray(off.shape[-2], each.dtype))
+    log_densities = scale - (nu + 3) / 2 * jnp.log1p(squared / nu)
+    return jax.nn.logsumexp(log_densities, axis=-1) - jnp.log(jnp.asarray(difference.shape[-2], log_densities.dtype))

@@ -1,12 +1,13 @@
 """The prior of the unknowns, and their coordinates z.
 
-The entries of the vector z are independent a priori and have variance one. The exception is the friction, of which only
-the range is known. So the prior term of the loss is |z|^2, and steps are well scaled. Conditions may share any of the
-unknowns.
+The entries of the vector z are independent a priori and have a standard normal distribution. The exception is the
+friction, of which only the range is known. So the prior term of the loss is the sum of the squares of the other
+entries, and steps are well scaled. Conditions may share any of the unknowns.
 
-friction         mu = low + (high - low) logistic(z).
-surface          H(F) = sum_k (F' L_k L_k' F)^(d/2), L_k = L0_k (1 + E_k). L0_k belongs to the mean surface. E_k is
-                 lower triangular, with variance 1 / m below the diagonal and 1 / (2 m) on it. To first order, for many
+friction         mu = low + (high - low) logistic(z), uniform in its range if z is logistic.
+surface          H(F) = sum_k (F' P_k F)^(d/2), P_k = L_k L_k', L_k = L0_k (1 + E_k). d is the degree: 2 for an
+                 ellipsoid, which has one term, and 4 for a quartic. L0_k belongs to the mean surface. E_k is lower
+                 triangular, with variance 1 / m below the diagonal and 1 / (2 m) on it. To first order, for many
                  degrees of freedom m, this is the distribution from which `FrictionModel` draws ("sum_of_squares"),
                  with the same meaning of dof. H is always convex.
 pressure_center  center of pressure c, about which the torque of the surface is taken: H(fx, fy, tau - c x f).
@@ -34,7 +35,7 @@ class Layout(eqx.Module):
 
     Attributes:
         names: Names of the unknowns.
-        sizes: How many numbers each has.
+        sizes: How many entries each has per condition.
         shared: Names that all conditions share.
         conditions: Number of conditions.
     """
@@ -53,13 +54,13 @@ class Layout(eqx.Module):
 
     @property
     def slices(self) -> dict[str, slice]:
-        """Slice of each unknown in the numbers of one condition."""
+        """Slice of each unknown among the entries of one condition."""
         ends = np.cumsum((0, *self.sizes))
         return {name: slice(int(a), int(b)) for name, a, b in zip(self.names, ends[:-1], ends[1:], strict=True)}
 
     @property
     def positions(self) -> np.ndarray:
-        """(conditions, numbers) positions in z of the numbers of each condition."""
+        """(conditions, entries) positions in z of the entries of each condition; shared entries occur in every row."""
         columns, used = [], 0
         for name, size in zip(self.names, self.sizes, strict=True):
             copies = 1 if name in self.shared else self.conditions
@@ -75,18 +76,18 @@ class Layout(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A label for every entry of z."""
+        """A label for every entry of z: name, condition if not shared, and index, such as "hand_offset[1].0"."""
         labels = [""] * self.size
         for condition, row in enumerate(self.positions):
-            for name, part in self.slices.items():
-                for k, position in enumerate(row[part]):
+            for name, columns in self.slices.items():
+                for k, position in enumerate(row[columns]):
                     where = f"[{condition}]" if self.conditions > 1 and name not in self.shared else ""
-                    labels[position] = f"{name}{where}" + (f".{k}" if part.stop - part.start > 1 else "")
+                    labels[position] = f"{name}{where}" + (f".{k}" if columns.stop - columns.start > 1 else "")
         return tuple(labels)
 
     @property
     def has_normal_prior(self) -> np.ndarray:
-        """(size,) 1 for entries of z whose square is in the loss, 0 for frictions."""
+        """(size,) 1 for entries of z with a normal prior, whose square is in the loss; 0 for frictions."""
         normal = np.ones(self.size)
         if "friction" in self.names:
             normal[self.positions[:, self.slices["friction"]]] = 0
@@ -109,13 +110,15 @@ class PriorSurface(eqx.Module):
 
     @staticmethod
     def of(surface: LimitSurface, dof: Array | None) -> "PriorSurface":
-        """Return the mean for surfaces with a leading axis of conditions."""
+        """Return the prior for mean surfaces with a leading axis of conditions; `dof` None: the surface is known."""
         factors = jax.vmap(_factors_of)(surface)
         if dof is None:
             return PriorSurface(factors, jnp.zeros_like(surface.length), surface.length)
-        n = jnp.asarray(dof, factors.dtype)
-        m = jax.vmap(lambda one: dof_of_terms(one, n))(factors) if isinstance(surface, Quartic) else n
-        return PriorSurface(factors, jnp.broadcast_to(1 / jnp.sqrt(m), surface.length.shape), surface.length)
+        dof_array = jnp.asarray(dof, factors.dtype)
+        term_dof = (
+            jax.vmap(lambda one: dof_of_terms(one, dof_array))(factors) if isinstance(surface, Quartic) else dof_array
+        )
+        return PriorSurface(factors, jnp.broadcast_to(1 / jnp.sqrt(term_dof), surface.length.shape), surface.length)
 
 
 def _factors_of(surface: LimitSurface) -> Array:
@@ -154,14 +157,21 @@ class Prior(eqx.Module):
 
     def parameters(self, z: Float[Array, "size"]) -> Parameters:
         """Return the physical parameters of every condition."""
-        each = jax.vmap(lambda numbers, *rest: _parameters(numbers, self.layout, self.unknowns, *rest))
-        return each(z[self.layout.positions], self.known_friction, self.mean_surface)
+        of_conditions = jax.vmap(
+            lambda numbers, *rest: _condition_parameters(numbers, self.layout, self.unknowns, *rest)
+        )
+        return of_conditions(z[self.layout.positions], self.known_friction, self.mean_surface)
 
     def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
-        """Return the lower triangular factors L_k of every condition's surface."""
-        each = jax.vmap(lambda numbers, mean: _factors(_by_name(numbers, self.layout), self.unknowns, mean))
-        whole = each(z[self.layout.positions], self.mean_surface)
-        return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(whole, -1, -2), mode="r"), -1, -2)
+        """Return the lower triangular factors L_k of every condition's surface.
+
+        A QR decomposition makes them triangular again if the center of pressure is an unknown.
+        """
+        of_conditions = jax.vmap(
+            lambda numbers, mean: _surface_factors(_entries_by_name(numbers, self.layout), self.unknowns, mean)
+        )
+        full = of_conditions(z[self.layout.positions], self.mean_surface)
+        return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
 
     @property
     def mean(self) -> Float[Array, "size"]:
@@ -169,63 +179,65 @@ class Prior(eqx.Module):
         return jnp.zeros(self.layout.size, self.known_friction.dtype)
 
 
-def _by_name(z: Array, layout: Layout) -> dict[str, Any]:
-    """Split the numbers of one condition by name."""
+def _entries_by_name(z: Array, layout: Layout) -> dict[str, Any]:
+    """Split the entries of one condition by the name of the unknown."""
     return {name: z[where] for name, where in layout.slices.items()}
 
 
-def _scaled(part: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
-    """Return entries of z times their standard deviation; zeros for what is known."""
+def _scaled_entries(entries: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
+    """Return the entries of an unknown times their standard deviation; zeros if the parameter is known."""
     std = getattr(unknowns, name)
-    return jnp.zeros(SIZES[name], dtype) if std is None else std.astype(dtype) * part[name]
+    return jnp.zeros(SIZES[name], dtype) if std is None else std.astype(dtype) * entries[name]
 
 
-def _factors(part: dict[str, Any], unknowns: Unknowns, mean: PriorSurface) -> Float[Array, "terms 3 3"]:
-    """Return L_k of the surface, with P_k = L_k L_k'; not triangular if the center of pressure is an unknown."""
+def _surface_factors(entries: dict[str, Any], unknowns: Unknowns, mean: PriorSurface) -> Float[Array, "terms 3 3"]:
+    """Return factors L_k of the surface, which are not triangular if the center of pressure is an unknown."""
     factors = mean.factors
-    if "surface" in part:
-        factors = factors + mean.relative_std * factors @ _perturbation(part["surface"].reshape(-1, 6))
-    if "pressure_center" in part:
-        cx, cy = _scaled(part, unknowns, "pressure_center", factors.dtype) / mean.length
+    if "surface" in entries:
+        factors = factors + mean.relative_std * factors @ _unit_perturbation(entries["surface"].reshape(-1, 6))
+    if "pressure_center" in entries:
+        cx, cy = _scaled_entries(entries, unknowns, "pressure_center", factors.dtype) / mean.length
         row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
         shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
         factors = shift.T[None] @ factors
     return factors
 
 
-def _parameters(z: Array, layout: Layout, unknowns: Unknowns, friction: Array, mean: PriorSurface) -> Parameters:
+def _condition_parameters(
+    z: Array, layout: Layout, unknowns: Unknowns, known_friction: Array, mean: PriorSurface
+) -> Parameters:
     """Return the physical parameters of one condition.
 
     Args:
-        z: (numbers,) numbers of the condition.
+        z: (entries,) entries of the condition.
         layout: Positions of the unknowns.
         unknowns: What is estimated, and its prior.
-        friction: Friction of the condition, used if it is known.
+        known_friction: Friction of the condition, used if it is known.
         mean: Mean surface of the condition.
     """
-    part = _by_name(z, layout)
-    mu = friction
+    entries = _entries_by_name(z, layout)
+    mu = known_friction
     if unknowns.friction is not None:
         low, high = unknowns.friction.astype(z.dtype)
-        mu = low + (high - low) * jax.nn.sigmoid(part["friction"][0])
-    factors = _factors(part, unknowns, mean)
-    forms = factors @ jnp.swapaxes(factors, 1, 2)
-    surface = squared_quadratics(forms) if factors.shape[0] > 1 else forms[0]
+        mu = low + (high - low) * jax.nn.sigmoid(entries["friction"][0])
+    factors = _surface_factors(entries, unknowns, mean)
+    gram = factors @ jnp.swapaxes(factors, 1, 2)
+    surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
 
     def scaled(name: str) -> Array:
-        return _scaled(part, unknowns, name, z.dtype)
+        return _scaled_entries(entries, unknowns, name, z.dtype)
 
     pressure_center, hand_offset = scaled("pressure_center"), scaled("hand_offset")
     inset, overshoot, lag_distance = (scaled(name)[0] for name in ("inset", "overshoot", "lag_distance"))
-    optional = {name: scaled(name) for name in Parameters._field_defaults if name in part}
+    optional = {name: scaled(name) for name in Parameters._field_defaults if name in entries}
     if "frame_offset" in optional:
         optional["frame_offset"] = optional["frame_offset"].at[2].divide(mean.length)
     optional = {name: value[0] if SIZES[name] == 1 else value for name, value in optional.items()}
     return Parameters(mu, surface, pressure_center, inset, overshoot, lag_distance, hand_offset, **optional)
 
 
-def _perturbation(e: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
-    """Return E_k in units of its standard deviation below the diagonal, from its six numbers."""
+def _unit_perturbation(entries: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
+    """Return E_k, in units of its standard deviation below the diagonal, from its six entries of z."""
     rows, columns = np.tril_indices(3)
-    size = np.where(rows == columns, np.sqrt(0.5), 1.0)
-    return unpack_lower(e * jnp.asarray(size, e.dtype)[None])
+    std = np.where(rows == columns, np.sqrt(0.5), 1.0)
+    return unpack_lower(entries * jnp.asarray(std, entries.dtype)[None])

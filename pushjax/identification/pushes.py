@@ -39,7 +39,8 @@ class PushInput(NamedTuple):
 class Pushes(eqx.Module):
     """Pushes of one slider by one hand; with a leading axis, pushes of several conditions.
 
-    The poses of one push share a total weight of one, because their errors are correlated. Likewise its pairs.
+    The poses of one push share a total weight of one, because their errors are correlated. So do its pairs of wrench
+    and twist.
 
     Attributes:
         start: (pushes, 3) slider's pose before each push, world, m and rad.
@@ -88,28 +89,30 @@ class Pushes(eqx.Module):
         self.start, self.path, self.end = (as_float(value, dtype) for value in (start, path, end))
         if self.start.ndim not in (2, 3):
             raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
-        many = self.start.shape[:-1]
-        none = jnp.zeros((*many, 0, 3), dtype)
-        self.weight = jnp.ones(many, dtype) if weight is None else as_float(weight, dtype)
+        leading = self.start.shape[:-1]
+        no_rows = jnp.zeros((*leading, 0, 3), dtype)
+        self.weight = jnp.ones(leading, dtype) if weight is None else as_float(weight, dtype, "weight")
         self.poses_between, self.wrench, self.twist = (
-            none if value is None else as_float(value, dtype) for value in (poses_between, wrench, twist)
+            no_rows if value is None else as_float(value, dtype) for value in (poses_between, wrench, twist)
         )
         self.age, self.side = (
-            jnp.zeros(many, dtype) if value is None else as_float(value, dtype) for value in (age, side)
+            jnp.zeros(leading, dtype) if value is None else as_float(value, dtype) for value in (age, side)
         )
-        check_shape("end", self.end, (*many, 3))
-        check_shape("path", self.path, (*many, "steps + 1", "dof"))
-        check_shape("weight", self.weight, many)
-        check_shape("age", self.age, many)
-        check_shape("side", self.side, many)
-        check_shape("poses_between", self.poses_between, (*many, "k", 3))
-        check_shape("wrench", self.wrench, (*many, "p", 3))
+        check_shape("end", self.end, (*leading, 3))
+        check_shape("path", self.path, (*leading, "steps + 1", "dof"))
+        check_shape("weight", self.weight, leading)
+        check_shape("age", self.age, leading)
+        check_shape("side", self.side, leading)
+        check_shape("poses_between", self.poses_between, (*leading, "k", 3))
+        check_shape("wrench", self.wrench, (*leading, "p", 3))
         check_shape("twist", self.twist, self.wrench.shape)
-        steps, seen = self.path.shape[-2] - 1, self.poses_between.shape[-2]
+        steps, between = self.path.shape[-2] - 1, self.poses_between.shape[-2]
         if steps < 1:
             raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
-        if seen >= steps:
-            raise ValueError(f"poses_between has {seen} poses on the way; between {steps} steps there are {steps - 1}")
+        if between >= steps:
+            raise ValueError(
+                f"poses_between has {between} poses on the way; between {steps} steps there are {steps - 1}"
+            )
         for name in ARRAYS:
             check_finite(name, getattr(self, name))
         check_non_negative("weight", self.weight)
@@ -178,25 +181,26 @@ class Pushes(eqx.Module):
         """
         if not several:
             raise ValueError("several: expected at least one condition's pushes; got none")
-        most = max(one.weight.shape[0] for one in several)
+        longest = max(one.weight.shape[0] for one in several)
         for name in ARRAYS:
             shapes = {getattr(one, name).shape[1:] for one in several}
             if len(shapes) > 1:
                 raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
 
-        def filled(name: str) -> Array:
+        def padded(name: str) -> Array:
+            """Return one array of all conditions; the padding repeats a condition's first push."""
             rows = []
             for one in several:
                 value = getattr(one, name)
-                rest = most - value.shape[0]
-                again = jnp.broadcast_to(value[:1], (rest, *value.shape[1:]))
-                rows.append(jnp.concatenate([value, 0 * again if name == "weight" else again]))
+                missing = longest - value.shape[0]
+                padding = jnp.broadcast_to(value[:1], (missing, *value.shape[1:]))
+                rows.append(jnp.concatenate([value, 0 * padding if name == "weight" else padding]))
             return jnp.stack(rows)
 
-        return Pushes(**{name: filled(name) for name in ARRAYS})
+        return Pushes(**{name: padded(name) for name in ARRAYS})
 
     def weighted(self, weight: ArrayLike) -> "Pushes":
         """Return the same pushes with other weights (pushes,), for example a training set or a bootstrap sample."""
-        value = as_float(weight, self.weight.dtype)
+        value = as_float(weight, self.weight.dtype, "weight")
         check_shape("weight", value, self.weight.shape)
         return eqx.tree_at(lambda p: p.weight, self, value)

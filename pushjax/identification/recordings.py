@@ -16,17 +16,21 @@ from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.hand import Hand, RoundFinger
 
-STRONG = 0.5  # of the mean force of a push: samples with a smaller force are not used for wrenches
-MOVES = 2e-4  # m, smallest displacement under a wrench that gives a direction of motion
+# Wrenches
+MIN_FORCE_FRACTION = 0.5  # samples whose force is below this fraction of the push's mean force are not used
+MIN_DISPLACEMENT = 2e-4  # m, smallest displacement under a wrench that gives a direction of motion
 
-ROWS = 200  # rows of a path that are checked: a fixed number, so that one compiled program is enough
-SHORTEST = 1e-4  # m, smallest distance that a hand moves
-NEAR = 0.005  # m, largest gap of a hand that touches: trackers and outlines have errors of millimeters
-MOVED = 5e-4  # m, displacement that exceeds the noise of a tracker
-LARGEST = 2.0  # m, largest size of a slider
-FAR = 30.0  # slider sizes, largest distance from the slider to the hand, and that the hand moves
-TURN = 2 * np.pi  # rad, largest rotation of a slider in a push
-ROOM = 0.01  # m, margin for a slider that moves farther than its hand, and for errors of the tracker
+# Limits of what is physically possible
+CHECKED_ROWS = 200  # rows of a path that are checked: a fixed number, so that one compiled program is enough
+MIN_TRAVEL = 1e-4  # m, smallest distance that a hand moves
+MAX_CONTACT_GAP = 0.005  # m, largest gap of a hand that touches: trackers and outlines have errors of millimeters
+TRACKER_NOISE = 5e-4  # m, largest displacement that may be noise of the tracker
+MAX_SLIDER_SIZE = 2.0  # m, largest extent of a slider
+MAX_DISTANCE = (
+    30.0  # largest distance from slider to hand, and largest travel of the hand, in units of the slider's size
+)
+MAX_TURN = 2 * np.pi  # rad, largest rotation of a slider in a push
+TRAVEL_MARGIN = 0.01  # m, margin for a slider that moves farther than its hand, and for errors of the tracker
 
 
 def screen(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
@@ -46,61 +50,66 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
     """
     low, high = (np.asarray(corner, float) for corner in shape.bounds)
     size = float(np.max(high - low))
-    if not size <= LARGEST:
-        raise ValueError(f"shape: {size:g} m across; expected at most {LARGEST:g} m: is it in millimeters?")
+    if not size <= MAX_SLIDER_SIZE:
+        raise ValueError(f"shape: {size:g} m across; expected at most {MAX_SLIDER_SIZE:g} m: is it in millimeters?")
     kept: list[Recording] = []
     problems: list[LogError] = []
     for push in recordings.pushes:
-        wrong = _wrong(push, size, shape, hand)
-        if wrong is None:
+        reason = _implausibility(push, size, shape, hand)
+        if reason is None:
             kept.append(push)
         else:
-            problems.append(LogError(recordings.source, wrong, push=push.index))
+            problems.append(LogError(recordings.source, reason, push=push.index))
     if not kept:
         raise nothing_usable(recordings.source, problems)
     return replace(recordings, pushes=tuple(kept), problems=(*recordings.problems, *problems))
 
 
-def _wrong(push: Recording, size: float, shape: Shape, hand: Hand) -> str | None:
-    """Return what is wrong with a push, or None. All comparisons fail for NaN."""
+def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> str | None:
+    """Return why a push is physically impossible, or None. The comparisons are written so that NaN fails them."""
     start, end = push.pose[0], push.pose[-1]
-    hop = np.linalg.norm(np.diff(push.hand[:, :2], axis=0), axis=1)
-    travel, apart = float(hop.sum()), float(np.linalg.norm(push.hand[:, :2] - start[:2], axis=1).min())
-    turned = push.hand.shape[1] > 2 and float(np.abs(np.diff(push.hand[:, 2:], axis=0)).sum()) > 1e-3
+    step_lengths = np.linalg.norm(np.diff(push.hand[:, :2], axis=0), axis=1)
+    travel, distance = float(step_lengths.sum()), float(np.linalg.norm(push.hand[:, :2] - start[:2], axis=1).min())
+    hand_turns = push.hand.shape[1] > 2 and float(np.abs(np.diff(push.hand[:, 2:], axis=0)).sum()) > 1e-3
     moved, turn = float(np.linalg.norm(end[:2] - start[:2])), float(abs(end[2] - start[2]))
-    if not (turn <= TURN and abs(start[2]) <= 2 * TURN):
-        found = f"turns by {turn:.4g}" if not turn <= TURN else f"starts at {start[2]:.4g}"
+    if not (turn <= MAX_TURN and abs(start[2]) <= 2 * MAX_TURN):
+        found = f"turns by {turn:.4g}" if not turn <= MAX_TURN else f"starts at {start[2]:.4g}"
         return f"the object {found} rad; expected at most a turn, from within two of zero: is it in degrees?"
-    if not (travel <= FAR * size and apart <= FAR * size):
-        what, found = ("the hand moves", travel) if travel > FAR * size else ("the hand stays away by", apart)
+    if not (travel <= MAX_DISTANCE * size and distance <= MAX_DISTANCE * size):
+        what, found = (
+            ("the hand moves", travel) if travel > MAX_DISTANCE * size else ("the hand stays away by", distance)
+        )
         return f"{what} {found:.4g} m, of an object {size:.3g} m across: are its coordinates in millimeters?"
-    if not (travel >= SHORTEST or turned):
-        return f"the hand moves {travel:.2g} m; expected at least {SHORTEST:g} m"
-    if not (moved <= travel + size + ROOM):
+    if not (travel >= MIN_TRAVEL or hand_turns):
+        return f"the hand moves {travel:.2g} m; expected at least {MIN_TRAVEL:g} m"
+    if not (moved <= travel + size + TRAVEL_MARGIN):
         return f"the object moves {moved:.4g} m, the hand {travel:.4g} m: the tracker jumped"
-    nearest = _gaps(shape, hand, push)
-    if nearest.size and not nearest.min() <= NEAR:
-        also = f", yet the object moves {moved:.3g} m" if moved > MOVED else ""
-        return f"the hand never touches: it stays {nearest.min():.3g} m away from where the object starts{also}"
-    if nearest.size and not nearest[0] >= -size / 4:
-        return f"the hand starts {-nearest[0]:.3g} m inside the object"
+    gaps = _finger_gaps(shape, hand, push)
+    if gaps.size and not gaps.min() <= MAX_CONTACT_GAP:
+        addition = f", yet the object moves {moved:.3g} m" if moved > TRACKER_NOISE else ""
+        return f"the hand never touches: it stays {gaps.min():.3g} m away from where the object starts{addition}"
+    if gaps.size and not gaps[0] >= -size / 4:
+        return f"the hand starts {-gaps[0]:.3g} m inside the object"
     return None
 
 
-def _gaps(shape: Shape, hand: Hand, push: Recording) -> np.ndarray:
-    """Return the gaps (rows,) in m from the nearest finger to the initial outline; empty if a finger is not a disk."""
+def _finger_gaps(shape: Shape, hand: Hand, push: Recording) -> np.ndarray:
+    """Return the gaps (CHECKED_ROWS,) in m from the nearest finger to the initial outline, negative inside.
+
+    The result is empty if a finger is not round.
+    """
     if not all(isinstance(finger, RoundFinger) for finger in hand.fingers):
         return np.zeros(0)
-    rows = np.linspace(0, len(push.hand) - 1, ROWS).round().astype(int)
+    rows = np.linspace(0, len(push.hand) - 1, CHECKED_ROWS).round().astype(int)
     centers = np.asarray(hand.poses(jnp.asarray(push.hand[rows])))[..., :2]
     body = (centers - push.pose[0, :2]) @ rotation(push.pose[0, 2])
-    distance = np.asarray(_distances(shape, jnp.asarray(body).reshape(-1, 2))).reshape(ROWS, -1)
+    distance = np.asarray(_signed_distances(shape, jnp.asarray(body).reshape(-1, 2))).reshape(CHECKED_ROWS, -1)
     return (distance - np.asarray(hand.radius)).min(axis=1)
 
 
 @quick_jit
-def _distances(shape: Shape, points: jax.Array) -> jax.Array:
-    """Return the signed distances of body points, as one compiled program."""
+def _signed_distances(shape: Shape, points: jax.Array) -> jax.Array:
+    """Return the signed distances (n,) in m of points (n, 2), body frame, from the outline."""
     return jax.vmap(shape.signed_distance)(points)
 
 
@@ -128,17 +137,22 @@ def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | N
     pushes = recordings.pushes
     if not observed_often_enough(recordings, parts):
         parts = 1
-    arcs = [_arc(push) for push in pushes]
-    path = [_at(push.hand, arc, np.arange(steps + 1) / steps * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)]
-    # rounded to steps of the path
-    shares = np.round(np.arange(parts + 1) / parts * steps) / steps
-    poses = np.stack([_poses(push, arc, shares * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)])
+    arcs = [_hand_travel(push) for push in pushes]
+    path = [
+        _interpolated_columns(push.hand, arc, np.arange(steps + 1) / steps * arc[-1])
+        for push, arc in zip(pushes, arcs, strict=True)
+    ]
+    # Parts end at steps of the path, because the prediction has poses only there.
+    fractions = np.round(np.arange(parts + 1) / parts * steps) / steps
+    poses = np.stack([_slider_poses(push, arc, fractions * arc[-1]) for push, arc in zip(pushes, arcs, strict=True)])
     pairs: dict[str, Floats] = {}
     if shape is not None and parts > 1 and has_wrenches(recordings):
-        which = [np.clip(np.searchsorted(shares * arc[-1], arc, side="right") - 1, 0, parts - 1) for arc in arcs]
-        pairs = _pairs(pushes, poses, which, shape)
-    ends = {"start": poses[:, 0], "path": np.stack(path), "end": poses[:, -1]}
-    return ends | {"poses_between": poses[:, 1:-1]} | pairs
+        part_of_sample = [
+            np.clip(np.searchsorted(fractions * arc[-1], arc, side="right") - 1, 0, parts - 1) for arc in arcs
+        ]
+        pairs = _wrench_motion_pairs(pushes, poses, part_of_sample, shape)
+    arrays = {"start": poses[:, 0], "path": np.stack(path), "end": poses[:, -1]}
+    return arrays | {"poses_between": poses[:, 1:-1]} | pairs
 
 
 def observed_often_enough(recordings: Recordings, parts: int) -> bool:
@@ -151,56 +165,65 @@ def has_wrenches(recordings: Recordings) -> bool:
     return all(push.force is not None and push.hand.shape[1] == 2 for push in recordings.pushes)
 
 
-def _arc(push: Recording) -> Floats:
+def _hand_travel(push: Recording) -> Floats:
     """Return the distance (m,) that the hand has moved at each sample, in the configuration's own units."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(push.hand, axis=0), axis=1))])
 
 
-def _at(values: Floats, arc: Floats, at: Floats) -> Floats:
-    """Interpolate each column of `values` at the arc lengths `at`."""
-    return np.stack([np.interp(at, arc, column) for column in values.T], axis=1)
+def _interpolated_columns(values: Floats, arc: Floats, query: Floats) -> Floats:
+    """Interpolate each column of `values` (m, c), known at `arc` (m,), at other arc lengths `query` (k,)."""
+    return np.stack([np.interp(query, arc, column) for column in values.T], axis=1)
 
 
-def _poses(push: Recording, arc: Floats, at: Floats) -> Floats:
-    """Return the slider's poses at the hand's arc lengths `at`."""
-    pose = _at(push.pose[push.seen], arc[push.seen], at)
-    # a tracker that lags may show the slider moving after the hand has stopped
+def _slider_poses(push: Recording, arc: Floats, query: Floats) -> Floats:
+    """Return the slider's poses (k, 3) at the hand's arc lengths `query` (k,), the first and last being the ends."""
+    pose = _interpolated_columns(push.pose[push.seen], arc[push.seen], query)
+    # A tracker that lags may show the slider moving after the hand has stopped, at equal arc lengths.
     pose[0], pose[-1] = push.pose[0], push.pose[-1]
     return pose
 
 
-def _pairs(pushes: tuple[Recording, ...], poses: Floats, which: list[np.ndarray], shape: Shape) -> dict[str, Floats]:
+def _wrench_motion_pairs(
+    pushes: tuple[Recording, ...], poses: Floats, part_of_sample: list[np.ndarray], shape: Shape
+) -> dict[str, Floats]:
     """Return the mean wrench and the displacement in each part of each push, in the body frame; zero where unknown.
 
     Args:
         pushes: Recorded pushes.
         poses: (pushes, parts + 1, 3) slider's poses between the parts.
-        which: For each push, the part that each sample is in.
+        part_of_sample: For each push, the index of the part that each sample is in.
         shape: Outline of the slider.
     """
     rows = [np.arange(len(push.hand), dtype=float) for push in pushes]
-    every = [_at(push.pose[push.seen], row[push.seen], row) for push, row in zip(pushes, rows, strict=True)]
-    tips = [np.einsum("kji,kj->ki", rotation(q[:, 2]), p.hand - q[:, :2]) for p, q in zip(pushes, every, strict=True)]
+    all_poses = [
+        _interpolated_columns(push.pose[push.seen], row[push.seen], row) for push, row in zip(pushes, rows, strict=True)
+    ]
+    fingertips = [
+        np.einsum("kji,kj->ki", rotation(q[:, 2]), p.hand - q[:, :2]) for p, q in zip(pushes, all_poses, strict=True)
+    ]
     # all pushes at once: otherwise each number of samples would need its own compiled program
-    feet = np.split(np.asarray(_feet(shape, jnp.asarray(np.concatenate(tips)))), np.cumsum([len(t) for t in tips])[:-1])
+    contacts = np.split(
+        np.asarray(_nearest_on_outline(shape, jnp.asarray(np.concatenate(fingertips)))),
+        np.cumsum([len(t) for t in fingertips])[:-1],
+    )
     wrench, twist = np.zeros_like(poses[:, 1:]), np.zeros_like(poses[:, 1:])
-    for k, (push, pose, arm) in enumerate(zip(pushes, every, feet, strict=True)):
+    for k, (push, pose, contact) in enumerate(zip(pushes, all_poses, contacts, strict=True)):
         force = np.asarray(push.force)
-        there = np.isfinite(force[:, 0]) & np.isfinite(force[:, 1])
-        pushed = np.einsum("kji,kj->ki", rotation(pose[:, 2]), np.where(there[:, None], force, 0.0))
-        strength = np.hypot(pushed[:, 0], pushed[:, 1])
-        strong = there & (strength >= STRONG * np.sum(strength) / max(int(there.sum()), 1))
+        measured = np.isfinite(force[:, 0]) & np.isfinite(force[:, 1])
+        body_force = np.einsum("kji,kj->ki", rotation(pose[:, 2]), np.where(measured[:, None], force, 0.0))
+        magnitude = np.hypot(body_force[:, 0], body_force[:, 1])
+        usable = measured & (magnitude >= MIN_FORCE_FRACTION * np.sum(magnitude) / max(int(measured.sum()), 1))
         for part, (before, after) in enumerate(zip(poses[k, :-1], poses[k, 1:], strict=True)):
-            mine = strong & (which[k] == part)
-            moved = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
-            if mine.any() and np.hypot(*moved) >= MOVES:
-                f, r = pushed[mine], arm[mine]
-                wrench[k, part] = *f.mean(axis=0), (r[:, 0] * f[:, 1] - r[:, 1] * f[:, 0]).mean()
-                twist[k, part] = *moved, after[2] - before[2]
+            in_part = usable & (part_of_sample[k] == part)
+            translation = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
+            if in_part.any() and np.hypot(*translation) >= MIN_DISPLACEMENT:
+                forces, arms = body_force[in_part], contact[in_part]
+                wrench[k, part] = *forces.mean(axis=0), (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).mean()
+                twist[k, part] = *translation, after[2] - before[2]
     return {"wrench": wrench, "twist": twist}
 
 
 @quick_jit
-def _feet(shape: Shape, points: jax.Array) -> jax.Array:
-    """Return the nearest point of the outline to each point, which is where a finger touches."""
+def _nearest_on_outline(shape: Shape, points: jax.Array) -> jax.Array:
+    """Return the points (n, 2) of the outline nearest to points (n, 2), body frame, m: where a finger touches."""
     return jax.vmap(lambda point: shape.closest(point)[1])(points)

@@ -24,9 +24,9 @@ from pushjax.simulation.trajectory import Trajectory
 
 FORMAT, VERSION = "pushjax identified", 1
 ARRAYS = ("z", "precision", "sigma", "direction_sigma", "gap_sigma", "residual", "information", "loss", "length")
-# what slider, hand and path can represent
-CORRECTED = ("friction", "surface", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset")
-LOGISTIC_VARIANCE = np.pi**2 / 3
+# Unknowns that slider, hand and path can represent.
+CORRECTABLE = ("friction", "surface", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset")
+LOGISTIC_VARIANCE = np.pi**2 / 3  # of z if the friction is uniform in its range
 
 
 class Identified(eqx.Module):
@@ -101,9 +101,9 @@ class Identified(eqx.Module):
         The prior variance of a friction is that of the uniform distribution over its range. Near zero, the pushes do
         not determine the number.
         """
-        before = np.where(self.prior.layout.has_normal_prior > 0, 1.0, LOGISTIC_VARIANCE)
-        share = 1 - np.diagonal(np.asarray(self.covariance, float)) / before
-        return dict(zip(self.labels, np.clip(share, 0, 1).tolist(), strict=True))
+        prior_variance = np.where(self.prior.layout.has_normal_prior > 0, 1.0, LOGISTIC_VARIANCE)
+        reduction = 1 - np.diagonal(np.asarray(self.covariance, float)) / prior_variance
+        return dict(zip(self.labels, np.clip(reduction, 0, 1).tolist(), strict=True))
 
     def information_share(self, name: str) -> Float[Array, "*conditions pushes"]:
         """Return the fraction of the total information about `name` that each push contributes.
@@ -121,9 +121,9 @@ class Identified(eqx.Module):
             raise ValueError(f"name must be one of {', '.join(self.prior.layout.names)}; got {name!r}")
         layout = self.prior.layout
         positions = np.unique(layout.positions[:, layout.slices[name]])
-        each = jnp.sum(self.information[..., positions], axis=-1)
-        total = jnp.sum(each)
-        return each / jnp.where(total > 0, total, 1.0)
+        per_push = jnp.sum(self.information[..., positions], axis=-1)
+        total = jnp.sum(per_push)
+        return per_push / jnp.where(total > 0, total, 1.0)
 
     def save(self, path: str | Path) -> None:
         """Write everything to a JSON file that `load` reads back to the same bits."""
@@ -211,14 +211,14 @@ class Identified(eqx.Module):
         """
         if not self.one_condition:
             raise ValueError("corrected is for what was found of one condition; of several there is `predict`")
-        more = [name for name in self.prior.layout.names if name not in CORRECTED]
-        if more:
+        uncorrectable = [name for name in self.prior.layout.names if name not in CORRECTABLE]
+        if uncorrectable:
             raise ValueError(
-                f"corrected cannot represent {', '.join(more)}; for what was found of them there is `predict`"
+                f"corrected cannot represent {', '.join(uncorrectable)}; for what was found of them there is `predict`"
             )
-        own = self.parameters
-        shape, hand = apply_inset(slider.shape, hand, own.inset)
-        path = correct_path(path, own.overshoot, own.lag_distance, own.hand_offset)
+        parameters = self.parameters
+        shape, hand = apply_inset(slider.shape, hand, parameters.inset)
+        path = correct_path(path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
         return Slider(shape, self.surface), hand, path
 
     def predict(self, pushes: Pushes, slider: Slider, hand: Hand) -> Trajectory:
@@ -234,19 +234,21 @@ class Identified(eqx.Module):
         """
         parameters = self.prior.parameters(self.z)
         scene = Scene(slider.shape, hand, self.prior.origin)
-        each = _predict_pushes(parameters, limit_surfaces(self.prior, parameters), scene, pushes.as_conditions())
-        return self._drop_condition_axis(each)
+        trajectories = _predict_pushes(
+            parameters, limit_surfaces(self.prior, parameters), scene, pushes.as_conditions()
+        )
+        return self._drop_condition_axis(trajectories)
 
-    def _drop_condition_axis(self, several: Any) -> Any:
+    def _drop_condition_axis(self, tree: Any) -> Any:
         """Drop the axis of conditions if the pushes had none."""
-        return jax.tree.map(lambda leaf: leaf[0], several) if self.one_condition else several
+        return jax.tree.map(lambda leaf: leaf[0], tree) if self.one_condition else tree
 
 
 _predict_pushes = quick_jit(predict_pushes)
 
 
 def to_record(found: Identified) -> dict[str, Any]:
-    """Return the result as numbers and lists, for a JSON file."""
+    """Return the result as a dictionary of numbers and lists, for a JSON file."""
     unknowns, mean = found.prior.unknowns, found.prior.mean_surface
     record: dict[str, Any] = {"one_condition": found.one_condition, "robust": found.robust}
     record["contact_at_end"] = found.contact_at_end
@@ -260,7 +262,7 @@ def to_record(found: Identified) -> dict[str, Any]:
     record["origin"] = to_list(found.prior.origin)
     record["known_friction"] = to_list(found.prior.known_friction)
     record["mean_surface"] = {name: to_list(getattr(mean, name)) for name in ("factors", "relative_std", "length")}
-    # for people who read the file: not read back
+    # The estimates are for people who read the file. `from_record` computes them again.
     estimates = found.parameters._asdict()
     record["estimates"] = {name: to_list(value) for name, value in estimates.items() if value is not None}
     return record
@@ -272,8 +274,8 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
     def array(value: Any) -> Any:
         return None if value is None else jnp.asarray(value, dtype)
 
-    known = {name: array(value) for name, value in record["unknowns"].items()}
-    unknowns = Unknowns(known.pop("friction"), **known, sides=record["sides"], shared=tuple(record["shared"]))
+    priors = {name: array(value) for name, value in record["unknowns"].items()}
+    unknowns = Unknowns(priors.pop("friction"), **priors, sides=record["sides"], shared=tuple(record["shared"]))
     mean = PriorSurface(**{name: array(value) for name, value in record["mean_surface"].items()})
     conditions, terms = mean.factors.shape[:2]
     layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)

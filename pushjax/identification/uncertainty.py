@@ -19,7 +19,7 @@ from pushjax.simulation.slider import Slider
 if TYPE_CHECKING:
     from pushjax.identification.result import Identified
 
-POINTS, REACH = 3, 2.7  # points of a profile on either side, and its half-width in standard deviations
+POINTS, REACH = 3, 2.7  # points of a profile on each side of the estimate, and its half-width in standard deviations
 TOLERANCE = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
 
 
@@ -71,26 +71,26 @@ def profile(
     if label not in positions:
         raise ValueError(f"label must be one of {', '.join(positions)}; got {label!r}")
     position = positions[label]
-    pushes, problem = _problem(found, pushes, slider, hand)
+    pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     covariance = found.covariance
     std = float(np.sqrt(np.asarray(covariance)[position, position]))
     distance = reach * np.arange(-points, points + 1) / points
-    # from the center outwards: each fit starts from the one before
+    # From the center outwards, because each fit starts from the one before.
     order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]
     loss, values = np.zeros(len(distance)), np.zeros(len(distance))
-    # the direction in which all other numbers would move if the posterior were normal
+    # The direction in which all other entries would move if the posterior were normal.
     direction = covariance[position] / covariance[position, position] * std
-    z, last = found.z, 0.0
+    z, last_distance = found.z, 0.0
     for k in order:
         if k in (points, points + 1):
-            z, last = found.z, 0.0
-        z, last = z + (distance[k] - last) * direction, distance[k]
+            z, last_distance = found.z, 0.0
+        z, last_distance = z + (distance[k] - last_distance) * direction, distance[k]
         fixed = FixedEntries(jnp.arange(len(z)) == position, z)
         schedule = Schedule.of(z.dtype, 1, TOLERANCE)
         given = jnp.array([True, True, True])
-        fitted = compiled_fit(problem, pushes, z, _sigma(found), given, fixed, schedule, robust=found.robust)
+        fitted = compiled_fit(problem, pushes, z, _sigma_by_kind(found), given, fixed, schedule, robust=found.robust)
         z, loss[k] = fitted.z, float(fitted.loss)
-        values[k] = _value(found, fitted.z, label)
+        values[k] = _physical_value(found, fitted.z, label)
     rise = (loss - loss.min()) / 2
     return Profile(label, values, rise, distance**2 / 2)
 
@@ -113,24 +113,30 @@ def bootstrap(
     Returns:
         The estimates, with a leading axis (n,), and their z, (n, size).
     """
-    pushes, problem = _problem(found, pushes, slider, hand)
+    pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     weights = np.asarray(pushes.weight)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
-    used = weights > 0
-    counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in used] for _ in range(n)])
-    z = _refitted(problem, pushes, found.z, _sigma(found), jnp.asarray(counts * weights, found.z.dtype), found.robust)
+    has_weight = weights > 0
+    counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in has_weight] for _ in range(n)])
+    z = _refitted(
+        problem, pushes, found.z, _sigma_by_kind(found), jnp.asarray(counts * weights, found.z.dtype), found.robust
+    )
     return jax.vmap(lambda one: found._drop_condition_axis(found.prior.parameters(one)))(z), z
 
 
 @jit
 def _refitted(problem: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
     """Fit z to each row of `weights`, with sigma fixed."""
-    fixed, given, once = FixedEntries.none(start), jnp.array([True, True, True]), Schedule.of(start.dtype, 1, TOLERANCE)
+    fixed, given, schedule = (
+        FixedEntries.none(start),
+        jnp.array([True, True, True]),
+        Schedule.of(start.dtype, 1, TOLERANCE),
+    )
 
-    def one(weight):
-        return fit(problem, pushes.weighted(weight), start, sigma, robust, given, fixed, once).z
+    def fit_weighted(weight):
+        return fit(problem, pushes.weighted(weight), start, sigma, robust, given, fixed, schedule).z
 
-    return jax.vmap(one)(weights)
+    return jax.vmap(fit_weighted)(weights)
 
 
 def scalar_positions(found: "Identified") -> dict[str, int]:
@@ -151,7 +157,7 @@ def normal_interval(found: "Identified", label: str, level: float = 0.9) -> tupl
     """
     position = scalar_positions(found)[label]
     reach = float(norm.ppf(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[position, position]))
-    low, high = (_value(found, found.z.at[position].add(sign * reach), label) for sign in (-1, 1))
+    low, high = (_physical_value(found, found.z.at[position].add(sign * reach), label) for sign in (-1, 1))
     return low, high
 
 
@@ -166,19 +172,19 @@ def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float
         The values between which the rise stays below that of the interval of a normal distribution. If the profile does
             not rise so far on one side, its outermost value on that side.
     """
-    least = int(np.argmin(profile.rise))
+    minimum = int(np.argmin(profile.rise))
     limit = norm.ppf(0.5 + level / 2) ** 2 / 2
     ends = []
     for values, rise in (
-        (profile.value[least::-1], profile.rise[least::-1]),
-        (profile.value[least:], profile.rise[least:]),
+        (profile.value[minimum::-1], profile.rise[minimum::-1]),
+        (profile.value[minimum:], profile.rise[minimum:]),
     ):
-        risen = np.maximum.accumulate(rise)
-        ends.append(float(np.interp(limit, risen, values)))
+        rising = np.maximum.accumulate(rise)
+        ends.append(float(np.interp(limit, rising, values)))
     return ends[0], ends[1]
 
 
-def _problem(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
+def _pushes_and_problem(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
     """Return pushes with a leading axis of conditions, and the problem of the fit, in the dtype of `found`."""
     dtype = found.z.dtype
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
@@ -186,15 +192,15 @@ def _problem(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) ->
     return pushes.as_conditions(), Problem(slider.shape, hand, surface, found.prior, found.length, found.contact_at_end)
 
 
-def _sigma(found: "Identified") -> Array:
-    """Return the (3,) estimated sigma; 1 for kinds that were not recorded."""
+def _sigma_by_kind(found: "Identified") -> Array:
+    """Return the estimated sigma (3,) of poses, directions and gaps; 1 for kinds that were not recorded."""
     return jnp.stack(
         [found.sigma, *(jnp.where(each > 0, each, 1.0) for each in (found.direction_sigma, found.gap_sigma))]
     )
 
 
-def _value(found: "Identified", z: Array, label: str) -> float:
-    """Return a number of z in its own unit, by its label, such as "friction[1]" or "pressure_center.0"."""
+def _physical_value(found: "Identified", z: Array, label: str) -> float:
+    """Return the physical value of an entry of z in its own unit, by label ("friction[1]", "pressure_center.0")."""
     name, _, part = label.partition(".")
     name, _, condition = name.partition("[")
     value = np.asarray(getattr(found.prior.parameters(z), name))[int(condition.rstrip("]") or 0) if condition else 0]

@@ -13,24 +13,29 @@ SIDES = 4
 
 
 def _optional_array(value: ArrayLike | None) -> Array | None:
-    """Convert the prior of an unknown; None stays None."""
+    """Return the prior of an unknown as an array; None, which stands for a known parameter, stays None."""
     return None if value is None else as_float(value)
 
 
 def _shared_names(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Convert `Unknowns.shared`; None stands for the calibration."""
+    """Return the names of the shared unknowns as a tuple; None stands for those of the calibration."""
     return CALIBRATION if names is None else tuple(names)
 
 
-def _numbers(size: int | None, group: str = "") -> dict[str, Any]:
-    """Describe an unknown: its size (None if that depends on the problem), and "calibration", "table" or neither."""
+def _field_metadata(size: int | None, group: str = "") -> dict[str, Any]:
+    """Return the metadata of a field that stands for an unknown.
+
+    Args:
+        size: Number of scalars that the unknown has; None if it depends on the problem.
+        group: "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither.
+    """
     return {"size": size, "group": group}
 
 
 class Unknowns(eqx.Module):
-    """What `identify` estimates, and the prior of each unknown. None: known, not estimated.
+    """What `identify` estimates, and the prior of each unknown. A parameter whose prior is None is not estimated.
 
-    If the friction or the surface is known, it is the one given to `identify`. Any other known parameter is zero.
+    Such a parameter is known: friction and surface are those given to `identify`, any other parameter is zero.
     `friction` is a range and `surface_dof` a number of degrees of freedom. From `pressure_center` to
     `friction_by_side`, each field is the standard deviation, in the unit named, of a normal prior about zero. Their
     default is None.
@@ -64,45 +69,47 @@ class Unknowns(eqx.Module):
             scalar, if `sides` is less than one, if a name in `shared` is unknown, or if everything is None.
     """
 
-    friction: Float[Array, "2"] | None = eqx.field(default=(0.0, 1.0), converter=_optional_array, metadata=_numbers(1))
+    friction: Float[Array, "2"] | None = eqx.field(
+        default=(0.0, 1.0), converter=_optional_array, metadata=_field_metadata(1)
+    )
     surface_dof: Float[Array, ""] | None = eqx.field(
-        default=50.0, converter=_optional_array, kw_only=True, metadata=_numbers(None)
+        default=50.0, converter=_optional_array, kw_only=True, metadata=_field_metadata(None)
     )
     pressure_center: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(2)
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2)
     )
     inset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(1, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
     )
     overshoot: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(1, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
     )
     lag_distance: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(1, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
     )
     hand_offset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(2, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "calibration")
     )
     frame_offset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(3, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(3, "calibration")
     )
     overlap: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(1, "calibration")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
     )
     anisotropy: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(2, "table")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "table")
     )
     log_gradient: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(2, "table")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "table")
     )
     log_hessian: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(3, "table")
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(3, "table")
     )
     friction_drift: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(1)
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1)
     )
     friction_by_side: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_numbers(None)
+        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(None)
     )
     sides: int = eqx.field(default=SIDES, static=True, kw_only=True)
     shared: tuple[str, ...] = eqx.field(default=None, converter=_shared_names, static=True, kw_only=True)
@@ -111,17 +118,17 @@ class Unknowns(eqx.Module):
         if self.friction is not None:
             _check_range(self.friction)
         for name in ("surface_dof", *NORMAL_PRIORS):
-            value = getattr(self, name)
-            if value is not None:
-                if value.shape != ():
-                    raise ValueError(f"{name} has shape {value.shape}; expected a scalar, or None for what is known")
-                check_finite(name, value)
-                check_positive(name, value)
+            prior = getattr(self, name)
+            if prior is not None:
+                if prior.shape != ():
+                    raise ValueError(f"{name} has shape {prior.shape}; expected a scalar, or None for what is known")
+                check_finite(name, prior)
+                check_positive(name, prior)
         if self.sides < 1:
             raise ValueError(f"sides must be at least 1; got {self.sides}")
-        wrong = [name for name in self.shared if name not in NAMES]
-        if wrong:
-            raise ValueError(f"shared: {wrong[0]!r} is not one of {', '.join(NAMES)}")
+        unknown = [name for name in self.shared if name not in NAMES]
+        if unknown:
+            raise ValueError(f"shared: {unknown[0]!r} is not one of {', '.join(NAMES)}")
         if not self.names:
             raise ValueError(f"friction, surface_dof, {', '.join(NORMAL_PRIORS)}: all None, nothing is to be found")
 
@@ -132,17 +139,17 @@ class Unknowns(eqx.Module):
 
 
 def _check_range(friction: Array) -> None:
-    """Check the range of the friction."""
+    """Check that the prior of the friction is a pair (lowest, highest) with 0 <= lowest < highest."""
     if friction.shape != (2,):
         raise ValueError(f"friction has shape {friction.shape}; expected (2,), lowest and highest")
     check_finite("friction", friction)
-    known = concrete(friction)
-    if known is not None and not 0 <= known[0] < known[1]:
-        raise ValueError(f"friction must be (lowest, highest), not negative; got ({known[0]:g}, {known[1]:g})")
+    bounds = concrete(friction)
+    if bounds is not None and not 0 <= bounds[0] < bounds[1]:
+        raise ValueError(f"friction must be (lowest, highest), not negative; got ({bounds[0]:g}, {bounds[1]:g})")
 
 
-# Every unknown is listed once, as a field of `Unknowns`. In z the surface, of which only the prior is a field, has the
-# name "surface".
+# Every unknown is listed once, as a field of `Unknowns`. The field `surface_dof` is only the prior of the limit
+# surface, so the unknown itself has another name: "surface".
 _DESCRIPTIONS = {
     "surface" if field.name == "surface_dof" else field.name: field.metadata
     for field in fields(Unknowns)
@@ -164,7 +171,8 @@ class Parameters(NamedTuple):
         friction: Friction coefficient mu.
         surface: Coefficients of the limit surface about the origin of the body frame: (15,) of a quartic, or (3, 3) of
             an ellipsoid.
-        pressure_center: (2,) m, center of pressure relative to that of the mean surface; `surface` already includes it.
+        pressure_center: (2,) m, center of pressure relative to that of the mean surface, in the body frame; `surface`
+            already includes it.
         inset: m, by how much the outline or the finger is smaller than given.
         overshoot: m, distance that the hand went on after the end of its path.
         lag_distance: m, distance by which the hand lags its logged position.

@@ -63,28 +63,28 @@ def animate(
             or if a trajectory is of a hand with another number of contacts.
     """
     by_name = dict(pushes) if isinstance(pushes, Mapping) else {"": pushes}
-    over = dict(measured or {})
+    measured_by_name = dict(measured or {})
     if not by_name:
         raise ValueError("pushes: there is none to show")
-    unknown = sorted(set(over) - set(by_name))
+    unknown = sorted(set(measured_by_name) - set(by_name))
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
-    tracks = [drawn_push(shape, hand, push, over.get(name), forces) for name, push in by_name.items()]
-    moments = _frame_fractions(tracks, frames)
-    largest = max(track.largest for track in tracks)
+    drawn = [drawn_push(shape, hand, push, measured_by_name.get(name), forces) for name, push in by_name.items()]
+    fractions = _frame_fractions(drawn, frames)
+    largest_force = max(track.largest_force for track in drawn)
     with plt.rc_context(STYLE):
-        figure, all_axes = panel_row(len(tracks), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
-        panels = [_Panel(axes, track, largest) for axes, track in zip(all_axes, tracks, strict=True)]
+        figure, all_axes = panel_row(len(drawn), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
+        panels = [_Panel(axes, track, largest_force) for axes, track in zip(all_axes, drawn, strict=True)]
         for axes, name in zip(all_axes, by_name, strict=True):
             axes.set_title(name, pad=18)  # leaves room for the words below it
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
-        _share_limits(figure, all_axes, tracks)
-        _legend(figure, all_axes[0], bool(over), largest)
+        _share_limits(figure, all_axes, drawn)
+        _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force)
 
     def draw(frame: int) -> None:
         for panel in panels:
-            panel.draw(moments[frame])
+            panel.draw(fractions[frame])
 
     draw(0)
     return Animation(figure, draw, frames, seconds)
@@ -125,7 +125,7 @@ def animate_cloud(
         raise ValueError(
             f"trajectories have shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
         )
-    lines = placed_outline(vertices(shape), poses)
+    outline_points = placed_outline(vertices(shape), poses)
     steps = _equally_spaced(poses.shape[1] - 1, frames).round().astype(int)
     opacity = float(np.clip(12 / len(poses), 0.05, 0.6))
     with plt.rc_context(STYLE):
@@ -134,16 +134,16 @@ def animate_cloud(
         axes.add_collection(outlines)
         axes.add_collection(paths)
         (centers,) = axes.plot([], [], ".", color=RED, ms=3, alpha=0.5, label="centers")
-        axes.plot(*lines[0, 0].T, color=BLACK, lw=1.4, label="start")
+        axes.plot(*outline_points[0, 0].T, color=BLACK, lw=1.4, label="start")
         axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
         tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
         axes.set(title=title, xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        _set_limits(axes, [lines.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
+        _set_limits(axes, [outline_points.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
         legend_below(figure, axes, columns=3)
 
     def draw(frame: int) -> None:
         k = steps[frame]
-        outlines.set_segments(list(lines[:, k]))
+        outlines.set_segments(list(outline_points[:, k]))
         paths.set_segments(list(MM * poses[:, : k + 1, :2]))
         centers.set_data(*(MM * poses[:, k, :2].T))
         for tip, finger in zip(tips, fingers, strict=True):
@@ -162,11 +162,11 @@ class _Panel:
         largest: Largest force of all panels, N, which sets the scale of the arrows.
     """
 
-    def __init__(self, axes: Axes, track: DrawnPush, largest: float):
+    def __init__(self, axes: Axes, track: DrawnPush, largest_force: float):
         self.track = track
         size = float(np.ptp(track.outline[0], axis=0).max())
-        self.scale = MAX_ARROW_LENGTH * size / largest if largest > 0 else 0.0
-        self.weakest = MIN_FORCE * largest
+        self.scale = MAX_ARROW_LENGTH * size / largest_force if largest_force > 0 else 0.0
+        self.weakest = MIN_FORCE * largest_force
         axes.plot(*track.outline[0].T, color=GRAY, lw=1.0, label="start")
         (self.outline,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
         (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its center")
@@ -174,44 +174,44 @@ class _Panel:
         (self.measured,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
         (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
         zero = np.zeros(track.force.shape[1])
-        quiver: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
-        quiver |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
-        self.arrows = axes.quiver(zero, zero, zero, zero, **quiver) if len(zero) else None
-        above: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
-        self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above)
+        arrow_style: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
+        arrow_style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
+        self.arrows = axes.quiver(zero, zero, zero, zero, **arrow_style) if len(zero) else None
+        above_axes: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
+        self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above_axes)
 
-    def draw(self, share: float) -> None:
+    def draw(self, fraction: float) -> None:
         """Show the push at a share of its steps, from 0 to 1."""
         track = self.track
-        k = round(share * (len(track.outline) - 1))
+        k = round(fraction * (len(track.outline) - 1))
         self.outline.set_data(*track.outline[k].T)
         self.trace.set_data(*track.center[: k + 1].T)
         for line, finger in zip(self.fingers, track.fingers, strict=True):
             line.set_data(*finger[k].T)
         if track.measured is not None:
-            self.measured.set_data(*track.measured[round(share * (len(track.measured) - 1))].T)
+            self.measured.set_data(*track.measured[round(fraction * (len(track.measured) - 1))].T)
         self.words.set_text(track.words[k])
         self.words.set_color(RED if 0 <= track.failed < k else "0.3")
-        acts = np.linalg.norm(track.force[k], axis=1) > self.weakest
-        self.contacts.set_data(*track.contact[k][acts].T)
+        is_acting = np.linalg.norm(track.force[k], axis=1) > self.weakest
+        self.contacts.set_data(*track.contact[k][is_acting].T)
         if self.arrows is not None:
             # an arrow of length zero would leave a dot
-            at, force = (np.where(acts[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
-            self.arrows.set_offsets(at)
+            tails, force = (np.where(is_acting[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
+            self.arrows.set_offsets(tails)
             self.arrows.set_UVC(*(self.scale * force).T)
 
 
-def _frame_fractions(tracks: list[DrawnPush], frames: int) -> np.ndarray:
+def _frame_fractions(drawn: list[DrawnPush], frames: int) -> np.ndarray:
     """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
-    last = 0.0
-    for track in tracks:
-        steps = len(track.outline) - 1
-        moving = [np.any(np.diff(each, axis=0) != 0, axis=(1, 2)) for each in (track.outline, *track.fingers)]
-        moves = np.flatnonzero(np.any(moving, axis=0))
+    last_fraction = 0.0
+    for push in drawn:
+        steps = len(push.outline) - 1
+        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (push.outline, *push.fingers)]
+        moving_steps = np.flatnonzero(np.any(moving, axis=0))
         # includes the step whose status says why nothing moves any more
-        stop = steps if moves.size == 0 else min(moves[-1] + 2, steps)
-        last = max(last, stop / steps)
-    return _equally_spaced(1.0, frames) * last
+        stop_step = steps if moving_steps.size == 0 else min(moving_steps[-1] + 2, steps)
+        last_fraction = max(last_fraction, stop_step / steps)
+    return _equally_spaced(1.0, frames) * last_fraction
 
 
 def _equally_spaced(end: float, frames: int) -> np.ndarray:
@@ -221,16 +221,16 @@ def _equally_spaced(end: float, frames: int) -> np.ndarray:
     return np.linspace(0, end, frames)
 
 
-def _share_limits(figure: Figure, all_axes: list[Axes], tracks: list[DrawnPush]) -> None:
+def _share_limits(figure: Figure, all_axes: list[Axes], drawn: list[DrawnPush]) -> None:
     """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
-    parts = [part for track in tracks for part in (track.outline, *track.fingers)]
-    parts += [track.measured for track in tracks if track.measured is not None]
+    parts = [part for push in drawn for part in (push.outline, *push.fingers)]
+    parts += [push.measured for push in drawn if push.measured is not None]
     _set_limits(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
     figure.set_layout_engine("compressed", h_pad=0.06)
-    around = EXTRA_HEIGHT + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
+    surrounding_height = EXTRA_HEIGHT + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
     figure.set_size_inches(
-        PANEL_WIDTH * len(all_axes) + 0.5, float(np.clip(PANEL_WIDTH * high / wide, 1.5, 5.5)) + around
+        PANEL_WIDTH * len(all_axes) + 0.5, float(np.clip(PANEL_WIDTH * high / wide, 1.5, 5.5)) + surrounding_height
     )
 
 
@@ -241,10 +241,10 @@ def _set_limits(axes: Axes, points: list[np.ndarray]) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
-def _legend(figure: Figure, axes: Axes, measured: bool, largest: float) -> None:
-    """Draw one legend for all panels, without `measured` if nothing was measured."""
-    if largest > 0:
-        axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest:.2g} N")
+def _draw_legend(figure: Figure, axes: Axes, show_measured: bool, largest_force: float) -> None:
+    """Draw one legend for all panels, without `show_measured` if nothing was measured."""
+    if largest_force > 0:
+        axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest_force:.2g} N")
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
-    shown = {label: handle for label, handle in handles.items() if measured or label != "measured"}
+    shown = {label: handle for label, handle in handles.items() if show_measured or label != "measured"}
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(figure.axes) == 1 else 3)

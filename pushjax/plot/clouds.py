@@ -15,7 +15,7 @@ from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 from pushjax.simulation.hand import Hand
 
 QUANTILES = (0.025, 0.5, 0.975)
-Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]
+Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]  # ((n, n) of x, (n, n) of y), m; density (n, n), 1/mm²
 
 
 def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.ndarray, title: str = "") -> Figure:
@@ -37,9 +37,9 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
         traces(axes, trajectories, alpha=_opacity(len(trajectories)))
         outline(axes, shape, trajectories[0, 0], BLACK, 1.4, label="start")
         order = np.argsort(trajectories[:, -1, 2])
-        for share in QUANTILES:
-            style, label = ("-", "median end") if share == 0.5 else (":", "end, 2.5 and 97.5 % of θ")
-            end = trajectories[order[round(share * (len(order) - 1))], -1]
+        for quantile in QUANTILES:
+            style, label = ("-", "median end") if quantile == 0.5 else (":", "end, 2.5 and 97.5 % of θ")
+            end = trajectories[order[round(quantile * (len(order) - 1))], -1]
             outline(axes, shape, end, RED, 1.2, linestyle=style, label=label)
         fingers = np.asarray(hand.poses(jnp.asarray(path)))
         hand_at(axes, hand, fingers[0], BLACK, 1.0)

@@ -40,11 +40,11 @@ def motion_cone_figure(
             ("friction cone", friction_cone(normal, mu), GREEN, "--"),
             ("motion cone", motion_cone(surface, point, normal, mu), BLUE, "-"),
         )
-        for name, edges, color, dash in cones:
+        for name, edges, color, linestyle in cones:
             ends = MM * (point + reach * np.asarray(edges))
             for k, end in enumerate(ends):
                 label = name if k == 0 else None
-                axes.plot(*np.array([MM * point, end]).T, dash, color=color, lw=1.6, label=label)
+                axes.plot(*np.array([MM * point, end]).T, linestyle, color=color, lw=1.6, label=label)
             axes.fill(*np.array([MM * point, *ends]).T, color=color, alpha=0.10, lw=0)
         push = np.asarray(contacts.displacement[0])
         push = 0.5 * reach * push / np.linalg.norm(push)
@@ -106,12 +106,12 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
             axes.fill([], [], color=color, alpha=0.16, label=label)
 
 
-def _labeled_contact(axes: Axes, name: str, p: np.ndarray, n: np.ndarray, mu: float, reach: float) -> None:
+def _labeled_contact(axes: Axes, name: str, point: np.ndarray, normal: np.ndarray, mu: float, reach: float) -> None:
     """Draw the normal, the friction cone and the closing finger of a contact at p (2,), mm."""
-    axes.plot(*np.array([p - 2 * reach * n, p + 2 * reach * n]).T, "--", color=BLUE, lw=0.9)
-    tangent = np.array([-n[1], n[0]])
+    axes.plot(*np.array([point - 2 * reach * normal, point + 2 * reach * normal]).T, "--", color=BLUE, lw=0.9)
+    tangent = np.array([-normal[1], normal[0]])
     for side in (1, -1):
-        edge = (n + side * mu * tangent) / np.hypot(1, mu)
-        axes.plot(*np.array([p, p + 0.9 * reach * edge]).T, color=GREEN, lw=1.6)
-    arrow(axes, p - 0.4 * reach * n, p, "0.3", 1.8)
-    axes.annotate(name, tuple(p - 0.5 * reach * n), ha="center", va="center")
+        edge = (normal + side * mu * tangent) / np.hypot(1, mu)
+        axes.plot(*np.array([point, point + 0.9 * reach * edge]).T, color=GREEN, lw=1.6)
+    arrow(axes, point - 0.4 * reach * normal, point, "0.3", 1.8)
+    axes.annotate(name, tuple(point - 0.5 * reach * normal), ha="center", va="center")

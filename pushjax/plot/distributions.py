@@ -35,10 +35,12 @@ def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = No
         label: Label in the legend.
         alpha: Opacity.
     """
-    at = MM * poses[:, :2]
-    along = TICK * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
-    axes.add_collection(LineCollection(list(np.stack([at, at + along], axis=1)), colors=color, lw=0.5, alpha=alpha))
-    axes.plot(*at.T, ".", color=color, ms=2.2, alpha=alpha, label=label, lw=0)
+    centers = MM * poses[:, :2]
+    tick = TICK * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    axes.add_collection(
+        LineCollection(list(np.stack([centers, centers + tick], axis=1)), colors=color, lw=0.5, alpha=alpha)
+    )
+    axes.plot(*centers.T, ".", color=color, ms=2.2, alpha=alpha, label=label, lw=0)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
 
 

@@ -21,6 +21,8 @@ class ContactForces(NamedTuple):
 
 def contact_forces(push: Trajectory) -> ContactForces:
     """Return the forces of a trajectory, and the points where they act."""
-    along, normal = np.asarray(push.force, float), np.asarray(push.contact_normal, float)
+    components, normal = np.asarray(push.force, float), np.asarray(push.contact_normal, float)
     tangent = np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-    return ContactForces(np.asarray(push.contact_point, float), along[..., :1] * normal + along[..., 1:] * tangent)
+    return ContactForces(
+        np.asarray(push.contact_point, float), components[..., :1] * normal + components[..., 1:] * tangent
+    )

@@ -16,10 +16,10 @@ from PIL import Image
 from pushjax.plot.style import STYLE
 
 DPI = 100
-REST = 1.2  # s, time that the last frame stays
-COLORS = 64  # number of colors of all frames together, small so that the files are small
-REFINE = 3  # rounds of refining the palette: without them thin gray lines come out tinted
-SAMPLES = 6  # frames that the palette is taken from
+LAST_FRAME_SECONDS = 1.2  # s, time that the last frame stays
+PALETTE_COLORS = 64  # number of colors of all frames together, small so that the files are small
+PALETTE_ROUNDS = 3  # rounds of refining the palette: without them thin gray lines come out tinted
+PALETTE_FRAMES = 6  # frames that the palette is taken from
 SUFFIXES = (".gif", ".html", ".mp4")
 
 
@@ -44,23 +44,25 @@ class Animation:
     def pictures(self) -> list[Image.Image]:
         """Return every frame as an image, all with one palette."""
         with plt.rc_context(STYLE):
-            self._lay_out()
-            drawn = [self._picture(k) for k in range(self.frames)]
+            self._freeze_layout()
+            drawn = [self._frame_image(k) for k in range(self.frames)]
         width, height = drawn[0].size
-        sampled = [drawn[round(k * (self.frames - 1) / (SAMPLES - 1))] for k in range(SAMPLES)]
-        sheet = Image.new("RGB", (width, SAMPLES * height))
+        sampled = [drawn[round(k * (self.frames - 1) / (PALETTE_FRAMES - 1))] for k in range(PALETTE_FRAMES)]
+        sheet = Image.new("RGB", (width, PALETTE_FRAMES * height))
         for k, each in enumerate(sampled):
             sheet.paste(each, (0, k * height))
-        palette = sheet.quantize(COLORS, Image.Quantize.MAXCOVERAGE, kmeans=REFINE, dither=Image.Dither.NONE)
+        palette = sheet.quantize(
+            PALETTE_COLORS, Image.Quantize.MAXCOVERAGE, kmeans=PALETTE_ROUNDS, dither=Image.Dither.NONE
+        )
         return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in drawn]
 
-    def _lay_out(self) -> None:
+    def _freeze_layout(self) -> None:
         """Fix the layout, so that only the contents move."""
         for _ in range(4):  # the layout learns from the drawing before how a panel of fixed aspect fits
             self.figure.canvas.draw()
         self.figure.set_layout_engine("none")
 
-    def _picture(self, k: int) -> Image.Image:
+    def _frame_image(self, k: int) -> Image.Image:
         """Return frame k as an image."""
         self.draw(k)
         buffer = io.BytesIO()
@@ -75,7 +77,9 @@ class Animation:
             picture.save(buffer, "PNG", optimize=True)
             encoded.append(f'"{base64.b64encode(buffer.getvalue()).decode()}"')
         interval = 1e3 * self.seconds / self.frames
-        return PLAYER.substitute(frames=",\n".join(encoded), last=self.frames - 1, interval=interval, rest=1e3 * REST)
+        return PLAYER.substitute(
+            frames=",\n".join(encoded), last=self.frames - 1, interval=interval, rest=1e3 * LAST_FRAME_SECONDS
+        )
 
     def _repr_html_(self) -> str:
         """Show the player in a notebook."""
@@ -95,24 +99,24 @@ class Animation:
         if suffix == ".gif":
             first, *others = self.pictures()
             interval = 1e3 * self.seconds / self.frames
-            durations = [interval] * len(others) + [1e3 * REST]
+            durations = [interval] * len(others) + [1e3 * LAST_FRAME_SECONDS]
             first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
         elif suffix == ".html":
             path.write_text(PAGE.substitute(title=html.escape(path.stem), player=self.player()), encoding="utf-8")
         elif suffix == ".mp4":
-            self._film(path)
+            self._write_film(path)
         else:
             raise ValueError(f"{path.name}: motion is written as {', '.join(SUFFIXES)}; got {path.suffix or 'none'}")
 
-    def _film(self, path: Path) -> None:
+    def _write_film(self, path: Path) -> None:
         """Write an .mp4 with `ffmpeg`."""
         if not FFMpegWriter.isAvailable():
             raise RuntimeError(f"{path.name}: .mp4 needs the program ffmpeg; .gif and .html need nothing")
         rate = max(1, round(self.frames / self.seconds))
         writer = FFMpegWriter(fps=rate, extra_args=["-pix_fmt", "yuv420p"])  # a pixel format that every player shows
         with plt.rc_context(STYLE), writer.saving(self.figure, str(path), dpi=DPI):
-            self._lay_out()
-            for k in [*range(self.frames), *[self.frames - 1] * round(REST * rate)]:
+            self._freeze_layout()
+            for k in [*range(self.frames), *[self.frames - 1] * round(LAST_FRAME_SECONDS * rate)]:
                 self.draw(k)
                 writer.grab_frame()
 

@@ -22,7 +22,7 @@ def vertices(shape: Shape) -> np.ndarray:
     return np.asarray(shape.boundary(SMOOTH_OUTLINE_POINTS) if points is None else points)
 
 
-def placed_outline(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def placed_outline(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return the closed outline of a body at each of several poses, in mm.
 
     Args:
@@ -32,10 +32,10 @@ def placed_outline(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     Returns:
         (..., points + 1, 2), mm.
     """
-    x, y, theta = np.moveaxis(np.asarray(pose)[..., None], -2, 0)
+    x, y, theta = np.moveaxis(np.asarray(poses)[..., None], -2, 0)
     c, s = np.cos(theta), np.sin(theta)
-    px, py = np.vstack([points, points[:1]]).T
-    return MM * np.stack([c * px - s * py + x, s * px + c * py + y], axis=-1)
+    body_x, body_y = np.vstack([points, points[:1]]).T
+    return MM * np.stack([c * body_x - s * body_y + x, s * body_x + c * body_y + y], axis=-1)
 
 
 def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float, **line: Any) -> None:
@@ -63,10 +63,10 @@ def hand_at(axes: Axes, hand: Hand, poses: np.ndarray, color: str, width: float)
         width: Width of the lines, in points.
     """
     for finger, where in zip(hand.fingers, np.asarray(poses), strict=True):
-        _finger(axes, finger, where, color, width)
+        _draw_finger(axes, finger, where, color, width)
 
 
-def _finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
+def _draw_finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
     """Draw one finger: a pad as its outline, a round finger as a circle."""
     if isinstance(finger, Pad):
         outline(axes, finger.shape, pose, color, width)

@@ -43,7 +43,7 @@ def push_figure(
                 outline(axes, shape, pose[k], color, 1.4 if color != GRAY else 0.8)
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != GRAY, lw=0.8))
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="center of the slider")
-            axes.set(title=_titled(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
+            axes.set(title=_title_with_failure(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
         return figure
 
@@ -66,25 +66,25 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
             pose = np.asarray(grasp.pose)
             fingers = np.asarray(hand.poses(grasp.configuration))
             # there is something to see only where the slider moves
-            moves = np.flatnonzero(np.any(np.diff(pose, axis=0) != 0, axis=1))
-            last = len(pose) - 1 if moves.size == 0 else min(moves[-1] + 1, len(pose) - 1)
-            first = 0 if moves.size == 0 else moves[0]
+            moving_steps = np.flatnonzero(np.any(np.diff(pose, axis=0) != 0, axis=1))
+            last = len(pose) - 1 if moving_steps.size == 0 else min(moving_steps[-1] + 1, len(pose) - 1)
+            first = 0 if moving_steps.size == 0 else moving_steps[0]
             between = np.linspace(first, last, frames + 2).round().astype(int)[1:-1]
             for k, color in [*((k, GRAY) for k in between), (0, BLACK), (last, RED)]:
                 width = 0.8 if color == GRAY else 1.4
                 outline(axes, shape, pose[k], color, width)
                 hand_at(axes, hand, fingers[k], color, width)
             axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="center of the slider", zorder=4)
-            axes.set(title=_titled(name.replace(": ", ":\n"), grasp), xlabel="x / mm", aspect="equal")
+            axes.set(title=_title_with_failure(name.replace(": ", ":\n"), grasp), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         legend_of_moments(figure, all_axes[0])
         return figure
 
 
-def _titled(name: str, push: Trajectory) -> str:
+def _title_with_failure(name: str, push: Trajectory) -> str:
     """Return the title of a push, with the status if a step failed: what is drawn after it is no answer."""
-    first = int(push.first_failure)
-    return name if first < 0 else f"{name}\n{Status(int(push.status[first])).name} from step {first}"
+    failed_step = int(push.first_failure)
+    return name if failed_step < 0 else f"{name}\n{Status(int(push.status[failed_step])).name} from step {failed_step}"
 
 
 class RealPush(NamedTuple):
@@ -119,7 +119,7 @@ def real_figure(shape: Shape, pushes: Mapping[str, RealPush], hand: Hand | None 
         for axes, (name, push) in zip(all_axes, pushes.items(), strict=True):
             outline(axes, shape, push.start, GRAY, 1.5, label="start")
             outline(axes, shape, push.end, BLACK, 1.5, label="measured end")
-            _predicted(axes, shape, np.asarray(push.predicted))
+            _draw_predicted(axes, shape, np.asarray(push.predicted))
             if hand is not None and push.path is not None:
                 fingers = np.asarray(hand.poses(jnp.asarray(push.path)))
                 for k in range(fingers.shape[1]):
@@ -132,7 +132,7 @@ def real_figure(shape: Shape, pushes: Mapping[str, RealPush], hand: Hand | None 
         return figure
 
 
-def _predicted(axes: Axes, shape: Shape, poses: np.ndarray) -> None:
+def _draw_predicted(axes: Axes, shape: Shape, poses: np.ndarray) -> None:
     """Draw one predicted pose (3,) dashed, or several (draws, 3) faint."""
     if poses.ndim == 1:
         outline(axes, shape, poses, BLUE, 1.5, linestyle="--", label="predicted end")

@@ -77,7 +77,7 @@ def curve_styles(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, An
 
 
 def bars(color: str, hatched: bool = False) -> dict[str, Any]:
-    """Return the style of one kind of bars and of their error bars, as arguments of `Axes.bar`."""
+    """Return the look of one kind of bars and of their error bars, as keyword arguments of `Axes.bar`."""
     hatch = HATCH if hatched else None
     return {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
 

@@ -42,25 +42,25 @@ def limit_surfaces(
         shown = _spread_out(wrench, arrows)
         for column, (name, surface, style) in enumerate(curve_styles(surfaces)):
             axes = figure.add_subplot(grid[:, column], projection="3d")
-            _level_set(axes, surface, load, style["color"])
+            _draw_level_set(axes, surface, load, style["color"])
             axes.scatter(*wrench.T, s=2, color="0.2", alpha=0.6, depthshade=False)
             axes.quiver(
                 *wrench[shown].T, *(ARROW_LENGTH * twist[shown]).T, color="black", lw=1.1, arrow_length_ratio=0.25
             )
             axes.set_title(name)
-        for place, title, other in ((0, "cut through $f_y = 0$", 2), (1, "cut through $\\tau = 0$", 1)):
-            axes = figure.add_subplot(grid[place, -1])
-            _cut(axes, surfaces, wrench, load, other)
+        for row, title, vertical in ((0, "cut through $f_y = 0$", 2), (1, "cut through $\\tau = 0$", 1)):
+            axes = figure.add_subplot(grid[row, -1])
+            _draw_cut(axes, surfaces, wrench, load, vertical)
             axes.set(title=title)
         figure.axes[-2].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
         return figure
 
 
-def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> None:
+def _draw_level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> None:
     """Draw the level set H = 1 of a surface in 3-D."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 49), np.linspace(0, np.pi, 25))
-    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    x, y, z = np.moveaxis(_on_level_set(surface, ball) / load, -1, 0)
+    directions = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+    x, y, z = np.moveaxis(_on_level_set(surface, directions) / load, -1, 0)
     axes.plot_surface(x, y, z, color=color, alpha=0.35, linewidth=0.2, edgecolor=color)  # type: ignore[attr-defined]
     # few ticks, because the labels of more ticks would run into the labels of the axes
     axes.set(xlabel=FORCE_X, ylabel=FORCE_Y, xticks=[-1, 0, 1], yticks=[-1, 0, 1])
@@ -70,35 +70,37 @@ def _level_set(axes: Axes, surface: LimitSurface, load: float, color: str) -> No
     axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
 
 
-def _cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, other: int) -> None:
-    """Draw the cut of the level sets with a plane: component `other` (1 is f_y, 2 the torque) over f_x.
+def _draw_cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, vertical: int) -> None:
+    """Draw the cut of the level sets with a plane: component `vertical` (1 is f_y, 2 the torque) over f_x.
 
     The remaining component, number 3 - other, is zero in this plane.
     """
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))
-    circle[:, 0], circle[:, other] = np.cos(angle), np.sin(angle)
+    circle[:, 0], circle[:, vertical] = np.cos(angle), np.sin(angle)
     for name, surface, style in curve_styles(surfaces):
         cut = _on_level_set(surface, circle) / load
-        axes.plot(cut[:, 0], cut[:, other], color=style["color"], linestyle=style["linestyle"], label=name)
-    near = np.abs(wrench[:, 3 - other]) < CUT_DISTANCE
-    axes.plot(wrench[near, 0], wrench[near, other], ".", color="0.2", ms=3, label="pairs nearby")
-    axes.set(xlabel=FORCE_X, ylabel=TORQUE if other == 2 else FORCE_Y, aspect="equal")
+        axes.plot(cut[:, 0], cut[:, vertical], color=style["color"], linestyle=style["linestyle"], label=name)
+    near = np.abs(wrench[:, 3 - vertical]) < CUT_DISTANCE
+    axes.plot(wrench[near, 0], wrench[near, vertical], ".", color="0.2", ms=3, label="pairs nearby")
+    axes.set(xlabel=FORCE_X, ylabel=TORQUE if vertical == 2 else FORCE_Y, aspect="equal")
 
 
 def _spread_out(wrench: np.ndarray, count: int) -> np.ndarray:
     """Return indices of up to `count` wrenches on the viewer's side, each as far as possible from those before it."""
     elevation, azimuth = VIEW
     viewer = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    seen = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
-    if count < 1 or not len(seen):
-        return seen[:0]
-    chosen = [int(np.argmax(wrench[seen] @ viewer))]
-    away = np.full(len(seen), np.inf)
-    while len(chosen) < min(count, len(seen)):
-        away = np.minimum(away, np.linalg.norm(wrench[seen] - wrench[seen[chosen[-1]]], axis=1))
-        chosen.append(int(np.argmax(away)))
-    return seen[chosen]
+    visible = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
+    if count < 1 or not len(visible):
+        return visible[:0]
+    chosen = [int(np.argmax(wrench[visible] @ viewer))]
+    nearest_distance = np.full(len(visible), np.inf)
+    while len(chosen) < min(count, len(visible)):
+        nearest_distance = np.minimum(
+            nearest_distance, np.linalg.norm(wrench[visible] - wrench[visible[chosen[-1]]], axis=1)
+        )
+        chosen.append(int(np.argmax(nearest_distance)))
+    return visible[chosen]
 
 
 def _on_level_set(surface: LimitSurface, normalized: np.ndarray) -> np.ndarray:

@@ -19,15 +19,15 @@ def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
     with plt.rc_context(STYLE):
         conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))
         figure, axes = plt.subplots(figsize=(width, 3.8), layout="constrained")
-        for k, (model, look) in enumerate((("quartic", bars(BLUE)), ("ellipsoid", bars(ORANGE, True)))):
-            mine = [cell for cell in cells if cell["model"] == model]
-            if not mine:
+        for k, (model, style) in enumerate((("quartic", bars(BLUE)), ("ellipsoid", bars(ORANGE, True)))):
+            of_model = [cell for cell in cells if cell["model"] == model]
+            if not of_model:
                 continue
             x = np.arange(len(conditions)) + (k - 0.5) * 0.36
-            height = [cell["mean_mm"] for cell in mine]
-            error = [cell["ci95_bootstrap_mm"] for cell in mine]
-            axes.bar(x, height, 0.34, yerr=error, label=f"{model}, this run", **look)
-            paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in mine]
+            height = [cell["mean_mm"] for cell in of_model]
+            error = [cell["ci95_bootstrap_mm"] for cell in of_model]
+            axes.bar(x, height, 0.34, yerr=error, label=f"{model}, this run", **style)
+            paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in of_model]
             axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
         axes.set_xticks(np.arange(len(conditions)), [name for _, name in conditions])
         surfaces = np.array([surface for surface, _ in conditions])

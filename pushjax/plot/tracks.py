@@ -37,7 +37,7 @@ class Animatable(Protocol):
 
 
 class DrawnPush(NamedTuple):
-    """A push as it is drawn, in mm and N.
+    """A push as it is drawn, in mm and N, world frame.
 
     Attributes:
         outline: (points, vertices, 2), outlines of the slider.
@@ -60,7 +60,7 @@ class DrawnPush(NamedTuple):
     failed: int
 
     @property
-    def largest(self) -> float:
+    def largest_force(self) -> float:
         """The largest force, N."""
         return float(np.max(np.linalg.norm(self.force, axis=-1), initial=0.0))
 
@@ -78,47 +78,61 @@ def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray 
     Raises:
         ValueError: If the push has another number of configurations than of poses.
     """
-    pose, body = np.asarray(push.pose, float), vertices(shape)
+    pose, outline_points = np.asarray(push.pose, float), vertices(shape)
     fingers = fingers_along(hand, push.configuration)
     if len(fingers[0]) != len(pose):
         raise ValueError(f"push has {len(pose)} poses, but {len(fingers[0])} configurations")
     contact, force, words = np.zeros((len(pose), 0, 2)), np.zeros((len(pose), 0, 2)), [""] * len(pose)
     failed = -1
     if isinstance(push, Trajectory):
-        words = ["", *(_words(int(s), m) for s, m in zip(push.status, np.asarray(push.mode), strict=True))]
+        words = ["", *(_describe_step(int(s), m) for s, m in zip(push.status, np.asarray(push.mode), strict=True))]
         if forces:
             contact, force = _in_world(pose, *contact_forces(push))
         failed = int(push.first_failure)
         if failed >= 0:  # what is drawn from here on is no answer
-            name = _plain(Status(int(push.status[failed])))
+            name = _plain_name(Status(int(push.status[failed])))
             words = [*words[: failed + 1], *[f"{name} at step {failed}"] * (len(pose) - failed - 1)]
-    over = None if measured is None else placed_outline(body, np.asarray(measured, float))
-    return DrawnPush(placed_outline(body, pose), fingers, MM * pose[:, :2], over, contact, force, words, failed)
+    measured_outlines = None if measured is None else placed_outline(outline_points, np.asarray(measured, float))
+    return DrawnPush(
+        placed_outline(outline_points, pose),
+        fingers,
+        MM * pose[:, :2],
+        measured_outlines,
+        contact,
+        force,
+        words,
+        failed,
+    )
 
 
 def _in_world(pose: np.ndarray, point: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each pose the contacts, mm, and forces of the step that led there; zero for the first pose."""
+    """Return for each pose the contacts (mm) and forces (N) of the step that led there, world; zero for the first."""
     c, s = np.cos(pose[1:, None, 2]), np.sin(pose[1:, None, 2])
 
-    def turned(v):
+    def rotated(v):
         return np.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
 
-    both = MM * (turned(point) + pose[1:, None, :2]), turned(force)
-    contact, force = (np.concatenate([np.zeros_like(part[:1]), part]) for part in both)
+    in_world = MM * (rotated(point) + pose[1:, None, :2]), rotated(force)
+    contact, force = (np.concatenate([np.zeros_like(part[:1]), part]) for part in in_world)
     return contact, force
 
 
-def _words(status: int, modes: np.ndarray) -> str:
+def _describe_step(status: int, modes: np.ndarray) -> str:
     """Describe a step in words: its status, and how many contacts stick and slide."""
-    kinds, counts = np.unique(modes[modes != ContactMode.SEPARATED], return_counts=True)
-    each = [f"{n} {_plain(ContactMode(int(kind)))}" for kind, n in zip(kinds, counts, strict=True)]
-    one = len(modes) == 1
-    return ": ".join([_plain(Status(status)), *([", ".join(each).removeprefix("1 " if one else "")] if each else [])])
+    modes_seen, counts = np.unique(modes[modes != ContactMode.SEPARATED], return_counts=True)
+    descriptions = [f"{n} {_plain_name(ContactMode(int(kind)))}" for kind, n in zip(modes_seen, counts, strict=True)]
+    only_one_contact = len(modes) == 1
+    return ": ".join(
+        [
+            _plain_name(Status(status)),
+            *([", ".join(descriptions).removeprefix("1 " if only_one_contact else "")] if descriptions else []),
+        ]
+    )
 
 
-def _plain(name: ContactMode | Status) -> str:
+def _plain_name(member: ContactMode | Status) -> str:
     """Return the name of a mode or status in lower case, with spaces."""
-    return name.name.lower().replace("_", " ")
+    return member.name.lower().replace("_", " ")
 
 
 def fingers_along(hand: Hand, configurations: Any) -> list[np.ndarray]:
@@ -127,9 +141,9 @@ def fingers_along(hand: Hand, configurations: Any) -> list[np.ndarray]:
     angle = np.linspace(0, 2 * np.pi, SMOOTH_OUTLINE_POINTS // 4, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     drawn = []
-    for finger, where in zip(hand.fingers, np.moveaxis(poses, 1, 0), strict=True):
-        if where.shape[1] == 2:  # a hand that never turns
-            where = np.column_stack([where, np.zeros(len(where))])
-        body = vertices(finger.shape) if isinstance(finger, Pad) else float(finger.radius) * circle
-        drawn.append(placed_outline(body, where))
+    for finger, finger_poses in zip(hand.fingers, np.moveaxis(poses, 1, 0), strict=True):
+        if finger_poses.shape[1] == 2:  # a hand that never turns
+            finger_poses = np.column_stack([finger_poses, np.zeros(len(finger_poses))])
+        outline_points = vertices(finger.shape) if isinstance(finger, Pad) else float(finger.radius) * circle
+        drawn.append(placed_outline(outline_points, finger_poses))
     return drawn

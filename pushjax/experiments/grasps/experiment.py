@@ -62,25 +62,29 @@ def run(
     setting = SLIDERS[slider]()
     count = setting.n if n is None else n
     hand = pj.Hand.parallel_jaw(PAD, THICKNESS)
-    opened, shut = ((0.0, 0.0, 0.0, d) for d in setting.opening)
-    path = jnp.concatenate([pj.line(opened, shut, steps), jnp.asarray([shut] * HOLD)])
+    open_configuration, shut_configuration = ((0.0, 0.0, 0.0, d) for d in setting.opening)
+    path = jnp.concatenate(
+        [pj.line(open_configuration, shut_configuration, steps), jnp.asarray([shut_configuration] * HOLD)]
+    )
     model = pj.FrictionModel(dof=dof, friction=friction)
-    bodies = {}
+    slider_by_pressure = {}
     for name, support in setting.supports.items():
         pairs = support.wrench_twist_pairs(jax.random.key(seed), PAIRS)
-        bodies[name] = pj.Slider(setting.shape, pj.fit_limit_surface(*pairs, degree=2))
-    starts, again = start_poses(next(iter(bodies.values())), hand, path[0], setting.circle, count, seed)
+        slider_by_pressure[name] = pj.Slider(setting.shape, pj.fit_limit_surface(*pairs, degree=2))
+    starts, resampled = start_poses(next(iter(slider_by_pressure.values())), hand, path[0], setting.circle, count, seed)
     cells, shown = [], {}
-    for k, (name, body) in enumerate(bodies.items()):
+    for k, (name, grasped_slider) in enumerate(slider_by_pressure.items()):
 
-        def told(done: int, total: int, before: int = k * count) -> None:
-            progress(before + done, len(bodies) * count)
+        def report_progress(done: int, total: int, before: int = k * count) -> None:
+            progress(before + done, len(slider_by_pressure) * count)
 
         key = jax.random.key(seed + 1)
-        grasps = pj.monte_carlo(key, count, body, hand, path, pose=starts, model=model, progress=told)
-        became = classify(grasps, setting.shape, PAD)
-        cells.append({"pressure": name} | _figures(grasps, became, setting.symmetry))
-        shown[name] = grasps, became
+        grasps = pj.monte_carlo(
+            key, count, grasped_slider, hand, path, pose=starts, model=model, progress=report_progress
+        )
+        outcomes = classify(grasps, setting.shape, PAD)
+        cells.append({"pressure": name} | _figures(grasps, outcomes, setting.symmetry))
+        shown[name] = grasps, outcomes
     pictures = []
     if out is not None:
         from pushjax.experiments.grasps.picture import draw
@@ -94,14 +98,14 @@ def run(
         settings,
         n=count,
         outcomes=first["outcomes"],
-        redrawn=again,
+        redrawn=resampled,
         starts=starts,
         cells=cells,
         pictures=pictures,
     )
 
 
-def _figures(grasps: pj.MonteCarlo, became: np.ndarray, symmetry: float) -> dict[str, Any]:
+def _figures(grasps: pj.MonteCarlo, outcomes: np.ndarray, symmetry: float) -> dict[str, Any]:
     """Compute the outcomes, the spikes of the angle, and the histograms of the grasps that hold."""
     held = grasps.stopped >= 0
     pose = np.asarray(grasps.pose, np.float64)
@@ -109,13 +113,13 @@ def _figures(grasps: pj.MonteCarlo, became: np.ndarray, symmetry: float) -> dict
         name: grasps.histogram(pose[held, k], BINS) for k, name in enumerate(("x", "y", "theta")) if held.any()
     }
     return {
-        "outcomes": {name: int(np.sum(became == name)) for name in OUTCOMES},
+        "outcomes": {name: int(np.sum(outcomes == name)) for name in OUTCOMES},
         "statuses": grasps.summary()["statuses"],
         "failed_steps": int(grasps.failed.sum()),
         "spikes": spikes(pose[held, 2], symmetry) if held.any() else [],
         "held": histograms,
         "pose": pose,
-        "outcome_of_each": became,
+        "outcome_of_each": outcomes,
         "seconds": grasps.seconds,
     }
 

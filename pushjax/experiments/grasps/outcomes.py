@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.experiments._starts import in_circle
+from pushjax.experiments._starts import uniform_in_circle
 
-TURN = np.radians(1.0)
-POINTS = 500
-SPIKE = np.radians(1.0)  # width of a bin of angles in which spikes are looked for
-FEWEST = 0.02  # smallest share of all angles that makes a spike
+PERTURBATION = np.radians(1.0)
+OUTLINE_POINTS = 500
+BIN_WIDTH = np.radians(1.0)  # width of a bin of angles in which spikes are looked for
+MIN_SPIKE_SHARE = 0.02  # smallest share of all angles that makes a spike
 
 
 def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
@@ -30,25 +30,25 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     Returns:
         (n,), m; zero where the slider is not between the pads.
     """
-    outline = np.asarray(shape.boundary(POINTS), np.float64)
+    outline = np.asarray(shape.boundary(OUTLINE_POINTS), np.float64)
     if isinstance(shape, pj.Polygon):
         corners = np.asarray(shape.vertices, np.float64)
-        share = np.arange(POINTS)[:, None, None] / POINTS
+        share = np.arange(OUTLINE_POINTS)[:, None, None] / OUTLINE_POINTS
         outline = (corners + share * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 2)
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
     y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
     top, bottom = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
-    after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    next_x, next_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
     for side in (-pad / 2, pad / 2):  # where the outline crosses the lines through the pads' corners
-        across = (x - side) * (after_x - side) < 0
-        share = np.where(across, (side - x) / np.where(across, after_x - x, 1.0), 0.0)
-        height = y + share * (after_y - y)
-        top = np.maximum(top, np.where(across, height, -np.inf).max(axis=1))
-        bottom = np.minimum(bottom, np.where(across, height, np.inf).min(axis=1))
-    between = np.abs(x) <= pad / 2
-    top = np.maximum(top, np.where(between, y, -np.inf).max(axis=1))
-    bottom = np.minimum(bottom, np.where(between, y, np.inf).min(axis=1))
+        crosses = (x - side) * (next_x - side) < 0
+        share = np.where(crosses, (side - x) / np.where(crosses, next_x - x, 1.0), 0.0)
+        height = y + share * (next_y - y)
+        top = np.maximum(top, np.where(crosses, height, -np.inf).max(axis=1))
+        bottom = np.minimum(bottom, np.where(crosses, height, np.inf).min(axis=1))
+    between_pads = np.abs(x) <= pad / 2
+    top = np.maximum(top, np.where(between_pads, y, -np.inf).max(axis=1))
+    bottom = np.minimum(bottom, np.where(between_pads, y, np.inf).min(axis=1))
     return np.where(top >= bottom, top - bottom, 0.0)
 
 
@@ -65,9 +65,9 @@ def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
     """
     pose = np.asarray(grasps.pose, np.float64)
     held, failed = grasps.stopped >= 0, grasps.failed > 0
-    here = openings(shape, pose, pad)
-    turned = [openings(shape, pose + np.array([0, 0, sign * TURN]), pad) for sign in (1, -1)]
-    stable = (here > 0) & (turned[0] >= here) & (turned[1] >= here)
+    opening = openings(shape, pose, pad)
+    turned_openings = [openings(shape, pose + np.array([0, 0, sign * PERTURBATION]), pad) for sign in (1, -1)]
+    stable = (opening > 0) & (turned_openings[0] >= opening) & (turned_openings[1] >= opening)
     return np.select([failed, held & stable, held], ["failed", "grasped", "jammed"], "free")
 
 
@@ -93,21 +93,21 @@ def start_poses(
     from pushjax.simulation.slider import overlaps
 
     rng = np.random.default_rng(seed)
-    kept, again = np.zeros((0, 3)), 0
+    kept, resampled = np.zeros((0, 3)), 0
     dtype = jnp.result_type(float)
     while len(kept) < n:
-        centers = in_circle(rng, circle, n)
+        centers = uniform_in_circle(rng, circle, n)
         poses = np.column_stack([centers, rng.uniform(-np.pi / 2, np.pi / 2, n)]).astype(dtype)
-        apart = np.asarray(overlaps(slider, hand, jnp.asarray(poses), jnp.asarray(configuration))) <= 0
+        is_free = np.asarray(overlaps(slider, hand, jnp.asarray(poses), jnp.asarray(configuration))) <= 0
         wanted = n - len(kept)
-        last = np.flatnonzero(apart)[:wanted]
-        again += int(np.sum(~apart[: last[-1] + 1])) if len(last) == wanted else int(np.sum(~apart))
-        kept = np.concatenate([kept, poses[last]])
-    return kept.astype(dtype), again
+        chosen = np.flatnonzero(is_free)[:wanted]
+        resampled += int(np.sum(~is_free[: chosen[-1] + 1])) if len(chosen) == wanted else int(np.sum(~is_free))
+        kept = np.concatenate([kept, poses[chosen]])
+    return kept.astype(dtype), resampled
 
 
 def spikes(angles: np.ndarray, symmetry: float) -> list[dict[str, float]]:
-    """Find spikes in a distribution of angles: bins that hold at least the share `FEWEST` of all angles.
+    """Find spikes in a distribution of angles: bins that hold at least the share `MIN_SPIKE_SHARE` of all angles.
 
     Args:
         angles: Angles, rad.
@@ -117,11 +117,11 @@ def spikes(angles: np.ndarray, symmetry: float) -> list[dict[str, float]]:
         The angle (degrees) and the share of each spike, largest share first.
     """
     wrapped = np.mod(np.asarray(angles, np.float64) + symmetry / 2, symmetry) - symmetry / 2
-    bins = round(symmetry / SPIKE)
+    bins = round(symmetry / BIN_WIDTH)
     # bins are centered at multiples of a degree, so that a spike at a right angle is in one bin
-    number = np.mod(np.round(wrapped / SPIKE).astype(int), bins)
-    counts = np.bincount(number, minlength=bins)
-    found = np.flatnonzero(counts >= FEWEST * len(angles))
-    signed = np.where(found > bins / 2, found - bins, found)
-    order = np.argsort(-counts[found])
-    return [{"degrees": float(signed[k]), "share": float(counts[found[k]] / len(angles))} for k in order]
+    bin_index = np.mod(np.round(wrapped / BIN_WIDTH).astype(int), bins)
+    counts = np.bincount(bin_index, minlength=bins)
+    spike_bins = np.flatnonzero(counts >= MIN_SPIKE_SHARE * len(angles))
+    signed_degrees = np.where(spike_bins > bins / 2, spike_bins - bins, spike_bins)
+    order = np.argsort(-counts[spike_bins])
+    return [{"degrees": float(signed_degrees[k]), "share": float(counts[spike_bins[k]] / len(angles))} for k in order]

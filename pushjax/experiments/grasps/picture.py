@@ -11,7 +11,7 @@ from pushjax import plot
 from pushjax.experiments.grasps.sliders import Setting
 
 COLORS = {"grasped": plot.RED, "jammed": plot.ORANGE, "free": plot.GRAY, "failed": plot.PURPLE}
-NUMBERS = ((plot.MM, "x / mm"), (plot.MM, "y / mm"), (180 / np.pi, "θ / °"))
+COORDINATES = ((plot.MM, "x / mm"), (plot.MM, "y / mm"), (180 / np.pi, "θ / °"))
 BINS = 60
 
 
@@ -41,9 +41,9 @@ def draw(
         plot.hand_at(first[0], hand, np.asarray(hand.poses(path[0])), plot.BLUE, 1.0)
         first[0].set_title(f"{len(starts)} start poses")
         _histograms(first[1:], starts)
-        for row, (pressure, (grasps, became)) in zip(axes[1:], shown.items(), strict=True):
+        for row, (pressure, (grasps, outcomes)) in zip(axes[1:], shown.items(), strict=True):
             for word, color in COLORS.items():
-                which = became == word
+                which = outcomes == word
                 if which.any():
                     plot.pose_panel(row[0], grasps.pose[which], color, f"{word}: {which.sum()}")
             ends = plot.MM * np.abs(grasps.pose[:, :2]).max(axis=0) + 4
@@ -60,7 +60,7 @@ def draw(
 
 def _histograms(panels, poses: np.ndarray) -> None:
     """Draw histograms of x, y (mm) and theta (degrees) of poses (n, 3)."""
-    for k, (axes, (scale, label)) in enumerate(zip(panels, NUMBERS, strict=True)):
+    for k, (axes, (scale, label)) in enumerate(zip(panels, COORDINATES, strict=True)):
         values = scale * np.asarray(poses[:, k], np.float64)
         if len(values):
             counts, edges = np.histogram(values, BINS)

@@ -12,9 +12,9 @@ import numpy as np
 
 import pushjax as pj
 
-LONG, WAIST = 0.039, 0.0286  # m, diameters of the butterfly
-HOLLOW = -0.001  # c, m
-CONTROLS = 24
+ENDS_DIAMETER, WAIST_DIAMETER = 0.039, 0.0286  # m, diameters of the butterfly
+HOLLOW_TERM = -0.001  # c, m
+CURVE_POINTS = 24
 
 
 class Setting(NamedTuple):
@@ -48,9 +48,9 @@ def rectangle() -> Setting:
 
 def butterfly() -> Setting:
     """Return the setting of the butterfly, on its rim."""
-    angle = 2 * np.pi * np.arange(CONTROLS) / CONTROLS
-    b = (LONG - WAIST) / 4
-    r = LONG / 2 - b - HOLLOW + b * np.cos(2 * angle) + HOLLOW * np.cos(4 * angle)
+    angle = 2 * np.pi * np.arange(CURVE_POINTS) / CURVE_POINTS
+    b = (ENDS_DIAMETER - WAIST_DIAMETER) / 4
+    r = ENDS_DIAMETER / 2 - b - HOLLOW_TERM + b * np.cos(2 * angle) + HOLLOW_TERM * np.cos(4 * angle)
     points = jnp.asarray(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1), jnp.result_type(float))
     curve = pj.Curve.through(points)
     return Setting(curve, {"rim": pj.Support.rim(curve, points=200)}, 900, 0.030, np.pi, (0.085, 0.001))

@@ -23,11 +23,13 @@ ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the archives
 APART = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
 MODELS = {"quartic": 4, "ellipsoid": 2}
 # Polygons with fewer vertices get this many, by splitting edges, so that one compiled program serves all polygons.
-CORNERS = 6
-BUTTERFLY = 64  # vertices, at most 0.3 mm from its 636 original ones; a spline takes three times as long to compile
+MIN_VERTICES = 6
+BUTTERFLY_VERTICES = (
+    64  # vertices, at most 0.3 mm from its 636 original ones; a spline takes three times as long to compile
+)
 SIDES = 6  # at most; an outline with more vertices is divided into quadrants
 
-LEARNED_SHARE = 0.2  # training share of the paper, used for pushes that come without a split
+TRAIN_SHARE = 0.2  # training share of the paper, used for pushes that come without a split
 
 # Zhou et al. 2017, table 1: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
 # of the ratio of the two in percent, delrin included.
@@ -83,7 +85,7 @@ def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
     """
     if (folder / ARCHIVES).is_dir():
         return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
-    log, problems = load_mit_folder(folder, surface, name, train_share=LEARNED_SHARE, seed=seed)
+    log, problems = load_mit_folder(folder, surface, name, train_share=TRAIN_SHARE, seed=seed)
     if problems:
         what = f"{len(problems)} files of {name} on {surface} are left out"
         warnings.warn(f"{what}, the first: {problems[0]}", stacklevel=2)
@@ -98,20 +100,20 @@ def paper_mm(surface: str, name: str, model: str) -> float | None:
 def outline(log: MitPushes) -> pj.Shape:
     """Return the outline of the object.
 
-    The data give ellipses and the butterfly by many vertices. An ellipse is fitted to its vertices, and `BUTTERFLY` of
-    the butterfly's vertices are kept. Other polygons get at least `CORNERS` vertices.
+    The data give ellipses and the butterfly by many vertices. An ellipse is fitted to its vertices, and
+    `BUTTERFLY_VERTICES` of the butterfly's vertices are kept. Other polygons get at least `MIN_VERTICES` vertices.
     """
     if log.shape.startswith("ellip"):
         inverse_squares = np.linalg.lstsq(log.vertices**2, np.ones(len(log.vertices)), rcond=None)[0]
         return pj.Ellipse(*(1 / np.sqrt(inverse_squares)))
     if log.shape == "butter":
-        return pj.Polygon(log.vertices[np.arange(BUTTERFLY) * len(log.vertices) // BUTTERFLY])
-    return pj.Polygon(_filled(log.vertices))
+        return pj.Polygon(log.vertices[np.arange(BUTTERFLY_VERTICES) * len(log.vertices) // BUTTERFLY_VERTICES])
+    return pj.Polygon(_with_split_edges(log.vertices))
 
 
-def _filled(vertices: Floats) -> Floats:
-    """Halve the longest edges until there are at least `CORNERS` vertices."""
-    while len(vertices) < CORNERS:
+def _with_split_edges(vertices: Floats) -> Floats:
+    """Halve the longest edges until there are at least `MIN_VERTICES` vertices."""
+    while len(vertices) < MIN_VERTICES:
         after = np.roll(vertices, -1, axis=0)
         longest = int(np.argmax(np.linalg.norm(after - vertices, axis=1)))
         vertices = np.insert(vertices, longest + 1, (vertices[longest] + after[longest]) / 2, axis=0)
@@ -133,7 +135,10 @@ def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
     vertices = log.vertices
     if len(vertices) > SIDES:
         return (np.arctan2(tip[:, 1], tip[:, 0]) // (np.pi / 2)).astype(int) % 4
-    edges = [np.stack([one, other]) for one, other in zip(vertices, np.roll(vertices, -1, axis=0), strict=True)]
+    edges = [
+        np.stack([vertex, next_vertex])
+        for vertex, next_vertex in zip(vertices, np.roll(vertices, -1, axis=0), strict=True)
+    ]
     return np.argmin([np.abs(nearest_on_outline(edge, tip)[0]) for edge in edges], axis=0)
 
 
@@ -156,12 +161,12 @@ def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: in
     path = lines(pushes, rows, steps)
     age = pushes.index / max(int(log.whole.index.max()), 1)
     parts = pushes.start[rows], path, pushes.end[rows], age[rows], sides(log, pushes)[rows]
-    rest = batch - len(rows)
-    if rest < 0:
+    padding = batch - len(rows)
+    if padding < 0:
         raise ValueError(f"batch must be at least {len(rows)}; got {batch}")
     dtype = jnp.result_type(float)
     start, path, end, age, side = (
-        jnp.asarray(np.concatenate([part, np.repeat(part[:1], rest, axis=0)]), dtype) for part in parts
+        jnp.asarray(np.concatenate([part, np.repeat(part[:1], padding, axis=0)]), dtype) for part in parts
     )
     return pj.Pushes(start, path, end, (np.arange(batch) < len(rows)).astype(float), age=age, side=side)
 

@@ -81,20 +81,20 @@ def _cell(
 ) -> dict[str, Any]:
     """Compute the figures of one cell, apart from its labels and run time."""
     predicted = method(setting())
-    off = deviation_mm(log, predicted.final)
+    deviations = deviation_mm(log, predicted.final)
     toolbox = log.middle.toolbox.get(model)
     return {
-        "mean_mm": float(off.mean()),
-        "ci95_bootstrap_mm": bootstrapped_ci95(off, np.random.default_rng(seed)),
-        "median_mm": float(np.median(off)),
-        "worst_mm": float(off.max()),
-        "valid_mm": float(off[log.middle.valid].mean()),
+        "mean_mm": float(deviations.mean()),
+        "ci95_bootstrap_mm": bootstrapped_ci95(deviations, np.random.default_rng(seed)),
+        "median_mm": float(np.median(deviations)),
+        "worst_mm": float(deviations.max()),
+        "valid_mm": float(deviations[log.middle.valid].mean()),
         "no_motion_mm": float(deviation_mm(log, log.middle.start).mean()),
         "paper_mm": paper_mm(log.surface, log.shape, model),
         "toolbox_mm": None if toolbox is None else float(deviation_mm(log, toolbox).mean()),
         "friction": predicted.friction,
         "learned": int(np.sum(log.is_training & log.whole.valid)),
-        "tested": len(off),
+        "tested": len(deviations),
         "failed_steps": predicted.failed,
         **_calibration(predicted),
         "noise_floor_mm": noise_floor_mm(log),
@@ -105,10 +105,10 @@ def _calibration(predicted: Predicted) -> dict[str, Any]:
     """Return what else was identified: lengths in mm, the angle of the object's frame in degrees."""
     if predicted.found is None:
         return {}
-    own = predicted.found.parameters
+    parameters = predicted.found.parameters
     names = ("pressure_center", "hand_offset", "inset")
-    found = {f"{name}_mm": 1e3 * np.asarray(getattr(own, name), float) for name in names}
-    offset = own.frame_offset
+    found = {f"{name}_mm": 1e3 * np.asarray(getattr(parameters, name), float) for name in names}
+    offset = parameters.frame_offset
     if offset is not None:
         found |= {"frame_offset_mm": 1e3 * np.asarray(offset[:2], float)}
         found |= {"frame_offset_deg": float(np.degrees(offset[2]))}
@@ -128,11 +128,13 @@ def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:
 
 def _means(cells: list[dict], method: str, model: str) -> dict[str, Any]:
     """Return the means over the paper's ten objects, over all surfaces and for each surface alone."""
-    mine = [c for c in cells if (c["method"], c["model"]) == (method, model) and c["object"] not in APART]
-    if not mine:
+    selected = [c for c in cells if (c["method"], c["model"]) == (method, model) and c["object"] not in APART]
+    if not selected:
         return {}
-    surfaces = dict.fromkeys(cell["surface"] for cell in mine)
-    return _mean(mine, model) | {name: _mean([c for c in mine if c["surface"] == name], model) for name in surfaces}
+    surfaces = dict.fromkeys(cell["surface"] for cell in selected)
+    return _mean(selected, model) | {
+        name: _mean([c for c in selected if c["surface"] == name], model) for name in surfaces
+    }
 
 
 def _mean(cells: list[dict], model: str) -> dict[str, float | None]:

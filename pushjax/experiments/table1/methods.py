@@ -140,14 +140,14 @@ def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: 
         The result, with the unknown `overlap` imposed and the standard deviation of its prior set to 1.
     """
     found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, contact_at_end=True)
-    places = jnp.asarray([label.startswith("overlap") for label in found.labels])
-    none = jnp.where(places, 1 - overlap, found.z).astype(found.z.dtype)
-    return eqx.tree_at(lambda f: (f.z, f.prior.unknowns.overlap), found, (none, jnp.ones_like(found.sigma)))
+    is_overlap = jnp.asarray([label.startswith("overlap") for label in found.labels])
+    z_with_overlap = jnp.where(is_overlap, 1 - overlap, found.z).astype(found.z.dtype)
+    return eqx.tree_at(lambda f: (f.z, f.prior.unknowns.overlap), found, (z_with_overlap, jnp.ones_like(found.sigma)))
 
 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}
 
 
 def own(values, pushes: pj.Pushes) -> np.ndarray:
-    """Return the values without those of the padding, as float64."""
+    """Return the values of a push's own rows, without those of the padding, as float64."""
     return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]

@@ -23,17 +23,17 @@ def noise_floor_mm(log: MitPushes) -> float | None:
     rows = log.repeats[log.fast.valid[log.repeats[:, 0]] & log.whole.valid[log.repeats[:, 1]]]
     if not len(rows):
         return None
-    one, other = _motion(log.fast)[rows[:, 0]], _motion(log.whole)[rows[:, 1]]
-    apart = np.asarray(pj.deviation(one, other, log.length), float)
-    share = _moved(log.middle, log.length) / _moved(log.whole, log.length)
-    return float(1e3 * apart.mean() / np.sqrt(2) * share)
+    fast, slow = _relative_motions(log.fast)[rows[:, 0]], _relative_motions(log.whole)[rows[:, 1]]
+    differences = np.asarray(pj.deviation(fast, slow, log.length), float)
+    ratio = _mean_motion(log.middle, log.length) / _mean_motion(log.whole, log.length)
+    return float(1e3 * differences.mean() / np.sqrt(2) * ratio)
 
 
-def _motion(pushes: StraightPushes) -> np.ndarray:
+def _relative_motions(pushes: StraightPushes) -> np.ndarray:
     """Return the end poses in the frames of the starts, (n, 3), in which repetitions are the same push."""
     return np.asarray(compose(inverse(pushes.start), pushes.end), float)
 
 
-def _moved(pushes: StraightPushes, length: float) -> float:
+def _mean_motion(pushes: StraightPushes, length: float) -> float:
     """Return the mean deviation of the end poses from the start poses, m."""
     return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, length), float)))

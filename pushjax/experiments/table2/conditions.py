@@ -98,18 +98,18 @@ def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
         steps: Steps of each path.
     """
     if geometry.commanded_end:
-        log = replace(log, pushes=tuple(_ended(log, push) for push in log.pushes))
+        log = replace(log, pushes=tuple(_with_commanded_end(log, push) for push in log.pushes))
     return pj.Pushes.of(log, steps)
 
 
-def _ended(log: PushLog, push: Push) -> Push:
-    """Append to the path the point where the robot was told to stop."""
+def _with_commanded_end(log: PushLog, push: Push) -> Push:
+    """Return the push with a path that ends where the robot was told to stop."""
     tip = np.vstack([push.tip, log.commanded_tip_end(push)])
     return replace(push, tip=tip, tip_time=np.append(push.tip_time, push.tip_time[-1]))
 
 
 def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Choose the random part of the pushes that each split learns from.
+    """Return masks of the pushes that each random split learns from.
 
     Args:
         log: The pushes of a condition.

@@ -91,7 +91,7 @@ def run(
         for name in method:
             rngs = [np.random.default_rng(seed + k) for k in range(len(logs))]
             train = [training(log, methods.TRAIN_SHARE[name], rng) for log, rng in zip(logs, rngs, strict=True)]
-            found = _predicted(name, model, logs, pushes, surfaces, train, where, step)
+            found = _predict_conditions(name, model, logs, pushes, surfaces, train, where, step)
             for k, (surface, target) in enumerate(CONDITIONS):
                 labels = {"surface": surface, "object": target, "model": model, "method": name}
                 paper = {"paper_mm": PAPER_MM[surface, model][OBJECTS.index(target)]}
@@ -103,34 +103,34 @@ def run(
     return result_record("table2", settings, cells=cells, means=means, pictures=pictures)
 
 
-def _predicted(name, model, logs, pushes, surfaces, train, where, done) -> list[Predicted]:
-    """Predict all conditions with one method, and call `done` after each part."""
+def _predict_conditions(name, model, logs, pushes, surfaces, train, where, step_done) -> list[Predicted]:
+    """Predict all conditions with one method, and call `step_done` after each part."""
     if name == "identified":
-        return methods.identified(logs, pushes, surfaces, train, where, done)
-    found = []
-    for log, mine, surface, split in zip(logs, pushes, surfaces, train, strict=True):
+        return methods.identified(logs, pushes, surfaces, train, where, step_done)
+    predictions = []
+    for log, condition_pushes, surface, split in zip(logs, pushes, surfaces, train, strict=True):
         if name == "ideal":
-            found.append(methods.ideal(log, mine, surface, split, where))
+            predictions.append(methods.ideal(log, condition_pushes, surface, split, where))
         else:
-            found.append(methods.wrench_twist(log, mine, surface.length, model, split, where))
-        done()
-    return found
+            predictions.append(methods.wrench_twist(log, condition_pushes, surface.length, model, split, where))
+        step_done()
+    return predictions
 
 
 def _cell(
     pushes: pj.Pushes, length: float, found: Predicted, train: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Compute the figures of the pushes that were not learned from, over all splits."""
-    still = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)
+    no_motion = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)
     test = ~train
-    means = [error[mine].mean() for error, mine in zip(found.errors, test, strict=True)]
-    times = test.sum(axis=0)
-    per_push = (found.errors * test).sum(axis=0)[times > 0] / times[times > 0]
+    means = [error[tested].mean() for error, tested in zip(found.errors, test, strict=True)]
+    times_tested = test.sum(axis=0)
+    per_push = (found.errors * test).sum(axis=0)[times_tested > 0] / times_tested[times_tested > 0]
     return {
         "mean_mm": float(np.mean(means)),
         "ci95_mm": float(1.96 * np.std(means, ddof=1) / np.sqrt(len(train))),
         "ci95_bootstrap_mm": bootstrapped_ci95(per_push, rng),
-        "no_motion_mm": float(np.mean([still[mine].mean() for mine in test])),
+        "no_motion_mm": float(np.mean([no_motion[tested].mean() for tested in test])),
         "worst_mm": float(per_push.max()),
         "friction": float(np.mean(found.friction)),
         "pushes": train.shape[1],
@@ -141,11 +141,11 @@ def _cell(
 
 def _mean(cells: list[dict], method: str, model: str) -> dict[str, float]:
     """Average the cells of one method and model."""
-    mine = [cell for cell in cells if (cell["method"], cell["model"]) == (method, model)]
+    selected = [cell for cell in cells if (cell["method"], cell["model"]) == (method, model)]
     return {
-        "mean_mm": float(np.mean([cell["mean_mm"] for cell in mine])),
-        "paper_mm": float(np.mean([cell["paper_mm"] for cell in mine])),
-        "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in mine])),
+        "mean_mm": float(np.mean([cell["mean_mm"] for cell in selected])),
+        "paper_mm": float(np.mean([cell["paper_mm"] for cell in selected])),
+        "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in selected])),
         "paper_percent": PAPER_PERCENT[model],
     }
 

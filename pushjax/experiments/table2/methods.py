@@ -56,8 +56,8 @@ def ideal(
         train: (splits, pushes), True for the pushes to learn from.
         geometry: Where the finger really was.
     """
-    errors, failed = _on_grid(log, pushes, surface, geometry)
-    return _best(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
+    errors, failed = _deviations_on_grid(log, pushes, surface, geometry)
+    return _choose_friction(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
 
 
 def wrench_twist(
@@ -75,12 +75,12 @@ def wrench_twist(
     """
     wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in log.wrench_twist_pairs())
     errors, failed = [], 0
-    for mine in train:
-        surface = pj.fit_limit_surface(wrench[mine], twist[mine], length, degree=MODELS[model])
-        each, wrong = _on_grid(log, pushes, surface, geometry)
-        errors.append(each)
-        failed += int(wrong.sum())
-    return _best(np.stack(errors), train, np.asarray(failed))
+    for trains in train:
+        surface = pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model])
+        split_errors, split_failed = _deviations_on_grid(log, pushes, surface, geometry)
+        errors.append(split_errors)
+        failed += int(split_failed.sum())
+    return _choose_friction(np.stack(errors), train, np.asarray(failed))
 
 
 def identified(
@@ -129,7 +129,7 @@ def identified(
     ]
 
 
-def _on_grid(
+def _deviations_on_grid(
     log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return every push's deviation in mm and number of failed steps at every friction, (frictions, pushes)."""
@@ -139,8 +139,10 @@ def _on_grid(
     return 1e3 * np.asarray(pj.deviation(final, pushes.end[None], log.length), np.float64), np.asarray(failed)
 
 
-def _best(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
+def _choose_friction(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
     """Choose for each split's errors (frictions, pushes) the friction that is best for its training pushes."""
-    best = [int(np.argmin(e[:, mine].mean(axis=1))) for e, mine in zip(errors, train, strict=True)]
-    chosen = np.stack([e[b] for e, b in zip(errors, best, strict=True)])
+    best = [
+        int(np.argmin(split_errors[:, trains].mean(axis=1))) for split_errors, trains in zip(errors, train, strict=True)
+    ]
+    chosen = np.stack([split_errors[row] for split_errors, row in zip(errors, best, strict=True)])
     return Predicted(chosen, FRICTIONS[best], int(failed.sum()))

@@ -30,7 +30,7 @@ from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz
 from pushjax.datasets.two_finger_logs import load_two_finger_logs
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
-from pushjax.experiments.two_finger.scores import STUCK, days, figures
+from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, figures
 
 OBJECTS = ("3pts1", "3pts3", "patch")
 
@@ -78,7 +78,7 @@ def run(
         from pushjax.experiments.two_finger.picture import draw
 
         pictures.append(draw(shown, out))
-    settings = {"seed": seed, "steps": steps, "model": model, "pairs": PAIRS, "stuck_mm": 1e3 * STUCK}
+    settings = {"seed": seed, "steps": steps, "model": model, "pairs": PAIRS, "stuck_mm": 1e3 * MAX_STUCK_MOTION}
     settings |= {
         "frictions": predictions.FRICTIONS,
         "radii": predictions.RADII,

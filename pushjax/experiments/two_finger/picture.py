@@ -41,18 +41,18 @@ def draw(shown: list[tuple], out: Path) -> str:
         return str(plot.save(figure, out / "two_finger.png"))
 
 
-def _distribution(axes, name: str, predicted: np.ndarray, still: np.ndarray) -> None:
+def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray) -> None:
     """Draw the cumulative distributions of two sets of deviations.
 
     Args:
         axes: The panel.
         name: Name of the object.
         predicted: Deviations of the predicted final poses, mm.
-        still: Deviations if nothing moved, that is, of the start poses, mm.
+        no_motion: Deviations if nothing moved, that is, of the start poses, mm.
     """
     for values, color, dash, label in (
         (predicted, plot.BLUE, "-", "predicted"),
-        (still, plot.GRAY, "--", "no motion"),
+        (no_motion, plot.GRAY, "--", "no motion"),
     ):
         order = np.sort(values)
         axes.step(order, 100 * np.arange(1, len(order) + 1) / len(order), dash, color=color, where="post", label=label)

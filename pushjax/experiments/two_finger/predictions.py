@@ -10,7 +10,7 @@ import pushjax as pj
 from pushjax.datasets.two_finger import TwoFingerLog
 
 MODELS = {"quartic": 4, "ellipsoid": 2}
-PAIRS, CELLS = 400, 150
+PAIRS, SUPPORT_POINTS = 400, 150
 SPLITS, TRAIN_SHARE = 10, 0.4
 FRICTIONS = np.linspace(0.0, 0.8, 17)
 RADII = (0.0, 0.0005, 0.001, 0.0015)
@@ -45,7 +45,7 @@ class Tested(NamedTuple):
 def support(log: TwoFingerLog) -> pj.Support:
     """Return the support of the object, with unit load: its points, or uniform pressure if it has none."""
     if len(log.support_points) == 0:
-        return pj.Support.uniform(pj.Polygon(log.vertices), CELLS)
+        return pj.Support.uniform(pj.Polygon(log.vertices), SUPPORT_POINTS)
     return pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
 
 
@@ -74,11 +74,11 @@ def _final_poses(slider: pj.Slider, radius, paths, starts, frictions):
     """Return the final poses, the number of failed steps, and whether the hand stopped, by friction and push."""
     hand = pj.Hand.two_fingers(radius)
 
-    def one(path, start, friction):
+    def final_pose(path, start, friction):
         push = pj.rollout(slider, hand, path, pose=start, friction=friction)
         return push.pose[-1], jnp.sum(push.failed), push.stopped >= 0
 
-    over_pushes = jax.vmap(one, in_axes=(0, 0, None))
+    over_pushes = jax.vmap(final_pose, in_axes=(0, 0, None))
     return jax.vmap(over_pushes, in_axes=(None, None, 0))(paths, starts, frictions)
 
 
@@ -93,7 +93,7 @@ def deviation_mm(log: TwoFingerLog, final: np.ndarray) -> np.ndarray:
 
 
 def splits(log: TwoFingerLog, errors: np.ndarray, rng: np.random.Generator) -> Tested:
-    """Choose friction and radius on part of the actions, for each of several random splits.
+    """Choose friction and radius on part of the actions, for each of `SPLITS` random splits.
 
     Args:
         log: The n pushes.

@@ -14,9 +14,9 @@ from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import SPLITS, Prediction, Tested, deviation_mm, per_push
 from pushjax.geometry.se2 import compose, inverse
 
-BOOTSTRAPS = 2000
-STUCK = 0.003  # m
-FEWEST_OF_A_DAY = 10
+BOOTSTRAP_SAMPLES = 2000
+MAX_STUCK_MOTION = 0.003  # m
+MIN_PUSHES_OF_A_DAY = 10
 DAY = 86400.0  # s
 
 
@@ -30,23 +30,23 @@ def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, teste
         tested: What the splits gave.
         seed: Seed of the bootstrap.
     """
-    still = deviation_mm(log, log.pose_start)
+    no_motion_errors = deviation_mm(log, log.pose_start)
     pairs = list(zip(tested.chosen, tested.test, strict=True))
     means = [errors[at][pushes].mean() for at, pushes in pairs]
-    no_motion = float(np.mean([still[pushes].mean() for pushes in tested.test]))
+    no_motion = float(np.mean([no_motion_errors[pushes].mean() for pushes in tested.test]))
     mean = float(np.mean(means))
-    each = per_push(errors, tested)
-    seen = np.isfinite(each)
-    interval = _interval(each[seen], log.group[seen], np.random.default_rng(seed))
+    push_errors = per_push(errors, tested)
+    was_tested = np.isfinite(push_errors)
+    interval = _interval(push_errors[was_tested], log.group[was_tested], np.random.default_rng(seed))
     return {
         "mean_mm": mean,
         "no_motion_mm": no_motion,
         "ratio": mean / no_motion,
         "ci95_mm": float(1.96 * np.std(means, ddof=1) / np.sqrt(SPLITS)),
         "ci95_bootstrap_mm": interval,
-        "median_mm": float(np.median(each[seen])),
-        "worst_mm": float(each[seen].max()),
-        "worst_push": int(log.index[np.nanargmax(each)]),
+        "median_mm": float(np.median(push_errors[was_tested])),
+        "worst_mm": float(push_errors[was_tested].max()),
+        "worst_push": int(log.index[np.nanargmax(push_errors)]),
         "friction": float(np.mean([predictions.FRICTIONS[friction] for _, friction in tested.chosen])),
         "radius_mm": float(1e3 * np.mean([predictions.RADII[radius] for radius, _ in tested.chosen])),
         "pushes": len(log),
@@ -55,30 +55,32 @@ def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, teste
         "splits": SPLITS,
         "failed_steps": int(prediction.failed.sum()),
         "jammed_pushes": float(np.mean([prediction.jammed[at].sum() for at in tested.chosen])),
-        "repeats": _repeats(log, each),
-    } | _stick(log, prediction.final, tested)
+        "repeats": _repeats(log, push_errors),
+    } | _stick_agreement(log, prediction.final, tested)
 
 
 def _interval(per_push: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
     """Return half the 95 % interval of the mean, by bootstrap over actions, because repeats are not independent."""
-    actions, of = np.unique(group, return_inverse=True)
-    total, count = np.bincount(of, per_push), np.bincount(of)
-    drawn = rng.integers(len(actions), size=(BOOTSTRAPS, len(actions)))
-    means = total[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    actions, action_of_push = np.unique(group, return_inverse=True)
+    total, count = np.bincount(action_of_push, per_push), np.bincount(action_of_push)
+    resampled = rng.integers(len(actions), size=(BOOTSTRAP_SAMPLES, len(actions)))
+    means = total[resampled].sum(axis=1) / count[resampled].sum(axis=1)
     return float(np.diff(np.quantile(means, [0.025, 0.975]))[0] / 2)
 
 
-def _stick(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
+def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
     """Compare prediction and measurement on whether the object stuck to the hand.
 
     Returns:
         How often the two agree, the agreement by chance, and the shares of the four cases, over all tests.
     """
-    really = log.stick_deviation < STUCK
+    measured_stuck = log.stick_deviation < MAX_STUCK_MOTION
     table = np.zeros((2, 2))
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
-        found = stick_deviation(log.hand_start, log.hand_end, log.pose_start, final[at], log.length) < STUCK
-        np.add.at(table, (really[pushes].astype(int), found[pushes].astype(int)), 1.0)
+        predicted_stuck = (
+            stick_deviation(log.hand_start, log.hand_end, log.pose_start, final[at], log.length) < MAX_STUCK_MOTION
+        )
+        np.add.at(table, (measured_stuck[pushes].astype(int), predicted_stuck[pushes].astype(int)), 1.0)
     table /= table.sum()
     shares = {
         "both": table[1, 1],
@@ -101,16 +103,16 @@ def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
     the other repeats. For k repeats that estimate is too large by sqrt(k / (k - 1)), which is divided out.
     `floor_agreement` is how often two repeats agree on whether the object stuck.
     """
-    moved, stuck = _object_motion(log), log.stick_deviation < STUCK
+    moved, stuck = _object_motion(log), log.stick_deviation < MAX_STUCK_MOTION
     floor, model, agree = [], [], []
     for action in np.unique(log.group):
-        mine = np.flatnonzero(log.group == action)
-        if len(mine) < 2:
+        same_action = np.flatnonzero(log.group == action)
+        if len(same_action) < 2:
             continue
-        for push in mine:
-            others = mine[mine != push]
-            away = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
-            floor.append(1e3 * float(away) * np.sqrt(len(others) / len(mine)))
+        for push in same_action:
+            others = same_action[same_action != push]
+            distance = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
+            floor.append(1e3 * float(distance) * np.sqrt(len(others) / len(same_action)))
             model.append(per_push[push])
             agree += list(stuck[others] == stuck[push])
     if not floor:
@@ -134,7 +136,7 @@ def _object_motion(log: TwoFingerLog) -> np.ndarray:
 def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
     """Find the friction and radius that suit each day's pushes (UTC) best, to see whether the setup stayed the same.
 
-    All pushes of a day are used; none are held back. Days with fewer than `FEWEST_OF_A_DAY` pushes are left out.
+    All pushes of a day are used; none are held back. Days with fewer than `MIN_PUSHES_OF_A_DAY` pushes are left out.
 
     Args:
         log: The n pushes of one object.
@@ -145,12 +147,12 @@ def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
     """
     rows, day = [], np.floor(log.time / DAY).astype(int)
     for number in np.unique(day):
-        mine = day == number
-        if np.count_nonzero(mine) < FEWEST_OF_A_DAY:
+        of_day = day == number
+        if np.count_nonzero(of_day) < MIN_PUSHES_OF_A_DAY:
             continue
-        scores = errors[..., mine].mean(axis=-1)
+        scores = errors[..., of_day].mean(axis=-1)
         radius, friction = np.unravel_index(int(np.argmin(scores)), scores.shape)
         date = str(np.datetime64(int(number), "D"))
         best = {"friction": float(predictions.FRICTIONS[friction]), "radius_mm": 1e3 * predictions.RADII[int(radius)]}
-        rows.append({"day": date, "pushes": int(mine.sum()), **best, "mean_mm": float(scores.min())})
+        rows.append({"day": date, "pushes": int(of_day.sum()), **best, "mean_mm": float(scores.min())})
     return rows
