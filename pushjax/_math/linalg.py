@@ -24,6 +24,7 @@ class Symmetric3(NamedTuple):
     yz: Scalar
 
     def times(self, v: Vec3) -> Vec3:
+        """Return the product of the matrix and v."""
         return Vec3(
             self.xx * v.x + self.xy * v.y + self.xz * v.z,
             self.xy * v.x + self.yy * v.y + self.yz * v.z,
@@ -67,6 +68,7 @@ class Basis(NamedTuple):
 
     @staticmethod
     def of(v1: Vec3, v2: Vec3, v3: Vec3, least: Scalar | float) -> "Basis":
+        """Return the basis of three vectors; it is regular where |det| exceeds `least`."""
         x1, x2, x3 = v2.cross(v3), v3.cross(v1), v1.cross(v2)
         det = v1.dot(x1)
         regular = jnp.abs(det) > least
@@ -106,8 +108,8 @@ def complete_basis(
         relative: The basis is regular where |det| exceeds this times the product of the three lengths.
     """
     zero = jnp.zeros_like(v1.x)
-    aside = tree_where(jnp.abs(v1.x) > jnp.abs(v1.y), Vec3(-v1.y, v1.x, zero), Vec3(zero, -v1.z, v1.y))
-    v2 = tree_where(used2, v2, aside)
+    orthogonal = tree_where(jnp.abs(v1.x) > jnp.abs(v1.y), Vec3(-v1.y, v1.x, zero), Vec3(zero, -v1.z, v1.y))
+    v2 = tree_where(used2, v2, orthogonal)
     v3 = tree_where(used3, v3, v1.cross(v2))
     v1, v2, v3 = compute_once((v1, v2, v3), v1.x)
     return Basis.of(v1, v2, v3, relative * jnp.sqrt(v1.dot(v1) * v2.dot(v2) * v3.dot(v3)))
@@ -142,20 +144,22 @@ class Cholesky(NamedTuple):
 
     @staticmethod
     def of(m: Lower) -> "Cholesky":
+        """Factorize a symmetric matrix, given by its lower triangle."""
         rows, inverses, positive = [], [], jnp.ones((), bool)
-        for i, given in enumerate(m):
+        for i, m_row in enumerate(m):
             row: list[Scalar] = []
             for j in range(i):
-                row.append((given[j] - _dot(row, rows[j][:j])) * inverses[j])
-            pivot = given[i] - _dot(row, row)
-            ahead = pivot > len(m) * jnp.finfo(pivot.dtype).eps * jnp.abs(given[i])
-            positive &= ahead
-            inverses.append(1 / jnp.sqrt(jnp.where(ahead, pivot, 1.0)))
-            row.append(jnp.where(ahead, pivot, 1.0) * inverses[i])
+                row.append((m_row[j] - _dot(row, rows[j][:j])) * inverses[j])
+            pivot = m_row[i] - _dot(row, row)
+            is_positive = pivot > len(m) * jnp.finfo(pivot.dtype).eps * jnp.abs(m_row[i])
+            positive &= is_positive
+            inverses.append(1 / jnp.sqrt(jnp.where(is_positive, pivot, 1.0)))
+            row.append(jnp.where(is_positive, pivot, 1.0) * inverses[i])
             rows.append(tuple(row))
         return Cholesky(tuple(rows), tuple(inverses), positive)
 
     def logdet(self) -> Scalar:
+        """Return log det m."""
         total = self.inverse_diagonal[0]
         for inverse in self.inverse_diagonal[1:]:
             total = total * inverse
@@ -203,6 +207,7 @@ def congruence(x: Lower, m: Lower) -> Lower:
 
 
 def _dot(a, b) -> Any:
+    """Return the sum of the products of two sequences of scalars, added from left to right."""
     total = 0.0  # a Python number, which does not affect the dtype
     for x, y in zip(a, b, strict=True):
         total = total + x * y

@@ -44,10 +44,10 @@ def bracketed_root(
     """
 
     def iterate(_, carry):
-        t, low, high = carry
-        found = propose(t)
-        low, high = jnp.where(found.is_above, t, low), jnp.where(found.is_above, high, t)
-        inside = found.usable & (((found.next >= low) & (found.next <= high)) | found.is_tiny)
-        return jnp.where(inside, found.next, (low + high) / 2), low, high
+        point, low, high = carry
+        proposal = propose(point)
+        low, high = jnp.where(proposal.is_above, point, low), jnp.where(proposal.is_above, high, point)
+        accepted = proposal.usable & (((proposal.next >= low) & (proposal.next <= high)) | proposal.is_tiny)
+        return jnp.where(accepted, proposal.next, (low + high) / 2), low, high
 
     return jax.lax.fori_loop(0, iterations, iterate, (start, low, high))[0]

@@ -26,12 +26,12 @@ def sample_wishart(key: PRNGKeyArray, factor: Lower, dof: Scalar) -> Lower:
 
 def bartlett(key: PRNGKeyArray, size: int, dof: Scalar) -> Lower:
     """Sample a lower triangular T with T T' ~ W(I, dof) / dof; NaN unless `dof` is above `size` - 1."""
-    below, diagonal = jax.random.split(key)
-    off = jax.random.normal(below, (size * (size - 1) // 2,), dof.dtype)
-    squares = 2 * jax.random.gamma(diagonal, (dof - jnp.arange(size, dtype=dof.dtype)) / 2, dtype=dof.dtype)
-    squares = jnp.where(dof > size - 1, squares, jnp.nan)  # every entry of T T' has one of these as a factor
+    lower_key, diagonal_key = jax.random.split(key)
+    normal_draws = jax.random.normal(lower_key, (size * (size - 1) // 2,), dof.dtype)
+    chi_squares = 2 * jax.random.gamma(diagonal_key, (dof - jnp.arange(size, dtype=dof.dtype)) / 2, dtype=dof.dtype)
+    chi_squares = jnp.where(dof > size - 1, chi_squares, jnp.nan)  # every entry of T T' has one of these as a factor
     scale = jax.lax.rsqrt(dof)
-    normals, chis = iter(unstack(off * scale)), unstack(jnp.sqrt(squares) * scale)
+    normals, chis = iter(unstack(normal_draws * scale)), unstack(jnp.sqrt(chi_squares) * scale)
     return tuple((*(next(normals) for _ in range(i)), chis[i]) for i in range(size))
 
 

@@ -41,8 +41,8 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     the contact sticks, else it moves along the motion cone's edge. This part of the twist is never computed from the
     surface, so a sticking contact has zero slip up to roundoff. Only the rotation is computed from the surface.
 
-    The scale v_n / motion_n of a sliding motion needs no guard against a small motion_n. Sliding left means
-    motion_n v_t > motion_t v_n, so the scale stays below v_t / motion_t.
+    A sliding motion is scaled by v_n / motion_n, where v is `Contact.approach`. This needs no guard against a small
+    motion_n: sliding left means motion_n v_t > motion_t v_n, so the factor stays below v_t / motion_t.
 
     Args:
         form: H of the limit surface, in scalars.
@@ -54,7 +54,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
     Reference: Zhou et al. 2017, section IV.A.
     """
-    known, contact = _known(contact)
+    known, contact = _replace_invalid(contact)
     # The motion does not depend on the scale of H, but squares of H overflow or underflow in float32. So h is divided
     # by its own size, which is a constant to every derivative too.
     curve = LimitCurve.of(form, contact)
@@ -69,52 +69,57 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
 
     left_edge, right_edge = curve.motion(mu), curve.motion(-mu)
-    left = (left_edge.x > 0) & (left_edge.cross(v) > 0)
-    right = (right_edge.x > 0) & (right_edge.cross(v) < 0)
-    left, right = compute_once((left, right & ~left), v.x)
-    slides = left | right
+    slides_left = (left_edge.x > 0) & (left_edge.cross(v) > 0)
+    slides_right = (right_edge.x > 0) & (right_edge.cross(v) < 0)
+    slides_left, slides_right = compute_once((slides_left, slides_right & ~slides_left), v.x)
+    slides = slides_left | slides_right
 
     # A sliding contact needs no root. Its search gets friction zero and ends at once, so that in a batch it does not
     # delay the contacts that stick.
-    stuck = solver(curve, v, jnp.where(slides, 0.0, mu))
-    s = jnp.where(left, mu, jnp.where(right, -mu, stuck.ratio))
-    g = curve.motion(s)
-    g2 = g.dot(g)
-    k = jnp.where(slides, v.x / jnp.where(slides, g.x, 1.0), v.dot(g) / jnp.where(g2 > 0, g2, 1.0))
-    follow = Vec2(v.x, jnp.where(slides, k * g.y, v.y))
+    sticking = solver(curve, v, jnp.where(slides, 0.0, mu))
+    s = jnp.where(slides_left, mu, jnp.where(slides_right, -mu, sticking.ratio))
+    motion = curve.motion(s)
+    squared = motion.dot(motion)
+    factor = jnp.where(
+        slides, v.x / jnp.where(slides, motion.x, 1.0), v.dot(motion) / jnp.where(squared > 0, squared, 1.0)
+    )
+    point_motion = Vec2(v.x, jnp.where(slides, factor * motion.y, v.y))
 
     one = jnp.ones_like(s)
-    ray = tree_where(valid, contact.wrench(Vec2(one, s), form.length), Vec3(one, 0 * one, 0 * one))
-    omega = k * form.spin(ray) / (size * form.length)
+    # the wrench up to its scale
+    direction = tree_where(valid, contact.wrench(Vec2(one, s), form.length), Vec3(one, 0 * one, 0 * one))
+    omega = factor * form.spin(direction) / (size * form.length)
     normal = contact.normal
-    linear = normal.scale(follow.x) + normal.perp().scale(follow.y) - contact.point.perp().scale(omega)
+    linear = normal.scale(point_motion.x) + normal.perp().scale(point_motion.y) - contact.point.perp().scale(omega)
     h = curve.value(s)
-    solved = (h > 0) & (slides | (stuck.residual <= sticking_tolerance(s.dtype))) & jnp.isfinite(omega)
+    solved = (h > 0) & (slides | (sticking.residual <= sticking_tolerance(s.dtype))) & jnp.isfinite(omega)
     moves = decide(pushes & solved, v.x)
-    scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
+    force_scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
 
     def where_moving(value):
         return type(value)(*(jnp.where(moves, entry, 0.0) for entry in value))
 
-    mode = jnp.where(left, ContactMode.SLIDING_LEFT, jnp.where(right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING))
+    mode = jnp.where(
+        slides_left, ContactMode.SLIDING_LEFT, jnp.where(slides_right, ContactMode.SLIDING_RIGHT, ContactMode.STICKING)
+    )
     status = jnp.where(moves, Status.MOVING, jnp.where(pushes, Status.NOT_CONVERGED, Status.FREE))
     return SingleSolution(
         where_moving(Vec3(linear.x, linear.y, omega)),
-        where_moving(ray.scale(scale)),
-        where_moving(Vec2(scale, scale * s)),
+        where_moving(direction.scale(force_scale)),
+        where_moving(Vec2(force_scale, force_scale * s)),
         jnp.where(moves, mode, ContactMode.SEPARATED).astype(jnp.int8),
         jnp.where(valid, status, Status.INVALID).astype(jnp.int8),
-        ~(valid & ~pushes & _drags(curve, mu, contact.approach())),
+        ~(valid & ~pushes & _can_drag(curve, mu, contact.approach())),
     )
 
 
-def _known(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
+def _replace_invalid(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
     """Whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
     known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
     return known, contact.where(known)
 
 
-def _drags(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
+def _can_drag(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
     """Whether a pusher that does not approach could also hold on to the slider and drag it along.
 
     Where the motion cone opens beyond 90 degrees, a push along the surface or slightly off it lies inside the cone. But

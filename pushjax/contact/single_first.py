@@ -30,7 +30,7 @@ from pushjax.contact.tolerances import relative_tolerance
 from pushjax.friction.limit_surface import Form
 
 # How far a contact has to separate to be left out, in units of the distance that passes as touching.
-CLEAR = 4
+CLEARANCE = 4
 
 Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
 
@@ -50,19 +50,19 @@ def single_first(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[A
         The motion. Its derivatives are those of the solution, not of the search. The margin is infinite where there is
         a motion.
     """
-    return _answered((form, contacts, active))
+    return _solve_one_first((form, contacts, active))
 
 
 @eqx.filter_custom_jvp
-def _answered(problem: Problem) -> ScalarSolution:
-    """The motion; all contacts are solved together only where one alone is not enough."""
-    enough, one = _alone(problem)
-    return only_where(~enough, _together, one, problem)
+def _solve_one_first(problem: Problem) -> ScalarSolution:
+    """Solve one contact alone, and all contacts together only where one is not enough."""
+    one_suffices, one = _solve_most_pressed(problem)
+    return only_where(~one_suffices, _together, one, problem)
 
 
-@_answered.def_jvp
-def _answered_jvp(primals, tangents):
-    return eqx.filter_jvp(_differentiable, primals, tangents)
+@_solve_one_first.def_jvp
+def _solve_one_first_jvp(primals, tangents):
+    return eqx.filter_jvp(_solve_differentiably, primals, tangents)
 
 
 @jax.jit
@@ -71,20 +71,22 @@ def _together(problem: Problem) -> ScalarSolution:
     return Exhaustive().solve(nondimensionalize(*problem, margin=False))
 
 
-def _differentiable(problem: Problem) -> ScalarSolution:
-    """`_answered` in a form that is differentiated.
+def _solve_differentiably(problem: Problem) -> ScalarSolution:
+    """`_solve_one_first` in a form that JAX can differentiate.
 
     Where all contacts are solved together, only the search is kept from differentiation.
     """
-    enough, one = _alone(problem)
-    found = without_derivatives(_search, enough, problem)
-    return tree_where(enough, one, refine_and_check(nondimensionalize(*problem, margin=False), found, proves_jams=True))
+    one_suffices, one = _solve_most_pressed(problem)
+    found = without_derivatives(_search, one_suffices, problem)
+    return tree_where(
+        one_suffices, one, refine_and_check(nondimensionalize(*problem, margin=False), found, proves_jams=True)
+    )
 
 
-def _search(enough: Bool[Array, ""], problem: Problem) -> Incumbent:
+def _search(one_suffices: Bool[Array, ""], problem: Problem) -> Incumbent:
     """The best set of cone edges, where one contact alone is not enough."""
     form, *_ = problem
-    return only_where(~enough, _enumerated, no_incumbent(form.length), problem)
+    return only_where(~one_suffices, _enumerated, no_incumbent(form.length), problem)
 
 
 @jax.jit
@@ -93,7 +95,7 @@ def _enumerated(problem: Problem) -> Incumbent:
     return enumerate_sets(nondimensionalize(*problem, margin=False))
 
 
-def _alone(problem: Problem) -> tuple[Bool[Array, ""], ScalarSolution]:
+def _solve_most_pressed(problem: Problem) -> tuple[Bool[Array, ""], ScalarSolution]:
     """Solve the contact that is pressed most, as if it were alone.
 
     Returns:
@@ -102,28 +104,28 @@ def _alone(problem: Problem) -> tuple[Bool[Array, ""], ScalarSolution]:
     """
     form, contacts, active = problem
     contacts = tuple(contact.where(a) for contact, a in zip(contacts, active, strict=True))
-    pressed = tuple(contact.approach().x for contact in contacts)
-    main, most = contacts[0], pressed[0]
-    mine = (jnp.ones((), bool),)
-    for contact, its in zip(contacts[1:], pressed[1:], strict=True):
-        more = decide(its > most, form.length)
-        main, most = tree_where(more, contact, main), jnp.where(more, its, most)
-        mine = (*(own & ~more for own in mine), more)
+    approaches = tuple(contact.approach().x for contact in contacts)
+    main, deepest = contacts[0], approaches[0]
+    is_main = (jnp.ones((), bool),)
+    for contact, approach in zip(contacts[1:], approaches[1:], strict=True):
+        deeper = decide(approach > deepest, form.length)
+        main, deepest = tree_where(deeper, contact, main), jnp.where(deeper, approach, deepest)
+        is_main = (*(is_own & ~deeper for is_own in is_main), deeper)
     one = solve_single(form, main, ScalarRoot())
-    twist, length, given = jax.lax.stop_gradient((one.twist, form.length, contacts))
+    twist, length, constant_contacts = jax.lax.stop_gradient((one.twist, form.length, contacts))
     size = jnp.abs(twist.x) + jnp.abs(twist.y) + length * jnp.abs(twist.z)
-    for contact in given:
-        goes = jnp.abs(contact.displacement.x) + jnp.abs(contact.displacement.y)
-        size = jnp.maximum(size, jnp.maximum(goes, -contact.gap))
-    clear, still, known = (jnp.ones((), bool),) * 3
-    for contact, its, own in zip(given, pressed, mine, strict=True):
-        away = contact.normal.dot(twist.xy + contact.point.perp().scale(twist.z))
-        clear &= (away - its > CLEAR * relative_tolerance(its.dtype) * size) | own
-        still &= its <= 0
-        known &= contact.friction >= 0
-    enough = decide(known & ((clear & (one.status == Status.MOVING)) | still), form.length)
-    zero = jnp.zeros_like(most)
-    force = tuple(tree_where(own, one.force, Vec2(zero, zero)) for own in mine)
-    mode = tuple(jnp.where(own, one.mode, ContactMode.SEPARATED).astype(jnp.int8) for own in mine)
-    motion = ScalarSolution(one.twist, one.wrench, force, mode, one.status, jnp.full_like(most, jnp.inf), one.unique)
-    return enough, motion
+    for contact in constant_contacts:
+        displacement = jnp.abs(contact.displacement.x) + jnp.abs(contact.displacement.y)
+        size = jnp.maximum(size, jnp.maximum(displacement, -contact.gap))
+    all_clear, none_pressed, valid = (jnp.ones((), bool),) * 3
+    for contact, approach, is_own in zip(constant_contacts, approaches, is_main, strict=True):
+        normal_motion = contact.normal.dot(twist.xy + contact.point.perp().scale(twist.z))
+        all_clear &= (normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size) | is_own
+        none_pressed &= approach <= 0
+        valid &= contact.friction >= 0
+    one_suffices = decide(valid & ((all_clear & (one.status == Status.MOVING)) | none_pressed), form.length)
+    zero = jnp.zeros_like(deepest)
+    force = tuple(tree_where(is_own, one.force, Vec2(zero, zero)) for is_own in is_main)
+    mode = tuple(jnp.where(is_own, one.mode, ContactMode.SEPARATED).astype(jnp.int8) for is_own in is_main)
+    motion = ScalarSolution(one.twist, one.wrench, force, mode, one.status, jnp.full_like(deepest, jnp.inf), one.unique)
+    return one_suffices, motion

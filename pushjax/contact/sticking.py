@@ -44,12 +44,12 @@ class Sticking(NamedTuple):
     Attributes:
         ratio: The ratio f_t / f_n.
         residual: Sine of the angle that is left between motion and push, less what is roundoff.
-        rounds: Number of iterations.
+        iterations: Number of iterations.
     """
 
     ratio: Scalar
     residual: Scalar
-    rounds: Int[Array, ""]
+    iterations: Int[Array, ""]
 
 
 class StickingSolver(eqx.Module):
@@ -80,15 +80,15 @@ class StickingSolver(eqx.Module):
         Returns:
             The ratio, its residual and the number of iterations.
         """
-        ratio, rounds = _solve(self, curve, v, friction)
-        g = curve.motion(ratio)
-        size = jnp.sqrt(g.dot(g) * v.dot(v))
+        ratio, iterations = _solve(self, curve, v, friction)
+        motion = curve.motion(ratio)
+        size = jnp.sqrt(motion.dot(motion) * v.dot(v))
         # The roundoff of the terms of g is subtracted, because no iteration can reduce it: where h is ill-conditioned
         # (the square of a thin ellipsoid), g is a small difference of large terms.
-        terms = LimitCurve(tuple(jnp.abs(c) for c in curve.c)).motion(jnp.abs(ratio))
-        rounding = 4 * jnp.finfo(size.dtype).eps * (terms.x * jnp.abs(v.y) + terms.y * jnp.abs(v.x))
-        residual = jnp.maximum(jnp.abs(g.cross(v)) - rounding, 0) / jnp.where(size > 0, size, 1.0)
-        return Sticking(ratio, jax.lax.stop_gradient(residual), rounds)
+        absolute_terms = LimitCurve(tuple(jnp.abs(c) for c in curve.c)).motion(jnp.abs(ratio))
+        roundoff = 4 * jnp.finfo(size.dtype).eps * (absolute_terms.x * jnp.abs(v.y) + absolute_terms.y * jnp.abs(v.x))
+        residual = jnp.maximum(jnp.abs(motion.cross(v)) - roundoff, 0) / jnp.where(size > 0, size, 1.0)
+        return Sticking(ratio, jax.lax.stop_gradient(residual), iterations)
 
 
 @eqx.filter_custom_jvp
@@ -101,23 +101,23 @@ def _solve(solver: StickingSolver, curve: LimitCurve, v: Vec2, friction: Scalar)
 def _solve_jvp(primals, tangents):
     solver, curve, v, friction = primals
     _, d_curve, d_v, _ = tangents
-    ratio, rounds = _solve(solver, curve, v, friction)
+    ratio, iterations = _solve(solver, curve, v, friction)
     zero = jnp.zeros_like(ratio)
-    # tangents of what is not perturbed are None
+    # Equinox gives None as the tangent of what is not perturbed.
     d_curve = LimitCurve(tuple(zero if d is None else d for d in d_curve.c))
     d_v = Vec2(*(zero if d is None else d for d in d_v))
-    g, dg = curve.motion(ratio), d_curve.motion(ratio)
-    slope = _slope(curve, v, ratio, g)
-    change = dg.cross(v) + g.cross(d_v)
+    motion, d_motion = curve.motion(ratio), d_curve.motion(ratio)
+    slope = _slope(curve, v, ratio, motion)
+    change = d_motion.cross(v) + motion.cross(d_v)
     usable = slope > jnp.finfo(slope.dtype).tiny
     d_ratio = jnp.where(usable, change / jnp.where(usable, slope, 1.0), 0.0)
-    return (ratio, rounds), (d_ratio, np.zeros(np.shape(rounds), jax.dtypes.float0))
+    return (ratio, iterations), (d_ratio, np.zeros(np.shape(iterations), jax.dtypes.float0))
 
 
-def _slope(curve: LimitCurve, v: Vec2, s: Scalar, g: Vec2) -> Scalar:
-    """Derivative with respect to s of cross(v, motion(s)) = v_n h' - v_t (d h - s h')."""
-    bend = curve.second_derivative(s)
-    return v.x * bend - v.y * ((curve.degree - 1) * g.y - s * bend)
+def _slope(curve: LimitCurve, v: Vec2, s: Scalar, motion: Vec2) -> Scalar:
+    """Derivative with respect to s of cross(v, motion(s)) = v_n h' - v_t (d h - s h'); `motion` is motion(s)."""
+    second = curve.second_derivative(s)
+    return v.x * second - v.y * ((curve.degree - 1) * motion.y - s * second)
 
 
 class ScalarRoot(StickingSolver):
@@ -151,50 +151,52 @@ class ScalarRoot(StickingSolver):
         forward = v.x > 0
         s = jnp.clip(v.y / jnp.where(forward, v.x, 1.0), -friction, friction)
         if curve.degree == 2:
-            g = curve.motion(s)
-            slope = _slope(curve, v, s, g)
-            s = jnp.clip(s - v.cross(g) / jnp.where(slope > 0, slope, 1.0), -friction, friction)
+            motion = curve.motion(s)
+            slope = _slope(curve, v, s, motion)
+            s = jnp.clip(s - v.cross(motion) / jnp.where(slope > 0, slope, 1.0), -friction, friction)
             return s, jnp.ones_like(s, jnp.int32)
         eps = float(jnp.finfo(s.dtype).eps)
-        # Newton's method doubles the digits, so it has converged after a step as short as `near`. A bisection is only
-        # as exact as its own length, so that has to be as short as `fine`.
-        near, fine = eps**0.6 * friction, eps**0.9 * friction
-        straight, most = 4 if eps > 1e-10 else 5, MAX_ITERATIONS if self.rounds is None else self.rounds
-        landed = jnp.zeros_like(forward)
-        for _ in range(straight):
-            new, power, steep, _ = _newton(curve, v, s)
-            landed = steep & (power > 0) & (jnp.abs(new - s) <= near) & (jnp.abs(new) <= friction)
-            s = compute_once(jnp.clip(new, -friction, friction), v.x)
-        landed = decide(landed | (friction <= 0), v.x)  # without friction there is nothing to find
+        # Newton's method doubles the digits, so it has converged after a step as short as `newton_tolerance`. A
+        # bisection is only as exact as its own length, so that has to be as short as `bisection_tolerance`.
+        newton_tolerance, bisection_tolerance = eps**0.6 * friction, eps**0.9 * friction
+        unguarded, max_guarded = 4 if eps > 1e-10 else 5, MAX_ITERATIONS if self.rounds is None else self.rounds
+        converged = jnp.zeros_like(forward)
+        for _ in range(unguarded):
+            next_s, power, rising, _ = _newton_step(curve, v, s)
+            converged = rising & (power > 0) & (jnp.abs(next_s - s) <= newton_tolerance) & (jnp.abs(next_s) <= friction)
+            s = compute_once(jnp.clip(next_s, -friction, friction), v.x)
+        converged = decide(converged | (friction <= 0), v.x)  # without friction there is nothing to find
 
-        def body(state):
+        def guarded_iteration(state):
             s, low, high, _, k = state
-            newton, power, steep, (r, side) = _newton(curve, v, s)
-            low, high = jnp.where(side > 0, low, s), jnp.where(side < 0, high, s)
-            trusted = steep & (power > 0) & (newton >= low) & (newton <= high)
+            newton, power, rising, (r, angle_sign) = _newton_step(curve, v, s)
+            low, high = jnp.where(angle_sign > 0, low, s), jnp.where(angle_sign < 0, high, s)
+            trusted = rising & (power > 0) & (newton >= low) & (newton <= high)
             trusted &= (k < 2) | (3 * r * r < power * power)
-            new = jnp.where(trusted, newton, (low + high) / 2)
-            return new, low, high, jnp.abs(new - s) > jnp.where(trusted, near, fine), k + 1
+            next_s = jnp.where(trusted, newton, (low + high) / 2)
+            unfinished = jnp.abs(next_s - s) > jnp.where(trusted, newton_tolerance, bisection_tolerance)
+            return next_s, low, high, unfinished, k + 1
 
         # a loop, because in an unrolled one the compiler would recompute each bracket from all iterations before it
-        begin = (s, -friction, friction, ~landed, jnp.zeros_like(s, jnp.int32))
-        s, *_, rounds = jax.lax.while_loop(lambda state: state[3] & (state[4] < most), body, begin)
-        return s, straight + rounds
+        start = (s, -friction, friction, ~converged, jnp.zeros_like(s, jnp.int32))
+        s, *_, guarded = jax.lax.while_loop(lambda state: state[3] & (state[4] < max_guarded), guarded_iteration, start)
+        return s, unguarded + guarded
 
 
-def _newton(curve: LimitCurve, v: Vec2, s: Scalar):
+def _newton_step(curve: LimitCurve, v: Vec2, s: Scalar):
     """One step of Newton's method from s.
 
     Returns:
         The next s; the power v . motion(s); whether the slope has the right sign; and a pair of r h^((d-2)/d) and a
         number with the sign of phi(s) - phi_v.
     """
-    g = curve.motion(s)
-    r, power = v.cross(g), v.dot(g)
-    dh = g.x + s * g.y  # Euler: d h
-    slope = _slope(curve, v, s, g) * dh - (curve.degree - 2) * r * g.y
-    steep = (slope > 0) & (dh > 0)
-    return s - r * dh / jnp.where(steep, slope, 1.0), power, steep, (r, jnp.where(g.x > 0, r, g.y))
+    motion = curve.motion(s)
+    r, power = v.cross(motion), v.dot(motion)
+    degree_times_h = motion.x + s * motion.y  # Euler's identity
+    slope = _slope(curve, v, s, motion) * degree_times_h - (curve.degree - 2) * r * motion.y
+    rising = (slope > 0) & (degree_times_h > 0)
+    next_s = s - r * degree_times_h / jnp.where(rising, slope, 1.0)
+    return next_s, power, rising, (r, jnp.where(motion.x > 0, r, motion.y))
 
 
 class HessianIteration(StickingSolver):
@@ -223,10 +225,10 @@ class HessianIteration(StickingSolver):
     tolerance: float | None = eqx.field(static=True, default=None)
 
     def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> tuple[Scalar, Int[Array, ""]]:
-        f, rounds, _ = self.trace(curve, v)
+        f, iterations, _ = self.trace(curve, v)
         # where f_n <= 0 the contact does not stick, and any finite ratio will do
         forward = f.x > 0
-        return jnp.where(forward, f.y / jnp.where(forward, f.x, 1.0), friction), rounds
+        return jnp.where(forward, f.y / jnp.where(forward, f.x, 1.0), friction), iterations
 
     def trace(self, curve: LimitCurve, v: Vec2) -> tuple[Vec2, Int[Array, ""], Scalar]:
         """Find the force whose motion is along v, without the limits of a friction cone.
@@ -239,25 +241,26 @@ class HessianIteration(StickingSolver):
             The force (f_n, f_t), the number of iterations, and the last |sin(angle)| between motion and v.
         """
         size = jnp.sqrt(v.dot(v))
-        unit = v.scale(1 / jnp.where(size > 0, size, 1.0))
-        stop = finest_tolerance(size.dtype) if self.tolerance is None else self.tolerance
+        direction = v.scale(1 / jnp.where(size > 0, size, 1.0))
+        tolerance = finest_tolerance(size.dtype) if self.tolerance is None else self.tolerance
 
-        def error(f: Vec2) -> Scalar:
-            g = _gradient(curve, f)
-            scale = jnp.sqrt(g.dot(g))
-            return jnp.abs(g.cross(unit)) / jnp.where(scale > 0, scale, 1.0)
+        def sine_of_angle(f: Vec2) -> Scalar:
+            motion = _gradient(curve, f)
+            scale = jnp.sqrt(motion.dot(motion))
+            return jnp.abs(motion.cross(direction)) / jnp.where(scale > 0, scale, 1.0)
 
-        def body(state):
-            f, _, rounds = state
-            new = compute_once(hessian_round(curve, unit, f), unit.x)  # so the error is that of the force kept
-            return new, error(new), rounds + 1
+        def iterate(state):
+            f, _, iterations = state
+            # `compute_once`, so that the angle is that of the force that is kept
+            next_force = compute_once(hessian_round(curve, direction, f), direction.x)
+            return next_force, sine_of_angle(next_force), iterations + 1
 
-        start = _rescaled(curve, unit, unit)
-        begin = (start, error(start), jnp.zeros((), jnp.int32))
-        f, residual, rounds = jax.lax.while_loop(
-            lambda state: (state[1] > stop) & (state[2] < self.max_rounds), body, begin
+        start_force = _rescaled(curve, direction, direction)
+        state = (start_force, sine_of_angle(start_force), jnp.zeros((), jnp.int32))
+        f, residual, iterations = jax.lax.while_loop(
+            lambda state: (state[1] > tolerance) & (state[2] < self.max_rounds), iterate, state
         )
-        return f, rounds, residual
+        return f, iterations, residual
 
 
 def hessian_round(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
@@ -271,13 +274,15 @@ def hessian_round(curve: LimitCurve, v: Vec2, f: Vec2) -> Vec2:
     Returns:
         The force after it.
     """
-    g = _gradient(curve, f)
-    hnn, hnt, htt = _hessian(curve, f)
-    r = v - g
-    det = hnn * htt - hnt * hnt
+    gradient = _gradient(curve, f)
+    h_nn, h_nt, h_tt = _hessian(curve, f)
+    residual = v - gradient
+    det = h_nn * h_tt - h_nt * h_nt
     singular = det <= 0
     inverse = jnp.where(singular, 0.0, 1.0 / jnp.where(singular, 1.0, det))
-    step = compute_once(Vec2(htt * r.x - hnt * r.y, hnn * r.y - hnt * r.x).scale(inverse), v.x)
+    step = compute_once(
+        Vec2(h_tt * residual.x - h_nt * residual.y, h_nn * residual.y - h_nt * residual.x).scale(inverse), v.x
+    )
     halvings = [0.5**k for k in range(10)]
     slopes = [jnp.abs((_gradient(curve, f + step.scale(t)) - v).dot(step)) for t in halvings]
     best, lowest = halvings[0] * jnp.ones_like(det), slopes[0]
