@@ -14,6 +14,7 @@ import shlex
 import subprocess
 import sys
 import traceback
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -245,15 +246,18 @@ def test_options_are_all_in_the_command_line_page():
     from pushjax.cli import commands
 
     page = (DOCS / "command-line.md").read_text()
-    common = set(commands.Common.__dataclass_fields__)
+
+    def names(command) -> set[str]:
+        return {field.name for field in fields(command)}
+
     for command in (commands.Common, commands.Identify, commands.Data):
-        for name in command.__dataclass_fields__.keys() - {"logs", "name"}:
+        for name in names(command) - {"logs", "name"}:
             assert re.search(rf"--(no-)?{name.replace('_', '-')}\b", page), name
     reproduce = (DOCS / "experiments" / "index.md").read_text()
     for name, command in commands.EXPERIMENTS.items():
         row = re.search(rf"^\| `{name}` \|.*$", reproduce, re.MULTILINE)
         assert row is not None, name
-        assert sorted(re.findall(r"--(\w+)", row[0])) == sorted(command.__dataclass_fields__.keys() - common), name
+        assert sorted(re.findall(r"--(\w+)", row[0])) == sorted(names(command) - names(commands.Common)), name
 
 
 # Examples

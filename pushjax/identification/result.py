@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._internal.jit import quick_jit
@@ -172,7 +172,7 @@ class Identified(eqx.Module):
         """
         if not 0 < level < 1:
             raise ValueError(f"level must be between 0 and 1; got {level!r}")
-        reach = float(norm.ppf(0.5 + level / 2)) * jnp.sqrt(jnp.diagonal(self.covariance))
+        reach = float(ndtri(0.5 + level / 2)) * jnp.sqrt(jnp.diagonal(self.covariance))
         low, high = (self._drop_condition_axis(self.prior.parameters(self.z + sign * reach)) for sign in (-1, 1))
         names = [name for name in self.prior.layout.names if name != "surface"]
         return {name: (getattr(low, name), getattr(high, name)) for name in names}

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pushjax._internal.jit import jit
 from pushjax.identification.fit import FixedEntries, Schedule, compiled_fit, fit
@@ -156,7 +156,7 @@ def normal_interval(found: "Identified", label: str, level: float = 0.9) -> tupl
         Lowest and highest value, in the number's own unit.
     """
     position = scalar_positions(found)[label]
-    reach = float(norm.ppf(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[position, position]))
+    reach = float(ndtri(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[position, position]))
     low, high = (_physical_value(found, found.z.at[position].add(sign * reach), label) for sign in (-1, 1))
     return low, high
 
@@ -173,7 +173,7 @@ def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float
             not rise so far on one side, its outermost value on that side.
     """
     minimum = int(np.argmin(profile.rise))
-    limit = norm.ppf(0.5 + level / 2) ** 2 / 2
+    limit = ndtri(0.5 + level / 2) ** 2 / 2
     ends = []
     for values, rise in (
         (profile.value[minimum::-1], profile.rise[minimum::-1]),

@@ -73,7 +73,7 @@ def _draw_level_set(axes: Axes, surface: LimitSurface, load: float, color: str) 
 def _draw_cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, vertical: int) -> None:
     """Draw the cut of the level sets with a plane: component `vertical` (1 is f_y, 2 the torque) over f_x.
 
-    The remaining component, number 3 - other, is zero in this plane.
+    The remaining component, number 3 - vertical, is zero in this plane.
     """
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))

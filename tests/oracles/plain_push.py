@@ -16,7 +16,7 @@ class Push(NamedTuple):
     """A slider with a quartic limit surface, and a round finger.
 
     Attributes:
-        vertices: Vertices of the slider's outline, counter-clockwise, m, body frame.
+        vertices: Vertices of the slider's outline, counterclockwise, m, body frame.
         coefficients: Coefficients of the quartic.
         length: Characteristic length, m.
         radius: Radius of the finger, m.

@@ -170,10 +170,10 @@ def test_recorded_drift_violates_the_conditions(grasps):
         assert cosine < 0.95
 
 
-def test_two_fingers_centre_a_disc():
-    disc = pj.Disk(0.03)
-    pairs = pj.Support.uniform(disc, points=64).wrench_twist_pairs(jax.random.key(0), 300)
-    slider = pj.Slider(disc, pj.fit_limit_surface(*pairs, degree=2))
+def test_two_fingers_center_a_disk():
+    disk = pj.Disk(0.03)
+    pairs = pj.Support.uniform(disk, points=64).wrench_twist_pairs(jax.random.key(0), 300)
+    slider = pj.Slider(disk, pj.fit_limit_surface(*pairs, degree=2))
     hand = pj.Hand.two_fingers(0.005)
     path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), 800)
     grasp = pj.rollout(slider, hand, path, pose=jnp.array([0.0, 0.012, 0.3]), friction=0.3)

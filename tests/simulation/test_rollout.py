@@ -248,7 +248,7 @@ def test_second_order_within_a_mode(mode, arguments):
         assert coarse / fine >= 3.5
 
 
-def test_fan_at_one_millimetre_steps():
+def test_fan_at_one_millimeter_steps():
     """Pushes with every mode, mode changes and slips off the corner: 1 mm steps agree with the converged push."""
     coarse, fine = run_all(fan(50)), run_all(fan(400))
     modes = np.concatenate([push.mode[:, 0] for push in coarse])
@@ -547,7 +547,7 @@ def test_friction_per_finger_and_lists():
     np.testing.assert_array_equal(a.pose, b.pose)
 
 
-def test_disk_pushed_through_its_centre():
+def test_disk_pushed_through_its_center():
     """An isotropic slider with a central push moves straight, by the travel minus the gap."""
     slider = Slider(Disk(0.05), Ellipsoid(np.eye(3), LENGTH))
     push = rollout(slider, HAND, line((-0.06, 0.0), (0.0, 0.0), 20), **PUSH)
