@@ -44,16 +44,29 @@ def pose_panel(axes: Axes, poses: np.ndarray, color: str, label: str | None = No
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
 
 
-def histogram_panel(axes: Axes, counted: dict[str, Any], label: str, *, gaussian: tuple[float, float] | None = None):
-    """Draw the bars of a histogram.
+def histogram_panel(
+    axes: Axes,
+    values: np.ndarray | dict[str, Any],
+    label: str,
+    *,
+    bins: int = 40,
+    gaussian: tuple[float, float] | None = None,
+):
+    """Draw a histogram.
 
     Args:
         axes: Axes to draw into.
-        counted: The histogram, with `edges` (bins + 1,) and `counts` (bins,).
+        values: Numbers of any shape, of which those that are not finite are left out. Or a histogram that is counted
+            already, with `edges` (bins + 1,) and `counts` (bins,), as `MonteCarlo.histogram` gives it.
         label: Label of the horizontal axis.
+        bins: Number of bins for numbers.
         gaussian: Mean and standard deviation of a Gaussian to draw over the bars. None: no Gaussian.
     """
-    edges, counts = np.asarray(counted["edges"]), np.asarray(counted["counts"])
+    if isinstance(values, dict):
+        edges, counts = np.asarray(values["edges"]), np.asarray(values["counts"])
+    else:
+        numbers = np.asarray(values, float).ravel()
+        counts, edges = np.histogram(numbers[np.isfinite(numbers)], bins=bins)
     axes.stairs(counts, edges, fill=True, color=BLUE, alpha=0.75)
     if gaussian is not None and gaussian[1] > 0:
         mean, std = gaussian

@@ -105,6 +105,9 @@ def test_panels():
     assert np.trapezoid(height, x) == pytest.approx(8, rel=0.06)  # 95 %: two deviations to each side
     plot.histogram_panel(axes[2], counts, "x / mm", gaussian=(1.0, 0.0))
     assert not axes[2].lines
+    numbers = np.array([[0.1, 0.2, 0.3], [1.5, 2.0, np.nan]])
+    plot.histogram_panel(axes[2], numbers, "x / mm", bins=2)
+    np.testing.assert_array_equal(axes[2].patches[-1].get_data().values, [3, 2])
     plot.traces(axes[3], np.zeros((2, 3, 3)) + np.arange(3)[None, :, None], plot.GREEN)
     np.testing.assert_allclose(axes[3].collections[0].get_segments(), 2 * [MM * np.arange(3)[:, None] * np.ones(2)])
     assert axes[3].get_xlim()[1] >= 2 * MM
