@@ -78,12 +78,19 @@ class Slider(eqx.Module):
 
 
 @quick_jit
-def overlaps(slider: Slider, hand: Hand, poses: Array, configurations: Array) -> Array:
-    """Depth of the deepest finger in the slider, m, for each of as many poses and configurations."""
+def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
+    """Return the depth of the deepest finger in the slider, m, for each pose.
+
+    Args:
+        slider: The slider.
+        hand: The hand.
+        poses: Poses of the slider, (poses, 3), world.
+        configuration: Configuration of the hand, (dof,) for all poses or (poses, dof).
+    """
 
     def depth_of(pose: Array, configuration: Array) -> Array:
         finger_poses = unstack_finger_poses(hand.poses(configuration))
         motions = finger_motions(hand, jnp.zeros(len(hand.fingers), poses.dtype), finger_poses, finger_poses)
         return max_penetration(slider.shape.outline(), motions, Vec3.of(pose), 0.0)
 
-    return jax.vmap(depth_of)(poses, configurations)
+    return jax.vmap(depth_of, (0, 0 if configuration.ndim == 2 else None))(poses, configuration)
