@@ -149,13 +149,20 @@ def test_grasps_turn_the_square_as_far_as_it_must():
 
 
 def test_rows_are_compared_with_their_own():
-    """A row is compared with the fastest peer of the same case."""
-    mine = [{"case": name, "dtype": "float32", "batch": 10, "processor_s": 2.0} for name in ("fit_quartic", "gradient")]
+    """A row is compared with the fastest peer of the same case, of those that find the most motions."""
+    named = ("fit_quartic", "gradient", "solve_2")
+    mine = [{"case": name, "dtype": "float32", "batch": 10, "processor_s": 2.0} for name in named]
     mine = [row | {"peer_ratio": None} for row in mine]
     theirs = [{"of": "fit_quartic", "peer": name, "processor_s_each": t} for name, t in (("a", 3.0), ("b", 1.0))]
     rows.compare(mine, [*theirs, {"of": "solve_1", "peer": "c", "processor_s_each": 0.1}])
     assert (mine[0]["peer"], mine[0]["peer_ratio"]) == ("b", 5.0)
     assert mine[1]["peer_ratio"] is None
+    theirs = [
+        {"of": "solve_2", "peer": name, "processor_s_each": t, "found": part}
+        for name, t, part in (("scipy", 4.0, 0.9), ("jaxopt", 0.1, 0.5))
+    ]
+    rows.compare(mine, theirs)
+    assert (mine[2]["peer"], mine[2]["peer_ratio"]) == ("scipy", 20.0)
 
 
 def peer(name, supports, each, **more):
