@@ -31,8 +31,9 @@ class Common:
 
     @property
     def title(self) -> str:
-        """Name of the command, for messages."""
-        return self.module.replace("_", "-")
+        """Name of the command or experiment, for messages."""
+        names = [name for name, kind in EXPERIMENTS.items() if kind is type(self)]
+        return names[0] if names else type(self).__name__.lower()
 
     out: Path = Path("pushjax-out")
     """Folder for pictures and pages."""
