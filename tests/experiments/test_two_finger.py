@@ -5,6 +5,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 
 import json
+import shutil
 
 import matplotlib.image
 import numpy as np
@@ -220,5 +221,16 @@ def test_draws_and_sums_up(record):
 def test_refuses_another_model(tmp_path):
     with pytest.raises(ValueError, match="model"):
         two_finger.run(tmp_path, model="cubic")
-    with pytest.raises(LogError, match="cannot read"):
+    with pytest.raises(LogError, match=r"expected 3pts1\.npz, or a folder 3pts1 of published logs"):
         two_finger.run(tmp_path)
+
+
+def test_published_logs_take_the_place_of_an_archive(data, tmp_path):
+    """A folder with the name of the arrangement, as `pushjax data triangle` leaves it, is read if there is no archive."""
+    from pushjax.experiments.two_finger.experiment import load
+
+    session = data / "raw/two_finger_push/30_90_30_30_30_90"
+    shutil.copytree(session, tmp_path / "3pts3")
+    log = load(tmp_path, "3pts3")
+    assert (len(log), log.arrangement) == (1, "3pts3")
+    assert len(load(data / "two_finger_push", "3pts3")) > 100

@@ -90,7 +90,7 @@ def test_the_command_line_says_once_that_it_cannot_keep_them(capsys, monkeypatch
 
 @pytest.mark.usefixtures("settings")
 def test_without_the_cache_nothing_is_kept(monkeypatch):
-    monkeypatch.setattr(cli, "enable_compilation_cache", lambda: pytest.fail("asked for"))
+    monkeypatch.setattr(compilation_cache, "enable_compilation_cache", lambda: pytest.fail("asked for"))
     cli._keep_compiled(False)
     assert jax.config.jax_enable_compilation_cache is False
 
