@@ -226,7 +226,7 @@ def test_refuses_another_model(tmp_path):
 
 
 def test_published_logs_take_the_place_of_an_archive(data, tmp_path):
-    """If there is no archive, a folder with the name of the arrangement is read, as `pushjax data triangle` leaves it."""
+    """Without an archive, a folder with the name of the arrangement is read, as `pushjax data triangle` leaves it."""
     from pushjax.experiments.two_finger.experiment import load
 
     session = data / "raw/two_finger_push/30_90_30_30_30_90"
