@@ -58,12 +58,9 @@ def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = Non
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
     one, args = each_push(model, dtype, batch, steps)
 
-    def final(*args):
-        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
-
     modes = jax.vmap(lambda *each: one(*each).mode)(*jax.tree.map(lambda leaf: leaf[: min(batch, 500)], args))
     contact = float(np.mean(np.asarray(modes) != pj.ContactMode.SEPARATED))
-    return Work(f"push_{model}", dtype, batch, steps * contact, final, args, by_steps.get(steps))
+    return Work(f"push_{model}", dtype, batch, steps * contact, final_poses(one, batch), args, by_steps.get(steps))
 
 
 def gradient(dtype: str, batch: int) -> Work:
@@ -86,14 +83,11 @@ def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
     one, args = each_grasp(grasps.hand(dtype), dtype, batch, steps)
 
-    def final(*args):
-        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
-
     name = "grasp_two_fingers"
     if varied:
         surface = tasks.task("quartic", dtype).slider.surface
         name, args = "grasp_surfaces", (*args, _surfaces(surface, jax.random.key(0), batch))
-    return Work(name, dtype, batch, steps, final, args, by_steps.get(steps))
+    return Work(name, dtype, batch, steps, final_poses(one, batch), args, by_steps.get(steps))
 
 
 def push_t(dtype: str, batch: int, where: str = "side") -> Work:
@@ -114,11 +108,8 @@ def push_t(dtype: str, batch: int, where: str = "side") -> Work:
         diagonal = jnp.array([[-1, -1], [1, -1]], dtype) / 2**0.5  # from the normal of the side to that of the corner
         path = start[None, None] + (path - path[:, :1]) @ diagonal
 
-    def final(*args):
-        return in_tiles(lambda *each: here.push(*each).pose[-1], args, batch)
-
     name = {"side": "push_t", "hull": "push_t_hull", "corner": "push_t_corner"}[where]
-    return Work(name, dtype, batch, MANY_STEPS, final, (path, friction))
+    return Work(name, dtype, batch, MANY_STEPS, final_poses(here.push, batch), (path, friction))
 
 
 def push_two_fingers(dtype: str, batch: int) -> Work:
@@ -134,10 +125,7 @@ def push_two_fingers(dtype: str, batch: int) -> Work:
     still = jnp.zeros_like(path[..., 0])
     path = jnp.stack([path[..., 0], path[..., 1], still, still + SPACING], axis=-1)
 
-    def final(*args):
-        return in_tiles(lambda *each: here.push(*each).pose[-1], args, batch)
-
-    return Work("push_two_fingers", dtype, batch, MANY_STEPS, final, (path, friction))
+    return Work("push_two_fingers", dtype, batch, MANY_STEPS, final_poses(here.push, batch), (path, friction))
 
 
 def grasp_jaw(dtype: str, batch: int) -> Work:
@@ -154,10 +142,7 @@ def grasp_jaw(dtype: str, batch: int) -> Work:
     centers = grasps.opening_at(grasps.touching_jaw(pose)[:, None] + diameter, share[None])  # as of round fingers
     path = path.at[..., 3].set(centers - diameter)
 
-    def final(*args):
-        return in_tiles(lambda *each: one(*each).pose[-1], args, batch)
-
-    return Work("grasp_jaw", dtype, batch, MANY_STEPS, final, (pose, path))
+    return Work("grasp_jaw", dtype, batch, MANY_STEPS, final_poses(one, batch), (pose, path))
 
 
 def solve(dtype: str, batch: int, contacts: int) -> Work:
@@ -218,6 +203,20 @@ def monte_carlo(dtype: str, batch: int) -> Work:
         return pushes.summary()
 
     return Work("monte_carlo", dtype, batch, steps, summary, (jax.random.key(1),), host=True)
+
+
+def final_poses(rollout: Callable[..., pj.Trajectory], batch: int) -> Callable[..., Array]:
+    """Return the function from the arguments of a batch to its final poses, (batch, 3).
+
+    Args:
+        rollout: Function of the arguments of one push or grasp.
+        batch: Size of the batch.
+    """
+
+    def final(*args):
+        return in_tiles(lambda *each: rollout(*each).pose[-1], args, batch)
+
+    return final
 
 
 def in_tiles(function: Callable, args: tuple, batch: int) -> Any:

@@ -96,8 +96,5 @@ def summary(record: dict[str, Any]) -> str:
 def _square(dtype: str, batch: int) -> cases.Work:
     """Make the program of the square's pushes, without the search for the fewest steps."""
     one, args = cases.each_push("quartic", dtype, batch, cases.MANY_STEPS)
-
-    def final(*args):
-        return cases.in_tiles(lambda *each: one(*each).pose[-1], args, batch)
-
-    return cases.Work("push_quartic", dtype, batch, cases.MANY_STEPS, final, args)
+    function = cases.final_poses(one, batch)
+    return cases.Work("push_quartic", dtype, batch, cases.MANY_STEPS, function, args)

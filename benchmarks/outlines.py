@@ -9,11 +9,10 @@ the negative x axis.
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 import pushjax as pj
 from benchmarks import tasks
-from benchmarks.cases import Work, in_tiles
+from benchmarks.cases import Work, final_poses
 from pushjax.geometry.shape import Shape
 
 HALF = tasks.SIDE / 2
@@ -75,8 +74,5 @@ def push(dtype: str, batch: int, which: tuple[str, int, int]) -> Work:
     start, along = ends[:, :1], (ends[:, 1:] - ends[:, :1]) * (TRAVEL / tasks.TRAVEL)
     path = start + jnp.linspace(0, 1, STEPS + 1, dtype=dtype)[None, :, None] * along
 
-    def final(*args: Array) -> Array:
-        return in_tiles(lambda path, mu: here.push(path, mu).pose[-1], args, batch)
-
     label = "_".join(str(part) for part in ("push", *which) if part)
-    return Work(label, dtype, batch, STEPS, final, (path, uniform(keys[2], 0.15, 0.35)))
+    return Work(label, dtype, batch, STEPS, final_poses(here.push, batch), (path, uniform(keys[2], 0.15, 0.35)))

@@ -49,9 +49,7 @@ def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array
             array = jnp.asarray(value) if holds_jax_arrays else np.asarray(value)
         except ValueError as error:
             raise ValueError(f"{name}: expected an array of numbers; got rows that differ: {error}") from None
-    if not (jnp.issubdtype(array.dtype, jnp.bool_) or jnp.issubdtype(array.dtype, jnp.integer)) and not jnp.issubdtype(
-        array.dtype, jnp.floating
-    ):
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.bool_, jnp.integer, jnp.floating)):
         raise TypeError(f"{name}: expected real numbers; got {value!r}")
     if dtype is None:
         is_floating = jnp.issubdtype(array.dtype, jnp.floating)

@@ -44,6 +44,9 @@ class Common:
     cache: bool = True
     """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
 
+    def check(self) -> None:
+        """Raise ValueError for options that cannot be, as far as that shows without JAX."""
+
     def settings(self) -> dict[str, Any]:
         """Return the arguments of the experiment's `run` that are its own; None stands for its default."""
         common = {each.name for each in fields(Common)}
@@ -231,6 +234,17 @@ class Identify(Options, Common):
     """Files of recorded pushes: CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI units,
     world frame; blank where the object was not seen), NPZ with start, path, end, MIT pushing data (JSON, HDF5), or
     triangle logs (text)."""
+
+    def check(self) -> None:
+        """Raise ValueError for options that cannot be, or if there is no log."""
+        Options.check(self)
+        if not any(log.exists() for log in self.logs):
+            missing = ", ".join(map(str, self.logs)) or "file"
+            raise ValueError(f"LOG: give at least one file of recorded pushes; there is no {missing}")
+
+    def settings(self) -> dict[str, Any]:
+        """Return the arguments of `run` that are its own."""
+        return {"logs": list(self.logs), "options": self}
 
 
 @dataclass

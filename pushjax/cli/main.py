@@ -14,7 +14,7 @@ from typing import Any
 
 import tyro
 
-from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, Command, Common, Data, Demo, Identify, Reproduce
+from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, Command, Common, Data, Demo, Reproduce
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -83,13 +83,7 @@ def _compute(command: Common) -> None:
     """Run an experiment, print its summary, and write its record and page."""
     from pushjax._internal.progress_bar import progress_bar
 
-    if isinstance(command, Identify):
-        command.check()
-        missing = [str(log) for log in command.logs if not log.exists()]
-        if len(missing) == len(command.logs):
-            raise ValueError(
-                f"LOG: give at least one file of recorded pushes; there is no {', '.join(missing) or 'file'}"
-            )
+    command.check()
     settings = command.settings()
     if "data" in vars(command):
         settings["folder"] = data_folder(settings.pop("data", None))
@@ -100,10 +94,8 @@ def _compute(command: Common) -> None:
         matplotlib.use("Agg")  # draws to files, because there may be no screen
         _keep_compiled(command.cache)
         experiment: Any = import_module(f"pushjax.experiments.{command.module}")
-        if isinstance(command, Identify):
-            settings = {"logs": list(command.logs), "options": command, "say": progress.say, "note": progress.note}
-        if "progress" in experiment.run.__annotations__:
-            settings["progress"] = progress
+        callbacks = {"progress": progress, "say": progress.say, "note": progress.note}
+        settings |= {name: each for name, each in callbacks.items() if name in experiment.run.__annotations__}
         progress.say(f"computing {command.title}")
         record = experiment.run(seed=command.seed, out=command.out, **settings)
     text = experiment.summary(record)

@@ -1,5 +1,7 @@
 """The contact problem as a user states it, in arrays, and `solve_contacts`, which solves it."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -177,10 +179,15 @@ def solve_contacts(
     """
     check_type("surface", surface, LimitSurface)
     check_type("contacts", contacts, Contacts)
-    if solver is not None:
-        check_type("solver", solver, ContactSolver, StickingSolver)
+    check_solver(solver)
     _check_num_contacts(contacts.point.shape[0])
     return _solved(surface, contacts, solver)
+
+
+def check_solver(solver: Any) -> None:
+    """Raise TypeError unless `solver` is a solver of contact problems or None."""
+    if solver is not None:
+        check_type("solver", solver, ContactSolver, StickingSolver)
 
 
 def _check_num_contacts(contacts: int) -> None:

@@ -9,7 +9,6 @@ Only the object's poses are taken from the sensor's file. The hand's path is the
 pose, because the robot's own stream ends after half of the rotation.
 """
 
-import itertools
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax.datasets import triangle_setup
+from pushjax.datasets.mit_shapes import nearest_on_outline
 from pushjax.datasets.pushes import Floats, LogError, nothing_usable, rotation, wrap_angle
 from pushjax.datasets.records import Record, read_records
 from pushjax.datasets.triangle import body_pose
@@ -185,11 +185,4 @@ def _finger_gaps(hand: Floats, pose: Floats) -> Floats:
     """Return the signed distances (2,) of the fingers' centers from the outline, m, for poses of hand and object."""
     offsets = np.array([[0.0, HALF_SPACING], [0.0, -HALF_SPACING]])
     fingers = hand[:2] + offsets @ rotation(hand[2]).T
-    points = (fingers - pose[:2]) @ rotation(pose[2])
-    corners = triangle_setup.VERTICES
-    distances, inside = [], np.ones(2, bool)
-    for a, b in itertools.pairwise([*corners, corners[0]]):
-        fraction = np.clip((points - a) @ (b - a) / np.sum((b - a) ** 2), 0, 1)
-        distances.append(np.linalg.norm(points - a - fraction[:, None] * (b - a), axis=1))
-        inside &= (b - a)[0] * (points - a)[:, 1] - (b - a)[1] * (points - a)[:, 0] < 0  # vertices go clockwise
-    return np.where(inside, -1, 1) * np.min(distances, axis=0)
+    return nearest_on_outline(triangle_setup.VERTICES, (fingers - pose[:2]) @ rotation(pose[2]))[0]

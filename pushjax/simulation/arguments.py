@@ -20,8 +20,6 @@ from pushjax._internal.checks import (
     concrete,
     traced,
 )
-from pushjax.contact.scaled_problem import ContactSolver
-from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
@@ -42,12 +40,6 @@ def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
     check_type("slider.shape", slider.shape, Shape)
     check_type("slider.surface", slider.surface, LimitSurface)
     check_type("hand", hand, Hand)
-
-
-def check_solver(solver: Any) -> None:
-    """Raise TypeError unless `solver` is a solver of contact problems or None."""
-    if solver is not None:
-        check_type("solver", solver, ContactSolver, StickingSolver)
 
 
 def checked_arguments(

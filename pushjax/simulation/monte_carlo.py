@@ -15,13 +15,14 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, check_type, traced
+from pushjax._internal.checks import ArrayLike, check_count, check_type, traced
 from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax.contact.problem import check_solver
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.random import FrictionModel
 from pushjax.friction.table import Table
-from pushjax.simulation.arguments import check_solver, checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
@@ -96,9 +97,8 @@ def monte_carlo(
         raise TypeError(
             "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
         )
-    for name, value in (("n", n), ("batch_size", 1 if batch_size is None else batch_size)):
-        if not isinstance(value, (int, np.integer)) or value < 1:
-            raise ValueError(f"{name} must be a whole number, at least 1; got {value!r}")
+    check_count("n", n)
+    check_count("batch_size", 1 if batch_size is None else batch_size)
     n = int(n)
     check_solver(solver)
     check_type("model", model, FrictionModel)

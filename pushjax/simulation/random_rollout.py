@@ -8,14 +8,14 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, check_key, check_type
 from pushjax._internal.jit import quick_jit
-from pushjax.contact.problem import to_scalars
+from pushjax.contact.problem import check_solver, to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import check_solver, checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
 from pushjax.simulation.slider import Slider

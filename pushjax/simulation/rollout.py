@@ -16,7 +16,7 @@ from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
-from pushjax.contact.problem import to_scalars
+from pushjax.contact.problem import check_solver, to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
@@ -24,7 +24,6 @@ from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import (
     check_opening,
-    check_solver,
     checked_arguments,
     checked_rollout_arguments,
     checked_table,
