@@ -27,6 +27,8 @@ ROOMS = (
     "identification",
     "testing",
     "plot",
+    "tasks",
+    "planning",
     "experiments",
     "cli",
 )

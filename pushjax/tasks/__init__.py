@@ -1,0 +1,1 @@
+"""Tasks to learn and plan on: functional environments, and their Gymnasium versions."""
