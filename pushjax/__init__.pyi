@@ -41,6 +41,8 @@ from .metrics import deviation as deviation
 from .metrics import energy_score as energy_score
 from .metrics import log_density as log_density
 from .metrics import total_variation as total_variation
+from .simulation.fixtures import Fixture as Fixture
+from .simulation.fixtures import Wall as Wall
 from .simulation.hand import Hand as Hand
 from .simulation.monte_carlo import monte_carlo as monte_carlo
 from .simulation.monte_carlo_result import MonteCarlo as MonteCarlo

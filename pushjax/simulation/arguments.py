@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -24,9 +25,10 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.detection import MAX_PENETRATION
+from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.path import checked_path
-from pushjax.simulation.slider import Slider, overlaps
+from pushjax.simulation.slider import Slider, fixture_overlaps, overlaps
 
 POSES_AT_ONCE = 4096  # poses whose overlaps are computed together
 # Numbers beyond these are probably in other units: length of a surface, m; distance of a hand from the origin, in
@@ -178,3 +180,32 @@ def checked_table(table: Table | None, dtype: Any) -> Table | None:
         return None
     check_type("table", table, Table)
     return jax.tree.map(lambda leaf: leaf.astype(dtype), table)
+
+
+def checked_fixtures(fixtures: Sequence[Wall | Fixture], dtype: Any) -> Fixtures:
+    """Return fixtures in a floating dtype. Raises TypeError for anything else than a sequence of them."""
+    if isinstance(fixtures, Wall | Fixture):
+        raise TypeError(f"fixtures: expected a sequence of Wall and Fixture; got one {type(fixtures).__name__}")
+    for k, fixture in enumerate(fixtures):
+        check_type(f"fixtures[{k}]", fixture, Wall, Fixture)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), tuple(fixtures))
+
+
+def check_start_among_fixtures(slider: Slider, fixtures: Fixtures, poses: Array) -> None:
+    """Raise ValueError if the slider starts too deep in a fixture, unless values are traced.
+
+    Args:
+        slider: The slider.
+        fixtures: The fixtures.
+        poses: Poses of the slider, (3,) or (pushes, 3), world.
+    """
+    if not fixtures or traced((slider, fixtures, poses)):
+        return
+    depth = np.asarray(fixture_overlaps(slider, fixtures, jnp.atleast_2d(poses)))
+    worst, allowed = int(np.argmax(depth)), MAX_PENETRATION * float(slider.surface.length)
+    if depth[worst] > allowed:
+        where = "" if poses.ndim == 1 else f" of push {worst}"
+        raise ValueError(
+            f"pose{where}: the slider starts inside a fixture, by {1e3 * depth[worst]:.3g} mm; at most "
+            f"{1e3 * allowed:.3g} mm ({MAX_PENETRATION:g} of the surface's length) is pushed out"
+        )

@@ -14,7 +14,9 @@ from pushjax._internal.xla import compute_once, decide
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import Outline
-from pushjax.simulation.detection import Candidate, Candidates, edges, is_nonconvex_polygon
+from pushjax.simulation.candidate import Candidate, Candidates, take
+from pushjax.simulation.detection import edges, is_nonconvex_polygon
+from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Finger, Pad
 
 # Two candidates nearer to each other than this, in units of the limit surface's length, count as one. The first is for
@@ -48,7 +50,7 @@ def select_contacts(
         return _select_three(candidates, length)
     distance = candidates.distance
     first = jnp.argmin(distance)
-    nearest = _take(candidates, first)
+    nearest = take(candidates, first)
     offset = candidates.point - nearest.point
     separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
     is_other = offset.dot(offset) > (separation * length) ** 2
@@ -64,7 +66,7 @@ def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""]
     both edges. Neither rests on two candidates side by side.
     """
     chosen = [jnp.argmin(candidates.distance).astype(jnp.int32)]
-    nearest = _take(candidates, chosen[0])
+    nearest = take(candidates, chosen[0])
     eligible, travel = candidates.distance < nearest.distance + 1e3 * length, jnp.zeros_like(candidates.distance)
     previous = nearest
     for _ in range(2):
@@ -72,7 +74,7 @@ def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""]
         eligible, travel = compute_once((eligible & differs, jnp.maximum(travel, distance)), length)
         best = jnp.argmin(jnp.where(eligible, travel, jnp.inf))
         chosen.append(jnp.where(jnp.any(eligible), best, chosen[0]).astype(jnp.int32))
-        previous = _take(candidates, chosen[-1])
+        previous = take(candidates, chosen[-1])
     return tuple(chosen)
 
 
@@ -94,7 +96,7 @@ def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tupl
     """Return the selected candidates; one that is selected a second time is moved 1 m away, which is out of reach."""
     if not isinstance(candidates, Candidate):
         return candidates
-    first, *others = (_take(candidates, index) for index in chosen)
+    first, *others = (take(candidates, index) for index in chosen)
     repeated = [index == chosen[0] for index in chosen[1:]]
     offsets = [jnp.where(same, 1.0, 0.0).astype(first.distance.dtype) for same in repeated]
     return first, *(
@@ -103,7 +105,11 @@ def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tupl
 
 
 def track_contacts(
-    candidates: Candidates, chosen: tuple[Any, ...], at_start: tuple[Candidate, ...], finger: Finger, outline: Outline
+    candidates: Candidates,
+    chosen: tuple[Any, ...],
+    at_start: tuple[Candidate, ...],
+    finger: Finger | Wall,
+    outline: Outline,
 ) -> tuple[Any, ...]:
     """Return the indices of the same contacts later in the step, where `contact_candidates` may order them differently.
 
@@ -113,7 +119,7 @@ def track_contacts(
         candidates: All candidates now.
         chosen: Indices at the start of the step.
         at_start: The selected candidates at the start of the step.
-        finger: The finger.
+        finger: The finger, or a wall.
         outline: The slider's outline.
     """
     if not isinstance(finger, Pad) or not isinstance(candidates, Candidate) or not is_nonconvex_polygon(outline):
@@ -127,12 +133,6 @@ def track_contacts(
         twin = jnp.where(
             index < pad_corners, index + twin_offset, jnp.where(index >= twin_offset, index - twin_offset, index)
         )
-        same_normal, twin_normal = (_take(candidates, k).normal.dot(original.normal) for k in (index, twin))
+        same_normal, twin_normal = (take(candidates, k).normal.dot(original.normal) for k in (index, twin))
         indices.append(jnp.where(decide(twin_normal > same_normal + SAME_PLACE, same_normal), twin, index))
     return tuple(indices)
-
-
-def _take(candidates: Candidate, index: Int[Array, ""]) -> Candidate:
-    """`touches[index]`, computed as a masked sum, which is cheap in a batch."""
-    mark = jnp.arange(candidates.distance.size) == index
-    return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), candidates)

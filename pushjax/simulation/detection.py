@@ -26,8 +26,11 @@ from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline, roundoff
 from pushjax.simulation import pad_on_curve
+from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, Candidates, FingerPose
+from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Finger, RoundFinger
 from pushjax.simulation.pad_on_curve import EdgeSupport
+from pushjax.simulation.wall_contact import num_wall_contacts, wall_candidates
 
 # Largest overlap of finger and slider, in units of the limit surface's length, that is pushed out. Up to this it is a
 # tracking error, not a finger on the wrong side.
@@ -44,42 +47,10 @@ END_TOLERANCE = {4: 2e-5, 8: 1e-6}
 # In units of the length. An edge is extended by this past an inner (reflex) corner, into the slider, so that what sinks
 # into one edge of that corner still projects onto the other.
 REFLEX_EXTENSION = 0.05
-OUT_OF_REACH = 1e3  # m, distance of a candidate that does not exist; no finger moves so far
-
-
-class FingerPose(NamedTuple):
-    """Pose of a finger in the slider's frame.
-
-    Attributes:
-        center: Center of the finger, m.
-        angle: Angle as the unit vector (cos, sin); None for a finger that never turns.
-    """
-
-    center: Vec2
-    angle: Vec2 | None
-
-
-class Candidate(NamedTuple):
-    """A place where a finger and the slider may touch, in the slider's frame; or several, as arrays.
-
-    Attributes:
-        distance: Signed distance, m; negative in penetration.
-        point: Point on the slider, m.
-        normal: Unit normal that points into the slider.
-    """
-
-    distance: Scalar
-    point: Vec2
-    normal: Vec2
-
-
-# A tuple of candidates, or, for a pad, one `Candidate` of arrays. With the corners of a pad unrolled, the program for a
-# jaw was twice as large and took nearly twice as long to compile.
-Candidates = tuple[Candidate, ...] | Candidate
 
 
 def contact_candidates(
-    finger: Finger,
+    finger: Finger | Wall,
     outline: Outline,
     finger_pose: FingerPose,
     path: Vec2,
@@ -89,7 +60,7 @@ def contact_candidates(
     """Return the contact candidates of a finger: every place where it and the slider may touch.
 
     Args:
-        finger: The finger.
+        finger: The finger, or a wall.
         outline: The slider's outline.
         finger_pose: Pose of the finger in the slider's frame.
         path: Displacement of the finger in the slider's frame, m. It decides which edge is touched where a corner lies
@@ -97,6 +68,8 @@ def contact_candidates(
         length: Characteristic length of the limit surface, m.
         supports: Result of `edge_supports`, if it is known already.
     """
+    if isinstance(finger, Wall):
+        return wall_candidates(outline, finger_pose)
     if isinstance(finger, RoundFinger):
         return tuple(
             Candidate(s.distance - finger.radius, s.point, -s.normal)
@@ -258,12 +231,14 @@ def _smooth_candidates(
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), at_corners, at_edges)
 
 
-def num_contacts(finger: Finger, outline: Outline) -> int:
-    """Number of contacts that a finger may have; it is known before any value is.
+def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
+    """Number of contacts that a finger or a wall may have; it is known before any value is.
 
     A pad has two (one on a disk). On a polygon that is not convex it has three, since three contacts constrain every
     motion in the plane.
     """
+    if isinstance(finger, Wall):
+        return num_wall_contacts(outline)
     zero = jnp.zeros(())
     still = Vec2(zero, zero)
     candidates = jax.eval_shape(lambda: contact_candidates(finger, outline, FingerPose(still, still), still, zero))
@@ -291,13 +266,15 @@ def time_of_impact(finger: Finger, outline: Outline, finger_pose: FingerPose, pa
     return jnp.where(presses, 0.0, jnp.where(hits, hit, 1.0))
 
 
-def penetration_depth(finger: Finger, outline: Outline, finger_pose: FingerPose) -> Scalar:
-    """Penetration depth of a finger in the slider, m; where they are apart, minus their distance.
+def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: FingerPose) -> Scalar:
+    """Penetration depth of a finger or a wall in the slider, m; where they are apart, minus their distance.
 
     For a pad it is the depth of the deepest corner of either body in the other. Where edges cross and no corner is
     inside, it is at least half of how deep an edge of the slider is in the pad. For a pad and a smooth outline it is
     the depth of the deepest corner, or of the deepest point of the outline that faces an edge.
     """
+    if isinstance(finger, Wall):
+        return -jnp.min(wall_candidates(outline, finger_pose).distance)
     if isinstance(finger, RoundFinger):
         return finger.radius - outline.closest(finger_pose.center).distance
     pad, angle = finger.shape.outline(), _pad_angle(finger_pose)

@@ -10,7 +10,9 @@ from jaxtyping import Array, Bool
 from pushjax._internal.xla import compute_once, map_items
 from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
 from pushjax.geometry.shape import Outline
-from pushjax.simulation.detection import FingerPose, penetration_depth
+from pushjax.simulation.candidate import FingerPose
+from pushjax.simulation.detection import penetration_depth
+from pushjax.simulation.fixtures import Fixtures, Wall
 from pushjax.simulation.hand import Finger, Hand, Pad
 
 # A jam is a grasp if every finger is nearer to the slider than this, in units of the length, or than four times the
@@ -61,10 +63,10 @@ class BodyFrame(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """Motion of one finger over a step, and its friction.
+    """Motion of one finger over a step, and its friction. A fixture is a finger that stays where it is.
 
     Attributes:
-        finger: The finger.
+        finger: The finger, or a wall.
         friction: Coefficient of friction mu between finger and slider.
         center: Center of the finger at the start, world, m.
         path: Displacement of the center, world, m.
@@ -72,7 +74,7 @@ class FingerMotion(NamedTuple):
         turning: Change of the angle, rad; None if the finger never turns.
     """
 
-    finger: Finger
+    finger: Finger | Wall
     friction: Scalar
     center: Vec2
     path: Vec2
@@ -82,6 +84,8 @@ class FingerMotion(NamedTuple):
     def pose_in_slider(self, slider: BodyFrame, fraction: Scalar) -> FingerPose:
         """Return the pose of the finger in the slider's frame when `fraction` of the step is done."""
         center = slider.local(self.center + self.path.scale(fraction))
+        if isinstance(self.finger, Wall):
+            return FingerPose(center, Vec2.of(self.finger.normal).unrotate(slider.angle))
         if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
             return FingerPose(center, None)
         if self.angle is None or self.turning is None:
@@ -128,6 +132,20 @@ def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> 
         angle, turning = (start[2], _wrap_to_pi(end[2] - start[2])) if len(start) == 3 else (None, None)
         center = Vec2(start[0], start[1])
         motions.append(FingerMotion(finger, friction[k], center, Vec2(end[0], end[1]) - center, angle, turning))
+    return tuple(motions)
+
+
+def fixture_motions(fixtures: Fixtures) -> tuple[FingerMotion, ...]:
+    """Return fixtures as fingers that stay where they are."""
+    motions = []
+    for fixture in fixtures:
+        zero = jnp.zeros_like(fixture.friction)
+        still = Vec2(zero, zero)
+        if isinstance(fixture, Wall):
+            motions.append(FingerMotion(fixture, fixture.friction, Vec2.of(fixture.point), still, None, None))
+        else:
+            angle, turning = (fixture.pose[2], zero) if isinstance(fixture.body, Pad) else (None, None)
+            motions.append(FingerMotion(fixture.body, fixture.friction, fixture.center, still, angle, turning))
     return tuple(motions)
 
 

@@ -22,8 +22,14 @@ from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.random import FrictionModel
 from pushjax.friction.table import Table
-from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import (
+    check_start_among_fixtures,
+    checked_fixtures,
+    checked_rollout_arguments,
+    checked_table,
+)
 from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
+from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
 from pushjax.simulation.monte_carlo_tiles import Devices, PushResults, Setup, copy_to_devices, fetch_round, start_round
@@ -47,6 +53,7 @@ def monte_carlo(
     model: FrictionModel,
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
+    fixtures: Sequence[Wall | Fixture] = (),
     trajectories: bool = False,
     batch_size: int | None = None,
     devices: Sequence[Any] | None = None,
@@ -72,6 +79,7 @@ def monte_carlo(
         model: Distribution from which friction is drawn around `slider.surface`.
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
+        fixtures: Walls and bodies that the slider may touch, as in `rollout`; their friction is not random.
         trajectories: Whether to keep every pose of every push (12 bytes a step in float32), not only the last.
         batch_size: Number of pushes that a device computes at once, in one compiled program. Default 2048 on a
             CPU and 262 144 on an accelerator, or for fewer pushes the next multiple of 64.
@@ -93,7 +101,7 @@ def monte_carlo(
     Reference: Zhou et al. 2017, sections V and VI.
     """
     start_time = time.perf_counter()
-    if traced((key, slider, hand, path, pose, model, table)):
+    if traced((key, slider, hand, path, pose, model, table, fixtures)):
         raise TypeError(
             "monte_carlo works on the host; under jit, vmap or grad use random_rollout, with vmap over keys"
         )
@@ -111,15 +119,16 @@ def monte_carlo(
         # connect the processes now: after compiling, one may be later than the 30 s that the others wait
         multihost_utils.sync_global_devices("pushjax monte_carlo")
     surfaces = model.around(slider.surface)
-    cast_table = checked_table(table, start.dtype)
-    setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table)
+    cast_table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
+    check_start_among_fixtures(slider, fixed, start)
+    setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table, fixed)
     run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
     saved: Checkpoint | None = None
     if checkpoint is not None:
         identity = {"n": n, "batch_size": tile, "trajectories": trajectories, "key": digest(key_data, impl)}
         identity |= {"slider": digest(slider), "hand": digest(hand, hand.poses(path_array)), "path": digest(path_array)}
         identity |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
-        identity |= {"table": digest(table) if table else "uniform"}
+        identity |= {"table": digest(table) if table else "uniform", "fixtures": digest(fixed)}
         versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
         identity |= versions | {"platform": used.local[0].platform}
         folder = Path(checkpoint)

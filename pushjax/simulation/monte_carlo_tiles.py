@@ -25,6 +25,7 @@ from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
+from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.random_rollout import draw, rollout_under_draws
 
@@ -40,6 +41,7 @@ class Setup(NamedTuple):
         hand: The hand.
         solver: Solver of contact problems; None for the default.
         table: A table whose friction depends on direction or place; None for uniform friction.
+        fixtures: Walls and bodies that the slider may touch.
     """
 
     key: Array
@@ -49,6 +51,7 @@ class Setup(NamedTuple):
     hand: Hand
     solver: ContactSolver | StickingSolver | None
     table: Table | None
+    fixtures: Fixtures
 
 
 class PushResults(NamedTuple):
@@ -146,7 +149,7 @@ def start_round(
         path = paths if paths.ndim == 2 else paths[device_index]
         index, pose, path = jax.device_put((indices[device_index], poses[device_index], path), devices.local[k])
         draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index)
-        shared = setup.shape, setup.hand, setup.solver, setup.table
+        shared = setup.shape, setup.hand, setup.solver, setup.table, setup.fixtures
         return _push(setup.model.resample_every, keep_trajectories, draws, shared, path, pose)
 
     # in parallel, because each device compiles its own program, once
@@ -182,8 +185,8 @@ def _push(
 
 
 def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:
-    shape, hand, solver, table = shared
-    push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table)
+    shape, hand, solver, table, fixtures = shared
+    push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table, fixtures)
     mode = push.mode
     return PushResults(
         push.pose[-1],

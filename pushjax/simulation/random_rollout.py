@@ -1,5 +1,6 @@
 """Rollout of one push under random friction."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -15,7 +16,13 @@ from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.arguments import checked_rollout_arguments, checked_table
+from pushjax.simulation.arguments import (
+    check_start_among_fixtures,
+    checked_fixtures,
+    checked_rollout_arguments,
+    checked_table,
+)
+from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import friction_on_table, simulate
 from pushjax.simulation.slider import Slider
@@ -81,6 +88,7 @@ def rollout_under_draws(
     solver: ContactSolver | StickingSolver | None,
     resample_every: int | None,
     table: Table | None,
+    fixtures: Fixtures,
 ) -> Trajectory:
     """Roll out a push under friction that was sampled before.
 
@@ -93,6 +101,7 @@ def rollout_under_draws(
         solver: Solver of contact problems; None for the default.
         resample_every: Number of steps after which the next draw is used; None for one draw.
         table: A table whose friction depends on direction or place; None for uniform friction.
+        fixtures: Walls and bodies that the slider may touch.
     """
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
     surfaces_and_frictions = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
@@ -105,7 +114,7 @@ def rollout_under_draws(
     def friction_at(step, pose):
         return first_draw if resample_every is None else draw_at(step // resample_every)
 
-    return simulate(shape, hand, path, pose, solver, friction_on_table(table, friction_at))
+    return simulate(shape, hand, path, pose, solver, friction_on_table(table, friction_at), fixtures)
 
 
 def random_rollout(
@@ -118,6 +127,7 @@ def random_rollout(
     model: FrictionModel,
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
+    fixtures: Sequence[Wall | Fixture] = (),
 ) -> RandomRollout:
     """Push the slider along a path under friction sampled from `model` around the slider's surface.
 
@@ -136,6 +146,7 @@ def random_rollout(
         model: Distribution of limit surface and friction.
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
+        fixtures: Walls and bodies that the slider may touch, as in `rollout`; their friction is not random.
 
     Returns:
         The push, and the friction that was sampled for it.
@@ -149,15 +160,16 @@ def random_rollout(
     check_solver(solver)
     check_type("model", model, FrictionModel)
     slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0)
-    table = checked_table(table, start.dtype)
+    table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
+    check_start_among_fixtures(slider, fixed, start)
     return _random_rollout(
-        key, model.around(slider.surface), slider.shape, hand, path_array, start, model, solver, table
+        key, model.around(slider.surface), slider.shape, hand, path_array, start, model, solver, table, fixed
     )
 
 
 @quick_jit
-def _random_rollout(key, surfaces, shape, hand, path, pose, model, solver, table) -> RandomRollout:
+def _random_rollout(key, surfaces, shape, hand, path, pose, model, solver, table, fixtures) -> RandomRollout:
     draws = draw(key, surfaces, model, len(path) - 1)
     return RandomRollout(
-        rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table), draws
+        rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table, fixtures), draws
     )

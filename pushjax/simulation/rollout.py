@@ -6,7 +6,7 @@ scheme of a step. The only state is the pose of the pushed slider.
 If no motion satisfies every contact, the hand has jammed, and it stops there for good.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +24,22 @@ from pushjax.friction.table import Table, TransformedForm
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import (
     check_opening,
+    check_start_among_fixtures,
     checked_arguments,
+    checked_fixtures,
     checked_rollout_arguments,
     checked_table,
     warn_about_units,
 )
 from pushjax.simulation.detection import num_contacts
-from pushjax.simulation.finger_motion import finger_motions, holding_distance, max_penetration, unstack_finger_poses
+from pushjax.simulation.finger_motion import (
+    finger_motions,
+    fixture_motions,
+    holding_distance,
+    max_penetration,
+    unstack_finger_poses,
+)
+from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import ScalarStep, step_in_scalars
@@ -48,6 +57,7 @@ def step(
     friction: ArrayLike,
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
+    fixtures: Sequence[Wall | Fixture] = (),
 ) -> Step:
     """Move the hand from one configuration to another; this is the one step that `rollout` scans.
 
@@ -63,6 +73,7 @@ def step(
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
+        fixtures: Walls and bodies that the slider may touch, as in `rollout`.
 
     Returns:
         The result of the step.
@@ -79,14 +90,15 @@ def step(
         check_opening(hand, q)
     check_solver(solver)
     warn_about_units(slider, start, *ends)
-    return _step(slider, hand, *ends, start, mu, solver, checked_table(table, dtype))
+    fixed = checked_fixtures(fixtures, dtype)
+    return _step(slider, hand, *ends, start, mu, solver, checked_table(table, dtype), fixed)
 
 
 @quick_jit
-def _step(slider, hand, q0, q1, pose, friction, solver, table) -> Step:
+def _step(slider, hand, q0, q1, pose, friction, solver, table, fixtures) -> Step:
     uniform = to_scalars(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
-    push = simulate(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, friction_at)
+    push = simulate(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, friction_at, fixtures)
     fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
     return Step(**fields)
 
@@ -100,6 +112,7 @@ def rollout(
     friction: ArrayLike,
     solver: ContactSolver | StickingSolver | None = None,
     table: Table | None = None,
+    fixtures: Sequence[Wall | Fixture] = (),
 ) -> Trajectory:
     """Push the slider along a path of hand configurations.
 
@@ -124,14 +137,16 @@ def rollout(
             (`pushjax.contact.single_first`). If several motions satisfy all contacts, `Exhaustive()` gives the one of
             largest power, which the default need not do.
         table: A table whose friction depends on direction or place; None for uniform friction.
+        fixtures: Walls (`Wall`) and convex bodies (`Fixture`) that stay where they are, and that the slider may touch.
+            Their contacts come after those of the fingers.
 
     Returns:
         The push, step by step.
 
     Raises:
-        ValueError: As in `step`. Also for a finger that starts inside the slider by more than a fifth of the surface's
-            length, where this is not traced (a smaller overlap is pushed out in the first step). For traced values the
-            `status` of each step shows the failure instead, and `first_failure` gives the step.
+        ValueError: As in `step`. Also for a finger or a fixture that starts inside the slider by more than a fifth of
+            the surface's length, where this is not traced (a smaller overlap is pushed out in the first step). For
+            traced values the `status` of each step shows the failure instead, and `first_failure` gives the step.
 
     Examples:
         >>> import numpy as np, pushjax as pj
@@ -146,14 +161,16 @@ def rollout(
     """
     check_solver(solver)
     slider, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
-    return _rollout(slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype))
+    fixed = checked_fixtures(fixtures, start.dtype)
+    check_start_among_fixtures(slider, fixed, start)
+    return _rollout(slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed)
 
 
 @quick_jit
-def _rollout(slider, hand, path, pose, friction, solver, table) -> Trajectory:
+def _rollout(slider, hand, path, pose, friction, solver, table, fixtures) -> Trajectory:
     uniform = to_scalars(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
-    return simulate(slider.shape, hand, path, pose, solver, friction_at)
+    return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures)
 
 
 # Called as `friction_at(step, pose)` with the index of a step and the pose of the slider before it. Returns H of the
@@ -188,6 +205,7 @@ def simulate(
     pose: Array,
     solver: ContactSolver | StickingSolver | None,
     friction_at: FrictionAt,
+    fixtures: Fixtures = (),
 ) -> Trajectory:
     """Roll out a path.
 
@@ -199,19 +217,22 @@ def simulate(
         solver: Solver of contact problems; None for the default.
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
             All surfaces must have the same length.
+        fixtures: Walls and bodies that the slider may touch.
     """
     outline, poses, steps = shape.outline(), hand.poses(path), len(path) - 1
-    start = Vec3.of(pose)
+    start, fixed = Vec3.of(pose), fixture_motions(fixtures)
+    if fixtures:
+        friction_at = _friction_among(fixtures, friction_at)
 
     def motions_at(step: Array, mu: Array):
         before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
         return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
 
-    if sum(num_contacts(finger, outline) for finger in hand.fingers) == 1:
+    if not fixed and sum(num_contacts(finger, outline) for finger in hand.fingers) == 1:
         records = _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at)
         fraction = jnp.zeros_like(start.x)
     else:
-        records, fraction = simulate_in_substeps(outline, steps, motions_at, solver, start, friction_at)
+        records, fraction = simulate_in_substeps(outline, steps, motions_at, solver, start, friction_at, fixed)
     results = to_arrays(records, friction_at(jnp.zeros((), jnp.int32), start)[0].length)
     stop_step = first_true(hand_stops(results.status))
     last_done = jnp.where(stop_step >= 0, stop_step, steps)
@@ -224,6 +245,19 @@ def simulate(
     poses = jnp.concatenate([pose[None], results.pose])
     other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
     return Trajectory(pose=poses, configuration=configuration, **other_fields)
+
+
+def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
+    """Return the same friction, but NaN, which makes every step INVALID, if the fixtures are not valid."""
+    is_valid = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(fixtures)))
+    for fixture in fixtures:
+        is_valid &= fixture.friction >= 0
+
+    def friction_if_valid(step: Array, pose: Vec3) -> tuple[Form, Array]:
+        form, mu = friction_at(step, pose)
+        return form, jnp.where(is_valid, mu, jnp.nan)
+
+    return friction_if_valid
 
 
 def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at) -> ScalarStep:

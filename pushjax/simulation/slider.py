@@ -12,7 +12,8 @@ from pushjax.friction.fit import fit_limit_surface
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.support import Support
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.finger_motion import finger_motions, max_penetration, unstack_finger_poses
+from pushjax.simulation.finger_motion import finger_motions, fixture_motions, max_penetration, unstack_finger_poses
+from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
 
 FIT_PAIRS = 400  # wrench-twist pairs of a fit; more change the fit by less than its own error
@@ -94,3 +95,10 @@ def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> 
         return max_penetration(slider.shape.outline(), motions, Vec3.of(pose), 0.0)
 
     return jax.vmap(depth_of, (0, 0 if configuration.ndim == 2 else None))(poses, configuration)
+
+
+@quick_jit
+def fixture_overlaps(slider: Slider, fixtures: Fixtures, poses: Array) -> Array:
+    """Return the depth of the slider in the fixture that it is deepest in, m, for each pose (poses, 3), world."""
+    outline, fixed = slider.shape.outline(), fixture_motions(fixtures)
+    return jax.vmap(lambda pose: max_penetration(outline, fixed, Vec3.of(pose), 0.0))(poses)

@@ -25,6 +25,7 @@ angles of the outline's corners. Whether the result is valid is judged afterward
 slider (`max_penetration`), which is computed from the whole outline. `substeps` divides a step that is too long.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -40,16 +41,12 @@ from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
+from pushjax.simulation.candidate import OUT_OF_REACH, Candidate
 from pushjax.simulation.contact_selection import select_contacts, selected_candidates, track_contacts
-from pushjax.simulation.detection import (
-    MAX_PENETRATION,
-    OUT_OF_REACH,
-    Candidate,
-    contact_candidates,
-    num_contacts,
-    time_of_impact,
-)
-from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
+from pushjax.simulation.detection import MAX_PENETRATION, contact_candidates, num_contacts, time_of_impact
+from pushjax.simulation.finger_motion import DEPTH_FLOOR, BodyFrame, FingerMotion
+from pushjax.simulation.fixtures import Wall
+from pushjax.simulation.wall_contact import select_on_wall
 from pushjax.simulation.working_set import Urgency, WorkingSet, num_solved_together, violations
 
 # rad. If a step, or a part of one, turns the slider farther than this, its result is rejected: contacts are detected at
@@ -93,7 +90,9 @@ class Stage(NamedTuple):
         status: `Status` so far.
         at_start: For each finger, its contacts as they were at the start of the step.
         chosen: For each finger, the index of each of its contacts among its candidates.
-        holds: Whether every finger is near enough to hold a jammed slider.
+        holds: Whether every finger is near enough to hold a jammed slider, and no fixture is.
+        urgency: Urgency by which contacts are selected (see `working_set`); None without fixtures, and if all contacts
+            are solved together.
     """
 
     twist: Vec3
@@ -103,20 +102,23 @@ class Stage(NamedTuple):
     at_start: tuple[tuple[Candidate, ...], ...]
     chosen: tuple[tuple[Int[Array, ""] | int, ...], ...]
     holds: Bool[Array, ""]
+    urgency: Urgency | None
 
     @staticmethod
-    def before(start: BodyFrame, counts: list[int]) -> "Stage":
+    def before(start: BodyFrame, counts: list[int], urgency: Urgency | None) -> "Stage":
         """What the predictor starts from: no motion yet, and no contacts selected.
 
         Args:
             start: Pose of the slider at the start.
-            counts: Number of contacts of each finger.
+            counts: Number of contacts of each finger and fixture.
+            urgency: Urgency of each contact.
         """
         zero = jnp.zeros_like(start.pose.x)
         still, nowhere = Vec3(zero, zero, zero), Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
         none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
         at_start = tuple((nowhere,) * n for n in counts)
-        return Stage(still, Vec2(zero, zero), start.angle, jnp.zeros((), jnp.int8), at_start, none, jnp.zeros((), bool))
+        no_status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+        return Stage(still, Vec2(zero, zero), start.angle, no_status, at_start, none, no, urgency)
 
 
 class FingerContacts(NamedTuple):
@@ -159,16 +161,18 @@ class PushingPart(NamedTuple):
         frame: BodyFrame,
         fraction: Scalar,
         in_predictor: Bool[Array, ""],
+        is_fixture: bool,
         finger_motion: FingerMotion,
         chosen: tuple[Int[Array, ""] | int, ...],
         at_start: tuple[Candidate, ...],
     ) -> FingerContacts:
-        """Contacts of one finger in a stage.
+        """Contacts of one finger, or of one fixture, in a stage.
 
         Args:
             frame: Pose of the slider in this stage.
             fraction: Fraction of the pushing part that is done in this stage.
             in_predictor: True in the predictor.
+            is_fixture: Whether `finger_motion` is that of a fixture.
             finger_motion: Motion of the finger over the step.
             chosen: Index of each contact among the candidates of the finger; not used in the predictor.
             at_start: The contacts as they were at the start of the step; not used in the predictor.
@@ -179,7 +183,11 @@ class PushingPart(NamedTuple):
         candidates = compute_once(
             contact_candidates(finger_motion.finger, self.outline, finger_pose, path, self.length), x
         )
-        selected = select_contacts(candidates, self.length, self.outline, path.scale(self.rest))
+        if isinstance(finger_motion.finger, Wall):
+            assert isinstance(candidates, Candidate)
+            selected = select_on_wall(candidates, self.length, self.outline)
+        else:
+            selected = select_contacts(candidates, self.length, self.outline, path.scale(self.rest))
         tracked = track_contacts(candidates, chosen, at_start, finger_motion.finger, self.outline)
         indices = tuple(jnp.where(in_predictor, new, old) for new, old in zip(selected, tracked, strict=True))
         contacts, originals, is_near = [], [], jnp.zeros((), bool)
@@ -188,7 +196,7 @@ class PushingPart(NamedTuple):
             # a corner that has passed the end of an edge by now keeps its contact from the start of the step
             candidate = tree_where(decide(candidate.distance > OUT_OF_REACH / 2, x), original, candidate)
             # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
-            gap = original.distance
+            gap = _gap_of_fixture(original.distance, self.length) if is_fixture else original.distance
             displacement = finger_motion.material_displacement(
                 frame, candidate.point, finger_pose.center, self.rest, in_predictor
             )
@@ -210,6 +218,8 @@ def step_in_scalars(
     reach: Scalar,
     urgency: Urgency | None = None,
     ongoing: Bool[Array, ""] | bool = True,
+    fixtures: tuple[FingerMotion, ...] = (),
+    is_first_try: Bool[Array, ""] | bool = True,
 ) -> tuple[ScalarStep, Urgency | None]:
     """Compute one step of all fingers, or a part of one; see the header of this module for the scheme.
 
@@ -223,6 +233,9 @@ def step_in_scalars(
         reach: Distance within which a finger holds a jammed slider, m.
         urgency: Urgency of each contact (see `working_set`); None if all are solved together.
         ongoing: False where no result is needed; no contact problem is solved then.
+        fixtures: Fixtures as fingers that stay where they are.
+        is_first_try: True where `urgency` says nothing yet. With fixtures, contacts are then selected by how far the
+            step would press them into a slider at rest.
 
     Returns:
         The record of the step, and the urgency of each contact after it (None if `urgency` is None).
@@ -230,32 +243,41 @@ def step_in_scalars(
     start = BodyFrame.at(pose)
     begin = _first_contact(motions, outline, start, form.length)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
-    counts = [num_contacts(finger_motion.finger, outline) for finger_motion in motions]
-    working = WorkingSet.most_urgent(urgency, num_solved_together(counts))
+    counts = [num_contacts(motion.finger, outline) for motion in motions + fixtures]
+    given_set = WorkingSet.most_urgent(urgency, num_solved_together(counts))
     active = (jnp.asarray(ongoing),) * num_solved_together(counts)
 
     def stage(carry: Stage, fraction: Scalar):
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         frame = start.moved(carry.point, carry.twist.scale(fraction), carry.angle)
         in_predictor = fraction == 0
-        finger_contacts = map_items(
-            lambda item: part.contacts_of(frame, fraction, in_predictor, *item),
-            tuple(zip(motions, carry.chosen, carry.at_start, strict=True)),
-        )
-        by_finger, chosen, at_start, near = zip(*finger_contacts, strict=True)
+        known = tuple(zip(carry.chosen, carry.at_start, strict=True))
+        found = ()
+        for bodies, is_fixture in ((motions, False), (fixtures, True)):
+            items = tuple((body, *known[len(found) + k]) for k, body in enumerate(bodies))
+            contacts_of = partial(part.contacts_of, frame, fraction, in_predictor, is_fixture)
+            if items:
+                found += map_items(lambda item, contacts_of=contacts_of: contacts_of(*item), items)
+        by_finger, chosen, at_start, near = zip(*found, strict=True)
         contacts, holds = sum(by_finger, ()), jnp.ones((), bool)
-        for finger_is_near in near:
-            holds &= finger_is_near
+        for k, is_near in enumerate(near):
+            holds &= is_near if k < len(motions) else ~is_near
+        used_urgency = carry.urgency
+        if used_urgency is not None:
+            pressed = jax.lax.stop_gradient(jnp.stack([contact.approach().x for contact in contacts]))
+            used_urgency = jnp.where(in_predictor & is_first_try, pressed, used_urgency)
+        working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, len(active))
         solution = solve_in_scalars(form, working.select(contacts), active, solver, margin=False)
         solution = working.spread(solution, len(contacts))
         urgency_after = None if urgency is None else violations(contacts, solution.twist, solution.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
         status = jnp.where(carry.status == Status.MOVING, solution.status, jnp.maximum(carry.status, solution.status))
         straight_point = _force_weighted_point(contacts, solution.force)
-        next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds)
+        next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency)
         return next_stage, (solution, _points_and_normals(contacts), urgency_after)
 
-    carry, outputs = jax.lax.scan(stage, Stage.before(start, counts), jnp.array([0.0, 0.5], pose.x.dtype))
+    before = Stage.before(start, counts, urgency if fixtures else None)
+    carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
     solution, points_and_normals, urgency_after = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
     status = _status(carry, overlap_before, form.length)
@@ -282,6 +304,7 @@ def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: B
     begin = jnp.ones_like(start.pose.x)
 
     def impact_of(finger_motion: FingerMotion) -> Scalar:
+        assert not isinstance(finger_motion.finger, Wall)
         finger_pose = finger_motion.pose_in_slider(start, jnp.zeros_like(start.pose.x))
         finger_pose, path = compute_once((finger_pose, finger_motion.path.unrotate(start.angle)), start.pose.x)
         return time_of_impact(finger_motion.finger, outline, finger_pose, path, length)
@@ -289,6 +312,15 @@ def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: B
     for impact in map_items(impact_of, motions):
         begin = jnp.minimum(begin, impact)
     return compute_once(begin, start.pose.x)
+
+
+def _gap_of_fixture(distance: Scalar, length: Scalar) -> Scalar:
+    """Gap of a fixture, m: zero where the slider rests against it within roundoff.
+
+    Otherwise the roundoff would move the slider, and its status would be MOVING though nothing pushes.
+    """
+    rests = (distance < 0) & (distance > -DEPTH_FLOOR * length)
+    return distance + jax.lax.stop_gradient(jnp.where(rests, -distance, 0.0))
 
 
 def _points_and_normals(contacts: tuple[Contact, ...]) -> tuple[Array, Array]:

@@ -92,6 +92,7 @@ def simulate_in_substeps(
     solver: ContactSolver | StickingSolver | None,
     pose: Vec3,
     friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]],
+    fixtures: tuple[FingerMotion, ...] = (),
 ) -> tuple[ScalarStep, Scalar]:
     """Roll out a path, dividing steps where necessary.
 
@@ -103,6 +104,7 @@ def simulate_in_substeps(
         solver: Solver of contact problems; None for the default.
         pose: Pose of the slider at the start, world.
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
+        fixtures: Fixtures as fingers that stay where they are.
 
     Returns:
         The stacked records of all steps; and, if the hand was stopped, the fraction of its last step that it did.
@@ -111,11 +113,11 @@ def simulate_in_substeps(
     form, mu = friction_at(first, pose)
     motions = motions_at(first, mu)
     max_trials = TRIALS_PER_STEP * steps + EXTRA_TRIALS
-    overlap = max_penetration(outline, motions, pose, 0.0)
+    overlap = max_penetration(outline, motions + fixtures, pose, 0.0)
     zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
     zero_status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
-    urgency = initial_urgency([num_contacts(motion.finger, outline) for motion in motions], pose.x)
-    idle_record = _idle_record(form, outline, motions, solver, pose, urgency)
+    urgency = initial_urgency([num_contacts(motion.finger, outline) for motion in motions + fixtures], pose.x)
+    idle_record = _idle_record(form, outline, motions, solver, pose, urgency, fixtures)
     initial_state = PushState(
         pose, pose, first, zero, one, no, no, urgency, zero_status, overlap, zero_status, zero_status, no, idle_record
     )
@@ -127,9 +129,19 @@ def simulate_in_substeps(
         part = tuple(motion.part(state.done, state.part) for motion in motions)
         ongoing = state.step < steps
         record, urgency_after = step_in_scalars(
-            form, outline, part, solver, state.pose, state.overlap, reach, state.urgency, ongoing
+            form,
+            outline,
+            part,
+            solver,
+            state.pose,
+            state.overlap,
+            reach,
+            state.urgency,
+            ongoing,
+            fixtures,
+            state.swaps == 0,
         )
-        next_state, end_of_step = _next_state(state, record, urgency_after, outline, part, tolerance, steps)
+        next_state, end_of_step = _next_state(state, record, urgency_after, outline, part + fixtures, tolerance, steps)
         if urgency_after is not None and urgency is not None:
             next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, urgency_after, urgency))
         return next_state, end_of_step
@@ -250,7 +262,7 @@ def _next_state(
         record: Result of the trial.
         urgency_after: Urgency of each contact after the trial; None if all are solved together.
         outline: The slider's outline.
-        part: Motion of each finger over the part of the step that was tried.
+        part: Motion of each finger over the part of the step that was tried, and the fixtures.
         tolerance: How much deeper a finger may be after a whole step, m.
         steps: Number of steps of the path.
     """
@@ -309,8 +321,10 @@ def _resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
     return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
-def _idle_record(form, outline, motions, solver, pose, urgency) -> ScalarStep:
+def _idle_record(form, outline, motions, solver, pose, urgency, fixtures) -> ScalarStep:
     """Record of a step in which nothing pushes, in the shapes and dtypes that `step_in_scalars` gives."""
-    shapes = jax.eval_shape(lambda: step_in_scalars(form, outline, motions, solver, pose, pose.x, pose.x, urgency)[0])
+    shapes = jax.eval_shape(
+        lambda: step_in_scalars(form, outline, motions, solver, pose, pose.x, pose.x, urgency, True, fixtures)[0]
+    )
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     return _resting(blank, pose)

@@ -27,7 +27,7 @@ def initial_urgency(counts: list[int], like: Scalar) -> Urgency | None:
     """The urgency before anything has been solved; None if all contacts are solved together.
 
     Args:
-        counts: Number of contacts of each finger. The contacts of a finger are sorted, the likeliest first.
+        counts: Number of contacts of each finger and fixture. The contacts of a finger are sorted, the likeliest first.
         like: A scalar of the floating dtype to use.
     """
     if num_solved_together(counts) == sum(counts):

@@ -13,7 +13,8 @@ import pushjax as pj
 from pushjax import plot
 from pushjax._math.vec import Vec2, Vec3, cos_sin
 from pushjax.plot.style import RED
-from pushjax.simulation.detection import OUT_OF_REACH, FingerPose, contact_candidates, penetration_depth
+from pushjax.simulation.candidate import OUT_OF_REACH, FingerPose
+from pushjax.simulation.detection import contact_candidates, penetration_depth
 from pushjax.simulation.finger_motion import finger_motions, max_penetration
 from pushjax.simulation.hand import Pad, RoundFinger
 

@@ -8,7 +8,8 @@ import pytest
 import pushjax as pj
 from pushjax._math.vec import Vec2
 from pushjax.experiments.grasps.sliders import butterfly
-from pushjax.simulation.detection import OUT_OF_REACH, FingerPose, contact_candidates, penetration_depth, time_of_impact
+from pushjax.simulation.candidate import OUT_OF_REACH, FingerPose
+from pushjax.simulation.detection import contact_candidates, penetration_depth, time_of_impact
 from pushjax.simulation.hand import Pad
 
 SEMI = np.array([0.02, 0.014])

@@ -1,0 +1,48 @@
+"""Contact candidates: places where a finger or a fixture and the slider may touch."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from pushjax._math.vec import Scalar, Vec2
+
+OUT_OF_REACH = 1e3  # m, distance of a candidate that does not exist; no finger moves so far
+
+
+class FingerPose(NamedTuple):
+    """Pose of a finger in the slider's frame.
+
+    Attributes:
+        center: Center of the finger, m.
+        angle: Angle as the unit vector (cos, sin); None for a finger that never turns.
+    """
+
+    center: Vec2
+    angle: Vec2 | None
+
+
+class Candidate(NamedTuple):
+    """A place where a finger and the slider may touch, in the slider's frame; or several, as arrays.
+
+    Attributes:
+        distance: Signed distance, m; negative in penetration.
+        point: Point on the slider, m.
+        normal: Unit normal that points into the slider.
+    """
+
+    distance: Scalar
+    point: Vec2
+    normal: Vec2
+
+
+# A tuple of candidates, or, for a pad, one `Candidate` of arrays. With the corners of a pad unrolled, the program for a
+# jaw was twice as large and took nearly twice as long to compile.
+Candidates = tuple[Candidate, ...] | Candidate
+
+
+def take(candidates: Candidate, index: Int[Array, ""]) -> Candidate:
+    """`candidates[index]`, computed as a masked sum, which is cheap in a batch."""
+    mark = jnp.arange(candidates.distance.size) == index
+    return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), candidates)

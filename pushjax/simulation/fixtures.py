@@ -1,0 +1,122 @@
+"""Fixtures: bodies that do not move, which the slider touches while the hand pushes it.
+
+In the contact problem a fixture is like a finger that does not move: it has gaps, friction and forces. There are three
+differences. A fixture does not start a push, because only the hand moves. A slider that rests against a fixture within
+roundoff is not pushed out of it. A jam in which the slider touches a fixture is no grasp, because the hand alone does
+not hold the slider.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    common_dtype,
+    concrete,
+)
+from pushjax._math.vec import Vec2
+from pushjax.geometry.disk import Disk
+from pushjax.geometry.polygon import Polygon
+from pushjax.simulation.hand import Pad, RoundFinger
+
+
+class Wall(eqx.Module):
+    """A straight wall without ends: the slider cannot enter the half plane behind it.
+
+    The hand passes through walls; only the slider touches them.
+
+    Args:
+        point: A point on the wall, (2,), world, m.
+        normal: Direction from the wall into the free space, (2,), world. It is scaled to unit length.
+        friction: Coefficient of friction mu between wall and slider.
+
+    Attributes:
+        point: The point on the wall, (2,), world, m.
+        normal: Unit normal into the free space, (2,), world.
+        friction: Coefficient of friction.
+
+    Raises:
+        ValueError: For a wrong shape; where they are not traced, also for values that are not finite, a normal of
+            length zero or a negative friction.
+    """
+
+    point: Float[Array, "2"]
+    normal: Float[Array, "2"]
+    friction: Float[Array, ""]
+
+    def __init__(self, point: ArrayLike, normal: ArrayLike, friction: ArrayLike = 0.0):
+        dtype = common_dtype(point, normal, friction)
+        self.point, direction = as_float(point, dtype, "point"), as_float(normal, dtype, "normal")
+        for name, value in (("point", self.point), ("normal", direction)):
+            check_shape(name, value, (2,))
+            check_finite(name, value)
+        known = concrete(direction)
+        if known is not None and not np.any(known):
+            raise ValueError("normal must not be zero; it is the direction from the wall into the free space")
+        self.normal = direction / jnp.linalg.norm(direction)
+        self.friction = _checked_friction(friction, dtype)
+
+
+class Fixture(eqx.Module):
+    """A convex body that does not move.
+
+    The hand passes through fixtures; only the slider touches them.
+
+    Args:
+        shape: A convex `Polygon` or a `Disk`, in its own frame, m. A body that is not convex is given as several.
+        pose: Pose of the body's frame, (3,), world, m and rad.
+        friction: Coefficient of friction mu between body and slider.
+
+    Raises:
+        ValueError: For a polygon that is not known to be convex, for another kind of shape, and for a wrong shape of
+            an array; where they are not traced, also for values that are not finite or a negative friction.
+    """
+
+    shape: Polygon | Disk
+    pose: Float[Array, "3"]
+    friction: Float[Array, ""]
+
+    def __init__(self, shape: Polygon | Disk, pose: ArrayLike = (0.0, 0.0, 0.0), friction: ArrayLike = 0.0):
+        convex = isinstance(shape, Disk) or (isinstance(shape, Polygon) and shape.convex)
+        if not convex:
+            raise ValueError(
+                f"shape: a fixture must be a Disk or a convex Polygon whose vertices are known; got "
+                f"{'a Polygon that is not convex' if isinstance(shape, Polygon) else type(shape).__name__}"
+            )
+        dtype = common_dtype(shape, pose, friction)
+        self.shape, self.pose = shape, as_float(pose, dtype, "pose")
+        check_shape("pose", self.pose, (3,))
+        check_finite("pose", self.pose)
+        self.friction = _checked_friction(friction, dtype)
+
+    @property
+    def body(self) -> RoundFinger | Pad:
+        """The body as contact detection takes it."""
+        return RoundFinger(self.shape.radius) if isinstance(self.shape, Disk) else Pad(self.shape)
+
+    @property
+    def center(self) -> Vec2:
+        """Origin of `body`, world, m."""
+        origin = Vec2.of(self.pose[:2])
+        if not isinstance(self.shape, Disk):
+            return origin
+        return origin + Vec2.of(self.shape.center).rotate(Vec2(jnp.cos(self.pose[2]), jnp.sin(self.pose[2])))
+
+
+Fixtures = tuple[Wall | Fixture, ...]
+
+
+def _checked_friction(friction: ArrayLike, dtype: Any) -> Float[Array, ""]:
+    mu = as_float(friction, dtype, "friction")
+    check_shape("friction", mu, ())
+    check_finite("friction", mu)
+    check_non_negative("friction", mu)
+    return mu
