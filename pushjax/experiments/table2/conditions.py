@@ -14,6 +14,7 @@ SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4
 CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
 MODELS = {"quartic": 4, "ellipsoid": 2}
 PAIRS, SPLITS = 400, 10
+COEFFICIENTS = {"quartic": 15, "ellipsoid": 6}  # a surface is fitted to at least as many pairs
 
 # Zhou et al. 2017, table 2: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
 # of the ratio of the two in percent.
@@ -46,7 +47,27 @@ class Geometry(NamedTuple):
 GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 0.0007, True)}
 
 
-def load(folder: Path, surface: str, name: str) -> PushLog:
+def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
+    """Load the pushes of every condition that the folder has, by surface and object.
+
+    Args:
+        folder: Folder of the files.
+
+    Raises:
+        ValueError: If the folder has none of the conditions.
+    """
+    logs = {condition: load(folder, *condition) for condition in CONDITIONS}
+    known = {condition: log for condition, log in logs.items() if log is not None}
+    if not known:
+        first = "_".join(CONDITIONS[0])
+        raise ValueError(
+            f"--data: expected {first}.npz, or published logs named {first}….txt, or another condition, in {folder}; "
+            "found none"
+        )
+    return known
+
+
+def load(folder: Path, surface: str, name: str) -> PushLog | None:
     """Load the pushes of a condition from its curated archive, or else from an original log.
 
     The name of an original log begins with the condition. If there are several, the first is read.
@@ -56,19 +77,30 @@ def load(folder: Path, surface: str, name: str) -> PushLog:
         surface: Name of the surface.
         name: Name of the object, which stands for the arrangement of its supports.
 
-    Raises:
-        ValueError: If there is neither an archive nor a log.
+    Returns:
+        The pushes, or None if there is neither an archive nor a log.
     """
     archive = folder / f"{surface}_{name}.npz"
     originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
     if archive.exists():
         return load_push_npz(archive)
-    if not originals:
-        raise ValueError(
-            f"--data: expected {surface}_{name}.npz, or published logs named {surface}_{name}….txt, in {folder}; "
-            "found neither"
-        )
-    return load_triangle_log(originals[0], surface=surface, arrangement=name)
+    return load_triangle_log(originals[0], surface=surface, arrangement=name) if originals else None
+
+
+def obstacle(train: np.ndarray | None, method: str, model: str) -> str | None:
+    """Say in a few words why a cell cannot be computed; None if it can.
+
+    Args:
+        train: (splits, pushes), True for the pushes to learn from. None if there is no log.
+        method: "ideal", "wrench_twist" or "identified".
+        model: "quartic" or "ellipsoid".
+    """
+    if train is None:
+        return "no log"
+    if train.shape[1] < 2:  # one to learn from, one to predict
+        return "1 push, needs 2"
+    pairs, needed = int(train[0].sum()), COEFFICIENTS[model]
+    return f"{pairs} pairs, needs {needed}" if method == "wrench_twist" and pairs < needed else None
 
 
 def ideal_surface(log: PushLog, model: str, key: jax.Array) -> pj.LimitSurface:
@@ -117,7 +149,7 @@ def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray
         rng: Random generator.
 
     Returns:
-        (splits, pushes), True for the pushes to learn from.
+        (splits, pushes), True for the pushes to learn from. Of two or more pushes, that is at least one, and not all.
     """
     chosen = np.zeros((SPLITS, len(log.pushes)), bool)
     for row in chosen:

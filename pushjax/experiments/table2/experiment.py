@@ -12,7 +12,7 @@ Second, one set of pairs serves all splits. Third, a surface is fitted to the fo
 percent: with the data at hand, half is the first share that has as many pairs as a quartic has coefficients.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ import numpy as np
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
+from pushjax.datasets import PushLog
 from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
@@ -35,12 +36,17 @@ from pushjax.experiments.table2.conditions import (
     PAPER_PERCENT,
     SPLITS,
     SURFACES,
+    Geometry,
     ideal_surface,
-    load,
+    load_all,
+    obstacle,
     recorded,
     training,
 )
-from pushjax.experiments.table2.methods import FRICTIONS, Predicted
+from pushjax.experiments.table2.methods import FRICTIONS, Predicted, Setup
+
+Condition = tuple[str, str]  # surface and object
+COLUMN = 20  # width of a column of the printed table
 
 
 def run(
@@ -53,6 +59,8 @@ def run(
     progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
     """Compute sixteen cells for each method: every condition with both models.
+
+    A cell that too few pushes, or none, leave without figures has `mean_mm` None and the reason as `missing`.
 
     Args:
         folder: Folder of the data, which contains `three_point_push/`.
@@ -67,35 +75,25 @@ def run(
         The record, with the cells, and the means by method and model.
 
     Raises:
-        ValueError: If the geometry or a method is unknown, or the data of a condition are missing.
+        ValueError: If the geometry or a method is unknown, or the folder has the data of no condition.
     """
     if geometry not in GEOMETRIES:
         raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}; got {geometry!r}")
     unknown = [name for name in method if name not in methods.TRAIN_SHARE]
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(methods.TRAIN_SHARE)}; got {unknown or 'none'}")
-    logs = [load(folder / "three_point_push", *condition) for condition in CONDITIONS]
-    where = GEOMETRIES[geometry]
-    pushes = [recorded(log, where, steps) for log in logs]
-    done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(CONDITIONS) for name in method)
+    logs, where = load_all(folder / "three_point_push"), GEOMETRIES[geometry]
+    pushes = {condition: recorded(log, where, steps) for condition, log in logs.items()}
+    done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(logs) for name in method)
 
     def step() -> None:
         nonlocal done
         done += 1
         progress(done, total)
 
-    cells = []
-    for model in MODELS:
-        # each condition has its own keys and generators, so that a cell does not depend on which others there are
-        surfaces = [ideal_surface(log, model, jax.random.key(seed + k)) for k, log in enumerate(logs)]
-        for name in method:
-            rngs = [np.random.default_rng(seed + k) for k in range(len(logs))]
-            train = [training(log, methods.TRAIN_SHARE[name], rng) for log, rng in zip(logs, rngs, strict=True)]
-            found = _predict_conditions(name, model, logs, pushes, surfaces, train, where, step)
-            for k, (surface, target) in enumerate(CONDITIONS):
-                labels = {"surface": surface, "object": target, "model": model, "method": name}
-                paper = {"paper_mm": PAPER_MM[surface, model][OBJECTS.index(target)]}
-                cells.append(labels | _cell(pushes[k], logs[k].length, found[k], train[k], rngs[k]) | paper)
+    cells = [
+        cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, where, seed, step)
+    ]
     means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
@@ -103,16 +101,51 @@ def run(
     return result_record("table2", settings, cells=cells, means=means, pictures=pictures)
 
 
-def _predict_conditions(name, model, logs, pushes, surfaces, train, where, step_done) -> list[Predicted]:
-    """Predict all conditions with one method, and call `step_done` after each part."""
-    if name == "identified":
-        return methods.identified(logs, pushes, surfaces, train, where, step_done)
-    predictions = []
-    for log, condition_pushes, surface, split in zip(logs, pushes, surfaces, train, strict=True):
-        if name == "ideal":
-            predictions.append(methods.ideal(log, condition_pushes, surface, split, where))
+def _cells(
+    method: str,
+    model: str,
+    logs: dict[Condition, PushLog],
+    pushes: dict[Condition, pj.Pushes],
+    where: Geometry,
+    seed: int,
+    step_done: Callable[[], None],
+) -> list[dict[str, Any]]:
+    """Compute the cells of one method and model, and call `step_done` after each part."""
+    # each condition has its own keys and generators, so that a cell does not depend on which others there are
+    seeds = {condition: seed + k for k, condition in enumerate(CONDITIONS)}
+    rngs = {condition: np.random.default_rng(own) for condition, own in seeds.items()}
+    train = {condition: training(log, methods.TRAIN_SHARE[method], rngs[condition]) for condition, log in logs.items()}
+    missing = {condition: obstacle(train.get(condition), method, model) for condition in CONDITIONS}
+    computed = [condition for condition, reason in missing.items() if reason is None]
+    setups = [
+        Setup(logs[each], pushes[each], ideal_surface(logs[each], model, jax.random.key(seeds[each])), train[each])
+        for each in computed
+    ]
+    predicted = dict(zip(computed, _predict(method, model, setups, where, step_done), strict=True))
+    cells = []
+    for surface, target in CONDITIONS:
+        condition = surface, target
+        labels = {"surface": surface, "object": target, "model": model, "method": method}
+        paper = {"paper_mm": PAPER_MM[surface, model][OBJECTS.index(target)]}
+        if condition in predicted:
+            log = logs[condition]
+            figures = _cell(pushes[condition], log.length, predicted[condition], train[condition], rngs[condition])
         else:
-            predictions.append(methods.wrench_twist(log, condition_pushes, surface.length, model, split, where))
+            figures = {"mean_mm": None, "missing": missing[condition]}
+        cells.append(labels | figures | paper)
+    return cells
+
+
+def _predict(
+    method: str, model: str, setups: list[Setup], where: Geometry, step_done: Callable[[], None]
+) -> list[Predicted]:
+    """Predict conditions with one method, and call `step_done` after each part."""
+    if method == "identified":
+        return methods.identified(setups, where, step_done) if setups else []
+    predictions = []
+    for setup in setups:
+        ideal = method == "ideal"
+        predictions.append(methods.ideal(setup, where) if ideal else methods.wrench_twist(setup, model, where))
         step_done()
     return predictions
 
@@ -139,15 +172,23 @@ def _cell(
     }
 
 
-def _mean(cells: list[dict], method: str, model: str) -> dict[str, float]:
-    """Average the cells of one method and model."""
-    selected = [cell for cell in cells if (cell["method"], cell["model"]) == (method, model)]
+def _mean(cells: list[dict], method: str, model: str) -> dict[str, Any]:
+    """Average the cells of one method and model that have figures; {} if none has."""
+    selected = _with_figures(cell for cell in cells if (cell["method"], cell["model"]) == (method, model))
+    if not selected:
+        return {}
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in selected])),
         "paper_mm": float(np.mean([cell["paper_mm"] for cell in selected])),
         "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in selected])),
         "paper_percent": PAPER_PERCENT[model],
+        "conditions": len(selected),
     }
+
+
+def _with_figures(cells: Iterable[dict]) -> list[dict]:
+    """Return the cells that could be computed."""
+    return [cell for cell in cells if cell["mean_mm"] is not None]
 
 
 def _draw(cells: list[dict], out: Path) -> list[str]:
@@ -167,25 +208,42 @@ def summary(record: dict[str, Any]) -> str:
     lines = [f"Mean deviation in mm, test pushes, {SPLITS} splits; the paper's in brackets."]
     for name, means in record["means"].items():
         cells = [cell for cell in record["cells"] if cell["method"] == name]
-        lines += ["", f"{name:22}" + "".join(f"{target:>20}" for target in OBJECTS)]
+        lines += ["", f"{name:22}" + "".join(f"{target:>{COLUMN}}" for target in OBJECTS)]
         for surface in SURFACES:
-            for model in MODELS:
-                row = [c for c in cells if (c["surface"], c["model"]) == (surface, model)]
-                entries = (f"{c['mean_mm']:.2f} ± {c['ci95_bootstrap_mm']:.2f} ({c['paper_mm']:.2f})" for c in row)
-                lines.append(f"{surface:10} {model:11}" + "".join(f"{entry:>20}" for entry in entries))
-            row = [c for c in cells if (c["surface"], c["model"]) == (surface, "quartic")]
-            still = zip(row, PAPER_NO_MOTION_MM[surface], strict=True)
-            entries = (f"{c['no_motion_mm']:.2f} ({paper:.2f})" for c, paper in still)
-            lines.append(f"{surface:10} {'no motion':11}" + "".join(f"{entry:>20}" for entry in entries))
+            rows = {model: [c for c in cells if (c["surface"], c["model"]) == (surface, model)] for model in MODELS}
+            for model, row in rows.items():
+                lines.append(f"{surface:10} {model:11}" + "".join(f"{_entry(cell):>{COLUMN}}" for cell in row))
+            still = zip(*rows.values(), PAPER_NO_MOTION_MM[surface], strict=True)
+            entries = (_no_motion_entry(of_object, paper) for *of_object, paper in still)
+            lines.append(f"{surface:10} {'no motion':11}" + "".join(f"{entry:>{COLUMN}}" for entry in entries))
         for model, mean in means.items():
-            lines.append(
-                f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}), "
-                f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
-            )
+            if mean:
+                count, every = mean["conditions"], len(CONDITIONS)
+                some = "" if count == every else f", on {count} of {every} conditions"
+                lines.append(
+                    f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}{some}), "
+                    f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
+                )
     lines.append("")
-    failed = sum(cell["failed_steps"] for cell in record["cells"])
+    computed = _with_figures(record["cells"])
+    if len(computed) < len(record["cells"]):
+        lines.append("A cell with words could not be computed, for the reason that it gives; the means leave it out.")
+    failed = sum(cell["failed_steps"] for cell in computed)
     if failed:
         lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
     lines.append("The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON.")
     lines += [f"drew {path}" for path in record["pictures"]]
     return "\n".join(lines)
+
+
+def _entry(cell: dict[str, Any]) -> str:
+    """Format a cell: its figure, interval and the paper's figure, or why it has none."""
+    if cell["mean_mm"] is None:
+        return cell["missing"]
+    return f"{cell['mean_mm']:.2f} ± {cell['ci95_bootstrap_mm']:.2f} ({cell['paper_mm']:.2f})"
+
+
+def _no_motion_entry(cells: Iterable[dict], paper: float) -> str:
+    """Format the deviation if nothing moved, which is the same in the cells of both models."""
+    known = _with_figures(cells)
+    return f"{known[0]['no_motion_mm']:.2f} ({paper:.2f})" if known else f"- ({paper:.2f})"

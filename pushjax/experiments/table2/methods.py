@@ -10,7 +10,7 @@ identified    Friction, surface, and how far the hand really went, identified fr
               `pushjax.identification`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -30,6 +30,22 @@ IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same
 SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
 
 
+class Setup(NamedTuple):
+    """One condition as the methods take it.
+
+    Attributes:
+        log: The pushes as logged, with their forces.
+        pushes: The same pushes as arrays.
+        surface: Limit surface of the known support.
+        train: (splits, pushes), True for the pushes to learn from.
+    """
+
+    log: PushLog
+    pushes: pj.Pushes
+    surface: pj.LimitSurface
+    train: np.ndarray
+
+
 class Predicted(NamedTuple):
     """Predictions of one condition.
 
@@ -44,79 +60,64 @@ class Predicted(NamedTuple):
     failed: int
 
 
-def ideal(
-    log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, train: np.ndarray, geometry: Geometry
-) -> Predicted:
-    """Predict one condition with a given surface and the friction that is best for the training pushes, on a grid.
+def ideal(setup: Setup, geometry: Geometry) -> Predicted:
+    """Predict one condition with the known surface and the friction that is best for the training pushes, on a grid.
 
     Args:
-        log: The pushes as logged.
-        pushes: The same pushes as arrays.
-        surface: Limit surface of the known support.
-        train: (splits, pushes), True for the pushes to learn from.
+        setup: The condition.
         geometry: Where the finger really was.
     """
-    errors, failed = _deviations_on_grid(log, pushes, surface, geometry)
-    return _choose_friction(np.broadcast_to(errors, (len(train), *errors.shape)), train, failed)
+    errors, failed = _deviations_on_grid(setup, setup.surface, geometry)
+    return _choose_friction(np.broadcast_to(errors, (len(setup.train), *errors.shape)), setup.train, failed)
 
 
-def wrench_twist(
-    log: PushLog, pushes: pj.Pushes, length: jax.Array, model: str, train: np.ndarray, geometry: Geometry
-) -> Predicted:
+def wrench_twist(setup: Setup, model: str, geometry: Geometry) -> Predicted:
     """Predict one condition with a surface fitted to measured forces, and the best friction on a grid.
 
     Args:
-        log: The pushes as logged, with their forces.
-        pushes: The same pushes as arrays.
-        length: Characteristic length of the fitted surfaces, m.
+        setup: The condition. The fitted surfaces have the characteristic length of its surface.
         model: "quartic" or "ellipsoid".
-        train: (splits, pushes), True for the pushes to learn from.
         geometry: Where the finger really was.
     """
-    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in log.wrench_twist_pairs())
+    length = setup.surface.length
+    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in setup.log.wrench_twist_pairs())
     errors, failed = [], 0
-    for trains in train:
+    for trains in setup.train:
         surface = pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model])
-        split_errors, split_failed = _deviations_on_grid(log, pushes, surface, geometry)
+        split_errors, split_failed = _deviations_on_grid(setup, surface, geometry)
         errors.append(split_errors)
         failed += int(split_failed.sum())
-    return _choose_friction(np.stack(errors), train, np.asarray(failed))
+    return _choose_friction(np.stack(errors), setup.train, np.asarray(failed))
 
 
-def identified(
-    logs: list[PushLog],
-    recordings: list[pj.Pushes],
-    surfaces: list[pj.LimitSurface],
-    train: list[np.ndarray],
-    geometry: Geometry,
-    done: Callable[[], None],
-) -> list[Predicted]:
-    """Predict all conditions with what is identified from the final poses of all of them at once.
+def identified(setups: Sequence[Setup], geometry: Geometry, done: Callable[[], None]) -> list[Predicted]:
+    """Predict conditions with what is identified from the final poses of all of them at once.
 
-    The conditions share the robot, whose geometry is not taken as given.
+    The conditions share the robot, whose geometry is not taken as given. The surface of each condition is the mean of
+    its prior.
 
     Args:
-        logs: The pushes of each condition as logged.
-        recordings: The same pushes as arrays, with the steps of the prediction.
-        surfaces: Limit surface of the known support of each condition: the mean of its prior.
-        train: For each condition (splits, pushes), True for the pushes to learn from.
+        setups: The conditions.
         geometry: Where the finger is assumed to have been, as the mean of the prior.
         done: Called after each split.
 
     Returns:
         One prediction per condition.
     """
-    fine = pj.Pushes.conditions(recordings)
+    first = setups[0]
+    fine = pj.Pushes.conditions([setup.pushes for setup in setups])
     steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
-    pushes = pj.Pushes.conditions([recorded(log, geometry, steps) for log in logs])
-    slider = pj.Slider(outline(logs[0], geometry), jax.tree.map(lambda *each: jnp.stack(each), *surfaces))
+    pushes = pj.Pushes.conditions([recorded(setup.log, geometry, steps) for setup in setups])
+    surfaces = jax.tree.map(lambda *each: jnp.stack(each), *(setup.surface for setup in setups))
+    slider = pj.Slider(outline(first.log, geometry), surfaces)
     unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, inset=INSET, overshoot=OVERSHOOT)
-    hand, length = pj.Hand.finger(geometry.radius), logs[0].length
-    errors, friction, failed = [], [], np.zeros(len(logs), int)
-    for split in range(len(train[0])):
+    hand, length = pj.Hand.finger(geometry.radius), first.log.length
+    counts = [setup.train.shape[1] for setup in setups]
+    errors, friction, failed = [], [], np.zeros(len(setups), int)
+    for split in range(len(first.train)):
         weight = np.zeros(pushes.weight.shape)
-        for condition, chosen in enumerate(train):
-            weight[condition, : chosen.shape[1]] = chosen[split]
+        for condition, (setup, count) in enumerate(zip(setups, counts, strict=True)):
+            weight[condition, :count] = setup.train[split]
         found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
         predicted = found.predict(fine, slider, hand)
         errors.append(1e3 * np.asarray(pj.deviation(predicted.pose[..., -1, :], fine.end, length), np.float64))
@@ -124,15 +125,14 @@ def identified(
         friction.append(np.asarray(found.friction))
         done()
     return [
-        Predicted(np.stack([e[k, : train[k].shape[1]] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
-        for k in range(len(logs))
+        Predicted(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
+        for k, count in enumerate(counts)
     ]
 
 
-def _deviations_on_grid(
-    log: PushLog, pushes: pj.Pushes, surface: pj.LimitSurface, geometry: Geometry
-) -> tuple[np.ndarray, np.ndarray]:
+def _deviations_on_grid(setup: Setup, surface: pj.LimitSurface, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
     """Return every push's deviation in mm and number of failed steps at every friction, (frictions, pushes)."""
+    log, pushes = setup.log, setup.pushes
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
     final, failed = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))

@@ -1,0 +1,119 @@
+"""Table 2 on few pushes: what can be computed is, and every other cell says why it cannot be."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drawn import legend
+
+import pushjax as pj
+from pushjax.datasets import load_push_npz
+from pushjax.experiments import table2
+from pushjax.experiments.table2 import conditions, experiment
+
+# Pushes of two conditions; the folder has no other. Half of fourteen are as many pairs as an ellipsoid needs, and
+# fewer than a quartic.
+PUSHES = {"3pts1": 14, "3pts2": 1}
+SPLITS = 3
+
+
+@pytest.fixture(scope="module")
+def few(data, tmp_path_factory):
+    """Return the record of table 2 of a few pushes on hardboard, and its folder."""
+
+    def load(folder, surface, name):
+        if surface != "hardboard" or name not in PUSHES:
+            return None
+        log = load_push_npz(folder / f"{surface}_{name}.npz")
+        return replace(log, pushes=log.pushes[: PUSHES[name]])
+
+    out = tmp_path_factory.mktemp("table2")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conditions, "load", load)
+        patch.setattr(conditions, "SPLITS", SPLITS)
+        return table2.run(data, out=out, steps=15, method=("ideal", "wrench_twist")), out
+
+
+def test_cells_say_why_they_have_no_figure(few):
+    missing = {
+        (cell["method"], cell["model"], cell["object"]): cell["missing"]
+        for cell in few[0]["cells"]
+        if cell["surface"] == "hardboard" and cell["mean_mm"] is None
+    }
+    for method in ("ideal", "wrench_twist"):
+        for model in ("quartic", "ellipsoid"):
+            assert missing.pop((method, model, "3pts2")) == "1 push, needs 2"
+            assert missing.pop((method, model, "3pts3")) == missing.pop((method, model, "3pts4")) == "no log"
+    assert missing == {("wrench_twist", "quartic", "3pts1"): "7 pairs, needs 15"}
+    assert {cell.get("missing") for cell in few[0]["cells"] if cell["surface"] == "plywood"} == {"no log"}
+
+
+def test_other_cells_and_means_are_of_the_few_pushes(few, data):
+    record, _ = few
+    log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")
+    moved = [push.pose_end - push.pose_start for push in log.pushes[:14]]
+    deviations = [1e3 * (np.hypot(*each[:2]) + log.length * abs(each[2])) for each in moved]
+    figures = [cell for cell in record["cells"] if cell["mean_mm"] is not None]
+    expected = {("ideal", "quartic"), ("ideal", "ellipsoid"), ("wrench_twist", "ellipsoid")}
+    assert {(cell["method"], cell["model"]) for cell in figures} == expected
+    for cell in figures:
+        assert (cell["pushes"], cell["splits"]) == (14, SPLITS)
+        assert min(deviations) < cell["no_motion_mm"] < max(deviations)
+        assert cell["mean_mm"] < 0.5 * cell["no_motion_mm"]
+        mean = record["means"][cell["method"]][cell["model"]]
+        assert (mean["mean_mm"], mean["conditions"]) == (cell["mean_mm"], 1)
+    assert record["means"]["wrench_twist"]["quartic"] == {}
+
+
+def test_summary_of_few_pushes(few):
+    text = table2.summary(few[0])
+    quartic = [line for line in text.splitlines() if line.startswith("hardboard  quartic")]
+    assert quartic[0].endswith("1 push, needs 2" + 2 * f"{'no log':>20}")
+    assert quartic[1].split("quartic")[1].strip().startswith("7 pairs, needs 15  ")
+    assert text.count("on 1 of 8 conditions") == 3
+    assert "could not be computed" in text
+
+
+def test_picture_of_few_pushes(few):
+    from pushjax import plot
+
+    record, out = few
+    assert (out / "table2_wrench_twist.png").exists()
+    mine = [cell for cell in record["cells"] if cell["method"] == "wrench_twist"]
+    (axes,) = plot.table_figure(mine, "Few").axes
+    words = [text.get_text() for text in axes.texts]
+    assert words.count("no log") == 12
+    assert words.count("1 push, needs 2") == 2
+    assert words.count("7 pairs, needs 15") == 1
+    assert np.sum(np.isfinite([bar.get_height() for bar in axes.patches])) == 1
+    assert "quartic, this run" in legend(axes)
+
+
+def test_few_or_no_pushes():
+    train = np.zeros((2, 40), bool)
+    train[:, :20] = True
+    for method in ("ideal", "wrench_twist", "identified"):
+        assert conditions.obstacle(train, method, "quartic") is None
+        assert conditions.obstacle(None, method, "ellipsoid") == "no log"
+        assert conditions.obstacle(train[:, :1], method, "ellipsoid") == "1 push, needs 2"
+    for count, model in ((15, "quartic"), (6, "ellipsoid")):
+        few, enough = (np.arange(40)[None] < each for each in (count - 1, count))
+        assert conditions.obstacle(enough, "wrench_twist", model) is None
+        assert conditions.obstacle(few, "wrench_twist", model) == f"{count - 1} pairs, needs {count}"
+        assert conditions.obstacle(few, "identified", model) is None
+        with pytest.raises(ValueError, match=f"{count - 1} pairs; a surface .* needs at least {count}"):
+            pj.fit_limit_surface(np.ones((count - 1, 3)), np.ones((count - 1, 3)), 1.0, degree=conditions.MODELS[model])
+
+
+def test_every_split_learns_from_some_and_predicts_others(data):
+    log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")
+    for count in (2, 3, 7):
+        for share in (0.4, 0.5):
+            chosen = conditions.training(replace(log, pushes=log.pushes[:count]), share, np.random.default_rng(0))
+            assert np.all((chosen.sum(axis=1) > 0) & (chosen.sum(axis=1) < count))
+
+
+def test_a_folder_without_any_condition(tmp_path):
+    (tmp_path / "three_point_push").mkdir()
+    with pytest.raises(ValueError, match=r"hardboard_3pts1\.npz, or published logs named .* found none"):
+        experiment.run(tmp_path)
