@@ -111,7 +111,8 @@ def _pair_areas(a: _Edges, b: _Edges) -> Array:
     at_low = a.at_left(low) - b.at_left(low)
     at_high = a.at_right(high) - b.at_right(high)
     below = jnp.minimum(at_low, 0) + jnp.minimum(at_high, 0)
-    share = _safe_divide(below, jnp.abs(at_low) + jnp.abs(at_high))
+    # |d| is written as d - 2 min(d, 0), whose derivative at d = 0 matches that of `below`: the quotient's has no jump.
+    share = _safe_divide(below, at_low + at_high - 2 * below)
     return -0.5 * a.sign * b.sign * width * below * share
 
 
