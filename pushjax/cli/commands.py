@@ -202,6 +202,28 @@ class GraspButterfly(Grasp):
     slider = "butterfly"
 
 
+@dataclass
+class PushtMpc(Common):
+    """PushT in the package gym-pusht, solved by a planner whose model is pushjax."""
+
+    module = "pusht_mpc"
+
+    episodes: int = 50
+    """Number of episodes; their starts have the seeds from --seed on."""
+    lookahead: bool = True
+    """Consider plans of two pushes."""
+    cost_to_go: bool = True
+    """Far from the goal, choose pushes by the cost to go; without it, by the distance to the goal."""
+    feedback: bool = True
+    """Correct a push while it runs."""
+    friction_in_model: float = 0.0
+    """Friction at the finger in the model; the plant has none."""
+    actuation_noise: float = 0.0
+    """Standard deviation of noise on the actions, px."""
+    observation_noise: float = 0.0
+    """Standard deviation of noise on the positions that the controller sees, px."""
+
+
 EXPERIMENTS: dict[str, type[Common]] = {
     "table1": Table1,
     "table2": Table2,
@@ -212,6 +234,7 @@ EXPERIMENTS: dict[str, type[Common]] = {
     "jam": Jam,
     "grasp-rectangle": GraspRectangle,
     "grasp-butterfly": GraspButterfly,
+    "pusht-mpc": PushtMpc,
 }
 Experiment = Union[*(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in EXPERIMENTS.items())]  # pyright: ignore
 

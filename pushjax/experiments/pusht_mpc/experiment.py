@@ -1,0 +1,141 @@
+"""Success of the planner in the task PushT of `gym-pusht`, by the package's own rule.
+
+An episode succeeds if the T covers more than 95 % of the goal at the end of a control step, within 300 steps. The plant
+is `gym-pusht`, which simulates with pymunk. The controller sees the observation "state" and nothing else: positions of
+the finger and of the T, and the angle. Policies that see pixels solve a harder task.
+"""
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import beta
+
+from pushjax._internal.checks import check_count
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.experiments.pusht_mpc import player, setting
+
+PUBLISHED = (
+    {"policy": "diffusion policy (LeRobot)", "success": 0.638, "episodes": 500, "sees": "pixels"},
+    {"policy": "diffusion policy (LeRobot, later card)", "success": 0.654, "episodes": 500, "sees": "pixels"},
+    {"policy": "VQ-BeT (LeRobot)", "success": 0.638, "episodes": 500, "sees": "pixels"},
+)
+# The same rule: coverage above 0.95 within 300 steps, as the model cards of huggingface.co/lerobot give it.
+
+
+def run(
+    seed: int = 0,
+    out: Path | None = None,
+    episodes: int = 50,
+    lookahead: bool = True,
+    cost_to_go: bool = True,
+    feedback: bool = True,
+    friction_in_model: float = 0.0,
+    actuation_noise: float = 0.0,
+    observation_noise: float = 0.0,
+    progress: ProgressCallback = no_progress,
+) -> dict[str, Any]:
+    """Play episodes of PushT.
+
+    Args:
+        seed: Seed of the first episode; the others follow.
+        out: Not used, because the experiment draws nothing.
+        episodes: Number of episodes.
+        lookahead: Whether plans of two pushes are considered.
+        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
+        feedback: Whether pushes are corrected while they run.
+        friction_in_model: Coefficient of contact friction in the model; there is none in the plant.
+        actuation_noise: Standard deviation of noise on the actions, px.
+        observation_noise: Standard deviation of noise on the positions that the controller sees, px; the angle has the
+            same, in units of the T's radius of gyration.
+        progress: Called after each episode.
+
+    Returns:
+        The record, with one row per episode.
+
+    Raises:
+        ValueError: If `gym-pusht` is not installed, or a number is out of its range.
+    """
+    check_count("episodes", episodes)
+    given = {"friction_in_model": friction_in_model, "actuation_noise": actuation_noise}
+    for name, value in (given | {"observation_noise": observation_noise}).items():
+        if not (np.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must not be negative; got {value!r}")
+    plant = player.make_plant()
+    began = time.perf_counter()
+    made, setup = player.controller(
+        lookahead=lookahead,
+        cost_to_go=cost_to_go,
+        feedback=feedback,
+        friction_in_model=friction_in_model,
+        observation_noise=observation_noise * setting.PIXEL,
+    )
+    setup["total"] = time.perf_counter() - began
+    noise = {"actuation_noise": actuation_noise, "observation_noise": observation_noise}
+    played = []
+    for k in range(episodes):
+        played.append(player.play(plant, made, seed + k, **noise))
+        progress(k + 1, episodes)
+    switches = {"lookahead": lookahead, "cost_to_go": cost_to_go, "feedback": feedback}
+    settings = {"seed": seed, "episodes": episodes} | switches | given | noise | {"pace": made.planner.pace._asdict()}
+    rows = [{name: value for name, value in asdict(each).items() if name != "seconds"} for each in played]
+    return result_record("pusht-mpc", settings, **_figures(played), setup_seconds=setup, published=PUBLISHED, rows=rows)
+
+
+def _figures(played: list[player.Episode]) -> dict[str, Any]:
+    """Return the figures over all episodes."""
+    successes, count = sum(each.success for each in played), len(played)
+    steps = [each.steps for each in played if each.success]
+    seconds = np.concatenate([each.seconds for each in played])
+    return {
+        "success": successes / count,
+        "success_ci95": clopper_pearson(successes, count),
+        "mean_largest_coverage": float(np.mean([each.largest_coverage for each in played])),
+        "mean_final_coverage": float(np.mean([each.final_coverage for each in played])),
+        "steps_of_successes": {
+            "median": float(np.median(steps)),
+            "percentile_95": float(np.percentile(steps, 95)),
+            "largest": max(steps),
+        }
+        if steps
+        else None,
+        "seconds_per_step": {
+            "mean": float(seconds.mean()),
+            "percentile_95": float(np.percentile(seconds, 95)),
+            "largest": float(seconds.max()),
+        },
+    }
+
+
+def clopper_pearson(successes: int, count: int) -> tuple[float, float]:
+    """Return the exact 95 % confidence interval of a probability, from the number of successes."""
+    low = beta.ppf(0.025, successes, count - successes + 1) if successes else 0.0
+    high = beta.ppf(0.975, successes + 1, count - successes) if successes < count else 1.0
+    return float(low), float(high)
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return the text that the command prints for a record of `run`."""
+    (low, high), steps, times = record["success_ci95"], record["steps_of_successes"], record["seconds_per_step"]
+    setup, count = record["setup_seconds"], len(record["rows"])
+    successes = sum(row["success"] for row in record["rows"])
+    lines = [
+        f"PushT (gym-pusht): success in {successes} of {count} episodes (95 % interval {low:.3f} to {high:.3f})",
+        f"  coverage: largest {record['mean_largest_coverage']:.3f}, final {record['mean_final_coverage']:.3f} (means)",
+    ]
+    if steps:
+        lines.append(
+            f"  control steps of successes: median {steps['median']:g}, 95 % within {steps['percentile_95']:.0f}, "
+            f"largest {steps['largest']}"
+        )
+    lines += [
+        f"  time per control step: mean {1e3 * times['mean']:.0f} ms, 95 % within {1e3 * times['percentile_95']:.0f} "
+        f"ms, largest {1e3 * times['largest']:.0f} ms; the task's clock gives 100 ms",
+        f"  set up in {setup['total']:.1f} s" + (", the library from a file" if setup["library_from_file"] else ""),
+        "The planner reads the exact positions. Published policies that see pixels, by the same rule:",
+    ]
+    lines += [f"  {each['policy']}: {each['success']:.1%} of {each['episodes']}" for each in record["published"]]
+    return "\n".join(lines)

@@ -1,0 +1,169 @@
+"""The planner for `gym-pusht`, built once and kept in the user's cache folder, and episodes that it plays."""
+
+import hashlib
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import platformdirs
+
+import pushjax as pj
+from pushjax.experiments.pusht_mpc import setting
+from pushjax.planning.controller import Observation, PushController
+from pushjax.planning.cost_to_go import CostToGo
+from pushjax.planning.coverage_table import CoverageTable
+from pushjax.planning.push_library import PushLibrary, digest, fan
+from pushjax.planning.push_planner import PushPlanner
+
+INSTALL = "gym-pusht is not installed; `pip install gym-pusht` gets it"
+
+
+@dataclass
+class Episode:
+    """One episode.
+
+    Attributes:
+        seed: Seed of the start.
+        success: Whether the coverage was above 0.95 at the end of a control step.
+        steps: Number of control steps.
+        largest_coverage: Largest coverage at the end of a control step.
+        final_coverage: Coverage at the end of the episode.
+        pushes: Number of pushes that were planned.
+        seconds: Time of the controller in each control step, s.
+    """
+
+    seed: int
+    success: bool = False
+    steps: int = 0
+    largest_coverage: float = 0.0
+    final_coverage: float = 0.0
+    pushes: int = 0
+    seconds: list[float] = field(default_factory=list)
+
+
+def make_plant() -> Any:
+    """Return the environment.
+
+    Raises:
+        ValueError: If its package is not installed.
+    """
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import gym_pusht  # noqa: F401  # registers the environment
+        import gymnasium
+    except ImportError:
+        raise ValueError(INSTALL) from None
+    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", disable_env_checker=True)
+
+
+def cache_folder() -> Path:
+    """Return the folder in which libraries of pushes and tables of costs are kept."""
+    return platformdirs.user_cache_path("pushjax", appauthor=False) / "planning"
+
+
+def library(friction: float, folder: Path) -> tuple[PushLibrary, bool]:
+    """Return the library of pushes for a friction in the model, and whether it was read from a file."""
+    slider, hand = setting.slider(), pj.Hand.finger(setting.FINGER_RADIUS)
+    starts, directions = fan(slider, setting.FINGER_RADIUS)
+    wanted = digest(slider, hand, starts, directions, friction)
+    path = folder / f"pushes-{wanted[:16]}.npz"
+    if path.exists():
+        return PushLibrary.load(path, wanted), True
+    built = PushLibrary.build(slider, setting.FINGER_RADIUS, friction=friction)
+    folder.mkdir(parents=True, exist_ok=True)
+    built.save(path)
+    return built, False
+
+
+def controller(
+    folder: Path | None = None,
+    *,
+    lookahead: bool = True,
+    cost_to_go: bool = True,
+    feedback: bool = True,
+    friction_in_model: float = 0.0,
+    observation_noise: float = 0.0,
+) -> tuple[PushController, dict[str, Any]]:
+    """Build the controller, or read its tables from files.
+
+    Args:
+        folder: Folder of the files. None: `cache_folder`.
+        lookahead: Whether plans of two pushes are considered.
+        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
+        feedback: Whether pushes are corrected while they run.
+        friction_in_model: Coefficient of contact friction in the model; there is none in the plant.
+        observation_noise: Standard deviation of what is seen, m.
+
+    Returns:
+        The controller, and how long its parts took to set up, s.
+    """
+    folder, began = folder or cache_folder(), time.perf_counter()
+    slider, goal = setting.slider(), setting.goal()
+    pushes, loaded = library(friction_in_model, folder)
+    times: dict[str, Any] = {"library": time.perf_counter() - began, "library_from_file": loaded}
+    began = time.perf_counter()
+    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
+    measure = CoverageTable(vertices, pushes.center, pushes.length, setting.ENOUGH)
+    pace = setting.pace()
+    name = hashlib.sha256(f"{pushes.digest} {pace} {goal}".encode()).hexdigest()[:16]
+    file = folder / f"cost-{name}.npz"
+    value: CostToGo | bool | None = (CostToGo.load(file) if file.exists() else None) if cost_to_go else False
+    planner = PushPlanner(
+        slider,
+        setting.FINGER_RADIUS,
+        pushes,
+        goal,
+        measure,
+        setting.workspace(),
+        pace,
+        look_ahead=lookahead,
+        value=value,
+    )
+    if value is None and planner.value is not None:
+        planner.value.save(file)
+    planner.prepare()
+    times["tables"] = time.perf_counter() - began
+    began = time.perf_counter()
+    made = PushController(
+        planner, setting.finger_control(), friction=friction_in_model, feedback=feedback, noise=observation_noise
+    )
+    made.prepare()
+    return made, times | {"feedback": time.perf_counter() - began}
+
+
+def play(
+    plant: Any, made: PushController, seed: int, *, actuation_noise: float = 0.0, observation_noise: float = 0.0
+) -> Episode:
+    """Play one episode.
+
+    Args:
+        plant: The environment, from `make_plant`.
+        made: The controller.
+        seed: Seed of the start and of the noise.
+        actuation_noise: Standard deviation of normal noise on each number of the action, px.
+        observation_noise: Standard deviation of normal noise on each position that the controller sees, px, and on the
+            angle, in units of the surface's length.
+    """
+    rng = np.random.default_rng([seed, 1])
+    turn = observation_noise / np.sqrt(setting.INERTIA)
+    scale = np.array([observation_noise] * 4 + [turn])
+    seen, _ = plant.reset(seed=seed)
+    memory, episode, key = made.initial_memory(), Episode(seed), jax.random.key(seed)
+    while True:
+        noisy = seen + scale * rng.standard_normal(5)
+        began = time.perf_counter()
+        observation = Observation(setting.PIXEL * noisy[:2], setting.from_gym(noisy[2:4], noisy[4]))
+        action, memory = made(key, observation, memory)
+        episode.seconds.append(time.perf_counter() - began)
+        action = action / setting.PIXEL + actuation_noise * rng.standard_normal(2)
+        seen, _, terminated, truncated, info = plant.step(np.clip(action, 0, 512))
+        episode.steps += 1
+        episode.final_coverage = float(info["coverage"])
+        episode.largest_coverage = max(episode.largest_coverage, episode.final_coverage)
+        if terminated or truncated or episode.steps == setting.STEPS:
+            episode.success, episode.pushes = bool(terminated), memory.pushes
+            return episode

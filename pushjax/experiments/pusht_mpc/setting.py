@@ -1,0 +1,56 @@
+"""The task PushT in SI units: slider, finger, workspace and goal of the package `gym-pusht`.
+
+One pixel of `gym-pusht` is 1 mm here. The body frame of the slider is at the T's center of gravity. In `gym-pusht` all
+velocity is lost in each time step, so a step's motion is the impulse divided by mass and inertia. That is the motion
+under an elliptic limit surface whose length is the square root of inertia over mass. There is no friction at the
+finger: the coefficients of the shapes are zero.
+"""
+
+import numpy as np
+
+import pushjax as pj
+from pushjax.planning.finger_control import SpringDamper
+from pushjax.planning.pace import Pace
+from pushjax.planning.workspace import Workspace
+
+PIXEL = 1e-3  # m
+CENTER_OF_GRAVITY = np.array([0.0, 45.0])  # px, in the body frame of gym-pusht
+CORNERS = np.array([(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)], float)
+INERTIA = 3000.0  # of unit mass, px^2
+FINGER_RADIUS = 15 * PIXEL
+GOAL = (256.0, 256.0, np.pi / 4)  # of the body frame of gym-pusht, px and rad
+ENOUGH = 0.95  # coverage from which an episode is a success
+STEPS = 300  # usual limit of an episode
+
+
+def slider() -> pj.Slider:
+    """Return the T."""
+    length = PIXEL * np.sqrt(INERTIA)
+    return pj.Slider(pj.Polygon(PIXEL * (CORNERS - CENTER_OF_GRAVITY)), pj.Ellipsoid(np.eye(3), length))
+
+
+def workspace() -> Workspace:
+    """Return the limits: of the finger a little within those of actions, of the T a little within the walls."""
+    return Workspace(*(PIXEL * np.full(2, each) for each in (2.0, 510.0, 8.0, 504.0)))
+
+
+def finger_control() -> SpringDamper:
+    """Return the model of the finger: ten substeps of 10 ms."""
+    return SpringDamper(100.0, 20.0, 0.01, 10, low=np.zeros(2), high=np.full(2, 512 * PIXEL))
+
+
+def pace() -> Pace:
+    """Return the speeds at which the planner moves the finger."""
+    return Pace(free=60 * PIXEL, push=24 * PIXEL, acceleration=20 * PIXEL)
+
+
+def from_gym(position: np.ndarray, angle: float) -> np.ndarray:
+    """Return the pose of the center of gravity, m and rad, for the position (px) and angle of gym-pusht's body."""
+    c, s = np.cos(angle), np.sin(angle)
+    (x, y), (px, py) = position, CENTER_OF_GRAVITY
+    return np.array([PIXEL * (x + c * px - s * py), PIXEL * (y + s * px + c * py), angle])
+
+
+def goal() -> np.ndarray:
+    """Return the goal of the center of gravity, (3,), m and rad."""
+    return from_gym(np.array(GOAL[:2]), GOAL[2])

@@ -1,0 +1,241 @@
+"""Ways of a round finger around a polygon that do not touch it.
+
+The shortest way around a polygon at a given distance consists of straight segments and of arcs around convex corners.
+`Roadmap` has a few points just outside of each such arc; the segments between points that see each other are a
+visibility graph. Start and goal are joined to it by the segments that keep the distance too.
+
+A finger that has just pushed is nearer than that distance, so it first retreats, straight to where it has the distance.
+The goal of an approach is the start of a push, which may be nearer too. The finger gets there along the direction of
+the push, from a point that has the distance: so a push begins with a run-up.
+
+The graph is fixed in the frame of the polygon. Where the limits of the workspace cut a point off, the point is moved to
+the limit and its segments are checked anew.
+"""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+
+from pushjax._internal.checks import check_positive
+from pushjax.planning.clearance import point_clearance, segment_clearance, turns
+from pushjax.planning.poses import to_body, to_world
+from pushjax.planning.workspace import Workspace
+
+ARC_STEP = np.pi / 4  # largest angle between neighboring points around a corner
+OUTSIDE = 1e-3  # points are outside of the arc by this part of its radius, so that segments along it keep the distance
+RETREATS = 24  # directions in which a retreat is tried
+
+
+class WayStatus(IntEnum):
+    """Why there is a way, or none."""
+
+    FOUND = 0
+    START_IN_SLIDER = 1
+    NO_RETREAT = 2
+    GOAL_BLOCKED = 3
+    NO_WAY = 4
+
+
+class Way(NamedTuple):
+    """A way of the finger's center.
+
+    Attributes:
+        points: Its corners, (points, 2), world, m; only the start if there is no way.
+        length: Its length, m; infinite if there is no way.
+        status: Whether there is a way, and why not.
+    """
+
+    points: np.ndarray
+    length: float
+    status: WayStatus
+
+
+class Ways(NamedTuple):
+    """Shortest ways from one start to many goals; `Roadmap.way` traces one of them.
+
+    Attributes:
+        lengths: Length of the way to each goal, (goals,), m, infinite where there is none.
+        status: FOUND, or why no goal can be reached at all.
+        points: The corners that ways may have, the start first, (nodes, 2), body frame.
+        previous: For each of these, the one before it on the shortest way from the start.
+        last: For each goal, the last of the corners on the way to it.
+    """
+
+    lengths: np.ndarray
+    status: WayStatus
+    points: np.ndarray
+    previous: np.ndarray
+    last: np.ndarray
+
+
+class Roadmap:
+    """Points around a polygon and the segments between them that a round finger can move along.
+
+    Args:
+        vertices: Vertices of the polygon, counterclockwise, (vertices, 2), m.
+        radius: Radius of the finger, m.
+        clearance: Distance that the finger keeps from the polygon on its way, m, positive.
+        goals: Ends of the ways, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
+            reached.
+    """
+
+    def __init__(self, vertices: np.ndarray, radius: float, clearance: float, goals: np.ndarray):
+        check_positive("clearance", clearance)
+        self.vertices, self.radius, self.apart = vertices, radius, radius + clearance
+        self.clearance, self.goals = clearance, np.asarray(goals, float)
+        points = _corner_points(vertices, self.apart * (1 + OUTSIDE))
+        self.nodes = points[point_clearance(vertices, points) >= self.apart]
+        self.goal_clearance = point_clearance(vertices, self.goals)
+        self.links = self._lengths(self.nodes[:, None], self.goals, at_end=self.goal_clearance)
+
+    def ways(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Ways:
+        """Find the shortest ways from one point to all goals.
+
+        Args:
+            start: Center of the finger, (2,), world, m.
+            pose: Pose of the polygon, (3,), m and rad.
+            workspace: Where the finger may be.
+        """
+        body_start = to_body(pose, np.asarray(start, float))
+        begin, status = self._retreat(body_start, pose, workspace)
+        if status != WayStatus.FOUND:
+            return self._none(body_start, status)
+        nodes, links = self._within(pose, workspace)
+        corners = np.concatenate([begin[-1:], nodes])
+        graph = self._lengths(corners[:, None], corners)
+        graph[np.isinf(graph)] = 0  # no edge
+        distance, previous = dijkstra(graph, indices=0, return_predecessors=True)
+        direct = self._lengths(begin[-1], self.goals, at_end=self.goal_clearance)
+        total = distance[:, None] + np.concatenate([direct[None], links])
+        total[:, ~workspace.allows_finger(to_world(pose, self.goals))] = np.inf
+        last = np.argmin(total, axis=0)
+        lengths = total[last, np.arange(len(self.goals))]
+        if len(begin) > 1:  # the retreat comes first
+            corners = np.concatenate([corners, begin[:1]])
+            previous = np.append(previous, -1)
+            previous[0] = len(corners) - 1
+            lengths = lengths + np.linalg.norm(begin[1] - begin[0])
+        status = WayStatus.FOUND if np.isfinite(lengths).any() else WayStatus.NO_WAY
+        return Ways(lengths, status, corners, previous, last)
+
+    def way(self, ways: Ways, goal: int, pose: np.ndarray) -> Way:
+        """Return the shortest way to one goal.
+
+        Args:
+            ways: Result of `ways`.
+            goal: Index of the goal.
+            pose: Pose of the polygon that `ways` was given.
+        """
+        if not np.isfinite(ways.lengths[goal]):
+            blocked = self.goal_clearance[goal] < self.apart
+            status = ways.status if ways.status != WayStatus.FOUND else WayStatus.NO_WAY
+            reached = status == WayStatus.NO_WAY and blocked
+            at = ways.points[:1] if ways.previous[0] < 0 else ways.points[-1:]
+            return Way(to_world(pose, at), np.inf, WayStatus.GOAL_BLOCKED if reached else status)
+        corner, points = int(ways.last[goal]), [self.goals[goal]]
+        while corner >= 0:
+            points.append(ways.points[corner])
+            corner = int(ways.previous[corner])
+        return Way(to_world(pose, np.array(points[::-1])), float(ways.lengths[goal]), WayStatus.FOUND)
+
+    def between(self, starts: np.ndarray) -> np.ndarray:
+        """Return the lengths of the shortest ways from points to all goals, without limits of a workspace.
+
+        Args:
+            starts: Points that have the clearance, (points, 2), body frame, m.
+
+        Returns:
+            The lengths, (points, goals), m, infinite where there is no way.
+        """
+        at = point_clearance(self.vertices, starts)
+        direct = self._lengths(starts[:, None], self.goals, at[:, None], self.goal_clearance)
+        graph = self._lengths(self.nodes[:, None], self.nodes)
+        graph[np.isinf(graph)] = 0
+        from_nodes = np.min(dijkstra(graph)[..., None] + self.links, axis=1)  # (nodes, goals)
+        to_nodes = self._lengths(starts[:, None], self.nodes, at[:, None])
+        through = np.stack([np.min(row[:, None] + from_nodes, axis=0) for row in to_nodes])
+        return np.minimum(direct, through)
+
+    def _lengths(self, start, end, at_start=None, at_end=None) -> np.ndarray:
+        """Return the lengths of segments, infinite where they do not keep the distance."""
+        free = segment_clearance(self.vertices, start, end, at_start, at_end) >= self.apart * (1 - 1e-9)
+        return np.where(free, np.linalg.norm(end - start, axis=-1), np.inf)
+
+    def _within(self, pose: np.ndarray, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
+        """Return the nodes, moved to the limits of the workspace where they are outside, and their links to goals."""
+        world = to_world(pose, self.nodes)
+        allowed = workspace.allows_finger(world)
+        if allowed.all():
+            return self.nodes, self.links
+        clipped = np.clip(world, workspace.finger_low, workspace.finger_high)
+        nodes = np.where(allowed[:, None], self.nodes, to_body(pose, clipped))
+        links = self.links.copy()
+        links[~allowed] = self._lengths(nodes[~allowed][:, None], self.goals, at_end=self.goal_clearance)
+        return nodes, links
+
+    def _retreat(self, start: np.ndarray, pose, workspace: Workspace) -> tuple[np.ndarray, WayStatus]:
+        """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2)."""
+        have = float(point_clearance(self.vertices, start))
+        if have >= self.apart:
+            return start[None], WayStatus.FOUND
+        if have <= 0:
+            return start[None], WayStatus.START_IN_SLIDER
+        angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
+        reach = (self.apart - have) * np.array([1.0, 1.5, 2.0, 3.0]) + 1e-3 * self.clearance
+        ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+        apart = point_clearance(self.vertices, ends)
+        # all along the way, at least as far as at its start; the margin excludes sliding along an edge
+        halfway = point_clearance(self.vertices, start + 0.2 * (ends - start)) > have + 0.02 * (self.apart - have)
+        free = segment_clearance(self.vertices, start, ends, at_end=apart) >= have * (1 - 1e-9)
+        good = free & halfway & (apart >= self.apart) & workspace.allows_finger(to_world(pose, ends))
+        if not good.any():
+            return start[None], WayStatus.NO_RETREAT
+        best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
+        return np.stack([start, ends[best]]), WayStatus.FOUND
+
+    def _none(self, start: np.ndarray, status: WayStatus) -> Ways:
+        count = len(self.goals)
+        return Ways(np.full(count, np.inf), status, start[None], np.array([-1]), np.zeros(count, int))
+
+
+def run_ups(
+    vertices: np.ndarray, radius: float, clearance: float, starts: np.ndarray, directions: np.ndarray, longest: float
+) -> np.ndarray:
+    """Return how far before its start each push can begin, without touching the polygon and with the clearance there.
+
+    Args:
+        vertices: Vertices of the polygon, counterclockwise, (vertices, 2), m.
+        radius: Radius of the finger, m.
+        clearance: Distance of the finger from the polygon at the beginning, m.
+        starts: Starts of the pushes, (pushes, 2), m.
+        directions: Unit vectors of the pushes, (pushes, 2).
+        longest: Largest run-up, m.
+
+    Returns:
+        The run-ups, (pushes,), m; NaN where there is none.
+    """
+    have = point_clearance(vertices, starts)
+    found = np.full(len(starts), np.nan)
+    for length in np.linspace(longest, 0.0, 9):
+        begin = starts - length * directions
+        apart = point_clearance(vertices, begin)
+        keeps = segment_clearance(vertices, begin, starts, apart, have) >= np.minimum(have, radius + clearance) * 0.999
+        found = np.where(np.isnan(found) & keeps & (apart >= radius + clearance), length, found)
+    return found
+
+
+def _corner_points(vertices: np.ndarray, distance: float) -> np.ndarray:
+    """Return points around the convex corners, such that the segments between neighbors keep the distance."""
+    edge = np.roll(vertices, -1, axis=0) - vertices
+    heading = np.arctan2(edge[:, 1], edge[:, 0])
+    points = []
+    for vertex, turn, leaving in zip(vertices, turns(vertices), heading, strict=True):
+        if turn <= 0:
+            continue
+        count = max(1, int(np.ceil(turn / ARC_STEP)))
+        half = turn / count / 2
+        normal = leaving - turn - np.pi / 2 + half + 2 * half * np.arange(count)
+        points.append(vertex + distance / np.cos(half) * np.stack([np.cos(normal), np.sin(normal)], axis=1))
+    return np.concatenate(points)

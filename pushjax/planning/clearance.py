@@ -1,0 +1,129 @@
+"""Distances of points and segments from a polygon, and the curve at a given distance around it, in NumPy.
+
+Planners ask for thousands of distances at a time, outside of any compiled program. All points are in the polygon's own
+frame, in m.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pushjax.geometry.polygon import Polygon
+from pushjax.geometry.shape import Shape
+
+CURVE_POINTS = 96  # vertices of the polygon that stands for a curved outline
+
+
+def outline_vertices(shape: Shape) -> np.ndarray:
+    """Return the vertices of a polygon, or points on the outline of another shape, counterclockwise, (vertices, 2)."""
+    points = shape.vertices if isinstance(shape, Polygon) else shape.boundary(CURVE_POINTS)
+    return np.asarray(points, np.float64)
+
+
+def point_clearance(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the distance of points from a polygon, negative inside.
+
+    Args:
+        vertices: Vertices, counterclockwise, (vertices, 2).
+        points: Points, (..., 2).
+    """
+    start, end = vertices, np.roll(vertices, -1, axis=0)
+    edge = end - start
+    offset = points[..., None, :] - start
+    along = np.clip((offset * edge).sum(-1) / (edge**2).sum(-1), 0, 1)
+    distance = np.sqrt(((offset - along[..., None] * edge) ** 2).sum(-1).min(-1))
+    return np.where(inside(vertices, points), -distance, distance)
+
+
+def inside(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return whether points are inside of a polygon, by the crossings of a ray along +x, (...,)."""
+    (xa, ya), (xb, yb) = vertices.T, np.roll(vertices, -1, axis=0).T
+    x, y = points[..., :1], points[..., 1:]
+    spans = (ya > y) != (yb > y)
+    slope = (xb - xa) / np.where(yb == ya, 1, yb - ya)
+    return ((spans & (x < xa + slope * (y - ya))).sum(-1) % 2).astype(bool)
+
+
+def segment_clearance(
+    vertices: np.ndarray,
+    start: np.ndarray,
+    end: np.ndarray,
+    at_start: np.ndarray | None = None,
+    at_end: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the distance of segments from a polygon, zero or negative where they touch it.
+
+    Args:
+        vertices: Vertices, counterclockwise, (vertices, 2).
+        start: First points, (..., 2).
+        end: Last points, (..., 2).
+        at_start: `point_clearance` of the first points where it is known, (...,).
+        at_end: The same for the last points.
+    """
+    start, end = np.broadcast_arrays(start, end)
+    at_start = point_clearance(vertices, start) if at_start is None else at_start
+    at_end = point_clearance(vertices, end) if at_end is None else at_end
+    step = (end - start)[..., None, :]
+    offset = vertices - start[..., None, :]
+    length2 = (step**2).sum(-1)
+    along = np.clip((offset * step).sum(-1) / np.where(length2 > 0, length2, 1), 0, 1)
+    from_vertices = np.sqrt(((offset - along[..., None] * step) ** 2).sum(-1).min(-1))
+    # a segment crosses an edge if each of the two has its ends on both sides of the other
+    side = step[..., 0] * offset[..., 1] - step[..., 1] * offset[..., 0]
+    edge = np.roll(vertices, -1, axis=0) - vertices
+    start_side = edge[:, 1] * offset[..., 0] - edge[:, 0] * offset[..., 1]
+    end_side = start_side + edge[:, 0] * step[..., 1] - edge[:, 1] * step[..., 0]
+    crosses = (side * np.roll(side, -1, axis=-1) < 0) & (start_side * end_side < 0)
+    apart = np.minimum(np.minimum(at_start, at_end), from_vertices)
+    return np.where(crosses.any(-1), np.minimum(apart, 0.0), apart)
+
+
+class OffsetCurve(NamedTuple):
+    """Points at one distance from a polygon, at equal spacing.
+
+    Attributes:
+        points: The points, (points, 2), m.
+        normals: Unit vectors from each point to the nearest point of the polygon, (points, 2).
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+
+
+def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCurve:
+    """Return points all around a polygon at one distance from it.
+
+    Args:
+        vertices: Vertices, counterclockwise, (vertices, 2), m.
+        distance: The distance, m.
+        count: Number of points on the curve made of shifted edges and of arcs around convex corners. Parts of it that
+            are nearer to another edge are left out, so there are fewer points where the polygon has reflex corners.
+
+    Returns:
+        The points in order around the polygon.
+    """
+    edge = np.roll(vertices, -1, axis=0) - vertices
+    length = np.linalg.norm(edge, axis=1)
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / length[:, None]
+    turn = turns(vertices)
+    arc = distance * np.maximum(np.roll(turn, -1), 0)  # at the end of each edge
+    ends = np.cumsum(np.stack([length, arc], axis=1).ravel())
+    at = (np.arange(count) + 0.5) / count * ends[-1]
+    piece = np.searchsorted(ends, at, side="right")
+    along = at - np.where(piece > 0, ends[piece - 1], 0.0)
+    k, on_arc = piece // 2, piece % 2 == 1
+    angle = np.where(on_arc, along / distance, 0.0)
+    c, s = np.cos(angle), np.sin(angle)
+    away = np.stack([c * outward[k, 0] - s * outward[k, 1], s * outward[k, 0] + c * outward[k, 1]], axis=1)
+    fraction = np.where(on_arc, 1.0, along / length[k])
+    points = vertices[k] + fraction[:, None] * edge[k] + distance * away
+    keep = point_clearance(vertices, points) > distance * (1 - 1e-9) - 1e-12
+    return OffsetCurve(points[keep], -away[keep])
+
+
+def turns(vertices: np.ndarray) -> np.ndarray:
+    """Return the angle by which the outline turns at each vertex, rad, positive at convex corners, (vertices,)."""
+    after = np.roll(vertices, -1, axis=0) - vertices
+    before = np.roll(after, 1, axis=0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    return np.arctan2(cross, (before * after).sum(1))

@@ -1,0 +1,220 @@
+"""Feedback: from what is seen, the next action of the finger.
+
+The controller is a state machine. It plans a push, goes around the slider to its start, pushes, and plans anew.
+
+Going: the finger follows the way as fast as its speed limits allow. Each action is tried on the model of the finger
+    first; a step that would come too near to the slider is shortened.
+Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
+    that are seen; the end whose final pose is nearest to the target is taken.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from pushjax.planning.approach import Way, WayStatus
+from pushjax.planning.clearance import point_clearance
+from pushjax.planning.finger_control import FingerControl, FingerState
+from pushjax.planning.poses import compose, inverse, to_body
+from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
+from pushjax.planning.push_planner import PlannedPush, PlanStatus, PushPlanner
+from pushjax.simulation.hand import Hand
+
+# Lengths in units of the surface's length
+ARRIVED = 0.007  # distance from a point at which the finger has arrived
+MOVED = 0.03  # motion of the slider on the way to a push, from which the push is planned anew
+CLOSE = 0.01  # distance from the slider that each point of a control step must have on the way, besides the radius
+SLOWER = np.array([1.0, 0.75, 0.5, 0.3, 0.15, 0.05])  # parts of a control step that are tried
+# Ends of a push that are tried around the planned one, along the push and across, in units of the surface's length
+ALONG = np.array([-0.22, -0.15, -0.09, -0.055, -0.027, 0, 0.027, 0.055, 0.09, 0.15, 0.22])
+ACROSS = np.array([-0.15, -0.09, -0.055, -0.027, -0.013, 0, 0.013, 0.027, 0.055, 0.09, 0.15])
+FINE, FULL = 0.25, 0.73  # the ends are this part as far apart at the end, and at FULL from there as far as above
+SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
+
+
+class Observation(NamedTuple):
+    """What the controller sees.
+
+    Attributes:
+        finger: Center of the finger, (2,), world, m.
+        pose: Pose of the slider, (3,), world, m and rad.
+    """
+
+    finger: np.ndarray
+    pose: np.ndarray
+
+
+class Memory(NamedTuple):
+    """What the controller remembers between control steps.
+
+    Attributes:
+        push: The push that is going on, or None.
+        pushing: Whether the finger is in the push, not on the way to it.
+        pose: Pose of the slider when the push was planned.
+        end: Where the push ends, as corrected, (2,), world, m.
+        along: How far along the way the finger is, m.
+        speed: Length of the last control step, m.
+        velocity: Velocity of the finger by its own model, (2,), m/s.
+        pushes: Number of pushes so far.
+        waited: Number of control steps in which there was no push to make.
+        status: Status of the last plan.
+    """
+
+    push: PlannedPush | None
+    pushing: bool
+    pose: np.ndarray
+    end: np.ndarray
+    along: float
+    speed: float
+    velocity: np.ndarray
+    pushes: int
+    waited: int
+    status: PlanStatus
+
+
+class PushController:
+    """Brings the slider of a planner to its goal, with a finger that moves as `control` says.
+
+    Args:
+        planner: Chooses the pushes.
+        control: Model of the finger.
+        friction: Coefficient of contact friction, as the library of the planner has it.
+        feedback: Whether the end of a push is corrected while it runs.
+        noise: Standard deviation of the positions that are seen, m.
+    """
+
+    def __init__(
+        self,
+        planner: PushPlanner,
+        control: FingerControl,
+        *,
+        friction: float = 0.0,
+        feedback: bool = True,
+        noise: float = 0.0,
+    ):
+        self.planner, self.control, self.friction, self.feedback = planner, control, friction, feedback
+        self.hand = Hand.finger(planner.radius)
+        self.length = planner.library.length
+        grid = np.stack(np.meshgrid(ALONG, ACROSS, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.offsets = self.length * grid
+        self.moved = MOVED * self.length + 4 * noise
+        self.arrived = ARRIVED * self.length + noise
+        if len(grid) > GROUP:
+            raise ValueError(f"there are {len(grid)} ends to try; at most {GROUP} are simulated together")
+
+    def initial_memory(self) -> Memory:
+        """Return the memory of the first control step; the finger is at rest."""
+        zero = np.zeros(2)
+        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, PlanStatus.NO_PUSH)
+
+    def prepare(self) -> None:
+        """Compile the program of the feedback, which is else compiled when it is first needed."""
+        if self.feedback:
+            far = self.planner.goal[:2] + 10 * self.length
+            aim = np.zeros(2)
+            push = PlannedPush(
+                PlanStatus.ONE_PUSH, Way(aim[None], 0.0, WayStatus.FOUND), aim, aim, self.planner.goal, 0.0
+            )
+            self._corrected(far, self.planner.goal, far + 0.1 * self.length, push)
+
+    def __call__(self, key: PRNGKeyArray, observation: Observation, memory: Memory) -> tuple[np.ndarray, Memory]:
+        """Return the next action and the memory after it.
+
+        Args:
+            key: Key of the random costs that end a cycle of pushes.
+            observation: What is seen now.
+            memory: Result of the control step before, or `initial_memory`.
+        """
+        state = FingerState(np.asarray(observation.finger, float), memory.velocity)
+        pose = np.asarray(observation.pose, float)
+        for _ in range(3):  # a push may be over at once
+            if memory.push is None:
+                memory = self._plan(key, state, pose, memory)
+                if memory.push is None:
+                    return self._finish(state, state.position, memory._replace(waited=memory.waited + 1))
+            if not memory.pushing:
+                target, memory = self._go(state, pose, memory)
+            else:
+                target, memory = self._push(state, pose, memory)
+            if target is not None:
+                return self._finish(state, target, memory)
+        return self._finish(state, state.position, memory)
+
+    def _finish(self, state: FingerState, target: np.ndarray, memory: Memory) -> tuple[np.ndarray, Memory]:
+        action = self.control.action(state, target)
+        return action, memory._replace(velocity=self.control.after(state, action).velocity)
+
+    def _plan(self, key: PRNGKeyArray, state: FingerState, pose: np.ndarray, memory: Memory) -> Memory:
+        """Plan a push. If there is none, `push` stays None."""
+        shake = None
+        if memory.pushes > SHAKE_AFTER:
+            seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, memory.pushes))).ravel().tolist()
+            shake = np.abs(np.random.default_rng(seed).normal(0, memory.pushes, len(self.planner.library.starts)))
+        push = self.planner.choose(pose, state.position, shake)
+        planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0)
+        if push.status.failed:
+            return planned._replace(push=None)
+        return planned._replace(push=push, end=push.end, pushes=memory.pushes + 1)
+
+    def _go(self, state: FingerState, pose: np.ndarray, memory: Memory) -> tuple[np.ndarray | None, Memory]:
+        """Return the next target on the way to a push, or None if the push begins or must be planned anew."""
+        features = self.planner.library.features
+        if np.linalg.norm(features(pose) - features(memory.pose)) > self.moved:
+            return None, memory._replace(push=None)
+        push = memory.push
+        assert push is not None
+        points = np.concatenate([push.way.points, push.start[None]])
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        total, run_up = lengths[-1], lengths[-1] - lengths[-2]
+        pace, left = self.planner.pace, total - memory.along
+        if left <= run_up + self.arrived and left <= pace.push:
+            return None, memory._replace(pushing=True)
+        # slow enough at the start of the push
+        braking = np.sqrt(pace.push**2 + 2 * pace.acceleration * max(left, 0.0))
+        speed = pace.next_speed(memory.speed, left + pace.push, min(pace.free, braking))
+        ahead = np.minimum(memory.along + speed * SLOWER, total)
+        targets = np.stack([np.interp(ahead, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
+        motions = self.control.motion(state, self.control.action(state, targets))
+        apart = point_clearance(self.planner.vertices, to_body(pose, motions)).min(-1) - self.planner.radius
+        now = float(point_clearance(self.planner.vertices, to_body(pose, state.position))) - self.planner.radius
+        needed = min(CLOSE * self.length, now + 1e-3 * self.length)
+        good = np.flatnonzero(apart >= needed)
+        best = int(good[0]) if len(good) else int(np.argmax(apart))
+        return targets[best], memory._replace(along=float(ahead[best]), speed=float(ahead[best] - memory.along))
+
+    def _push(self, state: FingerState, pose: np.ndarray, memory: Memory) -> tuple[np.ndarray | None, Memory]:
+        """Return the next target in a push, or None if the push is over."""
+        push, pace = memory.push, self.planner.pace
+        assert push is not None
+        end = memory.end
+        if self.feedback and np.linalg.norm(end - state.position) < LEG * self.planner.library.travel[1]:
+            end = self._corrected(state.position, pose, end, push)
+        way = end - state.position
+        left = float(np.linalg.norm(way))
+        if left < self.arrived:
+            return None, memory._replace(push=None, pushing=False, speed=0.0)
+        speed = pace.next_speed(memory.speed, left, pace.push)
+        return state.position + way * (speed / left), memory._replace(end=end, speed=speed)
+
+    def _corrected(self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush) -> np.ndarray:
+        """Return the end, of those around `end`, from which the slider comes nearest to the push's target."""
+        way = end - finger
+        left = float(np.linalg.norm(way))
+        along = way / left if left > 1e-9 else np.array([1.0, 0.0])
+        across = np.array([-along[1], along[0]])
+        scale = min(1.0, FINE + left / (FULL * self.length) * (1 - FINE))
+        ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)
+        paths = finger + (ends - finger)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
+        poses, _ = simulate_pushes(
+            self.planner.slider, self.hand, paths, np.broadcast_to(pose, (len(ends), 3)), self.friction
+        )
+        final = poses[:, -1].astype(float)
+        features = self.planner.library.features
+        missed = np.linalg.norm(features(final) - features(push.target), axis=1)
+        cost = (missed + 0.02 * np.linalg.norm(ends - end, axis=1)) / self.length
+        if push.status == PlanStatus.ONE_PUSH:
+            score = self.planner.measure(compose(inverse(self.planner.goal), final))
+            cost = 7.3 * (1 - score) + 0.1 * cost
+        return ends[np.argmin(cost)]

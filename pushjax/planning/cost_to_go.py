@@ -1,0 +1,192 @@
+"""Number of control steps from any pose to the goal, by value iteration over a library of pushes.
+
+Poses are on a grid: positions at equal spacing, and angles, which are periodic. The pushes that start at one angle
+move the slider by the same displacements wherever it is. So for each angle, a push that ends near the center of a cell
+stands for all pushes into that cell, and one sweep of the iteration takes minima of shifted grids.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pushjax.planning.poses import compose, inverse, to_world
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.workspace import Extent, Workspace
+
+NEVER = 1e3  # cost of poses from which the goal is not reached
+POSITIONS, ANGLES = 36, 36  # cells of the grid along x and y each, and around
+SWEEPS = 12
+CHANGE = 0.5  # control steps; smaller changes end the iteration
+NEAR_CENTER = 0.35  # a push stands for a cell if it ends within this part of a cell from the cell's center
+
+
+class CostToGo(NamedTuple):
+    """Cost of the poses on a grid, and of poses between them by interpolation.
+
+    Attributes:
+        origin: Position of the first cell, (2,), m.
+        spacing: Distance of the cells, m.
+        values: Costs, (positions, positions, angles), control steps.
+    """
+
+    origin: np.ndarray
+    spacing: float
+    values: np.ndarray
+
+    def nearest(self, poses: np.ndarray) -> np.ndarray:
+        """Return the cost at the nearest cell of poses (..., 3), (...,)."""
+        i, j, k = np.moveaxis(np.rint(self._cells(poses)).astype(np.int32), -1, 0)
+        rows, columns, angles = self.values.shape
+        return self.values[np.clip(i, 0, rows - 1), np.clip(j, 0, columns - 1), k % angles]
+
+    def __call__(self, poses: np.ndarray) -> np.ndarray:
+        """Return the cost of poses (..., 3) by linear interpolation, (...,)."""
+        cells = self._cells(poses)
+        rows, columns, angles = self.values.shape
+        cells[..., :2] = np.clip(cells[..., :2], 0, np.array([rows - 1.001, columns - 1.001]))
+        low = np.floor(cells).astype(np.int32)
+        part = cells - low
+        total = np.zeros(cells.shape[:-1])
+        for corner in np.ndindex(2, 2, 2):
+            i, j, k = np.moveaxis(low + np.array(corner), -1, 0)
+            weight = np.prod(np.where(corner, part, 1 - part), axis=-1)
+            total = total + weight * self.values[i, j, k % angles]
+        return total
+
+    def save(self, path: str | Path) -> None:
+        """Write the table to a file in NumPy's format "npz"."""
+        np.savez_compressed(path, **self._asdict())
+
+    @staticmethod
+    def load(path: str | Path) -> "CostToGo":
+        """Read a table that `save` wrote.
+
+        Raises:
+            ValueError: If the file holds none.
+        """
+        try:
+            with np.load(path) as file:
+                origin, spacing, values = (file[name] for name in CostToGo._fields)
+        except (KeyError, ValueError, EOFError) as error:
+            raise ValueError(f"{path} does not hold a cost to go: {error}") from error
+        return CostToGo(origin, float(spacing), values)
+
+    def _cells(self, poses: np.ndarray) -> np.ndarray:
+        """Return positions in the grid, in units of cells, (..., 3)."""
+        angles = self.values.shape[2]
+        return np.concatenate(
+            [(poses[..., :2] - self.origin) / self.spacing, poses[..., 2:] * (angles / (2 * np.pi))], axis=-1
+        )
+
+
+def cost_to_go(
+    library: PushLibrary,
+    goal: np.ndarray,
+    workspace: Workspace,
+    push_time: np.ndarray,
+    *,
+    usable: np.ndarray,
+    tolerance: float,
+    between: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    vertices: np.ndarray,
+) -> CostToGo:
+    """Compute the cost to go by value iteration.
+
+    Args:
+        library: Outcomes of pushes.
+        goal: The goal, (3,), world, m and rad.
+        workspace: Limits of finger and slider.
+        push_time: Control steps of each entry of the library, (entries,).
+        usable: Whether the finger can get to the start of each push, (pushes,).
+        tolerance: A push reaches the goal if its final pose is within this distance, m.
+        between: Control steps between two pushes.
+        low: Lowest position of the slider's origin on the grid, (2,), m.
+        high: Highest position, (2,), m.
+        vertices: Vertices of the slider, (vertices, 2), body frame.
+    """
+    spacing = float(np.max(high - low)) / (POSITIONS - 1)
+    axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
+    theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+    cells = np.stack(np.meshgrid(*axes, theta, indexing="ij"), axis=-1).astype(np.float32)
+    blocked = Extent(vertices).outside(cells, workspace) > 0
+    values = _last_push(library, goal, cells, push_time, usable, tolerance, between)
+    moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
+    allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
+    for _ in range(SWEEPS):
+        change = 0.0
+        for k, move in enumerate(moves):
+            best = _best_move(values, blocked, k, move, allowed[k])
+            new = np.minimum(values[:, :, k], best)
+            change = max(change, float(np.max(values[:, :, k] - new)))
+            values[:, :, k] = new
+        if change < CHANGE:
+            break
+    return CostToGo(np.asarray(low, np.float32), spacing, values)
+
+
+class _Moves(NamedTuple):
+    """Pushes from one angle, the best one into each cell.
+
+    Attributes:
+        shift: Whole cells by which the slider moves, (moves, 3).
+        cost: Control steps, (moves,).
+        entry: The entries of the library, (moves,).
+    """
+
+    shift: np.ndarray
+    cost: np.ndarray
+    entry: np.ndarray
+
+
+def _last_push(library, goal, cells, push_time, usable, tolerance, between) -> np.ndarray:
+    """Return the cost of the cells from which one push reaches the goal; NEVER for the others."""
+    values = np.full(cells.shape[:3], NEVER, np.float32)
+    wanted = compose(inverse(cells), np.broadcast_to(np.asarray(goal, np.float32), cells.shape))
+    distance, index = library.nearest(wanted.reshape(-1, 3), 1, tolerance)
+    found = np.isfinite(distance[:, 0])
+    entry = index[found, 0]
+    cost = np.where(usable[library.entries[entry, 0]], push_time[entry] + between, NEVER)
+    values.reshape(-1)[found] = cost
+    return values
+
+
+def _moves(library: PushLibrary, angle: float, spacing: float, cost: np.ndarray, usable: np.ndarray) -> _Moves:
+    """Return the cheapest push into each cell that some push ends near the center of."""
+    pose = np.array([0.0, 0.0, angle], np.float32)
+    reached = compose(pose, library.relative) - pose
+    cells = reached / np.array([spacing, spacing, 2 * np.pi / ANGLES], np.float32)
+    shift = np.rint(cells).astype(np.int32)
+    near = (np.abs(cells - shift).max(1) < NEAR_CENTER) & shift.any(1) & usable[library.entries[:, 0]]
+    entry = np.flatnonzero(near)
+    entry = entry[np.argsort(cost[entry], kind="stable")]
+    _, first = np.unique(_codes(shift[entry]), return_index=True)
+    entry = entry[first]
+    return _Moves(shift[entry], cost[entry].astype(np.float32), entry)
+
+
+def _codes(shift: np.ndarray) -> np.ndarray:
+    """Return one number for each different row of whole numbers."""
+    wide = 2 * int(np.abs(shift).max(initial=0)) + 1
+    return (shift[:, 0] * wide + shift[:, 1]) * wide + shift[:, 2]
+
+
+def _starts_allowed(library: PushLibrary, workspace: Workspace, cells: np.ndarray, moves: _Moves) -> np.ndarray:
+    """Return whether the finger can be where each move starts, (moves, positions, positions)."""
+    starts = library.starts[library.entries[moves.entry, 0], :2].astype(np.float32)
+    return workspace.allows_finger(to_world(cells[None], starts[:, None, None]))
+
+
+def _best_move(values: np.ndarray, blocked: np.ndarray, k: int, moves: _Moves, allowed: np.ndarray) -> np.ndarray:
+    """Return the least cost over the moves from the cells of one angle, (positions, positions)."""
+    rows, columns, angles = values.shape
+    beyond = int(np.abs(moves.shift[:, :2]).max(initial=0))
+    wide = np.full((rows + 2 * beyond, columns + 2 * beyond, angles), NEVER, np.float32)
+    wide[beyond : beyond + rows, beyond : beyond + columns] = np.where(blocked, NEVER, values)
+    best = np.full((rows, columns), NEVER, np.float32)
+    for (i, j, turn), cost, may in zip(moves.shift, moves.cost, allowed, strict=True):
+        part = wide[beyond + i : beyond + i + rows, beyond + j : beyond + j + columns, (k + turn) % angles]
+        np.minimum(best, np.where(may, part + cost, NEVER), out=best)
+    return best

@@ -1,0 +1,92 @@
+"""What a finger does with an action: where it is after a control step."""
+
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+
+class FingerState(NamedTuple):
+    """Where a finger is and how fast it moves.
+
+    Attributes:
+        position: Center, (2,), world, m.
+        velocity: Its velocity, (2,), m/s.
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+
+
+class FingerControl(Protocol):
+    """The motion of a finger in one control step, as a function of the action."""
+
+    def action(self, state: FingerState, target: np.ndarray) -> np.ndarray:
+        """Return the action after which the finger is at `target`, or as near as actions are allowed, (..., 2)."""
+        ...
+
+    def motion(self, state: FingerState, action: np.ndarray) -> np.ndarray:
+        """Return positions during the control step, the last one at its end, (..., points, 2), m."""
+        ...
+
+    def after(self, state: FingerState, action: np.ndarray) -> FingerState:
+        """Return the state after the control step."""
+        ...
+
+
+class PositionControl(NamedTuple):
+    """A finger that goes to any position in a straight line in one control step. The action is that position."""
+
+    def action(self, state: FingerState, target: np.ndarray) -> np.ndarray:
+        return target
+
+    def motion(self, state: FingerState, action: np.ndarray) -> np.ndarray:
+        part = np.arange(1, 11)[:, None] / 10
+        return state.position + part * (action[..., None, :] - state.position)
+
+    def after(self, state: FingerState, action: np.ndarray) -> FingerState:
+        return FingerState(np.asarray(action, float), np.zeros(2))
+
+
+class SpringDamper:
+    """A finger of unit mass that a spring pulls to the action and a damper brakes.
+
+    In each of the substeps, first the velocity changes by the acceleration, stiffness * (action - position) - damping *
+    velocity, and then the position by the velocity.
+
+    Args:
+        stiffness: Acceleration per distance, 1/s^2.
+        damping: Acceleration per velocity, 1/s.
+        substep: Duration of a substep, s.
+        substeps: Number of substeps of a control step.
+        low: Lowest action, (2,), world, m.
+        high: Highest action, (2,), world, m.
+    """
+
+    def __init__(
+        self, stiffness: float, damping: float, substep: float, substeps: int, low: np.ndarray, high: np.ndarray
+    ):
+        self.low, self.high = np.asarray(low, float), np.asarray(high, float)
+        kick = np.array([[1.0, 0.0], [-stiffness * substep, 1.0 - damping * substep]])
+        drift = np.array([[1.0, substep], [0.0, 1.0]])
+        self.substeps, self.once = substeps, drift @ kick
+
+    @cached_property
+    def powers(self) -> np.ndarray:
+        """The map of (position - action, velocity) over 1, 2, … substeps, (substeps, 2, 2)."""
+        return np.stack([np.linalg.matrix_power(self.once, k) for k in range(1, self.substeps + 1)])
+
+    def action(self, state: FingerState, target: np.ndarray) -> np.ndarray:
+        (stay, drift), _ = self.powers[-1]
+        wanted = (target - stay * state.position - drift * state.velocity) / (1 - stay)
+        return np.clip(wanted, self.low, self.high)
+
+    def motion(self, state: FingerState, action: np.ndarray) -> np.ndarray:
+        stay, drift = self.powers[:, 0, 0, None], self.powers[:, 0, 1, None]
+        away = (state.position - action)[..., None, :]
+        return action[..., None, :] + stay * away + drift * state.velocity
+
+    def after(self, state: FingerState, action: np.ndarray) -> FingerState:
+        (stay, drift), (pull, keep) = self.powers[-1]
+        away = state.position - action
+        return FingerState(action + stay * away + drift * state.velocity, pull * away + keep * state.velocity)

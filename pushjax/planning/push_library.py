@@ -1,0 +1,286 @@
+"""Outcomes of straight pushes in the body frame of a slider.
+
+Quasi-static motion depends neither on time nor on where the slider is. So the outcome of a push that is given in the
+body frame is one relative pose, and pushes that follow each other compose: if push a moves the slider by A and push b
+by B, a and then b move it from pose q to compose(compose(q, A), B).
+
+A slider at pose q is brought to the goal g by one push if the push's outcome is the relative pose compose(inverse(q),
+g). So one k-d tree of all outcomes answers from which poses one push reaches any goal, and all plans of two pushes are
+one query with the poses that first pushes lead to. The distance in the tree is that of `pose_features`; it is not
+changed by a motion of the world, so it is the distance of the final pose from the goal.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from scipy.spatial import KDTree
+
+from pushjax._internal.checks import check_count, check_type
+from pushjax.friction.random import FrictionModel
+from pushjax.planning.clearance import offset_curve, outline_vertices
+from pushjax.planning.poses import compose, inverse, pose_features
+from pushjax.planning.push_batch import simulate_pushes
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.slider import Slider
+
+FORMAT = 1  # of files and digests
+# Lengths in units of the surface's length, which is about the slider's radius.
+GAP, STEP, TRAVEL = 0.04, 0.0275, 2.3
+LEAST_MOTION = 0.005  # shorter outcomes are no pushes
+
+
+@dataclass(frozen=True)
+class PushLibrary:
+    """Outcomes of straight pushes of one slider, in its body frame.
+
+    Attributes:
+        starts: Configurations of the hand where each push starts, (pushes, dof), body frame.
+        directions: Unit vectors along which the hand moves, (pushes, 2), body frame.
+        travel: Distances of the hand from its start, (lengths,), m.
+        outcomes: Poses of the slider after each push, relative to its pose before, (samples, pushes, lengths, 3). There
+            is one sample if friction is known.
+        valid: Whether the push moves the slider and nothing failed or jammed in any sample, (pushes, lengths).
+        length: Characteristic length of the slider's limit surface, m.
+        center: Centroid of the slider, (2,), body frame, m.
+        digest: Hash of everything that the outcomes depend on.
+    """
+
+    starts: np.ndarray
+    directions: np.ndarray
+    travel: np.ndarray
+    outcomes: np.ndarray
+    valid: np.ndarray
+    length: float
+    center: np.ndarray
+    digest: str
+
+    @staticmethod
+    def build(
+        slider: Slider,
+        radius: float,
+        *,
+        friction: float = 0.0,
+        contacts: int = 240,
+        angles: int = 9,
+        max_angle: float = np.pi / 3,
+        model: FrictionModel | None = None,
+        samples: int = 1,
+        key: PRNGKeyArray | None = None,
+    ) -> "PushLibrary":
+        """Simulate the pushes of a round finger from all around the slider.
+
+        Args:
+            slider: The slider.
+            radius: Radius of the finger, m.
+            friction: Coefficient of contact friction.
+            contacts: Number of places around the slider, at equal spacing.
+            angles: Number of directions at each place.
+            max_angle: Largest angle between a direction and the inward normal, rad.
+            model: Distribution of friction. If it is given, `friction` is not used.
+            samples: Number of draws from `model`. All pushes share them, so that differences between pushes are not
+                due to the draws.
+            key: Key of the draws.
+
+        Returns:
+            The library.
+
+        Raises:
+            ValueError: If a number is out of its range, or if `model` is given without `key`.
+        """
+        starts, directions = fan(slider, radius, contacts, angles, max_angle)
+        hand = Hand.finger(radius)
+        return PushLibrary.simulate(
+            slider, hand, starts, directions, friction=friction, model=model, samples=samples, key=key
+        )
+
+    @staticmethod
+    def simulate(
+        slider: Slider,
+        hand: Hand,
+        starts: np.ndarray,
+        directions: np.ndarray,
+        *,
+        friction: float = 0.0,
+        model: FrictionModel | None = None,
+        samples: int = 1,
+        key: PRNGKeyArray | None = None,
+    ) -> "PushLibrary":
+        """Simulate given straight pushes of any hand.
+
+        Args:
+            slider: The slider.
+            hand: The hand. The first two numbers of its configuration are a position, which moves; the others rest.
+            starts: Configurations of the hand at the start, (pushes, dof), in the body frame of the slider.
+            directions: Unit vectors of the motion, (pushes, 2), body frame.
+            friction: Coefficient of contact friction.
+            model: Distribution of friction, as in `build`.
+            samples: Number of draws from `model`.
+            key: Key of the draws.
+        """
+        check_type("slider", slider, Slider)
+        check_count("samples", samples)
+        length = float(slider.surface.length)
+        steps = round(TRAVEL / STEP)
+        travel = length * STEP * np.arange(steps + 1)
+        pushes = len(starts)
+        paths = np.repeat(np.asarray(starts, np.float64)[:, None], steps + 1, axis=1)
+        paths[..., :2] += travel[:, None] * directions[:, None]
+        if model is None:
+            surfaces, mus = [slider.surface], [friction]
+        else:
+            if key is None:
+                raise ValueError("key: draws from a FrictionModel need a PRNG key; got None")
+            drawn, mu = jax.vmap(lambda each: model.sample(each, slider.surface))(jax.random.split(key, samples))
+            surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k], drawn) for k in range(samples)]
+            mus = np.asarray(mu).tolist()
+        outcomes, valid = [], np.ones((pushes, steps + 1), bool)
+        for surface, mu in zip(surfaces, mus, strict=True):
+            poses, good = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
+            moved = np.linalg.norm(poses * np.array([1, 1, length]), axis=-1)
+            valid &= (np.arange(steps + 1) <= good[:, None]) & (moved > LEAST_MOTION * length)
+            outcomes.append(poses)
+        return PushLibrary(
+            starts=np.asarray(starts, np.float64),
+            directions=np.asarray(directions, np.float64),
+            travel=travel,
+            outcomes=np.stack(outcomes).astype(np.float32),
+            valid=valid,
+            length=length,
+            center=np.asarray(slider.shape.centroid, np.float64),
+            digest=digest(slider, hand, starts, directions, friction, model, samples, key),
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the library to a file in NumPy's format "npz"."""
+        np.savez_compressed(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+
+    @staticmethod
+    def load(path: str | Path, digest: str | None = None) -> "PushLibrary":
+        """Read a library that `save` wrote.
+
+        Args:
+            path: The file.
+            digest: Digest that the library must have, from `push_library.digest`. None: any.
+
+        Raises:
+            ValueError: If the file holds no library, or one of another slider, hand or set of pushes.
+        """
+        try:
+            with np.load(path) as file:
+                fields = {name: file[name] for name in PushLibrary.__dataclass_fields__}
+        except (KeyError, ValueError, EOFError, OSError) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
+            raise ValueError(f"{path} does not hold a library of pushes: {error}") from error
+        fields |= {"length": float(fields["length"]), "digest": str(fields["digest"])}
+        library = PushLibrary(**fields)
+        if digest is not None and library.digest != digest:
+            raise ValueError(
+                f"{path} holds a library of another slider, hand, friction or set of pushes; build it again "
+                f"(its digest is {library.digest[:12]}, expected {digest[:12]})"
+            )
+        return library
+
+    @cached_property
+    def entries(self) -> np.ndarray:
+        """Valid outcomes as rows of the indices (push, length), (entries, 2)."""
+        return np.argwhere(self.valid)
+
+    @cached_property
+    def relative(self) -> np.ndarray:
+        """Relative poses of the entries in the first sample, (entries, 3)."""
+        return np.ascontiguousarray(self.outcomes[0][tuple(self.entries.T)])
+
+    @cached_property
+    def tree(self) -> KDTree:
+        """The k-d tree of the features of `relative`."""
+        return KDTree(self.features(self.relative), balanced_tree=False, compact_nodes=False)
+
+    def features(self, poses: np.ndarray) -> np.ndarray:
+        """Return `pose_features` about this slider's centroid, (..., 4)."""
+        return pose_features(poses, self.center, self.length)
+
+    def final_spread(self) -> np.ndarray:
+        """Return how much the outcomes scatter over the samples: the root mean square distance, (pushes, lengths), m.
+
+        The distance of a sample from the mean is that of `pose_features`.
+        """
+        features = self.features(self.outcomes)
+        return np.sqrt(((features - features.mean(0)) ** 2).sum(-1).mean(0))
+
+    def poses_reaching(self, goal: np.ndarray) -> np.ndarray:
+        """Return the pose from which each entry reaches a goal, (entries, 3), m and rad.
+
+        Args:
+            goal: The goal, (3,), world, m and rad.
+        """
+        return compose(np.asarray(goal), inverse(self.relative))
+
+    def nearest(self, relative: np.ndarray, count: int, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the entries whose outcomes are nearest to relative poses.
+
+        Args:
+            relative: Relative poses, (poses, 3).
+            count: Number of entries for each.
+            max_distance: Largest distance, m.
+
+        Returns:
+            Distances (poses, count), m, infinite where there are fewer, and indices (poses, count) into `entries`, then
+            the number of entries.
+        """
+        wanted = np.arange(1, count + 1)
+        distance, index = self.tree.query(
+            self.features(relative),
+            k=wanted,  # pyright: ignore[reportArgumentType]  # an array keeps the axis also for one
+            distance_upper_bound=max_distance,
+        )
+        return np.asarray(distance), np.asarray(index)
+
+
+def fan(
+    slider: Slider, radius: float, contacts: int = 240, angles: int = 9, max_angle: float = np.pi / 3
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the starts and the directions of straight pushes of a round finger from all around a slider.
+
+    Args:
+        slider: The slider.
+        radius: Radius of the finger, m.
+        contacts: Number of places around the slider, at equal spacing; in reflex corners some are left out.
+        angles: Number of directions at each place.
+        max_angle: Largest angle between a direction and the inward normal, rad, less than pi / 2.
+
+    Returns:
+        Centers of the finger (pushes, 2), m, a small gap away from the slider, and unit vectors (pushes, 2).
+
+    Raises:
+        ValueError: If a number is out of its range.
+    """
+    check_count("contacts", contacts)
+    check_count("angles", angles)
+    if not radius >= 0:
+        raise ValueError(f"radius must not be negative; got {radius!r}")
+    if not 0 <= max_angle < np.pi / 2:
+        raise ValueError(f"max_angle must be at least 0 and less than pi / 2; got {max_angle!r}")
+    gap = GAP * float(slider.surface.length)
+    curve = offset_curve(outline_vertices(slider.shape), radius + gap, contacts)
+    angle = np.linspace(-max_angle, max_angle, angles) if angles > 1 else np.zeros(1)
+    (x, y), c, s = curve.normals.T[..., None], np.cos(angle), np.sin(angle)
+    directions = np.stack([c * x - s * y, s * x + c * y], axis=-1).reshape(-1, 2)
+    return np.repeat(curve.points, angles, axis=0), directions
+
+
+def digest(slider, hand, starts, directions, friction=0.0, model=None, samples=1, key=None) -> str:
+    """Return the hash of what the outcomes of `PushLibrary.simulate` depend on; the arguments are the same."""
+    content = hashlib.sha256(f"{FORMAT} {GAP} {STEP} {TRAVEL} {samples}".encode())
+    parts = (slider, hand, model, np.asarray(starts), np.asarray(directions), np.asarray(friction))
+    content.update(str(jax.tree.structure(parts)).encode())
+    for leaf in jax.tree.leaves(parts):
+        content.update(np.round(np.asarray(leaf, np.float64), 9).tobytes())
+    if key is not None:
+        content.update(np.asarray(jax.random.key_data(key)).tobytes())
+    return content.hexdigest()

@@ -1,0 +1,304 @@
+"""Choice of the next push: one that reaches the goal, else the first of two, else by cost to go.
+
+Costs are control steps: the way around the slider to the start of the push, the push, and what comes after it.
+
+One push: the outcomes near the relative pose of the goal, by the library's k-d tree.
+Two pushes: the poses that promising first pushes lead to are looked up in the same tree. Promising are those for which
+    the way, the push and the cost to go make the least sum.
+Farther away: the push with that least sum.
+"""
+
+from enum import IntEnum
+from functools import cached_property
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from pushjax.planning.approach import Roadmap, Way, Ways, run_ups
+from pushjax.planning.clearance import outline_vertices
+from pushjax.planning.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.pace import Pace
+from pushjax.planning.poses import compose, inverse, to_body, to_world
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.workspace import Extent, Workspace
+from pushjax.simulation.slider import Slider
+
+CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
+CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
+STRIDE = 4  # of the lengths of first pushes, one in so many is considered
+BETWEEN = 6.0  # control steps between two pushes, for the cost to go
+LOST = 60.0  # control steps of a way that the table of ways does not have
+
+
+class Measure(Protocol):
+    """How good a final pose is."""
+
+    @property
+    def enough(self) -> float:
+        """Score from which a pose counts as the goal."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a pose that counts as the goal, m, in the sense of `pose_features`."""
+        ...
+
+    def __call__(self, errors: np.ndarray) -> np.ndarray:
+        """Return the score of poses relative to the goal, (..., 3), between 0 and 1, (...,)."""
+        ...
+
+
+class PlanStatus(IntEnum):
+    """What the next push is for, or why there is none."""
+
+    ONE_PUSH = 0
+    TWO_PUSHES = 1
+    COST_TO_GO = 2
+    NO_WAY = 3
+    NO_PUSH = 4
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no push."""
+        return self >= PlanStatus.NO_WAY
+
+
+class PlannedPush(NamedTuple):
+    """The next push.
+
+    Attributes:
+        status: What the push is for, or why there is none.
+        way: Way of the finger to where the run-up begins, world; its status says why there is none.
+        start: Where the finger is about to touch the slider, (2,), world, m.
+        end: Where the push ends, (2,), world, m.
+        target: Pose of the slider that the push is for, (3,), world, m and rad.
+        cost: Predicted number of control steps to the goal.
+    """
+
+    status: PlanStatus
+    way: Way
+    start: np.ndarray
+    end: np.ndarray
+    target: np.ndarray
+    cost: float
+
+
+class Candidate(NamedTuple):
+    """A push that may come next: its kind, its entry in the library, the pose it is for, and its predicted cost."""
+
+    status: PlanStatus
+    entry: int
+    target: np.ndarray
+    cost: float
+
+
+class PushPlanner:
+    """Chooses pushes that bring one slider to one goal.
+
+    Args:
+        slider: The slider.
+        radius: Radius of the finger, m.
+        library: Pushes of that slider and finger.
+        goal: The goal, (3,), world, m and rad.
+        measure: Score of final poses.
+        workspace: Limits of finger and slider.
+        pace: Speeds of the finger.
+        look_ahead: Whether to consider plans of two pushes.
+        value: Cost to go. None: it is computed when it is first needed. False: the distance to the goal instead.
+    """
+
+    def __init__(
+        self,
+        slider: Slider,
+        radius: float,
+        library: PushLibrary,
+        goal: np.ndarray,
+        measure: Measure,
+        workspace: Workspace,
+        pace: Pace,
+        *,
+        look_ahead: bool = True,
+        value: CostToGo | bool | None = None,
+    ):
+        self.slider, self.library, self.measure = slider, library, measure
+        self.goal, self.workspace, self.pace, self.look_ahead = np.asarray(goal, float), workspace, pace, look_ahead
+        self.radius, self.vertices, length = radius, outline_vertices(slider.shape), library.length
+        self.extent = Extent(self.vertices)
+        self.clearance = CLEARANCE * length
+        starts = library.starts[:, :2]
+        self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
+        self.usable = np.isfinite(self.run_up)
+        goals = starts - np.where(self.usable, self.run_up, 0)[:, None] * library.directions
+        self.roadmap = Roadmap(self.vertices, radius, self.clearance, goals)
+        push, index = library.entries.T
+        self.push, self.travel = push, library.travel[index]
+        self.push_time = pace.push_time(self.travel)
+        self.ends = (starts[push] + self.travel[:, None] * library.directions[push]).astype(np.float32)
+        self.coarse = np.flatnonzero((index % STRIDE == 0) & self.usable[push])
+        self._value = value
+
+    @cached_property
+    def value(self) -> CostToGo | None:
+        """Cost to go, or None if the distance to the goal takes its place."""
+        if isinstance(self._value, CostToGo):
+            return self._value
+        if self._value is False:
+            return None
+        reach = np.abs(self.vertices).max() / 2
+        low, high = self.workspace.slider_low + reach, self.workspace.slider_high - reach
+        return cost_to_go(
+            self.library,
+            self.goal,
+            self.workspace,
+            self.push_time,
+            usable=self.usable,
+            tolerance=self.measure.reach,
+            between=BETWEEN,
+            low=low,
+            high=high,
+            vertices=self.vertices,
+        )
+
+    @cached_property
+    def after_push(self) -> np.ndarray:
+        """Control steps of the way from where a push along each row ends to the start of each push, (places, pushes).
+
+        A row is a place of the finger around the slider; `place` is that of each entry.
+        """
+        return (
+            self.pace.free_time(np.nan_to_num(self.roadmap.between(self.places), posinf=1e9))
+            .clip(max=LOST)
+            .astype(np.float32)
+        )
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Points around the slider where pushes begin, one for each start that some have in common, (places, 2)."""
+        _, first = np.unique(self.library.starts[self.usable, :2], axis=0, return_index=True)
+        return self.roadmap.goals[self.usable][first]
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """Index of the place that is nearest to the finger at the end of each entry, (entries,)."""
+        finger = to_body(self.library.relative, self.ends)
+        return np.asarray(KDTree(self.places).query(finger)[1])
+
+    def prepare(self) -> None:
+        """Compute all tables, which are else computed when they are first needed."""
+        _ = self.value, self.after_push, self.place, self.library.tree
+
+    def choose(self, pose: np.ndarray, finger: np.ndarray, shake: np.ndarray | None = None) -> PlannedPush:
+        """Choose the next push.
+
+        Args:
+            pose: Pose of the slider, (3,), world, m and rad.
+            finger: Center of the finger, (2,), world, m.
+            shake: Control steps that are added to the cost of each push, (pushes,), for another choice than before.
+        """
+        pose = np.asarray(pose, float)
+        ways = self.roadmap.ways(finger, pose, self.workspace)
+        nowhere = Way(np.asarray(finger, float)[None], np.inf, ways.status)
+        none = PlannedPush(PlanStatus.NO_WAY, nowhere, finger, finger, pose, np.inf)
+        reachable = np.isfinite(ways.lengths) & self.usable
+        reachable &= self.workspace.allows_finger(to_world(pose, self.library.starts[:, :2]))
+        if not reachable.any():
+            return none
+        way_time = self.pace.free_time(np.where(reachable, ways.lengths + np.nan_to_num(self.run_up), np.inf))
+        if shake is not None:
+            way_time = way_time + shake
+        found = [self._one_push(pose, way_time), *self._more_pushes(pose, way_time)]
+        best = min((each for each in found if each is not None), key=lambda each: each.cost, default=None)
+        if best is None:
+            return none._replace(status=PlanStatus.NO_PUSH)
+        return self._planned(best, ways, pose)
+
+    def _planned(self, best: Candidate, ways: Ways, pose: np.ndarray) -> PlannedPush:
+        push = int(self.push[best.entry])
+        way = self.roadmap.way(ways, push, pose)
+        start = to_world(pose, self.library.starts[push, :2])
+        end = to_world(pose, self.ends[best.entry].astype(float))
+        return PlannedPush(best.status, way, start, end, best.target, best.cost)
+
+    def _one_push(self, pose: np.ndarray, way_time: np.ndarray) -> Candidate | None:
+        """Return the push that reaches the goal in the fewest steps; a better score counts some steps."""
+        relative = compose(inverse(pose), self.goal)
+        near = self.library.tree.query_ball_point(self.library.features(relative), self.measure.reach)
+        entries = np.asarray(near, int)
+        entries = entries[np.isfinite(way_time[self.push[entries]])]
+        entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
+        if not len(entries):
+            return None
+        errors = compose(inverse(relative), self.library.relative[entries])
+        score = self.measure(errors)
+        cost = way_time[self.push[entries]] + self.push_time[entries] + self._shortfall(score)
+        cost = np.where(score > self.measure.enough, cost, np.inf)
+        best = int(np.argmin(cost))
+        return (
+            Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
+            if np.isfinite(cost[best])
+            else None
+        )
+
+    def _shortfall(self, score: np.ndarray) -> np.ndarray:
+        """Return control steps that stand for the risk of missing the goal by a push of a predicted score."""
+        margin = self.measure.enough + 0.6 * (1 - self.measure.enough)
+        return 200 * np.maximum(margin - score, 0)
+
+    def _more_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> list[Candidate]:
+        """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
+        entries, reached = self._first_pushes(pose, way_time)
+        if not len(entries):
+            return []
+        spent = way_time[self.push[entries]] + self.push_time[entries]
+        total = spent + self._estimate(reached, quick=True)
+        best = np.argpartition(total, min(CANDIDATES, len(total) - 1))[:CANDIDATES]
+        entries, reached, spent = entries[best], reached[best], spent[best]
+        two = self._two_pushes(entries, reached, spent) if self.look_ahead else None
+        if two is not None:
+            return [two]
+        total = spent + self._estimate(reached, quick=False)
+        k = int(np.argmin(total))
+        return [Candidate(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
+
+    def _first_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the entries that can come next, and the poses that they lead to."""
+        entries = self.coarse[np.isfinite(way_time[self.push[self.coarse]])]
+        here = pose.astype(np.float32)
+        entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
+        reached = compose(here, self.library.relative[entries])
+        outside = self.extent.outside(reached, self.workspace)
+        # a slider that is outside must come back
+        now = float(self.extent.outside(here, self.workspace))
+        good = outside <= max(0.0, now - 0.04 * self.library.length)
+        return entries[good], reached[good]
+
+    def _estimate(self, poses: np.ndarray, quick: bool) -> np.ndarray:
+        """Return the control steps from poses to the goal."""
+        if self.value is not None:
+            return self.value.nearest(poses) if quick else 1.2 * self.value(poses)
+        goal = self.library.features(self.goal.astype(np.float32))
+        apart = np.sqrt(((self.library.features(poses) - goal) ** 2).sum(-1))
+        return 20 * apart / self.library.length
+
+    def _two_pushes(self, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray) -> Candidate | None:
+        """Return the best of the first pushes that a second one continues to the goal."""
+        goal = self.goal.astype(np.float32)
+        wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
+        distance, second = self.library.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
+        first, column = np.nonzero(np.isfinite(distance))
+        if not len(first):
+            return None
+        second, distance = second[first, column], distance[first, column]
+        starts = self.library.starts[self.push[second], :2].astype(np.float32)
+        allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
+        allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
+        errors = compose(inverse(wanted[first]), self.library.relative[second])
+        between = self.after_push[self.place[entries[first]], self.push[second]]
+        total = spent[first] + between + self.push_time[second] + self._shortfall(self.measure(errors))
+        total = np.where(allowed, total, np.inf)
+        k = int(np.argmin(total))
+        if not np.isfinite(total[k]):
+            return None
+        at = first[k]
+        return Candidate(PlanStatus.TWO_PUSHES, int(entries[at]), reached[at].astype(float), float(total[k]))

@@ -1,0 +1,63 @@
+"""The rectangle in which a finger and a slider may move."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Workspace(NamedTuple):
+    """Limits of the centers of fingers, and walls that the slider must stay within. All are parallel to the axes.
+
+    Attributes:
+        finger_low: Lowest x and y of the finger's center, (2,), world, m.
+        finger_high: Highest x and y of the finger's center.
+        slider_low: Lowest x and y of any point of the slider.
+        slider_high: Highest x and y of any point of the slider.
+    """
+
+    finger_low: np.ndarray
+    finger_high: np.ndarray
+    slider_low: np.ndarray
+    slider_high: np.ndarray
+
+    @staticmethod
+    def rectangle(low: tuple[float, float], high: tuple[float, float]) -> "Workspace":
+        """Return a workspace with the same limits for finger and slider, m."""
+        return Workspace(*(np.asarray(corner, float) for corner in (low, high, low, high)))
+
+    @staticmethod
+    def unlimited() -> "Workspace":
+        """Return a workspace without limits."""
+        return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf))
+
+    def allows_finger(self, points: np.ndarray) -> np.ndarray:
+        """Return whether a finger's center may be at points (..., 2)."""
+        return np.all((points >= self.finger_low) & (points <= self.finger_high), axis=-1)
+
+
+class Extent:
+    """How far a slider reaches beyond its origin along the world's axes, as a function of its angle.
+
+    Args:
+        vertices: Vertices of the slider, (vertices, 2), body frame, m.
+        angles: Number of angles in the table. The table holds the largest reach between neighboring angles.
+    """
+
+    def __init__(self, vertices: np.ndarray, angles: int = 720):
+        self.angles = angles
+        # twice as many directions as cells, so that each cell has its ends and its middle
+        theta = np.arange(2 * angles) * np.pi / angles
+        c, s = np.cos(theta)[:, None], np.sin(theta)[:, None]
+        x, y = c * vertices[:, 0] - s * vertices[:, 1], s * vertices[:, 0] + c * vertices[:, 1]
+        reach = np.stack([-x.min(1), -y.min(1), x.max(1), y.max(1)], axis=1)
+        around = np.maximum(np.maximum(np.roll(reach, 1, axis=0), reach), np.roll(reach, -1, axis=0))
+        self.reach = around[::2].astype(np.float32)
+
+    def outside(self, poses: np.ndarray, workspace: Workspace) -> np.ndarray:
+        """Return how far the slider is outside of the workspace, at most; zero within it, (...,), m."""
+        cell = np.round(poses[..., 2] * (self.angles / (2 * np.pi))).astype(np.int32) % self.angles
+        reach = self.reach[cell]
+        (x, y), low, high = (poses[..., 0], poses[..., 1]), workspace.slider_low, workspace.slider_high
+        over_x = np.maximum(low[0] - x + reach[..., 0], x + reach[..., 2] - high[0])
+        over_y = np.maximum(low[1] - y + reach[..., 1], y + reach[..., 3] - high[1])
+        return np.maximum(np.maximum(over_x, over_y), 0)
