@@ -40,6 +40,7 @@ def run(
     scale: float = 1.0,
     starts: int = 50,
     contacts: tuple[int, ...] = tuple(COUNTS),
+    fixtures: int = 0,
     dtype: Literal["float32", "float64"] = "float64",
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
@@ -54,6 +55,7 @@ def run(
             2000 problems.
         starts: Starts of the different solver on each problem that was called jammed.
         contacts: Numbers of contacts, each from one to eight.
+        fixtures: Number of contacts of each problem that do not move; less than each of `contacts`.
         dtype: Floating type.
         progress: Called after every row with the number of rows done and their total.
         keep: Called after every row with the record so far.
@@ -62,25 +64,31 @@ def run(
         The record, with the counts of `judge`, the largest violation and the time per problem in each row.
 
     Raises:
-        ValueError: If a number of contacts is not from one to eight.
+        ValueError: If a number of contacts is not from one to eight, or not greater than `fixtures`.
     """
     wrong = [m for m in contacts if m not in COUNTS]
     if wrong:
         raise ValueError(f"contacts must be from 1 to {max(COUNTS)}; got {wrong[0]}")
+    if fixtures < 0 or fixtures >= min(contacts):
+        raise ValueError(f"fixtures must be from 0 to {min(contacts) - 1}, one less than contacts; got {fixtures}")
     jax.config.update("jax_enable_x64", dtype == "float64")
     cases = [(m, model) for m in contacts for model in MODELS]
     rows: list[dict[str, Any]] = []
-    settings = {"seed": seed, "scale": scale, "starts": starts, "allowed": ALLOWED[dtype], "chunk": CHUNK}
+    settings = {"seed": seed, "scale": scale, "starts": starts, "fixtures": fixtures}
+    settings |= {"allowed": ALLOWED[dtype], "chunk": CHUNK}
     record = result_record("contacts", settings, rows=rows)
     for done, (m, model) in enumerate(cases):
-        rows.append(_row(m, model, dtype, max(CHUNK, int(scale * COUNTS[m])), starts, seed))
+        rows.append(_row(m, model, dtype, max(CHUNK, int(scale * COUNTS[m])), starts, seed, fixtures))
         keep(record)
         progress(done + 1, len(cases))
     return record
 
 
-def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int) -> dict[str, Any]:
-    draw = jax.jit(jax.vmap(lambda key: random_contacts_problem(key, contacts=m, degree=MODELS[model])))
+def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int, fixtures: int) -> dict[str, Any]:
+    def problem_of(key):
+        return random_contacts_problem(key, contacts=m, degree=MODELS[model], fixtures=fixtures)
+
+    draw = jax.jit(jax.vmap(problem_of))
     solve = jax.jit(jax.vmap(pj.solve_contacts))
     names = ("solved", "jammed", "wrong", "borderline", "not_converged", "nonunique")
     counts: dict[str, int] = dict.fromkeys(names, 0)

@@ -10,7 +10,7 @@ import shapely
 from scipy.optimize import linprog
 
 import pushjax as pj
-from benchmarks.survey import Survey, outline_of, rollout, seen_by_slider
+from benchmarks.survey import Survey, fixtures_seen_by_slider, outline_of, rollout, seen_by_slider
 from pushjax.simulation.hand import RoundFinger
 
 FINER = 256  # parts into which the step of a jam is divided to confirm it
@@ -42,7 +42,7 @@ def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
         reach = max(1e-4 * float(survey.slider.surface.length), 4 * float(np.max(np.abs(step).sum(axis=-1))))
         pose = np.asarray(survey.push.pose[i, -1], float)
         fingers = _placed(survey, pose, np.asarray(survey.push.configuration[i, -1]))
-        away = [finger.away(body) for finger in fingers]
+        away = [finger.away(body) for finger in fingers[: len(step)]]
         if status[i] == pj.Status.GRASPED and max(away) > 1.01 * reach:
             found.append((int(i), f"a finger is {1e3 * max(away):.3f} mm away"))
         elif isinstance(survey.shape, pj.Polygon):
@@ -61,7 +61,8 @@ def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
 def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
     """Return whether push `i` jams within step `at`, done in `FINER` parts."""
     path = pj.line(survey.path[i, at], survey.path[i, at + 1], FINER)
-    push = jax.jit(rollout)(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i])
+    again = jax.jit(rollout, static_argnums=5)
+    push = again(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i], survey.scene)
     stopped = int(push.stopped)
     if stopped < 0:
         return False
@@ -131,12 +132,11 @@ class Plate(NamedTuple):
 
 
 def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disk | Plate]:
-    """Return the fingers in the body frame of the slider."""
+    """Return the fingers, and then the fixtures, in the body frame of the slider."""
     seen = seen_by_slider(survey.hand, pose, configuration)
-    return [
-        Disk(where[0], float(finger.radius)) if isinstance(finger, RoundFinger) else Plate(shapely.Polygon(where))
-        for finger, where in zip(survey.hand.fingers, seen, strict=True)
-    ]
+    radii = [float(finger.radius) if isinstance(finger, RoundFinger) else 0.0 for finger in survey.hand.fingers]
+    bodies = [*zip(radii, seen, strict=True), *fixtures_seen_by_slider(survey.scene, pose)]
+    return [Disk(where[0], radius) if len(where) == 1 else Plate(shapely.Polygon(where)) for radius, where in bodies]
 
 
 def _jams(body: shapely.Polygon, fingers: list[Disk | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:
@@ -144,13 +144,14 @@ def _jams(body: shapely.Polygon, fingers: list[Disk | Plate], steps: np.ndarray,
 
     Args:
         body: Outline of the slider.
-        fingers: Fingers in the body frame.
-        steps: Displacements of the fingers in the body frame, (fingers, 2), m.
+        fingers: Fingers and fixtures in the body frame.
+        steps: Displacements of the fingers in the body frame, (fingers, 2), m; fixtures have none.
         mu: Friction coefficient, which limits the forces to their friction cones.
         reach: Distance within which a place counts as a contact, m.
     """
     wrenches, works = [], []
-    for finger, step in zip(fingers, steps, strict=True):
+    still = np.zeros((len(fingers) - len(steps), 2))
+    for finger, step in zip(fingers, np.concatenate([steps, still]), strict=True):
         for point, normal in finger.places(body, reach):
             tangent = np.array([-normal[1], normal[0]])
             for force in (normal + mu * tangent, normal - mu * tangent):

@@ -1,4 +1,4 @@
-"""Check by shapely that no finger ends a step inside the slider.
+"""Check by shapely that no finger and no fixture ends a step inside the slider.
 
 Shapely computes the penetration depth; it shares no code with the library. Every hand pushes outlines of many kinds,
 convex or not, with corners or without, from random starts and with random friction, in fine and coarse steps and in
@@ -8,6 +8,7 @@ displacement in the step with 60 steps. A push that ends GRASPED or JAMMED has t
 """
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any, Literal, get_args
 
 import jax
@@ -17,7 +18,17 @@ import shapely
 
 import pushjax as pj
 from benchmarks.held import unconfirmed
-from benchmarks.survey import HANDS, MM, SHAPES, Survey, outline_of, seen_by_slider, simulate
+from benchmarks.survey import (
+    HANDS,
+    MM,
+    SCENES,
+    SHAPES,
+    Survey,
+    fixtures_seen_by_slider,
+    outline_of,
+    seen_by_slider,
+    simulate,
+)
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.simulation.hand import RoundFinger
@@ -33,6 +44,7 @@ def run(
     dtype: tuple[Dtype, ...] = get_args(Dtype),
     starts: int = 500,
     seed: int = 0,
+    scenes: tuple[str, ...] = ("free",),
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
@@ -45,29 +57,29 @@ def run(
         dtype: Floating types.
         starts: Number of pushes of each row.
         seed: Seed of the pushes.
+        scenes: Names of scenes: "free", or fixtures around the slider.
         progress: Called with the number of rows done and their total.
         keep: Called with the record so far.
 
     Returns:
-        The record, with the figures of `judged` for each hand, outline, number of steps and floating type.
+        The record, with the figures of `judged` for each scene, hand, outline, number of steps and floating type.
 
     Raises:
-        ValueError: If an outline or a hand is unknown.
+        ValueError: If an outline, a hand or a scene is unknown.
     """
-    for kind, names, known in (("shapes", shapes, SHAPES), ("hands", hands, HANDS)):
+    for kind, names, known in (("shapes", shapes, SHAPES), ("hands", hands, HANDS), ("scenes", scenes, tuple(SCENES))):
         if unknown := sorted(set(names) - set(known)):
             raise ValueError(f"{kind} must be of {', '.join(known)}; got {', '.join(unknown)}")
     jax.config.update("jax_enable_x64", True)
     rows: list[dict[str, Any]] = []
     record = result_record("overlaps", {"starts": starts, "seed": seed}, rows=rows)
-    for hand in hands:
-        for shape in shapes:
-            for count in steps:
-                for kind in dtype:
-                    found = judged(simulate(shape, hand, starts, count, np.dtype(kind), seed), count)
-                    rows.append({"hand": hand, "shape": shape, "steps": count, "dtype": kind} | found)
-                    keep(record)
-                    progress(len(rows), len(hands) * len(shapes) * len(steps) * len(dtype))
+    cells = list(product(scenes, hands, shapes, steps, dtype))
+    for scene, hand, shape, count, kind in cells:
+        found = judged(simulate(shape, hand, starts, count, np.dtype(kind), seed, scene), count)
+        rows.append({"scene": scene, "hand": hand, "shape": shape, "steps": count, "dtype": kind} | found)
+        keep(record)
+        progress(len(rows), len(cells))
+        if (count, kind) == (steps[-1], dtype[-1]):
             jax.clear_caches()
     return record
 
@@ -77,8 +89,8 @@ def summary(record: dict[str, Any]) -> str:
     lines = []
     for row in record["rows"]:
         lines.append(
-            f"{row['hand']:6}{row['shape']:10}{row['steps']:4} {row['dtype']}: {row['wrong']:3} wrong, deepest "
-            f"{row['deepest_mm']:.3f} mm; {row['failed']:3} failed, {len(row['unconfirmed'])} unconfirmed; "
+            f"{row['scene']:7}{row['hand']:6}{row['shape']:10}{row['steps']:4} {row['dtype']}: {row['wrong']:3} wrong, "
+            f"deepest {row['deepest_mm']:.3f} mm; {row['failed']:3} failed, {len(row['unconfirmed'])} unconfirmed; "
             f"{row['ends']}"
         )
         told = [row[kind][:SHOWN] for kind in ("steps_wrong", "failures", "unconfirmed")]
@@ -119,7 +131,7 @@ def judged(survey: Survey, steps: int) -> dict[str, Any]:
 
 
 def penetration_depths(survey: Survey) -> np.ndarray:
-    """Return the largest penetration depth of any finger at each pose, by shapely.
+    """Return the largest penetration depth of any finger or fixture at each pose, by shapely.
 
     Args:
         survey: The pushes.
@@ -133,13 +145,13 @@ def penetration_depths(survey: Survey) -> np.ndarray:
     shapely.prepare(edge)
     pose = np.asarray(survey.push.pose, float)
     deepest = np.full(pose.shape[:-1], -np.inf)
-    for finger, placed in zip(
-        survey.hand.fingers, seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration)), strict=True
-    ):
-        if isinstance(finger, RoundFinger):
+    seen = seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration))
+    radii = [float(finger.radius) if isinstance(finger, RoundFinger) else 0.0 for finger in survey.hand.fingers]
+    for radius, placed in [*zip(radii, seen, strict=True), *fixtures_seen_by_slider(survey.scene, pose)]:
+        if placed.shape[-2] == 1:
             centers = shapely.points(placed[..., 0, :])
             distance = shapely.distance(edge, centers)
-            depth = float(finger.radius) - np.where(shapely.contains(body, centers), -distance, distance)
+            depth = radius - np.where(shapely.contains(body, centers), -distance, distance)
         else:
             depth = _pads(body, edge, placed)
         deepest = np.maximum(deepest, depth)

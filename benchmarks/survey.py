@@ -1,4 +1,4 @@
-"""Random pushes and grasps of many outlines by four hands, for the survey `overlaps`."""
+"""Random pushes and grasps of many outlines by four hands, free or among fixtures, for the survey `overlaps`."""
 
 from typing import NamedTuple
 
@@ -55,6 +55,19 @@ SMOOTH = {
 }
 SHAPES = (*POLYGONS, *SMOOTH)
 HANDS = ("one", "two", "three", "jaw")
+# Fixtures around the slider: walls as (point, normal), m; disks as (radius, center) and rectangles as (size, pose).
+SCENES = {
+    "free": (),
+    "wall": (("wall", (0.0, -0.14), (0.0, 1.0)),),
+    "corner": (("wall", (0.0, -0.14), (0.0, 1.0)), ("wall", (0.15, 0.0), (-1.0, 0.0))),
+    "wedge": (("wall", (0.0, -0.14), (0.3, 1.0)), ("wall", (0.15, 0.0), (-1.0, 0.4))),
+    "room": tuple(
+        ("wall", (-0.15 * x, -0.15 * y), (x, y)) for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
+    ),
+    "peg": (("disk", 0.02, (0.15, 0.0)),),
+    "pegs": (("disk", 0.02, (0.15, 0.06)), ("disk", 0.02, (0.15, -0.06)), ("disk", 0.03, (-0.12, 0.14))),
+    "block": (("rectangle", (0.06, 0.04), (0.16, 0.01, 0.4)), ("wall", (0.0, -0.14), (0.0, 1.0))),
+}
 FINGER = 8 * MM
 PAD = (50 * MM, 10 * MM)
 
@@ -115,6 +128,7 @@ class Survey(NamedTuple):
         pose: Start poses of the slider, (starts, 3).
         friction: Friction coefficients, (starts,).
         push: Trajectories, with a leading axis (starts,).
+        scene: Name of the fixtures.
     """
 
     hand: pj.Hand
@@ -123,6 +137,7 @@ class Survey(NamedTuple):
     pose: np.ndarray
     friction: np.ndarray
     push: pj.Trajectory
+    scene: str = "free"
 
     @property
     def shape(self):
@@ -136,7 +151,9 @@ def surface_of(shape, key) -> pj.LimitSurface:
     return pj.fit_limit_surface(*support.wrench_twist_pairs(key, 400), degree=4)
 
 
-def simulate(shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: int = 0) -> Survey:
+def simulate(
+    shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: int = 0, scene: str = "free"
+) -> Survey:
     """Simulate random pushes of one outline by one hand.
 
     Args:
@@ -146,6 +163,7 @@ def simulate(shape_name: str, hand_name: str, starts: int, steps: int, dtype, se
         steps: Number of steps of each push.
         dtype: Floating type.
         seed: Seed of the pushes.
+        scene: One of `SCENES`.
     """
     shape, hand = shape_of(shape_name), hand_of(hand_name)
     seeds = (seed, SHAPES.index(shape_name), HANDS.index(hand_name))
@@ -158,14 +176,59 @@ def simulate(shape_name: str, hand_name: str, starts: int, steps: int, dtype, se
     t = np.linspace(0, 1, steps + 1)[:, None]
     path = (ends[:, :1] * (1 - t) + ends[:, 1:] * t).astype(dtype)
     pose, friction = pose.astype(dtype), friction.astype(dtype)
-    push = jax.jit(jax.vmap(rollout, (None, None, 0, 0, 0)))(slider, hand, path, pose, friction)
-    return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push))
+    push_all = jax.jit(jax.vmap(rollout, (None, None, 0, 0, 0, None)), static_argnums=5)
+    push = push_all(slider, hand, path, pose, friction, scene)
+    return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push), scene)
+
+
+def fixtures_of(scene: str, friction) -> tuple[pj.Wall | pj.Fixture, ...]:
+    """Return the fixtures of a scene, all with the same friction."""
+    found = []
+    for kind, first, second in SCENES[scene]:
+        if kind == "wall":
+            found.append(pj.Wall(first, second, friction))
+        elif kind == "disk":
+            found.append(pj.Fixture(pj.Disk(first), (*second, 0.0), friction))
+        else:
+            found.append(pj.Fixture(pj.Polygon.rectangle(*first), second, friction))
+    return tuple(found)
 
 
 # The slider is an argument so that polygons with the same number of vertices share a program in the compilation cache.
-def rollout(slider, hand, path, pose, friction) -> pj.Trajectory:
+def rollout(slider, hand, path, pose, friction, scene="free") -> pj.Trajectory:
     """Simulate one push."""
-    return pj.rollout(slider, hand, path, pose=pose, friction=friction)
+    fixtures = fixtures_of(scene, friction)
+    return pj.rollout(slider, hand, path, pose=pose, friction=friction, fixtures=fixtures)
+
+
+def fixtures_seen_by_slider(scene: str, poses: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Return the place of each fixture in the body frame of the slider.
+
+    Args:
+        scene: Name of the fixtures.
+        poses: Poses of the slider, (..., 3).
+
+    Returns:
+        For each fixture a radius, m, and its center, (..., 1, 2); for a rectangle, or a wall as a rectangle of 2 m by
+        1 m, zero and the corners, (..., 4, 2), m.
+    """
+    c, s = np.cos(poses[..., None, 2]), np.sin(poses[..., None, 2])
+    found = []
+    for kind, first, second in SCENES[scene]:
+        if kind == "wall":
+            normal = np.asarray(second) / np.linalg.norm(second)
+            along = np.array([normal[1], -normal[0]])
+            points = np.asarray(first) + np.array([along, -along, -along - normal, along - normal])[::-1]
+        elif kind == "disk":
+            points = np.asarray(second)[None]
+        else:
+            half, angle = np.asarray(first) / 2, second[2]
+            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            points = second[:2] + (half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])) @ turn.T
+        away = points - poses[..., None, :2]
+        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
+        found.append((float(first) if kind == "disk" else 0.0, local))
+    return found
 
 
 def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:

@@ -153,6 +153,7 @@ def random_contacts_problem(
     friction: float | Float[Array, ""] = 1.5,
     gaps: float | Float[Array, ""] = 0.5,
     slots: int | None = None,
+    fixtures: int = 0,
 ) -> ContactsProblem:
     """Draw a problem with several contacts on a slider of some 0.1 m, from the mix of cases that a solver must handle.
 
@@ -179,7 +180,7 @@ def random_contacts_problem(
     The size of the displacements is log-uniform from 0.1 to 10 mm. In half of the problems all contacts have the same
     friction coefficient.
 
-    All arguments but `degree` and `slots` may be traced, so that one compiled program draws all problems.
+    All arguments but `degree`, `slots` and `fixtures` may be traced, so that one compiled program draws all problems.
 
     Args:
         key: PRNG key.
@@ -192,6 +193,7 @@ def random_contacts_problem(
             apart, and a fifth overlap by up to 0.5 mm. In the other problems all contacts touch.
         slots: Number of contacts that the arrays hold. Default: `contacts`. The additional contacts are inactive, at
             random places in the arrays, with numbers of their own.
+        fixtures: Number of active contacts that do not move, as those of walls.
 
     Returns:
         The problem.
@@ -210,7 +212,10 @@ def random_contacts_problem(
     push, dragged = _random_pushes(uniform_numbers, normal_numbers, surface, mu, point, normal, middle)
     push = size * push + jnp.where(dragged, gap, 0.0)[:, None] * normal
     order = jnp.argsort(uniform_numbers.take(num_slots))
-    active = jnp.arange(num_slots) < contacts
+    index = jnp.arange(num_slots)
+    active = index < contacts
+    if fixtures:
+        push = jnp.where((active & (index >= contacts - fixtures))[:, None], 0.0, push)
     return ContactsProblem(surface, Contacts(*(a[order] for a in (point, normal, push, mu, gap, active))))
 
 
