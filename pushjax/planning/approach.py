@@ -5,6 +5,7 @@ The shortest way around a polygon at a given distance consists of straight segme
 visibility graph. Start and goal are joined to it by the segments that keep the distance too.
 
 A finger that has just pushed is nearer than that distance, so it first retreats, straight to where it has the distance.
+So does a finger that overlaps the polygon a little, as positions that are measured may, if its center is outside.
 The goal of an approach is the start of a push, which may be nearer too. The finger gets there along the direction of
 the push, from a point that has the distance: so a push begins with a run-up.
 

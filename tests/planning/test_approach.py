@@ -1,0 +1,174 @@
+"""Ways of a round finger around polygons, judged by shapely."""
+
+import numpy as np
+import pytest
+
+from pushjax.planning.approach import Roadmap, WayStatus, run_ups
+from pushjax.planning.clearance import inside, offset_curve, point_clearance, segment_clearance
+from pushjax.planning.poses import to_body, to_world
+from pushjax.planning.workspace import Workspace
+
+shapely = pytest.importorskip("shapely")
+
+RADIUS, CLEARANCE = 0.015, 0.005
+L = np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.12), (0, 0.12)])
+PLUS = 0.03 * np.array(
+    [(1, -3), (1, -1), (3, -1), (3, 1), (1, 1), (1, 3), (-1, 3), (-1, 1), (-3, 1), (-3, -1), (-1, -1), (-1, -3)]
+)
+T = 0.03 * np.array([(-2, 1), (-2, 0), (-0.5, 0), (-0.5, -3), (0.5, -3), (0.5, 0), (2, 0), (2, 1)])
+
+
+def star(rng):
+    """Return a random polygon that is star-shaped about the origin, with narrow notches among others."""
+    count = int(rng.integers(4, 12))
+    angle = np.sort(rng.uniform(0, 2 * np.pi, count) * 0.3 + 2 * np.pi * np.arange(count) / count * 0.7)
+    radius = rng.uniform(0.01, 0.1, count)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def polygons(count):
+    rng = np.random.default_rng(0)
+    stars = [star(rng) for _ in range(count)]
+    return [L, PLUS, T] + [
+        each for each in stars if shapely.Polygon(each).is_valid and shapely.Polygon(each).area > 1e-4
+    ]
+
+
+def counterclockwise(vertices):
+    return vertices if shapely.Polygon(vertices).exterior.is_ccw else vertices[::-1]
+
+
+def test_distances_are_those_of_shapely():
+    rng = np.random.default_rng(1)
+    for vertices in map(counterclockwise, polygons(20)):
+        polygon = shapely.Polygon(vertices)
+        points = rng.uniform(-0.15, 0.15, (200, 2))
+        ends = rng.uniform(-0.15, 0.15, (200, 2))
+        assert np.array_equal(inside(vertices, points), shapely.contains_xy(polygon, points))
+        apart = np.array([polygon.exterior.distance(shapely.Point(p)) for p in points])
+        np.testing.assert_allclose(np.abs(point_clearance(vertices, points)), apart, atol=1e-12)
+        wanted = [shapely.LineString(pair).distance(polygon) for pair in zip(points, ends, strict=True)]
+        np.testing.assert_allclose(np.maximum(segment_clearance(vertices, points, ends), 0), wanted, atol=1e-12)
+
+
+def test_offset_curve_is_at_its_distance():
+    for vertices in map(counterclockwise, polygons(20)):
+        curve = offset_curve(vertices, 0.02, 150)
+        polygon = shapely.Polygon(vertices)
+        apart = [polygon.distance(shapely.Point(p)) for p in curve.points]
+        np.testing.assert_allclose(apart, 0.02, rtol=1e-6)
+        on_outline = curve.points + 0.02 * curve.normals
+        assert max(polygon.exterior.distance(shapely.Point(p)) for p in on_outline) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def found_ways():
+    """Ways around many polygons from anywhere, also from where the finger has just pushed: polygon, start, goal, way."""
+    rng = np.random.default_rng(2)
+    found = []
+    for vertices in map(counterclockwise, polygons(40)):
+        anywhere = rng.uniform(-0.2, 0.2, (20, 2))
+        touching = offset_curve(vertices, RADIUS + 1e-6, 30).points
+        starts = np.concatenate([anywhere[point_clearance(vertices, anywhere) > RADIUS], touching[::6]])
+        roadmap = Roadmap(vertices, RADIUS, CLEARANCE, np.concatenate([anywhere, touching]))
+        pose = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-4, 4)])
+        for start in to_world(pose, starts):
+            ways = roadmap.ways(start, pose, Workspace.unlimited())
+            for goal in rng.choice(len(roadmap.goals), 8, replace=False):
+                found.append((vertices, pose, start, roadmap.goals[goal], roadmap.way(ways, int(goal), pose), ways))
+    return found
+
+
+def test_no_way_touches_the_slider(found_ways):
+    count = 0
+    for vertices, pose, start, goal, way, _ in found_ways:
+        if way.status != WayStatus.FOUND:
+            continue
+        polygon = shapely.Polygon(to_world(pose, vertices))
+        assert polygon.distance(shapely.LineString(way.points)) >= RADIUS - 1e-9
+        np.testing.assert_allclose(way.points[0], start, atol=1e-12)
+        np.testing.assert_allclose(way.points[-1], to_world(pose, goal), atol=1e-12)
+        pieces = np.linalg.norm(np.diff(way.points, axis=0), axis=1)
+        assert way.length == pytest.approx(pieces.sum())
+        count += 1
+    assert count > 1000
+
+
+def test_a_way_is_found_where_there_is_one(found_ways):
+    """If start and goal are in one part of the plane that is a little farther away than the clearance."""
+    missing = 0
+    for vertices, pose, start, goal, way, _ in found_ways:
+        if way.status == WayStatus.FOUND:
+            assert np.isfinite(way.length)
+            continue
+        assert np.isinf(way.length)
+        assert len(way.points) == 1
+        fat = shapely.Polygon(vertices).buffer(1.02 * (RADIUS + CLEARANCE), quad_segs=64)
+        free = shapely.box(-9, -9, 9, 9).difference(fat)
+        parts = getattr(free, "geoms", [free])
+        ends = [shapely.Point(to_body(pose, start)), shapely.Point(goal)]
+        assert not any(all(part.contains(end) for end in ends) for part in parts)
+        missing += 1
+    assert missing > 100
+
+
+def test_ways_are_shortest():
+    """Around a square, from the middle of one side to that of the other: two straight pieces and two quarter arcs."""
+    square = 0.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
+    apart = RADIUS + CLEARANCE
+    roadmap = Roadmap(square, RADIUS, CLEARANCE, np.array([[0.0, 0.05 + 1.01 * apart]]))
+    ways = roadmap.ways(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3), Workspace.unlimited())
+    best = 2 * 0.05 + 0.1 + np.pi * apart
+    assert best < ways.lengths[0] < 1.06 * best
+
+
+def test_ways_stay_in_the_workspace():
+    rng = np.random.default_rng(3)
+    limits = Workspace.rectangle((-0.1, -0.1), (0.1, 0.1))
+    goals = offset_curve(L, RADIUS + 1.1 * CLEARANCE, 60).points
+    roadmap = Roadmap(L, RADIUS, CLEARANCE, goals)
+    found = blocked = 0
+    for _ in range(60):
+        pose = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(-4, 4)])
+        start = rng.uniform(-0.1, 0.1, 2)
+        if point_clearance(L, to_body(pose, start)) < RADIUS:
+            continue
+        ways = roadmap.ways(start, pose, limits)
+        for goal in range(0, len(goals), 7):
+            way = roadmap.way(ways, goal, pose)
+            if way.status == WayStatus.FOUND:
+                assert limits.allows_finger(way.points[1:]).all()
+                assert shapely.Polygon(to_world(pose, L)).distance(shapely.LineString(way.points)) >= RADIUS - 1e-9
+            found, blocked = found + np.isfinite(way.length), blocked + np.isinf(way.length)
+    assert found > 50
+    assert blocked > 50
+
+
+def test_why_there_is_no_way():
+    pose = np.zeros(3)
+    near = offset_curve(L, RADIUS + 0.2 * CLEARANCE, 20).points
+    roadmap = Roadmap(L, RADIUS, CLEARANCE, np.concatenate([[[0.3, 0.3]], near]))
+    in_slider = roadmap.ways(np.array([0.01, 0.01]), pose, Workspace.unlimited())
+    assert roadmap.way(in_slider, 0, pose).status == WayStatus.START_IN_SLIDER
+    free = roadmap.ways(np.array([-0.2, 0.0]), pose, Workspace.unlimited())
+    assert roadmap.way(free, 0, pose).status == WayStatus.FOUND
+    assert roadmap.way(free, 3, pose).status == WayStatus.GOAL_BLOCKED
+    walls = Workspace.rectangle((-0.3, -0.3), (0.2, 0.2))
+    assert roadmap.way(roadmap.ways(np.array([-0.2, 0.0]), pose, walls), 0, pose).status == WayStatus.NO_WAY
+    narrow = Workspace.rectangle((-RADIUS - 1e-3, -0.3), (-RADIUS, 0.3))
+    stuck = roadmap.ways(np.array([-RADIUS - 1e-4, 0.05]), pose, narrow)
+    assert roadmap.way(stuck, 0, pose).status == WayStatus.NO_RETREAT
+    with pytest.raises(ValueError, match="clearance must be positive"):
+        Roadmap(L, RADIUS, 0.0, near)
+
+
+def test_run_ups_do_not_touch():
+    polygon = shapely.Polygon(T)
+    curve = offset_curve(counterclockwise(T), RADIUS + 0.002, 80)
+    lengths = run_ups(counterclockwise(T), RADIUS, CLEARANCE, curve.points, curve.normals, 0.02)
+    assert np.isfinite(lengths).mean() > 0.9
+    for point, normal, length in zip(curve.points, curve.normals, lengths, strict=True):
+        if np.isfinite(length):
+            begin = point - length * normal
+            assert polygon.distance(shapely.LineString([begin, point])) >= RADIUS
+            assert polygon.distance(shapely.Point(begin)) >= RADIUS + CLEARANCE - 1e-9

@@ -1,0 +1,217 @@
+"""Libraries of pushes: their outcomes, their composition, their files, and the cost to go."""
+
+import jax
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.geometry import se2
+from pushjax.planning import poses
+from pushjax.planning.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.pace import Pace
+from pushjax.planning.push_library import PushLibrary, digest, fan
+from pushjax.planning.workspace import Extent, Workspace
+
+RADIUS, FRICTION = 0.01, 0.2
+GOAL = np.array([0.25, 0.3, 0.7])
+FLOAT32 = 2e-6  # of positions around 0.3 m, after a hundred steps
+
+
+@pytest.fixture(scope="module")
+def slider():
+    return pj.Slider(pj.Polygon.rectangle(0.1, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), 0.04))
+
+
+@pytest.fixture(scope="module")
+def library(slider):
+    return PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=60, angles=5)
+
+
+def test_numpy_poses_agree_with_se2():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(0, 2, (2, 50, 3))
+    points = rng.normal(0, 1, (50, 2))
+    close = {"atol": 1e-5}
+    np.testing.assert_allclose(poses.compose(a, b), se2.compose(a, b), **close)
+    np.testing.assert_allclose(poses.inverse(a), se2.inverse(a), **close)
+    np.testing.assert_allclose(poses.to_world(a, points), se2.transform(a, points), **close)
+    np.testing.assert_allclose(poses.to_body(a, poses.to_world(a, points)), points, atol=1e-12)
+
+
+def test_features_are_a_distance_of_poses():
+    rng = np.random.default_rng(1)
+    center, length = np.array([0.03, -0.01]), 0.05
+    a, move = rng.normal(0, 1, (2, 3))
+    near = a + 1e-5 * rng.normal(0, 1, 3)
+
+    def apart(p, q):
+        return np.linalg.norm(poses.pose_features(p, center, length) - poses.pose_features(q, center, length))
+
+    shift = poses.to_world(near, center) - poses.to_world(a, center)
+    wanted = np.sqrt(np.sum(shift**2) + (length * (near[2] - a[2])) ** 2)
+    assert apart(a, near) == pytest.approx(wanted, rel=1e-6)
+    assert apart(a, a + np.array([0, 0, 2 * np.pi])) < 1e-12
+    # a motion of the world changes no distance
+    assert apart(poses.compose(move, a), poses.compose(move, near)) == pytest.approx(apart(a, near), rel=1e-6)
+
+
+def test_an_outcome_is_that_of_a_push_anywhere(slider, library):
+    """A push of the library, moved with the slider to another pose, ends at the composed pose."""
+    rng = np.random.default_rng(2)
+    entry = int(rng.choice(np.flatnonzero(library.entries[:, 1] == 60)))
+    push, index = library.entries[entry]
+    pose = np.array([0.2, -0.1, 2.0])
+    path = library.starts[push] + library.travel[: index + 1, None] * library.directions[push]
+    hand = pj.Hand.finger(RADIUS)
+    moved = pj.rollout(slider, hand, se2.transform(pose, path), pose=pose, friction=FRICTION)
+    np.testing.assert_allclose(moved.pose[-1], poses.compose(pose, library.relative[entry]), atol=1e-5)
+
+
+def test_every_push_moves_the_slider_away_from_the_finger(library):
+    """The work is positive: the displacement of the touched place is along the push."""
+    last = library.outcomes[0, :, -1]
+    finger = library.starts + library.travel[-1] * library.directions
+    assert library.valid[:, -1].mean() > 0.5
+    touched = library.valid[:, -1]
+    contact = library.starts + RADIUS * library.directions
+    displacement = poses.to_world(last, contact) - contact
+    assert ((displacement * library.directions).sum(1)[touched] > 0).mean() > 0.95
+    # and the finger does not end in the slider
+    body = poses.to_body(last, finger)
+    depth = np.minimum(0.05 + RADIUS - np.abs(body[:, 0]), 0.03 + RADIUS - np.abs(body[:, 1]))
+    assert depth.max() < RADIUS + 1e-4
+
+
+def test_poses_reaching_a_goal(library):
+    """From each of them its push leads to the goal, and the tree finds it there."""
+    back = library.poses_reaching(GOAL)
+    reached = poses.compose(back, library.relative)
+    np.testing.assert_allclose(reached[:, :2], np.broadcast_to(GOAL[:2], reached[:, :2].shape), atol=FLOAT32)
+    some = back[::501]
+    wanted = poses.compose(poses.inverse(some), np.broadcast_to(GOAL, some.shape))
+    distance, index = library.nearest(wanted, 3, 0.01)
+    assert distance.shape == index.shape == (len(some), 3)
+    assert distance[:, 0].max() < 2 * FLOAT32
+    # the nearest of all, by brute force
+    far = wanted + np.array([0.004, -0.003, 0.05])
+    distance, index = library.nearest(far, 1, 0.05)
+    features = library.features(library.relative)
+    for each, found in zip(far, distance[:, 0], strict=True):
+        assert found == pytest.approx(np.linalg.norm(features - library.features(each), axis=1).min(), rel=1e-4)
+
+
+def test_files(slider, library, tmp_path):
+    file = tmp_path / "pushes.npz"
+    library.save(file)
+    starts, directions = fan(slider, RADIUS, 60, 5)
+    wanted = digest(slider, pj.Hand.finger(RADIUS), starts, directions, FRICTION)
+    read = PushLibrary.load(file, wanted)
+    for name in PushLibrary.__dataclass_fields__:
+        assert np.array_equal(getattr(read, name), getattr(library, name)), name
+    other = digest(slider, pj.Hand.finger(RADIUS), starts, directions, 0.3)
+    with pytest.raises(ValueError, match="another slider, hand, friction or set of pushes"):
+        PushLibrary.load(file, other)
+    (tmp_path / "text.npz").write_text("no library")
+    with pytest.raises(ValueError, match="does not hold a library"):
+        PushLibrary.load(tmp_path / "text.npz")
+
+
+def test_random_friction(slider, library):
+    """Outcomes under drawn friction scatter, less with a better known surface; without noise they do not."""
+    few = slice(0, 120, 12)
+    starts, directions = library.starts[few], library.directions[few]
+    hand, key = pj.Hand.finger(RADIUS), jax.random.key(0)
+
+    def spread(dof, friction):
+        model = pj.FrictionModel(dof=dof, friction=friction)
+        many = PushLibrary.simulate(slider, hand, starts, directions, model=model, samples=12, key=key)
+        assert many.outcomes.shape == (12, 10, len(library.travel), 3)
+        return many, many.final_spread()
+
+    exact, none = spread(None, (FRICTION, FRICTION))
+    np.testing.assert_allclose(exact.outcomes[0], library.outcomes[0, few], atol=1e-6)
+    assert none.max() < 1e-6
+    loose, wide = spread(10, (0.05, 0.4))
+    _, narrow = spread(1000, (0.19, 0.21))
+    at_end = loose.valid[:, -1]
+    assert at_end.sum() >= 4
+    assert (wide[at_end, -1] > 3 * narrow[at_end, -1]).all()
+    with pytest.raises(ValueError, match="key"):
+        PushLibrary.simulate(slider, hand, starts, directions, model=pj.FrictionModel(10, 0.2), samples=2)
+
+
+def test_bad_numbers(slider):
+    for name, bad in {"contacts": 0, "angles": 2.5, "max_angle": 2.0}.items():
+        with pytest.raises(ValueError, match=name):
+            fan(slider, RADIUS, **{name: bad})
+    with pytest.raises(ValueError, match="radius"):
+        fan(slider, -1.0)
+
+
+@pytest.fixture(scope="module")
+def costs(slider, library):
+    limits = Workspace.rectangle((0.0, 0.0), (0.5, 0.6))
+    pace = Pace(0.05, 0.02, 0.02)
+    time = pace.push_time(library.travel[library.entries[:, 1]])
+    vertices = np.asarray(slider.shape.vertices)
+    usable = np.ones(len(library.starts), bool)
+    low, high = np.array([0.04, 0.04]), np.array([0.46, 0.56])
+    value = cost_to_go(
+        library, GOAL, limits, time, usable=usable, tolerance=0.006, between=5.0, low=low, high=high, vertices=vertices
+    )
+    return value, limits, time, vertices
+
+
+def test_cost_to_go_of_pushes(library, costs):
+    """From where one push reaches the goal the cost is about that of the push, and it grows with the distance."""
+    value, limits, time, vertices = costs
+    back = library.poses_reaching(GOAL)
+    within = Extent(vertices).outside(back, limits) == 0
+    within &= limits.allows_finger(poses.to_world(back, library.starts[library.entries[:, 0]]))
+    excess = value.nearest(back[within]) - (time[within] + 5)
+    assert np.median(excess) < 5
+    at_goal, beside, far = (value(GOAL + np.array([x, 0, 0.0])) for x in (0.0, -0.06, -0.16))
+    assert at_goal < far
+    assert beside < far + 5
+    assert value(GOAL + np.array([0, 0, np.pi])) > at_goal + 5  # half a turn takes more than one push
+    np.testing.assert_allclose(value(GOAL + np.array([0, 0, 2 * np.pi])), at_goal, rtol=1e-4)
+
+
+def test_cost_to_go_is_a_fixed_point(library, costs):
+    """No push of the library leads to a cell from which the goal is nearer by more than the push costs, walls heeded."""
+    value, limits, time, vertices = costs
+    rng = np.random.default_rng(4)
+    gains = []
+    for _ in range(40):
+        cell = np.array([*rng.integers(6, 30, 2), rng.integers(36)])
+        here = np.array([*(value.origin + value.spacing * cell[:2]), cell[2] * np.pi / 18])
+        reached = poses.compose(here, library.relative)
+        good = Extent(vertices).outside(reached, limits) == 0
+        good &= limits.allows_finger(poses.to_world(here, library.starts[library.entries[:, 0]]))
+        best = np.min((time + 5 + value(reached))[good])
+        gains.append(float(value(here)) - best)
+    # pushes are rounded to cells, so single cells differ by about a step across one cell
+    assert abs(np.median(gains)) < 4
+    assert max(gains) < 20
+
+
+def test_files_of_costs(costs, tmp_path):
+    value = costs[0]
+    value.save(tmp_path / "cost.npz")
+    read = CostToGo.load(tmp_path / "cost.npz")
+    assert all(np.array_equal(a, b) for a, b in zip(read, value, strict=True))
+    (tmp_path / "text.npz").write_text("none")
+    with pytest.raises(ValueError, match="does not hold a cost to go"):
+        CostToGo.load(tmp_path / "text.npz")
+
+
+def test_extent_is_that_of_the_corners(slider):
+    vertices = np.asarray(slider.shape.vertices, float)
+    rng = np.random.default_rng(5)
+    where = np.column_stack([rng.uniform(0, 0.5, (200, 2)), rng.uniform(-9, 9, 200)])
+    limits = Workspace.rectangle((0.1, 0.05), (0.4, 0.5))
+    corners = poses.to_world(where[:, None], vertices)
+    over = np.maximum(limits.slider_low - corners, corners - limits.slider_high).max((1, 2))
+    found = Extent(vertices).outside(where, limits)
+    assert (found >= np.maximum(over, 0) - 1e-6).all()  # never too small
+    assert (found - np.maximum(over, 0)).max() < 0.001
