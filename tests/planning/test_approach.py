@@ -63,7 +63,7 @@ def test_offset_curve_is_at_its_distance():
 
 @pytest.fixture(scope="module")
 def found_ways():
-    """Ways around many polygons from anywhere, also from where the finger has just pushed: polygon, start, goal, way."""
+    """Ways around many polygons from anywhere, also from where the finger has just pushed."""
     rng = np.random.default_rng(2)
     found = []
     for vertices in map(counterclockwise, polygons(40)):

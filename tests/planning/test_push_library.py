@@ -178,7 +178,7 @@ def test_cost_to_go_of_pushes(library, costs):
 
 
 def test_cost_to_go_is_a_fixed_point(library, costs):
-    """No push of the library leads to a cell from which the goal is nearer by more than the push costs, walls heeded."""
+    """No push of the library leads to a cell from which the goal is nearer by more than the push costs."""
     value, limits, time, vertices = costs
     rng = np.random.default_rng(4)
     gains = []
