@@ -7,7 +7,8 @@ from urllib.parse import unquote
 
 import pytest
 
-from pushjax.datasets import find_data
+from pushjax.cli import main as cli
+from pushjax.datasets import download, find_data
 from pushjax.datasets.data_folder import default_folder
 from pushjax.datasets.download import RemoteFile, fetch, triangle_files
 
@@ -112,3 +113,15 @@ def test_fetched_data_are_found(tmp_path, monkeypatch):
     assert find_data() == default_folder()
     monkeypatch.setenv("PUSHJAX_DATA", str(tmp_path))
     assert find_data() == tmp_path
+
+
+def test_the_command_says_how_far_it_is(server, tmp_path, monkeypatch, capsys):
+    """In a pipe too: a line before the first file, and one for each tenth of the bytes."""
+    monkeypatch.setattr(download, "SOURCE", server.address)
+    monkeypatch.setattr(download, "triangle_files", lambda: FILES)
+    cli.main(["data", "triangle", "--to", str(tmp_path)])
+    printed = capsys.readouterr()
+    first, *rest = printed.err.splitlines()
+    assert first.startswith("pushjax: fetching 118 files of 34 MB")
+    assert [line.split(": ")[-1] for line in rest] == ["99%", "100%"]  # 9000 of 9009 bytes, and all
+    assert printed.out == f"the logs are in {tmp_path}\n"
