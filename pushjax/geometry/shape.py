@@ -293,12 +293,12 @@ def check_simple_polygon(name: str, v: np.ndarray) -> None:
             f"{name}: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
             "first is not repeated at the end"
         )
-    if abs(signed_area(v)) <= 1e-12 * size**2:
-        raise ValueError(f"{name} enclose no area ({abs(signed_area(v)):.3g} m^2)")
+    if np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[1] <= 1e-12 * size:
+        raise ValueError(f"{name} lie on one line and enclose no area")
     crossed = find_self_intersection(v, 1e-9 * size)
     if crossed is not None:
-        i, j = crossed
-        raise ValueError(f"{name}: the outline crosses or touches itself (edges {i} and {j}, counted from 0)")
+        first, second = (f"the edge from vertex {k} to vertex {(k + 1) % n}" for k in crossed)
+        raise ValueError(f"{name}: the outline crosses or touches itself: {first}, and {second}, counted from 0")
 
 
 def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] | None:

@@ -700,8 +700,15 @@ def test_dtype_is_the_input_s():
 
 SQUARE = POLYGONS["square"]
 BAD = {
-    "no area": (lambda: Polygon([(0, 0), (1, 1), (2, 2)]), "vertices"),
-    "bow tie": (lambda: Polygon(SQUARE[[0, 2, 1, 3]]), "vertices"),
+    "no area": (lambda: Polygon([(0, 0), (1, 1), (2, 2)]), "vertices lie on one line and enclose no area"),
+    "bow tie": (
+        lambda: Polygon(SQUARE[[0, 2, 1, 3]]),
+        "crosses or touches itself: the edge from vertex 0 to vertex 1, and the edge from vertex 2 to vertex 3",
+    ),
+    "uneven bow tie": (
+        lambda: Polygon([(0, 0), (4, 0), (1, 3), (1, -1)]),
+        "the edge from vertex 0 to vertex 1, and the edge from vertex 2 to vertex 3, counted from 0",
+    ),
     "crossing": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (1, -1), (0, 3)]), "vertices: the outline crosses"),
     "touching": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (2, 0), (0, 3)]), "vertices: the outline crosses or touches"),
     "spike": (lambda: Polygon([(0, 0), (4, 0), (4, 3), (4, 5), (4, 3.5), (0, 3)]), "vertices: the outline"),
