@@ -1,1 +1,33 @@
 """Plans of pushes and grasps that reach a goal, also where friction is not known."""
+
+from pushjax.planning.costs import Clearance as Clearance
+from pushjax.planning.costs import Cost as Cost
+from pushjax.planning.costs import CVaR as CVaR
+from pushjax.planning.costs import FinalPose as FinalPose
+from pushjax.planning.costs import Mean as Mean
+from pushjax.planning.costs import Missed as Missed
+from pushjax.planning.costs import Risk as Risk
+from pushjax.planning.costs import Travel as Travel
+from pushjax.planning.costs import WayPoints as WayPoints
+from pushjax.planning.costs import Work as Work
+from pushjax.planning.costs import Worst as Worst
+from pushjax.planning.dubins import DubinsPath as DubinsPath
+from pushjax.planning.dubins import dubins as dubins
+from pushjax.planning.goal import Goal as Goal
+from pushjax.planning.plan import Outcomes as Outcomes
+from pushjax.planning.plan import PushPlan as PushPlan
+from pushjax.planning.plan import PushPlanStatus as PushPlanStatus
+from pushjax.planning.plan import plan_pushes as plan_pushes
+from pushjax.planning.plan import push_outcomes as push_outcomes
+from pushjax.planning.pushes import Pushes as Pushes
+from pushjax.planning.search import MPPI as MPPI
+from pushjax.planning.search import CrossEntropy as CrossEntropy
+from pushjax.planning.search import GradientRefinement as GradientRefinement
+from pushjax.planning.search import Search as Search
+from pushjax.planning.search import Selection as Selection
+from pushjax.planning.stable import StableContact as StableContact
+from pushjax.planning.stable import StablePush as StablePush
+from pushjax.planning.stable import StableStatus as StableStatus
+from pushjax.planning.stable import shortest_push as shortest_push
+from pushjax.planning.stable import stable_contacts as stable_contacts
+from pushjax.planning.stable import stable_push as stable_push

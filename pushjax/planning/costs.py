@@ -1,0 +1,258 @@
+"""Costs of a push, and the risk of a cost that is random.
+
+A `Cost` is a function of a `Trajectory`. Costs add up and are multiplied by numbers:
+
+    cost = FinalPose(goal) + 0.1 * Travel() + 50.0 * Clearance(shape, fixtures, 0.01)
+
+A plan of several pushes is a trajectory with a leading axis of pushes, and every cost takes it as it is. A cost is a
+pure function, and its derivatives are finite wherever those of the trajectory are.
+
+The friction of a push is random, and so is the pose it starts from. For samples of both a cost has as many values, and
+a `Risk` makes one number of them.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_non_negative, check_positive, check_shape
+from pushjax._math.vec import Vec2
+from pushjax.geometry import se2
+from pushjax.geometry.polygon import Polygon
+from pushjax.geometry.shape import Shape
+from pushjax.planning.goal import Goal, norm
+from pushjax.simulation.fixtures import Fixtures, Wall
+from pushjax.simulation.trajectory import Trajectory
+
+OUTLINE_POINTS = 48  # points on an outline whose distances from fixtures are measured, besides its corners
+
+
+class Cost(eqx.Module):
+    """A cost of a push. Costs are added, and multiplied by numbers."""
+
+    @abstractmethod
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        """Return the cost of a push, or of several pushes in a row with a leading axis of pushes."""
+
+    def __add__(self, other: "Cost") -> "Cost":
+        return Sum((self, other)) if isinstance(other, Cost) else NotImplemented
+
+    def __mul__(self, factor: ArrayLike) -> "Cost":
+        return Scaled(self, as_float(factor, name="factor"))
+
+    __rmul__ = __mul__
+
+
+class Sum(Cost):
+    """The sum of several costs.
+
+    Attributes:
+        costs: The costs.
+    """
+
+    costs: tuple[Cost, ...]
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        return sum((cost(push) for cost in self.costs), jnp.zeros((), push.pose.dtype))
+
+
+class Scaled(Cost):
+    """A cost times a number.
+
+    Attributes:
+        cost: The cost.
+        factor: The number.
+    """
+
+    cost: Cost
+    factor: Float[Array, ""]
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        value = self.cost(push)
+        return self.factor.astype(value.dtype) * value
+
+
+class FinalPose(Cost):
+    """Squared error of the final pose in units of the goal's tolerances, `Goal.squared_error`.
+
+    Attributes:
+        goal: The goal.
+    """
+
+    goal: Goal
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        return self.goal.squared_error(_poses(push)[-1])
+
+
+class Missed(Cost):
+    """Whether the final pose misses the goal: its mean over samples is the probability of failure.
+
+    Attributes:
+        goal: The goal.
+        width: Zero for a step from 0 to 1 at the tolerance. Otherwise the width of a smooth transition, in tolerances;
+            its value at the tolerance is a half.
+    """
+
+    goal: Goal
+    width: Float[Array, ""]
+
+    def __init__(self, goal: Goal, width: ArrayLike = 0.0):
+        self.goal, self.width = goal, as_float(width, name="width")
+        check_shape("width", self.width, ())
+        check_finite("width", self.width)
+        check_non_negative("width", self.width)
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        beyond = self.goal.excess(_poses(push)[-1]) - 1
+        smooth = self.width > 0
+        slope = jax.nn.sigmoid(beyond / jnp.where(smooth, self.width, 1.0).astype(beyond.dtype))
+        return jnp.where(smooth, slope, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))
+
+
+class WayPoints(Cost):
+    """Squared errors from several goals on the way, each at the pose that is nearest to it.
+
+    Attributes:
+        goals: The goals, in any order.
+    """
+
+    goals: tuple[Goal, ...]
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        poses = _poses(push)
+        nearest = [jnp.min(goal.squared_error(poses)) for goal in self.goals]
+        return sum(nearest, jnp.zeros((), poses.dtype))
+
+
+class Travel(Cost):
+    """Length of the hand's path, m, from its first two numbers. The way between pushes is not counted."""
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        return jnp.sum(norm(jnp.diff(push.configuration[..., :2], axis=-2)))
+
+
+class Work(Cost):
+    """Work of the hand against the friction of the table, J, for a limit surface whose load is known."""
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        return jnp.sum(push.wrench * push.twist)
+
+
+class Clearance(Cost):
+    """How much nearer than a distance the slider comes to walls and fixtures: squared, in units of the distance.
+
+    The mean over the poses of the push. The distance is that between points on both outlines and the other body, so it
+    is exact for polygons that are apart.
+
+    Args:
+        shape: Outline of the slider.
+        fixtures: Walls and fixtures to stay away from.
+        distance: The distance, m.
+
+    Raises:
+        ValueError: For a distance that is not positive.
+    """
+
+    shape: Shape
+    fixtures: Fixtures
+    distance: Float[Array, ""]
+    points: Float[Array, "points 2"]
+
+    def __init__(self, shape: Shape, fixtures: Fixtures, distance: ArrayLike):
+        self.shape, self.fixtures, self.distance = shape, tuple(fixtures), as_float(distance, name="distance")
+        check_shape("distance", self.distance, ())
+        check_finite("distance", self.distance)
+        check_positive("distance", self.distance)
+        self.points = _outline_points(shape)
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        missing = jnp.maximum(self.distance - jax.vmap(self.nearest)(_poses(push)), 0) / self.distance
+        return jnp.mean(missing**2)
+
+    def nearest(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
+        """Return the distance between the slider at a pose and the nearest wall or fixture, m, negative inside.
+
+        Args:
+            pose: Pose of the slider, (3,), world.
+        """
+        points, found = se2.transform(pose, self.points), [jnp.asarray(jnp.inf, pose.dtype)]
+        for each in self.fixtures:
+            if isinstance(each, Wall):
+                found.append(jnp.min((points - each.point[None]) @ each.normal))
+                continue
+            found.append(_distance(each.shape, se2.transform(se2.inverse(each.pose), points)))
+            corners = se2.transform(each.pose, _outline_points(each.shape))
+            found.append(_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
+        return jnp.min(jnp.stack(found))
+
+
+def _outline_points(shape: Shape) -> Float[Array, "points 2"]:
+    points = shape.boundary(OUTLINE_POINTS)
+    return jnp.concatenate([shape.vertices, points]) if isinstance(shape, Polygon) else points
+
+
+def _distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
+    """Return the smallest signed distance of points from a shape, both in its body frame, m."""
+    outline = shape.outline()
+    return jnp.min(jax.vmap(lambda point: outline.closest(Vec2.of(point)).distance)(points))
+
+
+def _poses(push: Trajectory) -> Float[Array, "poses 3"]:
+    """Return the poses of a push, or of several pushes in a row."""
+    return push.pose.reshape(-1, 3)
+
+
+class Risk(eqx.Module):
+    """A number that says how bad a random cost is, from samples of it."""
+
+    @abstractmethod
+    def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
+        """Return the risk of samples of a cost, all of one probability."""
+
+
+class Mean(Risk):
+    """The mean. Of `Missed`, it is the probability of failure."""
+
+    def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
+        return jnp.mean(costs)
+
+
+class Worst(Risk):
+    """The largest of all samples."""
+
+    def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
+        return jnp.max(costs)
+
+
+class CVaR(Risk):
+    """Conditional value at risk: the mean of the worst fraction of the samples.
+
+    The fraction need not be a whole number of samples; the last one then counts by a part. A fraction of one gives the
+    mean, and one that is at most one sample the worst.
+
+    Args:
+        fraction: The fraction, above 0 and at most 1.
+
+    Raises:
+        ValueError: If the fraction is outside.
+
+    Reference: Rockafellar & Uryasev 2000.
+    """
+
+    fraction: float = eqx.field(static=True)
+
+    def __init__(self, fraction: float = 0.1):
+        if not 0 < fraction <= 1:
+            raise ValueError(f"fraction must be above 0 and at most 1; got {fraction!r}")
+        self.fraction = float(fraction)
+
+    def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
+        count = max(self.fraction * len(costs), 1.0)
+        weights = np.minimum(count - np.arange(int(np.ceil(count))), 1) / count
+        worst = jnp.sort(costs, descending=True)[: len(weights)]
+        return jnp.sum(worst * jnp.asarray(weights, costs.dtype))

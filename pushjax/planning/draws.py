@@ -1,0 +1,51 @@
+"""Friction that all candidates of a search share, so that their costs differ by the candidates and not by luck."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from pushjax._internal.checks import check_count, check_key, check_type
+from pushjax._internal.jit import quick_jit
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.simulation.random_rollout import Draws, draw
+
+
+def draw_friction(key: PRNGKeyArray, surface: LimitSurface, model: FrictionModel, samples: int) -> Draws:
+    """Sample limit surface and contact friction of many pushes, each of which keeps its friction.
+
+    Args:
+        key: PRNG key. Sample i has the key `fold_in(key, i)`.
+        surface: Mean of the limit surfaces.
+        model: Distribution of friction; its `resample_every` must be None.
+        samples: Number of samples.
+
+    Returns:
+        The samples, whose arrays have the leading axes (samples, 1).
+
+    Raises:
+        ValueError: If `samples` is less than one, or the model samples again during a push.
+        TypeError: If `key` is not a key, or `model` is not a `FrictionModel`.
+    """
+    check_key(key)
+    check_type("model", model, FrictionModel)
+    check_count("samples", samples)
+    if model.resample_every is not None:
+        raise ValueError(f"model.resample_every must be None for a plan; got {model.resample_every}")
+    return _draw(key, model.around(surface), model, jnp.arange(samples))
+
+
+@quick_jit
+def _draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel, indices: jax.Array) -> Draws:
+    return jax.vmap(lambda index: draw(jax.random.fold_in(key, index), surfaces, model, 1))(indices)
+
+
+def mean_friction(surface: LimitSurface, model: FrictionModel) -> Draws:
+    """Return the mean of a distribution of friction as a single sample, with the leading axes (1, 1).
+
+    Args:
+        surface: Mean of the limit surfaces.
+        model: Distribution of friction.
+    """
+    mean = Draws(surface, jnp.mean(model.friction), jnp.zeros_like(surface.length))
+    return jax.tree.map(lambda leaf: leaf[None, None], mean)

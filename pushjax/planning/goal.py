@@ -1,0 +1,170 @@
+"""The pose that a plan shall reach, and how far from it another pose is."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_count,
+    check_finite,
+    check_positive,
+    check_shape,
+    common_dtype,
+)
+
+ANGLE = float(np.radians(5))  # default tolerance of the angle, rad
+
+
+class Goal(eqx.Module):
+    """A pose to reach, with a tolerance of position and one of angle.
+
+    A slider that looks the same after a turn about its body origin may reach the goal at several angles.
+
+    Args:
+        pose: Pose of the slider, (3,), world, m and rad.
+        position: Tolerance of the position of the body origin, m.
+        angle: Tolerance of the angle, rad.
+        length: Length that weighs the angle in `distance`, m.
+        symmetry: Number of angles in a full turn at which the slider looks the same (4 for a square), or a list of the
+            turns after which it does, (turns,), rad.
+
+    Attributes:
+        pose: The pose, (3,), world, m and rad.
+        position: Tolerance of the position, m.
+        angle: Tolerance of the angle, rad.
+        length: Length that weighs the angle, m.
+        turns: Turns after which the slider looks the same, (turns,), rad.
+
+    Raises:
+        ValueError: For a pose or turns of a wrong shape, for a tolerance or a length that is not positive, for values
+            that are not finite, and for a symmetry below one.
+
+    Examples:
+        >>> goal = Goal((0.1, 0.0, 0.0), symmetry=4)
+        >>> print(goal.reached((0.103, 0.0, 1.6)), goal.reached((0.103, 0.0, 0.8)))
+        True False
+    """
+
+    pose: Float[Array, "3"]
+    position: Float[Array, ""]
+    angle: Float[Array, ""]
+    length: Float[Array, ""]
+    turns: Float[Array, "turns"]
+
+    def __init__(
+        self,
+        pose: ArrayLike,
+        *,
+        position: ArrayLike = 0.005,
+        angle: ArrayLike = ANGLE,
+        length: ArrayLike = 0.05,
+        symmetry: int | ArrayLike = 1,
+    ):
+        dtype = common_dtype(pose, position, angle, length)
+        self.pose = as_float(pose, dtype, "pose")
+        check_shape("pose", self.pose, (3,))
+        check_finite("pose", self.pose)
+        self.position, self.angle, self.length = (
+            as_float(value, dtype, name)
+            for name, value in (("position", position), ("angle", angle), ("length", length))
+        )
+        for name in ("position", "angle", "length"):
+            check_shape(name, getattr(self, name), ())
+            check_finite(name, getattr(self, name))
+            check_positive(name, getattr(self, name))
+        if np.ndim(symmetry) == 0:  # pyright: ignore[reportArgumentType]
+            check_count("symmetry", symmetry)
+            symmetry = 2 * np.pi * np.arange(symmetry) / symmetry  # pyright: ignore
+        self.turns = as_float(symmetry, dtype, "symmetry")
+        check_shape("symmetry", self.turns, ("turns",))
+        check_finite("symmetry", self.turns)
+        if not len(self.turns):
+            raise ValueError("symmetry must have at least one turn, zero for a slider without symmetry; got none")
+
+    def offset(self, pose: ArrayLike) -> Float[Array, "*batch 3"]:
+        """Return what is missing from the goal: the difference of the poses, with the smallest of the angles.
+
+        Args:
+            pose: Poses, (..., 3), world, m and rad.
+
+        Returns:
+            Pose minus goal, (..., 3), m and rad. The angle is that of the turn that is nearest, within half a turn.
+            Its derivative is one everywhere; where two turns are equally near, that of either.
+
+        Raises:
+            ValueError: For poses of another shape.
+        """
+        given = as_float(pose, common_dtype(pose, self.pose), "pose")
+        if given.ndim == 0 or given.shape[-1] != 3:
+            raise ValueError(f"pose has shape {given.shape}; expected (..., 3)")
+        difference = given - jnp.broadcast_to(self.pose, given.shape)
+        # wrapped to half a turn by a whole number of turns, which has no derivative
+        angles = difference[..., 2:] - jnp.broadcast_to(self.turns, (*given.shape[:-1], len(self.turns)))
+        angles = angles - 2 * jnp.pi * jnp.round(angles / (2 * jnp.pi))
+        nearest = jnp.argmin(jnp.abs(angles), axis=-1, keepdims=True)
+        return jnp.concatenate([difference[..., :2], jnp.take_along_axis(angles, nearest, axis=-1)], axis=-1)
+
+    def squared_error(self, pose: ArrayLike) -> Float[Array, "*batch"]:
+        """Return the squared error in units of the tolerances: (distance / position)^2 + (turn / angle)^2.
+
+        Its derivative is zero at the goal and finite everywhere. A pose with an error of at most one has reached the
+        goal.
+
+        Args:
+            pose: Poses, (..., 3), world, m and rad.
+
+        Raises:
+            ValueError: For poses of another shape.
+        """
+        offset = self.offset(pose)
+        squared = offset[..., 0] ** 2 + offset[..., 1] ** 2
+        return squared / self.position**2 + (offset[..., 2] / self.angle) ** 2
+
+    def distance(self, pose: ArrayLike) -> Float[Array, "*batch"]:
+        """Return the distance from the goal, m: that of the positions plus `length` times that of the angles.
+
+        It is `pushjax.deviation` from the nearest of the equivalent goals. It has corners at equal positions and at
+        equal angles, where its derivative is zero.
+
+        Args:
+            pose: Poses, (..., 3), world, m and rad.
+
+        Raises:
+            ValueError: For poses of another shape.
+        """
+        offset = self.offset(pose)
+        return norm(offset[..., :2]) + self.length * offset[..., 2] * jnp.sign(offset[..., 2])
+
+    def excess(self, pose: ArrayLike) -> Float[Array, "*batch"]:
+        """Return the larger of the errors of position and angle in units of their tolerances; at most one if reached.
+
+        Args:
+            pose: Poses, (..., 3), world, m and rad.
+
+        Raises:
+            ValueError: For poses of another shape.
+        """
+        offset = self.offset(pose)
+        turn = offset[..., 2] * jnp.sign(offset[..., 2])
+        return jnp.maximum(norm(offset[..., :2]) / self.position, turn / self.angle)
+
+    def reached(self, pose: ArrayLike) -> Bool[Array, "*batch"]:
+        """Return whether poses are within both tolerances.
+
+        Args:
+            pose: Poses, (..., 3), world, m and rad.
+
+        Raises:
+            ValueError: For poses of another shape.
+        """
+        return self.excess(pose) <= 1
+
+
+def norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Return the Euclidean norm along the last axis. Its derivative at the zero vector is zero."""
+    squared = jnp.sum(vector**2, axis=-1)
+    moves = squared > 0
+    return jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)

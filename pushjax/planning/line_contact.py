@@ -1,0 +1,267 @@
+"""A hand that pushes a straight edge of a slider in two places, and how tightly it can turn without slip.
+
+Two round fingers side by side, or a flat pad, touch an edge along a line. All of this module is in the *pushing frame*:
+its origin is midway between the two contacts, its x axis is the inward normal of the edge. Let the contacts be at
+y = +b and y = -b, and their forces in cones of friction mu. Together they can apply exactly the wrenches with
+
+    |f_y| <= mu f_x    and    |tau| <= b f_x,
+
+because tangential forces along the line of the contacts have no torque about the origin. Both contacts stick where the
+wrench that the slider's twist needs, by its limit surface, is strictly inside this cone. That the hand then moves the
+slider with it follows for any limit surface; no mode is assumed.
+
+The hand moves along its *heading*, and turns. The point of the slider that follows the path of a car is a point on the
+heading through the origin, at some distance ahead of it. The curvature of that path determines the twist, and the
+wrench. So for one limit surface and one coefficient of friction the curvatures without slip form an interval; for many
+of them it is the intersection. Its ends are found by bisection.
+
+Where the point is decides how tight the turn can be: ahead of the center of friction the slider must swing out, which
+takes a tangential force, and in exchange less torque. `turn` tries points over the whole depth of the slider and takes
+the one with the tightest turns.
+
+Reference: Lynch & Mason 1996, section 3 (stable pushes by line contact). Zhou & Mason 2017 (such a point, and paths of
+bounded curvature).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from pushjax._internal.jit import quick_jit
+from pushjax._math.vec import Vec3
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.geometry import se2
+from pushjax.planning.poses import compose
+from pushjax.simulation.hand import Hand, RoundFinger
+from pushjax.simulation.slider import Slider
+
+FLAT = 1e-5  # points whose distance along an axis is less than this, in units of the surface's length, are side by side
+GRID, BISECTIONS = 48, 30  # curvatures tried to either side, and halvings of the interval between two of them
+POINTS = 25  # points that are tried for the one that follows the path
+
+
+class LineContact(NamedTuple):
+    """A hand against an edge of a slider, in the slider's body frame.
+
+    Attributes:
+        edge: Index of the edge, from vertex `edge` to the next one.
+        hand: Pose of the hand, (3,), m and rad.
+        frame: Pose of the pushing frame, (3,), m and rad.
+        half_width: Half of the distance between the two contacts, m.
+        heading: Direction in which the hand moves straight ahead, rad, in the pushing frame.
+        depth: Extent of the slider along the inward normal, m.
+    """
+
+    edge: int
+    hand: np.ndarray
+    frame: np.ndarray
+    half_width: float
+    heading: float
+    depth: float
+
+
+class HandFront(NamedTuple):
+    """The foremost part of a hand, along the x axis of its frame.
+
+    Attributes:
+        x: How far it reaches along x, m.
+        low: Smallest y of the points that reach that far, m.
+        high: Largest y of them, m.
+        is_flat: Whether it is the face of a pad, which may be longer than the edge. Round fingers must both touch it.
+    """
+
+    x: float
+    low: float
+    high: float
+    is_flat: bool
+
+
+def hand_front(hand: Hand, opening: np.ndarray, length: float) -> HandFront:
+    """Find the foremost points of a hand along the x axis of its frame.
+
+    Args:
+        hand: A hand whose configuration begins with its pose (x, y, theta).
+        opening: The other numbers of the configuration, (dof - 3,).
+        length: Length of the limit surface, m, which says what is flat.
+
+    Raises:
+        ValueError: If the hand does not move like a rigid body with the first three numbers of its configuration, or
+            its foremost part is a single point.
+    """
+    if hand.dof < 3 or opening.shape != (hand.dof - 3,):
+        raise ValueError(
+            f"opening has shape {opening.shape}; expected ({max(hand.dof - 3, 0)},), what a configuration of the hand "
+            "has beyond x, y and theta; a hand that does not turn cannot push stably"
+        )
+    rest = np.asarray(hand.poses(jnp.asarray(np.concatenate([np.zeros(3), opening]))), np.float64)
+    placed = np.array([0.3 * length, -0.7 * length, 1.0])
+    moved = np.asarray(hand.poses(jnp.asarray(np.concatenate([placed, opening]))), np.float64)
+    if rest.shape[1] != 3 or np.abs(np.asarray(se2.compose(placed, rest)) - moved).max() > 1e-5:
+        raise ValueError("hand must move like a rigid body with x, y and theta, the first numbers of its configuration")
+    points, flat = [], []
+    for finger, pose in zip(hand.fingers, rest, strict=True):
+        if isinstance(finger, RoundFinger):
+            points.append(np.array([[pose[0] + float(finger.radius), pose[1]]]))
+        else:
+            points.append(np.asarray(se2.transform(pose, finger.shape.vertices), np.float64))
+        flat += [not isinstance(finger, RoundFinger)] * len(points[-1])
+    corners = np.concatenate(points)
+    foremost = corners[:, 0] > corners[:, 0].max() - FLAT * length
+    low, high = corners[foremost, 1].min(), corners[foremost, 1].max()
+    if high - low <= FLAT * length:
+        raise ValueError("hand touches an edge in one point; a stable push needs two fingers side by side, or a pad")
+    return HandFront(float(corners[:, 0].max()), float(low), float(high), bool(np.asarray(flat)[foremost].all()))
+
+
+def line_contacts(slider: Slider, front: HandFront) -> list[LineContact]:
+    """Place a hand on every edge of a slider on which it fits, where it pushes the mean surface straight ahead.
+
+    A normal force moves the slider without turning it if it acts where H is least. The middle of the contact is put
+    there, or as near as the edge allows, and the heading is the direction of that motion.
+
+    Args:
+        slider: The slider, a polygon.
+        front: Foremost points of the hand.
+
+    Returns:
+        The contacts, one an edge at most. Only edges with the whole slider behind them are used.
+    """
+    vertices, found = np.asarray(slider.shape.vertices, np.float64), []  # pyright: ignore[reportAttributeAccessIssue]
+    for edge, (start, end) in enumerate(zip(vertices, np.roll(vertices, -1, axis=0), strict=True)):
+        length = float(np.hypot(*(end - start)))
+        along = (end - start) / length
+        normal = np.array([-along[1], along[0]])
+        inward = (vertices - start[None]) @ normal
+        if inward.min() < -FLAT * length or (front.high - front.low > length and not front.is_flat):
+            continue
+        torque, motion = _straight_push(slider.surface, normal)
+        # the torque about the body origin of a force along the normal, which acts at a distance from the start
+        distance = torque - (start[0] * normal[1] - start[1] * normal[0])
+        width = min(front.high - front.low, length)
+        middle = start + np.clip(distance, width / 2, length - width / 2) * along
+        frame = np.array([*middle, np.arctan2(normal[1], normal[0])])
+        hand = np.array([-front.x, -(front.low + front.high) / 2, 0.0])
+        heading = float(np.arctan2(-motion @ along, motion @ normal))  # the frame's y axis is against the edge
+        found.append(LineContact(edge, compose(frame, hand), frame, width / 2, heading, float(inward.max())))
+    return found
+
+
+def _straight_push(surface: LimitSurface, force: np.ndarray) -> tuple[float, np.ndarray]:
+    """Find the torque with which a force moves the slider without turning it, N m, and the direction of the motion.
+
+    The angular velocity is zero where H is least over the torque. H is a convex polynomial of the torque.
+    """
+    form, one = surface.form(), jnp.ones_like(surface.length)
+    push, torque = Vec3(one * force[0], one * force[1], 0 * one), Vec3(0 * one, 0 * one, one)
+    polynomial = np.polynomial.Polynomial([float(c) for c in form.restrict(push, torque)])
+    roots = polynomial.deriv().roots()
+    best = float(np.real(roots[np.argmin(np.abs(np.imag(roots)))]))
+    motion = form.gradient(Vec3(push.x, push.y, one * best))
+    return best * float(surface.length), np.array([float(motion.x), float(motion.y)])
+
+
+class Turn(NamedTuple):
+    """How tightly a line contact can turn without slip.
+
+    Attributes:
+        point: Distance ahead of the pushing frame's origin of the point that follows the path, m.
+        left: Largest curvature of its path to the left, 1/m.
+        right: Largest curvature of its path to the right, 1/m.
+    """
+
+    point: float
+    left: float
+    right: float
+
+    @property
+    def radii(self) -> tuple[float, float]:
+        """Radii of the tightest turns to the left and to the right, m; infinite where there is none."""
+        return 1 / self.left if self.left > 0 else np.inf, 1 / self.right if self.right > 0 else np.inf
+
+
+def turn(contact: LineContact, surfaces: LimitSurface, friction: Array, margin: float) -> Turn | None:
+    """Find the tightest turns of a line contact at which both of its ends stick, for all sampled surfaces.
+
+    Args:
+        contact: The contact.
+        surfaces: Limit surfaces, with a leading axis of samples. All have one length.
+        friction: Coefficient of friction of each sample, (samples,).
+        margin: Fraction by which friction and width are reduced.
+
+    Returns:
+        The turns with the smallest sum of the radii, or None if not even a straight push is stable.
+    """
+    points = np.linspace(0, contact.depth, POINTS)
+    numbers = (contact.frame, contact.half_width, contact.heading, points, margin)
+    numbers = (jnp.asarray(number, friction.dtype) for number in numbers)
+    curvatures = np.asarray(_stable_curvatures(surfaces, friction, *numbers), np.float64)
+    if np.isnan(curvatures).any():  # whether straight ahead is stable does not depend on the point
+        return None
+    turns = [
+        Turn(float(point), float(left), float(right)) for point, (left, right) in zip(points, curvatures, strict=True)
+    ]
+    return min(turns, key=lambda each: sum(each.radii))
+
+
+@quick_jit
+def _stable_curvatures(
+    surfaces: LimitSurface,
+    friction: Float[Array, "samples"],
+    frame: Float[Array, "3"],
+    half_width: Float[Array, ""],
+    heading: Float[Array, ""],
+    points: Float[Array, "points"],
+    margin: Float[Array, ""],
+) -> Float[Array, "points 2"]:
+    """Find the largest curvatures of the path of each point, to the left and to the right, (points, 2), 1/m.
+
+    Args:
+        surfaces: Limit surfaces, with a leading axis of samples.
+        friction: Coefficient of friction of each sample.
+        frame: Pose of the pushing frame in the body frame.
+        half_width: Half of the distance between the two contacts, m.
+        heading: Direction straight ahead, rad, in the pushing frame.
+        points: Distances ahead of the pushing frame's origin of the point that follows the path, m.
+        margin: Fraction by which friction and width are reduced.
+
+    Returns:
+        The curvatures. NaN if not even the straight push is stable.
+    """
+    length, to_frame = surfaces.length[0], se2.inverse(frame)
+    ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
+
+    def slack(surface: LimitSurface, mu: Array, point: Array, psi: Array) -> Array:
+        """How far the wrench of the curvature tan(psi) / length is inside the cone; not positive outside."""
+        spin = jnp.sin(psi) / length
+        swing = -spin * point
+        twist = jnp.stack(
+            [jnp.cos(psi) * ahead[0] - swing * ahead[1], jnp.cos(psi) * ahead[1] + swing * ahead[0], spin]
+        )
+        normal, tangential, torque = se2.transport_wrench(to_frame, surface.wrench(se2.transport_twist(frame, twist)))
+        kept = 1 - margin
+        return jnp.minimum(
+            kept * mu * normal - jnp.abs(tangential), (kept * half_width * normal - jnp.abs(torque)) / length
+        )
+
+    @jax.vmap
+    def is_stable(point: Array, psi: Array) -> Array:
+        """Whether the contact sticks for all samples at each of the angles psi, (angles,)."""
+        each = jax.vmap(jax.vmap(slack, (0, 0, None, None)), (None, None, None, 0))
+        return jnp.all(each(surfaces, friction, point, psi) > 0, axis=1)
+
+    signs = jnp.array([[1.0, -1.0]], points.dtype)
+    stride = 0.499 * jnp.pi / GRID  # up to almost a turn about the point itself
+
+    def search(_, ends):
+        """Go on until an angle is not stable, then halve the interval."""
+        low, high = ends
+        tried = jnp.where(jnp.isinf(high), jnp.minimum(low + stride, 0.499 * jnp.pi), (low + high) / 2)
+        stable = is_stable(points, signs * tried)
+        return jnp.where(stable, tried, low), jnp.where(stable, high, tried)
+
+    start = jnp.full((len(points), 2), -stride), jnp.full((len(points), 2), jnp.inf)
+    low, _ = jax.lax.fori_loop(0, GRID + 1 + BISECTIONS, search, start)
+    return jnp.where(low >= 0, jnp.tan(low) / length, jnp.nan)

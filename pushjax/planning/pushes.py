@@ -1,0 +1,164 @@
+"""Parameters of pushes: from a few numbers to the path of a hand.
+
+A push is a line in the slider's body frame: a direction, and a signed distance from the body origin. The hand comes
+along that line from outside. Where it first touches the outline is found exactly (`Outline.sweep`), and the push goes
+on from there by a length. So contact point, direction and length are free, for any outline, without a border between
+its edges. With bends the path is a Bezier curve whose ends are those of the line.
+"""
+
+from math import comb
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_positive, check_shape
+from pushjax._math.vec import Vec2
+from pushjax.geometry import se2
+from pushjax.simulation.hand import Hand, RoundFinger
+from pushjax.simulation.slider import Slider
+
+
+class Pushes(eqx.Module):
+    """Several pushes in a row, each given by three numbers and its bends.
+
+    The numbers of a push, in units that make all of them of order one:
+
+    - direction, rad, in the slider's body frame at the start of the push;
+    - distance of the line from the body origin to the left, in units of the slider's radius about its origin;
+    - length of the push from first contact, in units of `length`, clipped to [0, 1];
+    - sideways displacement of each inner control point, in units of the push's length.
+
+    A push of length zero ends where the hand touches, so a plan of three pushes contains those of fewer.
+
+    Args:
+        count: Number of pushes.
+        length: Longest push from first contact, m.
+        steps: Number of steps of each push.
+        clearance: Distance before first contact at which a push starts, m.
+        bends: Number of inner control points of the path; zero for a straight line.
+        opening: For a hand that turns: what its configuration has beyond x, y and theta, (dof - 3,). Its x axis points
+            in the direction of the push.
+
+    Raises:
+        ValueError: For a count below one, a negative number of bends, or a length or clearance that is not positive.
+    """
+
+    count: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    bends: int = eqx.field(static=True)
+    length: Float[Array, ""]
+    clearance: Float[Array, ""]
+    opening: Float[Array, "numbers"]
+
+    def __init__(
+        self,
+        count: int = 1,
+        *,
+        length: ArrayLike,
+        steps: int = 12,
+        clearance: ArrayLike = 0.01,
+        bends: int = 0,
+        opening: ArrayLike = (),
+    ):
+        check_count("count", count)
+        check_count("steps", steps)
+        check_count("bends", bends + 1 if isinstance(bends, int) and bends >= 0 else bends)
+        self.count, self.steps, self.bends = int(count), int(steps), int(bends)
+        self.length, self.clearance = as_float(length, name="length"), as_float(clearance, name="clearance")
+        for name in ("length", "clearance"):
+            check_shape(name, getattr(self, name), ())
+            check_finite(name, getattr(self, name))
+            check_positive(name, getattr(self, name))
+        self.opening = as_float(opening, name="opening")
+        check_shape("opening", self.opening, ("numbers",))
+        check_finite("opening", self.opening)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters of all pushes."""
+        return self.count * (3 + self.bends)
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Change of each parameter that makes another push of it, (size,)."""
+        return np.tile([0.5, 0.3, 0.3] + [0.2] * self.bends, self.count)
+
+    def sample(self, key: PRNGKeyArray, candidates: int) -> np.ndarray:
+        """Draw random pushes from all sides, (candidates, size)."""
+        low = np.tile([-np.pi, -0.8, 0.0] + [-0.2] * self.bends, self.count)
+        high = np.tile([np.pi, 0.8, 1.0] + [0.2] * self.bends, self.count)
+        return low + (high - low) * np.asarray(jax.random.uniform(key, (candidates, self.size)), np.float64)
+
+    def check_hand(self, hand: Hand) -> None:
+        """Raise an error unless the hand consists of round fingers, and its configuration is as the pushes have it.
+
+        Raises:
+            TypeError: For a hand with pads.
+            ValueError: For a hand with another number of coordinates.
+        """
+        if not all(isinstance(finger, RoundFinger) for finger in hand.fingers):
+            raise TypeError("hand: plans of pushes need round fingers; got a pad")
+        expected = 2 if hand.dof == 2 else 3 + len(self.opening)
+        if hand.dof != expected or (hand.dof == 2 and len(self.opening)):
+            raise ValueError(
+                f"opening has {len(self.opening)} number(s), which does not fit a hand of {hand.dof} coordinates; "
+                "it is what a configuration has beyond x, y and theta"
+            )
+
+    def path(
+        self, numbers: Float[Array, "3+bends"], slider: Slider, hand: Hand, pose: Float[Array, "3"]
+    ) -> Float[Array, "steps+1 dof"]:
+        """Return the path of the hand for one push.
+
+        Args:
+            numbers: The numbers of the push.
+            slider: The slider.
+            hand: The hand.
+            pose: Pose of the slider in which the push is given, (3,), world.
+        """
+        length = self.length * jnp.clip(numbers[2], 0, 1)
+        ahead = jnp.stack([jnp.cos(numbers[0]), jnp.sin(numbers[0])])
+        left = jnp.stack([-ahead[1], ahead[0]])
+        radius = jnp.sqrt(jnp.max(jnp.sum(slider.shape.boundary(64) ** 2, axis=1)))
+        line = numbers[1] * radius * left
+        touch = self._first_contact(slider, hand, line, ahead, numbers[0], radius)
+        # distances along and to the left of the line, of control points and then of the path
+        inner = np.arange(1, self.bends + 1) / (self.bends + 1)
+        start, end = touch - self.clearance, touch + length
+        along = jnp.concatenate([start[None], start + (end - start) * jnp.asarray(inner, start.dtype), end[None]])
+        zero = jnp.zeros(1, start.dtype)
+        aside = jnp.concatenate([zero, numbers[3:] * length, zero])
+        weights = jnp.asarray(_bernstein(self.bends + 1, self.steps), start.dtype)
+        points = line[None] + (weights @ along)[:, None] * ahead[None] + (weights @ aside)[:, None] * left[None]
+        points = se2.transform(pose, points)
+        if hand.dof == 2:
+            return points
+        rest = jnp.concatenate([(pose[2] + numbers[0])[None], self.opening.astype(points.dtype)])
+        return jnp.concatenate([points, jnp.broadcast_to(rest, (self.steps + 1, len(rest)))], axis=1)
+
+    def _first_contact(
+        self, slider: Slider, hand: Hand, line: Array, ahead: Array, angle: Array, radius: Array
+    ) -> Array:
+        """Return how far along its line the hand first touches, m; zero, abreast of the origin, if it never does."""
+        rest = jnp.concatenate([angle[None], self.opening.astype(angle.dtype)])[: hand.dof - 2]
+        centers = hand.poses(jnp.concatenate([line, rest]))[:, :2]
+        reach = radius + jnp.max(
+            hand.radius + jnp.sqrt(jnp.sum((centers - line[None]) ** 2, axis=1) + radius**2 * 1e-6)
+        )
+        outline, way = slider.shape.outline(), Vec2.of(2 * reach * ahead)
+        fractions = [
+            outline.sweep(Vec2.of(center - reach * ahead), way, finger.radius)  # pyright: ignore[reportAttributeAccessIssue]
+            for center, finger in zip(centers, hand.fingers, strict=True)
+        ]
+        first = jnp.min(jnp.stack(fractions))
+        return jnp.where(jnp.isfinite(first), (2 * jnp.where(jnp.isfinite(first), first, 0.5) - 1) * reach, 0.0)
+
+
+def _bernstein(degree: int, steps: int) -> np.ndarray:
+    """Return the weights of the control points of a Bezier curve at equal steps, (steps + 1, degree + 1)."""
+    t = np.arange(steps + 1)[:, None] / steps
+    k = np.arange(degree + 1)[None]
+    return np.array([comb(degree, j) for j in range(degree + 1)])[None] * t**k * (1 - t) ** (degree - k)
