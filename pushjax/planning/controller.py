@@ -28,8 +28,9 @@ MOVED = 0.03  # motion of the slider on the way to a push, from which the push i
 CLOSE = 0.01  # distance from the slider that each point of a control step must have on the way, besides the radius
 SLOWER = np.array([1.0, 0.75, 0.5, 0.3, 0.15, 0.05])  # parts of a control step that are tried
 # Ends of a push that are tried around the planned one, along the push and across, in units of the surface's length
-ALONG = np.array([-0.22, -0.15, -0.09, -0.055, -0.027, 0, 0.027, 0.055, 0.09, 0.15, 0.22])
-ACROSS = np.array([-0.15, -0.09, -0.055, -0.027, -0.013, 0, 0.013, 0.027, 0.055, 0.09, 0.15])
+ALONG = np.array([-0.2, -0.11, -0.06, -0.025, 0, 0.025, 0.06, 0.11, 0.2])
+ACROSS = np.array([-0.12, -0.055, -0.02, 0, 0.02, 0.055, 0.12])
+CORRECTED = 1.3  # the end is corrected from this distance on; longer pushes would be simulated too coarsely
 FINE, FULL = 0.25, 0.73  # the ends are this part as far apart at the end, and at FULL from there as far as above
 SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
 
@@ -129,15 +130,17 @@ class PushController:
         """
         state = FingerState(np.asarray(observation.finger, float), memory.velocity)
         pose = np.asarray(observation.pose, float)
+        fresh = False
         for _ in range(3):  # a push may be over at once
             if memory.push is None:
-                memory = self._plan(key, state, pose, memory)
+                memory, fresh = self._plan(key, state, pose, memory), True
                 if memory.push is None:
                     return self._finish(state, state.position, memory._replace(waited=memory.waited + 1))
             if not memory.pushing:
                 target, memory = self._go(state, pose, memory)
             else:
-                target, memory = self._push(state, pose, memory)
+                # the end of a push that has just been planned needs no correction
+                target, memory = self._push(state, pose, memory, correct=self.feedback and not fresh)
             if target is not None:
                 return self._finish(state, target, memory)
         return self._finish(state, state.position, memory)
@@ -184,12 +187,14 @@ class PushController:
         best = int(good[0]) if len(good) else int(np.argmax(apart))
         return targets[best], memory._replace(along=float(ahead[best]), speed=float(ahead[best] - memory.along))
 
-    def _push(self, state: FingerState, pose: np.ndarray, memory: Memory) -> tuple[np.ndarray | None, Memory]:
+    def _push(
+        self, state: FingerState, pose: np.ndarray, memory: Memory, correct: bool
+    ) -> tuple[np.ndarray | None, Memory]:
         """Return the next target in a push, or None if the push is over."""
         push, pace = memory.push, self.planner.pace
         assert push is not None
         end = memory.end
-        if self.feedback and np.linalg.norm(end - state.position) < LEG * self.planner.library.travel[1]:
+        if correct and np.linalg.norm(end - state.position) < CORRECTED * self.length:
             end = self._corrected(state.position, pose, end, push)
         way = end - state.position
         left = float(np.linalg.norm(way))

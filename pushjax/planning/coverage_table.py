@@ -42,8 +42,10 @@ class CoverageTable:
         shift = to_world(errors, self.center.astype(errors.dtype)) - self.center
         turn = (errors[..., 2] + np.pi) % (2 * np.pi) - np.pi
         x, y = np.moveaxis(shift, -1, 0) / self.length
-        cells = [(each + RANGE) / (2 * RANGE) * (n - 1) for each, n in ((x, POSITIONS), (y, POSITIONS), (turn, ANGLES))]
-        return map_coordinates(self.table, cells, order=1, mode="constant", cval=0.0)
+        sizes = (POSITIONS, POSITIONS, ANGLES)
+        cells = np.stack([(each + RANGE) / (2 * RANGE) * (n - 1) for each, n in zip((x, y, turn), sizes, strict=True)])
+        found = map_coordinates(self.table, cells.reshape(3, -1), order=1, mode="constant", cval=0.0)
+        return found.reshape(cells.shape[1:])
 
 
 @quick_jit

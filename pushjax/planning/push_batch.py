@@ -16,8 +16,8 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import rollout
 from pushjax.simulation.slider import Slider
 
-GROUP = 128  # pushes that are simulated together
-LEG = 48  # steps of a leg
+GROUP = 64  # pushes that are simulated together
+LEG = 32  # steps of a leg
 
 
 def simulate_pushes(

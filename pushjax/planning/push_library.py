@@ -11,6 +11,7 @@ changed by a motion of the world, so it is the distance of the final pose from t
 """
 
 import hashlib
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from scipy.spatial import KDTree
 
+import pushjax
 from pushjax._internal.checks import check_count, check_type
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.clearance import offset_curve, outline_vertices
@@ -28,7 +30,6 @@ from pushjax.planning.push_batch import simulate_pushes
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
-FORMAT = 1  # of files and digests
 # Lengths in units of the surface's length, which is about the slider's radius.
 GAP, STEP, TRAVEL = 0.04, 0.0275, 2.3
 LEAST_MOTION = 0.005  # shorter outcomes are no pushes
@@ -276,9 +277,10 @@ def fan(
 
 def digest(slider, hand, starts, directions, friction=0.0, model=None, samples=1, key=None) -> str:
     """Return the hash of what the outcomes of `PushLibrary.simulate` depend on; the arguments are the same."""
-    content = hashlib.sha256(f"{FORMAT} {GAP} {STEP} {TRAVEL} {samples}".encode())
     parts = (slider, hand, model, np.asarray(starts), np.asarray(directions), np.asarray(friction))
-    content.update(str(jax.tree.structure(parts)).encode())
+    # types and static fields, without the addresses of functions, which differ from process to process
+    structure = re.sub("0x[0-9a-f]+", "", str(jax.tree.structure(parts)))
+    content = hashlib.sha256(f"{pushjax.__version__} {GAP} {STEP} {TRAVEL} {samples} {structure}".encode())
     for leaf in jax.tree.leaves(parts):
         content.update(np.round(np.asarray(leaf, np.float64), 9).tobytes())
     if key is not None:

@@ -1,0 +1,214 @@
+"""The choice of pushes and the feedback, with this library's own rollouts and with gym-pusht as plants."""
+
+import sys
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.experiments import pusht_mpc
+from pushjax.experiments.pusht_mpc import experiment, player, setting
+from pushjax.planning.clearance import outline_vertices, point_clearance
+from pushjax.planning.controller import Observation, PushController
+from pushjax.planning.coverage_table import CoverageTable
+from pushjax.planning.finger_control import FingerState, PositionControl
+from pushjax.planning.pace import Pace
+from pushjax.planning.poses import compose, inverse, to_body, to_world
+from pushjax.planning.push_batch import LEG, simulate_pushes
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.push_planner import PlanStatus, PushPlanner
+from pushjax.planning.workspace import Workspace
+
+RADIUS, ENOUGH = 0.015, 0.95
+GOAL = np.array([0.25, 0.25, 0.8])
+LIMITS = Workspace.rectangle((0.0, 0.0), (0.5, 0.5))
+PACE = Pace(0.05, 0.02, 0.02)
+
+
+def block(vertices):
+    """Return a slider with the limit surface of gym-pusht's T."""
+    return pj.Slider(pj.Polygon(vertices), pj.Ellipsoid(np.eye(3), 0.05))
+
+
+def made_controller(slider, contacts, angles, friction=0.0):
+    pushes = PushLibrary.build(slider, RADIUS, friction=friction, contacts=contacts, angles=angles)
+    measure = CoverageTable(outline_vertices(slider.shape), pushes.center, pushes.length, ENOUGH)
+    planner = PushPlanner(slider, RADIUS, pushes, GOAL, measure, LIMITS, PACE)
+    return PushController(planner, PositionControl(), friction=friction)
+
+
+class Outcome(NamedTuple):
+    covered: float
+    steps: int
+    pushes: int
+
+
+def play(made, seed, steps=150):
+    """Play one episode in a plant of this library's rollouts, from a random start without overlap."""
+    rng, slider, hand = np.random.default_rng(seed), made.planner.slider, pj.Hand.finger(RADIUS)
+    while True:
+        pose = np.array([*rng.uniform(0.12, 0.38, 2), rng.uniform(-3, 3)])
+        finger = rng.uniform(0.05, 0.45, 2)
+        if point_clearance(made.planner.vertices, to_body(pose, finger)) > RADIUS:
+            break
+    memory = made.initial_memory()
+    for step in range(steps):
+        action, memory = made(jax.random.key(seed), Observation(finger, pose), memory)
+        path = finger + np.linspace(0, 1, LEG + 1)[:, None] * (action - finger)
+        poses, _ = simulate_pushes(slider, hand, path[None], pose[None], made.friction)
+        pose, finger = poses[0, -1].astype(float), action
+        covered = float(made.planner.measure(compose(inverse(GOAL), pose)))
+        if covered > ENOUGH:
+            return Outcome(covered, step + 1, memory.pushes)
+    return Outcome(covered, steps, memory.pushes)
+
+
+@pytest.fixture(scope="module")
+def rectangle():
+    half = np.array([0.05, 0.03])
+    corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    return made_controller(block(corners), contacts=120, angles=7, friction=0.1)
+
+
+def test_a_rectangle_gets_to_the_goal(rectangle):
+    outcomes = [play(rectangle, seed) for seed in range(8)]
+    assert all(each.covered > ENOUGH for each in outcomes), outcomes
+    assert np.median([each.steps for each in outcomes]) < 60
+
+
+def test_one_push_where_one_is_enough(rectangle):
+    """A start from which an entry of the library leads to the goal: that is what is chosen, and it arrives."""
+    planner = rectangle.planner
+    index = np.flatnonzero((planner.library.entries[:, 1] == 50) & planner.usable[planner.push])[40]
+    pose = planner.library.poses_reaching(GOAL)[index].astype(float)
+    finger = to_world(pose, planner.roadmap.goals[planner.push[index]])
+    push = planner.choose(pose, finger)
+    assert push.status == PlanStatus.ONE_PUSH
+    assert push.cost < 15
+    path = np.linspace(push.start, push.end, LEG + 1)
+    reached, _ = simulate_pushes(planner.slider, rectangle.hand, path[None], pose[None], rectangle.friction)
+    assert planner.measure(compose(inverse(GOAL), reached[0, -1].astype(float))) > ENOUGH
+
+
+def test_same_key_same_actions(rectangle):
+    seen = Observation(np.array([0.1, 0.4]), np.array([0.3, 0.2, 1.0]))
+    memory = rectangle.initial_memory()._replace(pushes=9)  # costs are random after some pushes
+    first, second = (rectangle(jax.random.key(3), seen, memory)[0] for _ in range(2))
+    assert np.array_equal(first, second)
+
+
+def test_why_there_is_no_push(rectangle):
+    planner, pose = rectangle.planner, np.array([0.25, 0.25, 0.0])
+    inside = planner.choose(pose, pose[:2])
+    assert inside.status == PlanStatus.NO_WAY
+    assert inside.status.failed
+    outside = planner.choose(np.array([2.0, 2.0, 0.0]), np.array([0.1, 0.1]))
+    assert outside.status.failed
+    action, memory = rectangle(jax.random.key(0), Observation(pose[:2], pose), rectangle.initial_memory())
+    np.testing.assert_array_equal(action, pose[:2])  # the finger waits
+    assert memory.status == PlanStatus.NO_WAY
+    assert memory.waited == 1
+
+
+def test_coverage_is_that_of_shapely():
+    shapely = pytest.importorskip("shapely")
+    slider = setting.slider()
+    vertices = outline_vertices(slider.shape) + np.array([0.02, -0.01])  # about a frame away from the center
+    center, length = np.asarray(slider.shape.centroid) + np.array([0.02, -0.01]), 0.055
+    measure = CoverageTable(vertices, center, length, ENOUGH)
+    rng = np.random.default_rng(0)
+    errors = rng.uniform(-1, 1, (200, 3)) * np.array([0.006, 0.006, 0.1])
+    polygon = shapely.Polygon(vertices)
+    wanted = [shapely.Polygon(to_world(error, vertices)).intersection(polygon).area / polygon.area for error in errors]
+    found = measure(errors)
+    inside = found > 0
+    assert inside.mean() > 0.9
+    assert np.abs(found - wanted)[inside].max() < 0.02
+    assert np.abs(found - wanted)[inside].mean() < 0.004
+    features = np.linalg.norm(np.column_stack([to_world(errors, center) - center, length * errors[:, 2]]), axis=1)
+    assert features[np.array(wanted) > ENOUGH].max() <= measure.reach
+    assert measure(np.array([0.0, 0.0, 2 * np.pi])) == pytest.approx(1, abs=1e-6)
+
+
+def test_the_finger_moves_as_in_gym_pusht():
+    pytest.importorskip("gym_pusht")
+    plant, control = player.make_plant(), setting.finger_control()
+    seen, info = plant.reset(seed=0)
+    rng = np.random.default_rng(0)
+    state = FingerState(setting.PIXEL * info["pos_agent"], setting.PIXEL * np.array(info["vel_agent"]))
+    for _ in range(10):
+        target = rng.uniform(0.1, 0.4, 2)
+        action = control.action(state, target)
+        state = control.after(state, action)
+        motion = control.motion(state, action)
+        seen, _, _, _, info = plant.step(action / setting.PIXEL)
+        np.testing.assert_allclose(state.position, setting.PIXEL * seen[:2], atol=1e-9)
+        np.testing.assert_allclose(state.velocity, setting.PIXEL * np.array(info["vel_agent"]), atol=1e-8)
+        assert motion.shape == (10, 2)
+        if ((action > 0) & (action < 0.512)).all():
+            np.testing.assert_allclose(state.position, target, atol=1e-9)
+
+
+def test_without_gym_pusht_one_line_says_how_to_get_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gym_pusht", None)
+    with pytest.raises(ValueError, match="pip install gym-pusht"):
+        pusht_mpc.run(episodes=1)
+
+
+def test_bad_options():
+    for name, bad in {"episodes": 0, "friction_in_model": -0.1, "actuation_noise": np.nan}.items():
+        with pytest.raises(ValueError, match=name):
+            pusht_mpc.run(**{name: bad})
+
+
+def test_interval_of_a_probability():
+    low, high = experiment.clopper_pearson(0, 20)
+    assert (low, high) == (0, pytest.approx(1 - 0.025 ** (1 / 20)))
+    low, high = experiment.clopper_pearson(500, 500)
+    assert (low, high) == (pytest.approx(0.025 ** (1 / 500)), 1)
+    assert experiment.clopper_pearson(5, 10) == (pytest.approx(0.1871, abs=1e-4), pytest.approx(0.8129, abs=1e-4))
+
+
+@pytest.mark.long
+def test_pusht(monkeypatch, tmp_path):
+    pytest.importorskip("gym_pusht")
+    monkeypatch.setattr(player, "cache_folder", lambda: tmp_path)
+    record = pusht_mpc.run(seed=70000, episodes=5)
+    assert record["success"] == 1
+    assert record["steps_of_successes"]["largest"] < 120
+    assert "success in 5 of 5" in pusht_mpc.summary(record)
+    again, setup = player.controller(tmp_path)
+    assert setup["library_from_file"]
+    assert player.play(player.make_plant(), again, 70000).steps == record["rows"][0]["steps"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["L", "plus"])
+def test_other_blocks(name):
+    """The same code and settings for two other blocks; L and plus have reflex corners as the T has."""
+    corners = {
+        "L": [(0, 0), (90, 0), (90, 30), (60, 30), (30, 30), (30, 75), (30, 120), (0, 120)],
+        "plus": [
+            (1, -3),
+            (1, -1),
+            (3, -1),
+            (3, 1),
+            (1, 1),
+            (1, 3),
+            (-1, 3),
+            (-1, 1),
+            (-3, 1),
+            (-3, -1),
+            (-1, -1),
+            (-1, -3),
+        ],
+    }[name]
+    scale = 1e-3 if name == "L" else 0.018
+    vertices = scale * np.array(corners, float)
+    vertices -= np.asarray(pj.Polygon(vertices).centroid)
+    made = made_controller(block(vertices), contacts=240, angles=9)
+    outcomes = [play(made, seed) for seed in range(20)]
+    print(name, [each.steps for each in outcomes])
+    assert sum(each.covered > ENOUGH for each in outcomes) >= 19
