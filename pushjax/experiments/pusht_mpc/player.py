@@ -18,6 +18,7 @@ from pushjax.planning.cost_to_go import CostToGo
 from pushjax.planning.coverage_table import CoverageTable
 from pushjax.planning.push_library import PushLibrary, digest, fan
 from pushjax.planning.push_planner import PushPlanner
+from pushjax.tasks.push_t import SIZE
 
 INSTALL = "gym-pusht is not installed; `pip install gym-pusht` gets it"
 
@@ -149,7 +150,7 @@ def play(
             angle, in units of the surface's length.
     """
     rng = np.random.default_rng([seed, 1])
-    turn = observation_noise / np.sqrt(setting.INERTIA)
+    turn = observation_noise * setting.PIXEL / made.length
     scale = np.array([observation_noise] * 4 + [turn])
     seen, _ = plant.reset(seed=seed)
     memory, episode, key = made.initial_memory(), Episode(seed), jax.random.key(seed)
@@ -160,7 +161,7 @@ def play(
         action, memory = made(key, observation, memory)
         episode.seconds.append(time.perf_counter() - began)
         action = action / setting.PIXEL + actuation_noise * rng.standard_normal(2)
-        seen, _, terminated, truncated, info = plant.step(np.clip(action, 0, 512))
+        seen, _, terminated, truncated, info = plant.step(np.clip(action, 0, SIZE))
         episode.steps += 1
         episode.final_coverage = float(info["coverage"])
         episode.largest_coverage = max(episode.largest_coverage, episode.final_coverage)

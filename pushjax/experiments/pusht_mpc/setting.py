@@ -12,21 +12,19 @@ import pushjax as pj
 from pushjax.planning.finger_control import SpringDamper
 from pushjax.planning.pace import Pace
 from pushjax.planning.workspace import Workspace
+from pushjax.tasks.push_t import AGENT_RADIUS, GOAL, SIZE, T_CENTER, T_LENGTH, T_VERTICES
 
 PIXEL = 1e-3  # m
-CENTER_OF_GRAVITY = np.array([0.0, 45.0])  # px, in the body frame of gym-pusht
-CORNERS = np.array([(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)], float)
-INERTIA = 3000.0  # of unit mass, px^2
-FINGER_RADIUS = 15 * PIXEL
-GOAL = (256.0, 256.0, np.pi / 4)  # of the body frame of gym-pusht, px and rad
+CENTER_OF_GRAVITY = np.array(T_CENTER)  # px, in the body frame of gym-pusht
+FINGER_RADIUS = AGENT_RADIUS * PIXEL
 ENOUGH = 0.95  # coverage from which an episode is a success
 STEPS = 300  # usual limit of an episode
 
 
 def slider() -> pj.Slider:
     """Return the T."""
-    length = PIXEL * np.sqrt(INERTIA)
-    return pj.Slider(pj.Polygon(PIXEL * (CORNERS - CENTER_OF_GRAVITY)), pj.Ellipsoid(np.eye(3), length))
+    corners = PIXEL * (np.array(T_VERTICES, float) - CENTER_OF_GRAVITY)
+    return pj.Slider(pj.Polygon(corners), pj.Ellipsoid(np.eye(3), PIXEL * T_LENGTH))
 
 
 def workspace() -> Workspace:
@@ -36,7 +34,7 @@ def workspace() -> Workspace:
 
 def finger_control() -> SpringDamper:
     """Return the model of the finger: ten substeps of 10 ms."""
-    return SpringDamper(100.0, 20.0, 0.01, 10, low=np.zeros(2), high=np.full(2, 512 * PIXEL))
+    return SpringDamper(100.0, 20.0, 0.01, 10, low=np.zeros(2), high=np.full(2, SIZE * PIXEL))
 
 
 def pace() -> Pace:
