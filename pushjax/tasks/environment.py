@@ -1,0 +1,319 @@
+"""Base class of the tasks: environments with the interface of gymnax 1.x.
+
+An environment is a frozen object without arrays, its parameters and its state are pytrees, and everything can be
+compiled, batched with `vmap` and differentiated. Nothing is imported from gymnax.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from pushjax._internal.checks import ArrayLike, as_float, check_shape
+from pushjax._internal.jit import quick_jit
+from pushjax.contact.status import Status
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.simulation.fixtures import Wall
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.slider import Slider
+from pushjax.tasks.conditional import where_needed
+from pushjax.tasks.control_step import Pushed, control_step
+from pushjax.tasks.spaces import Space
+
+
+class _Replaceable(eqx.Module):
+    """A frozen pytree with the method `replace` of gymnax."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other values of some fields.
+
+        Raises:
+            TypeError: For a name that is no field.
+        """
+        unknown = sorted(set(changes) - set(type(self).__dataclass_fields__))
+        if unknown:
+            raise TypeError(f"{type(self).__name__} has no field {', '.join(unknown)}")
+        copy = object.__new__(type(self))
+        for name in type(self).__dataclass_fields__:
+            object.__setattr__(copy, name, changes.get(name, getattr(self, name)))
+        return copy
+
+
+class TaskParams(_Replaceable):
+    """Parameters that all tasks share.
+
+    Attributes:
+        slider: The slider, m. The origin of its frame is the center of gravity.
+        friction: Coefficient of friction between fingers and slider, if `model` is None.
+        goal: Pose at the goal, in the frame that is observed, (3,), world, length unit of the task and rad.
+        model: Distribution of the friction, drawn at each reset for the whole episode; None for none.
+        surfaces: The distribution of limit surfaces that `model` has around that of the slider; None for none.
+        position_noise: Standard deviation of the noise on observed positions, length unit of the task; None for none.
+        angle_noise: Standard deviation of the noise on the observed angle, rad; None for none.
+        action_noise: Standard deviation of the noise on actions, length unit of the task; None for none.
+        success_coverage: Coverage of the goal above which an episode terminates.
+        max_steps_in_episode: Number of control steps after which an episode is truncated.
+    """
+
+    slider: Slider
+    friction: Float[Array, ""]
+    goal: Float[Array, "3"]
+    model: FrictionModel | None
+    surfaces: SurfaceDistribution | None
+    position_noise: Float[Array, ""] | None
+    angle_noise: Float[Array, ""] | None
+    action_noise: Float[Array, ""] | None
+    success_coverage: Float[Array, ""]
+    max_steps_in_episode: int | Int[Array, ""]
+
+
+class TaskState(_Replaceable):
+    """State of an episode.
+
+    Attributes:
+        pose: Pose of the slider's frame, (3,), world, length unit of the task and rad; the angle is not wrapped.
+        hand: Configuration of the hand, (dof,), world.
+        velocity: Its velocity, (dof,), per second.
+        time: Number of control steps since the reset.
+        surface: The limit surface that was drawn for this episode; None for that of the parameters.
+        friction: The coefficient of friction that was drawn; None for that of the parameters.
+    """
+
+    pose: Float[Array, "3"]
+    hand: Float[Array, "dof"]
+    velocity: Float[Array, "dof"]
+    time: Int[Array, ""]
+    surface: LimitSurface | None = None
+    friction: Float[Array, ""] | None = None
+
+
+Transition = tuple[Any, TaskState, Array, Array, Array, dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Environment(ABC):
+    """An environment with the interface of gymnax 1.x.
+
+    `reset` and `step` are compiled; under `jit` and `vmap` they are part of the surrounding program. A task defines
+    `default_params`, `draw_start`, `walk`, `goal_coverage`, `observe` and the spaces.
+    """
+
+    METERS: ClassVar[float] = 1.0  # m, length unit of the task
+
+    @property
+    def name(self) -> str:
+        """Name of the environment."""
+        return type(self).__name__
+
+    @property
+    def num_actions(self) -> int:
+        """Number of entries of an action."""
+        return int(np.prod(self.action_space(self.default_params).shape))
+
+    @property
+    @abstractmethod
+    def default_params(self) -> Any:
+        """The parameters that are used where None is given."""
+
+    @property
+    @abstractmethod
+    def hand_model(self) -> Hand:
+        """The hand, m."""
+
+    @abstractmethod
+    def draw_start(self, key: PRNGKeyArray, params: Any) -> tuple[Array, Array]:
+        """Return a random pose of the slider, (3,), and configuration of the hand, (dof,)."""
+
+    @abstractmethod
+    def walk(self, state: TaskState, action: Array) -> tuple[Array, Array]:
+        """Return the path of the hand in a control step, (steps + 1, dof), and its velocity at the end, (dof,)."""
+
+    @abstractmethod
+    def goal_coverage(self, state: TaskState, params: Any) -> Float[Array, ""]:
+        """Return which fraction of the slider's area lies on the goal."""
+
+    @abstractmethod
+    def observe(self, key: PRNGKeyArray, state: TaskState, action: Array | None, params: Any) -> Any:
+        """Return the observation of a state.
+
+        Args:
+            key: PRNG key of the observation's noise.
+            state: The state.
+            action: The action that led to it; not used.
+            params: The parameters.
+        """
+
+    @abstractmethod
+    def action_space(self, params: Any = None) -> Any:
+        """Return the space of actions."""
+
+    @abstractmethod
+    def observation_space(self, params: Any = None) -> Space:
+        """Return the space of observations."""
+
+    def fixtures(self, state: TaskState, params: Any) -> tuple[Wall, ...]:
+        """Return the walls that the slider may touch in a control step, m."""
+        return ()
+
+    def reset(self, key: PRNGKeyArray, params: Any = None) -> tuple[Any, TaskState]:
+        """Start an episode.
+
+        Args:
+            key: PRNG key of the start, the drawn friction and the observation's noise.
+            params: The parameters; None for `default_params`.
+
+        Returns:
+            The observation, and the state.
+        """
+        return _reset(self, key, self.default_params if params is None else params)
+
+    def step(self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any = None) -> Transition:
+        """Take one control step, and start a new episode if it ended this one.
+
+        Args:
+            key: PRNG key of everything random in the step and in a new start.
+            state: The state.
+            action: The action, as in `action_space`. One that is not finite leaves the hand where it is going.
+            params: The parameters; None for `default_params`.
+
+        Returns:
+            Observation, state, reward, whether the episode terminated, whether it was truncated, and a dictionary. If
+            the episode ended, observation and state are those of the next one. The dictionary has that of `step_env`,
+            and "final_observation", the observation before a reset, "terminated" and "truncated".
+
+        Raises:
+            ValueError: If the action has another shape than in `action_space`.
+        """
+        return _step(self, key, state, action, self.default_params if params is None else params)
+
+    def reset_env(self, key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
+        """Start an episode, as `reset`, which is this compiled."""
+        start_key, friction_key, observation_key = jax.random.split(key, 3)
+        pose, hand = self.draw_start(start_key, params)
+        state = TaskState(pose, hand, jnp.zeros_like(hand), jnp.zeros((), jnp.int32))
+        if params.model is not None:
+            surface_key, contact_key = jax.random.split(friction_key)
+            surface = params.surfaces.sample(surface_key).surface
+            state = state.replace(surface=surface, friction=params.model.sample_friction(contact_key))
+        return self.observe(observation_key, state, None, params), state
+
+    def step_env(
+        self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any
+    ) -> tuple[Any, TaskState, Array, Array, dict[str, Any]]:
+        """Take one control step, without a reset.
+
+        Args:
+            key: PRNG key of the noise.
+            state: The state.
+            action: The action, as in `action_space`.
+            params: The parameters.
+
+        Returns:
+            Observation, state, reward, whether the episode terminated, and a dictionary. It has the "coverage" of the
+            goal, whether that "is_success", and "status", the number of steps of the simulator with each `Status`,
+            (7,). A step that is JAMMED stops the hand for the rest of the control step; the slider stays.
+        """
+        key_action, key_observation = jax.random.split(key)
+        target = as_float(action, state.hand.dtype, "action")
+        check_shape("action", target, self.action_space(params).shape)
+        if params.action_noise is not None:
+            target = target + params.action_noise * jax.random.normal(key_action, target.shape, target.dtype)
+        path, velocity = self.walk(state, target)
+        pushed = self._pushed(state, path, params)
+        stopped = jnp.any((pushed.status == Status.JAMMED) | (pushed.status == Status.GRASPED))
+        new_state = state.replace(
+            pose=jnp.concatenate([pushed.pose[:2] / self.METERS, pushed.pose[2:]]),
+            hand=jnp.where(stopped, pushed.configuration / self.METERS, path[-1]),
+            velocity=jnp.where(stopped, 0.0, velocity),
+            time=state.time + 1,
+        )
+        coverage = self.goal_coverage(new_state, params)
+        success = coverage > params.success_coverage
+        reward = jnp.clip(coverage / params.success_coverage, 0, 1)
+        counts = jnp.stack([jnp.sum(pushed.status == status, dtype=jnp.int32) for status in Status])
+        info = {"coverage": coverage, "is_success": success, "status": counts}
+        return self.observe(key_observation, new_state, target, params), new_state, reward, success, info
+
+    def _pushed(self, state: TaskState, path: Array, params: Any) -> Pushed:
+        """What the hand's path leaves, m."""
+        slider = params.slider
+        return control_step(
+            slider.shape,
+            slider.surface if state.surface is None else state.surface,
+            params.friction if state.friction is None else state.friction,
+            self.hand_model,
+            self.fixtures(state, params),
+            path * self.METERS,
+            jnp.concatenate([state.pose[:2] * self.METERS, state.pose[2:]]),
+        )
+
+    def is_terminated(self, state: TaskState, params: Any) -> Bool[Array, ""]:
+        """Whether the slider covers the goal."""
+        return self.goal_coverage(state, params) > params.success_coverage
+
+    def is_truncated(self, state: TaskState, params: Any) -> Bool[Array, ""]:
+        """Whether the time limit is reached."""
+        return state.time >= params.max_steps_in_episode
+
+
+@quick_jit
+def _reset(env: Environment, key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
+    return env.reset_env(key, params)
+
+
+@quick_jit
+def _step(env: Environment, key: PRNGKeyArray, state: TaskState, action: Any, params: Any) -> Transition:
+    observation, state, reward, terminated, info = env.step_env(key, state, action, params)
+    truncated = env.is_truncated(state, params)
+
+    def new_episode(key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
+        return env.reset_env(jax.random.fold_in(key, 1), params)
+
+    info |= {"terminated": terminated, "truncated": truncated, "final_observation": observation}
+    next_episode = where_needed(terminated | truncated, new_episode, (observation, state), key, params)
+    return *next_episode, reward, terminated, truncated, info
+
+
+class FiveValues:
+    """An environment with the interface of gymnax 0.0.9: `step` and `step_env` return five values.
+
+    They are observation, state, reward, done and a dictionary, where done is terminated or truncated. Everything else
+    is that of the environment.
+
+    Args:
+        env: The environment.
+    """
+
+    def __init__(self, env: Environment):
+        self.env = env
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":  # while it is copied or unpickled
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FiveValues) and self.env == other.env
+
+    def __hash__(self) -> int:
+        return hash((FiveValues, self.env))
+
+    def step(self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any = None):
+        """Take one control step, as `Environment.step`."""
+        observation, state, reward, terminated, truncated, info = self.env.step(key, state, action, params)
+        return observation, state, reward, terminated | truncated, info
+
+    def step_env(self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any):
+        """Take one control step, as `Environment.step_env`."""
+        observation, state, reward, terminated, info = self.env.step_env(key, state, action, params)
+        return observation, state, reward, terminated | self.env.is_truncated(state, params), info
+
+    def is_terminal(self, state: TaskState, params: Any) -> Bool[Array, ""]:
+        """Whether the episode has ended."""
+        return self.env.is_terminated(state, params) | self.env.is_truncated(state, params)
