@@ -1,0 +1,94 @@
+"""Compiled steps of episodes with a PRNG key of their own, and their automatic reset, for `pushjax.tasks.gym`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from pushjax._internal.jit import jit, quick_jit
+from pushjax.contact.status import Status
+from pushjax.tasks.conditional import where_needed
+from pushjax.tasks.environment import Environment, TaskState
+from pushjax.tasks.render import render
+
+
+@quick_jit
+def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, ...]:
+    """Start an episode, at a row of `state_of` if that is given. Return the next key, observation, state and info."""
+    key, start_key, noise_key = jax.random.split(key, 3)
+    observation, state = task.reset_env(start_key, params)
+    if row is not None:
+        at_row = task.state_of(row, params)
+        state = state.replace(pose=at_row.pose, hand=at_row.hand)
+        observation = task.observe(noise_key, state, None, params)
+    info = {
+        "coverage": task.goal_coverage(state, params),
+        "is_success": task.is_terminated(state, params),
+        "status": jnp.zeros(len(Status), jnp.int32),
+    }
+    return key, observation, state, info
+
+
+@quick_jit
+def step(task: Environment, key: Array, state: TaskState, action: Array, params: Any) -> tuple[Any, ...]:
+    """Take a step. Return the next key, observation, state, reward, terminated, truncated and info."""
+    key, step_key = jax.random.split(key)
+    observation, state, reward, terminated, info = task.step_env(step_key, state, action, params)
+    return key, observation, state, reward, terminated, task.is_truncated(state, params), info
+
+
+@jit
+def start_all(task: Environment, keys: np.ndarray, params: Any, rows: Array | None) -> tuple[Any, ...]:
+    """Start all episodes, as `start`."""
+    return jax.vmap(lambda key, row: start(task, key, params, row))(keys, rows)
+
+
+@jit
+def step_all(
+    task: Environment, mode: str, keys: Array, states: TaskState, ended: Any, actions: Array, params: Any
+) -> tuple[tuple[Any, ...], tuple[Any, Any] | None]:
+    """Take a step in all environments, and reset those that need it.
+
+    Args:
+        task: The task.
+        mode: When episodes that have ended are reset: value of an `AutoresetMode` of Gymnasium.
+        keys: Keys of the environments.
+        states: Their states.
+        ended: Whether the step before ended their episodes.
+        actions: The actions.
+        params: Parameters of the task.
+
+    Returns:
+        What `step` returns. And if the mode is "SameStep", observations and info before the resets, else None.
+    """
+
+    def restart(key: Array, params: Any) -> tuple[Any, ...]:
+        return start(task, key, params, None)
+
+    def one(key: Array, state: TaskState, ended: Array, action: Array) -> tuple[tuple[Any, ...], Any]:
+        stepped = step(task, key, state, action, params)
+        if mode == "Disabled":
+            return stepped, None
+        next_key, observation, state, reward, terminated, truncated, info = stepped
+        otherwise = next_key, observation, state, info
+        if mode == "SameStep":
+            now = where_needed(terminated | truncated, restart, otherwise, next_key, params)
+            return (*now[:3], reward, terminated, truncated, now[3]), (observation, info)
+        now = where_needed(ended, restart, otherwise, key, params)
+        reward = jnp.where(ended, 0.0, reward)
+        return (*now[:3], reward, terminated & ~ended, truncated & ~ended, now[3]), None
+
+    return jax.vmap(one)(keys, states, ended, actions)
+
+
+@jit
+def merged(mask: np.ndarray, new: Any, old: Any) -> Any:
+    """Return the rows of `new` where `mask` holds, else those of `old`."""
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+
+
+@quick_jit
+def picture(task: Any, state: TaskState, action: Array | None, params: Any, size: int) -> Array:
+    return render(task.vertices(state, params), task.goal_vertices(params), state.hand, action, size=size)
