@@ -1,5 +1,7 @@
 """Plans of pushes and grasps that reach a goal, also where friction is not known."""
 
+from pushjax.planning.controller import Observation as Observation
+from pushjax.planning.controller import PushController as PushController
 from pushjax.planning.costs import Clearance as Clearance
 from pushjax.planning.costs import Cost as Cost
 from pushjax.planning.costs import CVaR as CVaR
@@ -11,14 +13,21 @@ from pushjax.planning.costs import Travel as Travel
 from pushjax.planning.costs import WayPoints as WayPoints
 from pushjax.planning.costs import Work as Work
 from pushjax.planning.costs import Worst as Worst
+from pushjax.planning.coverage_table import CoverageTable as CoverageTable
 from pushjax.planning.dubins import DubinsPath as DubinsPath
 from pushjax.planning.dubins import dubins as dubins
+from pushjax.planning.finger_control import PositionControl as PositionControl
+from pushjax.planning.finger_control import SpringDamper as SpringDamper
 from pushjax.planning.goal import Goal as Goal
+from pushjax.planning.pace import Pace as Pace
 from pushjax.planning.plan import Outcomes as Outcomes
 from pushjax.planning.plan import PushPlan as PushPlan
 from pushjax.planning.plan import PushPlanStatus as PushPlanStatus
 from pushjax.planning.plan import plan_pushes as plan_pushes
 from pushjax.planning.plan import push_outcomes as push_outcomes
+from pushjax.planning.push_library import PushLibrary as PushLibrary
+from pushjax.planning.push_planner import PlanStatus as PlanStatus
+from pushjax.planning.push_planner import PushPlanner as PushPlanner
 from pushjax.planning.pushes import Pushes as Pushes
 from pushjax.planning.search import MPPI as MPPI
 from pushjax.planning.search import CrossEntropy as CrossEntropy
@@ -31,3 +40,4 @@ from pushjax.planning.stable import StableStatus as StableStatus
 from pushjax.planning.stable import shortest_push as shortest_push
 from pushjax.planning.stable import stable_contacts as stable_contacts
 from pushjax.planning.stable import stable_push as stable_push
+from pushjax.planning.workspace import Workspace as Workspace

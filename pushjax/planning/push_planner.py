@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 from pushjax.planning.approach import Roadmap, Way, Ways, run_ups
 from pushjax.planning.clearance import outline_vertices
 from pushjax.planning.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.coverage_table import CoverageTable
 from pushjax.planning.pace import Pace
 from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_library import PushLibrary
@@ -28,6 +29,7 @@ CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
+COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 LOST = 60.0  # control steps of a way that the table of ways does not have
 
 
@@ -101,9 +103,9 @@ class PushPlanner:
         radius: Radius of the finger, m.
         library: Pushes of that slider and finger.
         goal: The goal, (3,), world, m and rad.
-        measure: Score of final poses.
         workspace: Limits of finger and slider.
         pace: Speeds of the finger.
+        measure: Score of final poses. None: the slider must cover 95 % of the goal.
         look_ahead: Whether to consider plans of two pushes.
         value: Cost to go. None: it is computed when it is first needed. False: the distance to the goal instead.
     """
@@ -114,18 +116,18 @@ class PushPlanner:
         radius: float,
         library: PushLibrary,
         goal: np.ndarray,
-        measure: Measure,
         workspace: Workspace,
         pace: Pace,
         *,
+        measure: Measure | None = None,
         look_ahead: bool = True,
         value: CostToGo | bool | None = None,
     ):
-        self.slider, self.library, self.measure = slider, library, measure
-        self.goal, self.workspace, self.pace, self.look_ahead = np.asarray(goal, float), workspace, pace, look_ahead
-        self.radius, self.vertices, length = radius, outline_vertices(slider.shape), library.length
-        self.extent = Extent(self.vertices)
-        self.clearance = CLEARANCE * length
+        self.slider, self.radius, self.library = slider, radius, library
+        self.goal, self.workspace, self.pace = np.asarray(goal, float), workspace, pace
+        self.vertices, length = outline_vertices(slider.shape), library.length
+        self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
+        self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
         starts = library.starts[:, :2]
         self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
         self.usable = np.isfinite(self.run_up)

@@ -34,8 +34,7 @@ def block(vertices):
 
 def made_controller(slider, contacts, angles, friction=0.0):
     pushes = PushLibrary.build(slider, RADIUS, friction=friction, contacts=contacts, angles=angles)
-    measure = CoverageTable(outline_vertices(slider.shape), pushes.center, pushes.length, ENOUGH)
-    planner = PushPlanner(slider, RADIUS, pushes, GOAL, measure, LIMITS, PACE)
+    planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
     return PushController(planner, PositionControl(), friction=friction)
 
 

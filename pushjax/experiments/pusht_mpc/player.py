@@ -118,9 +118,9 @@ def controller(
         setting.FINGER_RADIUS,
         pushes,
         goal,
-        measure,
         setting.workspace(),
         pace,
+        measure=measure,
         look_ahead=lookahead,
         value=value,
     )
