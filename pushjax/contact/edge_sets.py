@@ -35,6 +35,9 @@ class Incumbent(NamedTuple):
 
     Attributes:
         edges: Numbers of the set's generators (see `scaled_problem`), the used ones first, then `NO_EDGE`.
+        contacts: Number of the contact whose condition each slot has. If the first two are the same, the second
+            condition is that this contact sticks. These are the contacts of the edges, but for the last one in the
+            case that `solve_three_edges` describes.
         weight: Weight of each generator in the wrench, up to one common factor.
         twist: Dimensionless twist.
         power: Power F . V with the wrench F scaled to H = 1. Of several solutions, the one with the largest is kept.
@@ -45,6 +48,7 @@ class Incumbent(NamedTuple):
     """
 
     edges: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
+    contacts: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
     weight: Vec3
     twist: Vec3
     power: Scalar
@@ -58,7 +62,7 @@ def no_incumbent(runtime_scalar: Scalar) -> Incumbent:
     zero = jnp.zeros_like(runtime_scalar)
     none, no = jnp.full(zero.shape, NO_EDGE, jnp.int32), jnp.zeros(zero.shape, bool)
     zero_vector = Vec3(zero, zero, zero)
-    return Incumbent((none, none, none), zero_vector, zero_vector, zero, no, no, no)
+    return Incumbent((none, none, none), (none, none, none), zero_vector, zero_vector, zero, no, no, no)
 
 
 def solve_one_edge(problem: ScaledProblem, incumbent: Incumbent, edge: Index) -> Incumbent:
@@ -89,7 +93,8 @@ def solve_one_edge(problem: ScaledProblem, incumbent: Incumbent, edge: Index) ->
     power = _power_on_limit_surface(
         problem.form, raw_power, raw_power / (problem.form.degree * jnp.where(scale > 0, scale, 1.0))
     )
-    return _update_incumbent(incumbent, passes, (edge, NO_EDGE, NO_EDGE), Vec3(one, 0 * one, 0 * one), twist, power)
+    edges, contacts = (edge, NO_EDGE, NO_EDGE), (contact, NO_EDGE, NO_EDGE)
+    return _update_incumbent(incumbent, passes, edges, contacts, Vec3(one, 0 * one, 0 * one), twist, power)
 
 
 def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, edge2: Index) -> Incumbent:
@@ -147,9 +152,8 @@ def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, 
         degree_times_h = motion.dot(f)  # Euler's identity
         s = segment.nearest + u
         power = _power_on_limit_surface(form, scale * degree_times_h, degree_times_h / form.degree)
-        return pending, _update_incumbent(
-            incumbent, passes, (edge1, edge2, NO_EDGE), Vec3(1 - s, s, 0 * s), twist, power
-        )
+        edges, contacts = (edge1, edge2, NO_EDGE), (c1, c2, NO_EDGE)
+        return pending, _update_incumbent(incumbent, passes, edges, contacts, Vec3(1 - s, s, 0 * s), twist, power)
 
     # few examples of a batch have more than one root: all take their next root in the same iteration
     return jax.lax.while_loop(
@@ -160,12 +164,18 @@ def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, 
 def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tuple, num_choices: Index) -> Incumbent:
     """Solve and check sets of three edges: one of each of three contacts, or both of one contact and one of another.
 
+    The conditions of these contacts fix the twist. Where one of them sticks, the third edge may also belong to another
+    contact that happens to touch under this twist. This occurs where two fingers are exactly opposite each other and
+    move together, so that their normal conditions are the same, and a third contact limits how far the slider turns,
+    at a force of zero.
+
     Args:
         problem: The dimensionless contact problem.
         incumbent: The best set so far.
         contacts: Numbers of the three contacts. If the first two are the same, both edges of that one are in the set
             and it sticks.
-        num_choices: How many choices of edges to try: 8, or 2 where one contact sticks.
+        num_choices: How many choices of edges to try: 8, or 2 where one contact sticks, and 2 more for every other
+            contact that touches.
 
     Returns:
         The best set so far, these included.
@@ -182,30 +192,40 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
     twist, regular = solve_rows(rows, Vec3(approach.x, second, dynamic_index(problem.approach, c3).x))
     twist = compute_once(twist, problem.runtime_scalar)
     tolerance = kinematic_tolerance(twist)
-    states, none_violated = _contact_states(problem, twist, contacts)
-    feasible, allowed = regular & none_violated, []
-    for touching, slip in states:
-        feasible &= touching
-        allowed.append((slip <= tolerance, slip >= -tolerance))  # left edge, right edge; both where the contact sticks
+    m = problem.count
+    states, none_violated = _contact_states(problem, twist, tuple(range(m)))
+    feasible = regular & none_violated
+    # left edge, right edge; both where the contact sticks
+    may_carry = tuple((touching & (slip <= tolerance), touching & (slip >= -tolerance)) for touching, slip in states)
+    touches = tuple(left | right for left, right in may_carry)
+    for contact in contacts:
+        feasible &= dynamic_index(touches, contact)
+    if m > 2:  # the third edge of a set with a contact that sticks may be that of any other contact
+        others = sum((touching & (c1 != k) & (c3 != k)).astype(jnp.int32) for k, touching in enumerate(touches))
+        num_choices = jnp.where(sticks & feasible & (others > 0), 2 * (m - 1), num_choices)
     feasible = compute_once(feasible, problem.runtime_scalar)
     f, aligned = aligned_wrench(problem.form, twist, feasible, relative_tolerance(problem.runtime_scalar.dtype))
     h = problem.form.value(f)
-    feasible, allowed = compute_once((feasible & aligned & (h > 0), tuple(allowed)), problem.runtime_scalar)
-    violation_per_weight = tuple(problem.violation_per_weight(c) for c in contacts)
-    edge_pairs = [
-        (dynamic_index(problem.generators, 2 * c), dynamic_index(problem.generators, 2 * c + 1)) for c in contacts
-    ]
+    feasible, may_carry = compute_once((feasible & aligned & (h > 0), may_carry), problem.runtime_scalar)
+    pairs = tuple(zip(problem.generators[::2], problem.generators[1::2], strict=True))
+    per_weight = tuple(problem.violation_per_weight(k) for k in range(m))
+    of_contact = tuple(zip(pairs, may_carry, per_weight, strict=True))
 
     def try_choice(choice, state):
         best_share, weight, best_edges = state
         side = jnp.where(sticks, 0, choice // 4), jnp.where(sticks, 1, choice // 2 % 2), choice % 2
-        generators = tuple(tree_where(k == 0, *pair) for pair, k in zip(edge_pairs, side, strict=True))
-        candidate, inside, least_share = _cone_coordinates(f, generators, violation_per_weight)
-        for (left, right), k in zip(allowed, side, strict=True):
+        last = c3
+        if m > 2:  # after c3 the other contacts in a circle, without c1
+            last = jnp.where(sticks, (c1 + 1 + ((c3 - c1 - 1) % m + choice // 2) % (m - 1)) % m, c3)
+        owners = (c1, c2, last)
+        chosen = tuple(dynamic_index(of_contact, c) for c in owners)
+        generators = tuple(tree_where(k == 0, *pair) for (pair, *_), k in zip(chosen, side, strict=True))
+        candidate, inside, least_share = _cone_coordinates(f, generators, tuple(entry[2] for entry in chosen))
+        for (_, (left, right), _), k in zip(chosen, side, strict=True):
             inside &= jnp.where(k == 0, left, right)
         better = decide(inside & (least_share > best_share), h)  # of several sets, the one with f farthest inside
         best_share, weight = jnp.where(better, least_share, best_share), tree_where(better, candidate, weight)
-        edges = tuple(jnp.where(better, 2 * c + k, old) for c, k, old in zip(contacts, side, best_edges, strict=True))
+        edges = tuple(jnp.where(better, 2 * c + k, old) for c, k, old in zip(owners, side, best_edges, strict=True))
         return best_share, weight, edges
 
     no_edges = tuple(jnp.full(h.shape, NO_EDGE, jnp.int32) for _ in contacts)
@@ -215,6 +235,7 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
         incumbent,
         feasible & (best_share >= 0),
         best_edges,
+        contacts,
         weight,
         twist,
         _power_on_limit_surface(problem.form, f.dot(twist), h),
@@ -222,7 +243,7 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
 
 
 def _update_incumbent(
-    incumbent: Incumbent, passes, edges: tuple, weight: Vec3, twist: Vec3, power: Scalar
+    incumbent: Incumbent, passes, edges: tuple, contacts: tuple, weight: Vec3, twist: Vec3, power: Scalar
 ) -> Incumbent:
     """Keep the better of two sets: more power on H = 1, or, where that is equal, the smaller twist."""
     squared, squared_before = twist.dot(twist), incumbent.twist.dot(incumbent.twist)
@@ -241,11 +262,13 @@ def _update_incumbent(
     smaller = squared < (1 - 8 * relative_tolerance(power.dtype)) * squared_before
     better = passes & (~incumbent.found | jnp.where(tie, smaller, power > incumbent.power))
     better, second_found = compute_once((better, incumbent.second_found | second_found), power)
-    edges = tuple(
-        jnp.where(better, jnp.asarray(new, jnp.int32), old) for new, old in zip(edges, incumbent.edges, strict=True)
+    edges, contacts = (
+        tuple(jnp.where(better, jnp.asarray(new, jnp.int32), old) for new, old in zip(numbers, before, strict=True))
+        for numbers, before in ((edges, incumbent.edges), (contacts, incumbent.contacts))
     )
     return Incumbent(
         edges,
+        contacts,
         tree_where(better, weight, incumbent.weight),
         tree_where(better, twist, incumbent.twist),
         jnp.where(better, power, incumbent.power),

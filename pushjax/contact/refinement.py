@@ -191,14 +191,14 @@ def _edges(problem: ScaledProblem, chosen: Incumbent, moves: Bool[Array, ""]) ->
 
 
 def _system(problem: ScaledProblem, chosen: Incumbent, moves: Bool[Array, ""], edges: Basis) -> _System:
-    """The system of the chosen edges: normal conditions, and the tangential one of a contact with both edges."""
+    """The system of the chosen edges: normal conditions, and the tangential one of a contact that sticks."""
     zero = jnp.zeros_like(problem.runtime_scalar)
-    sticks = (chosen.edges[1] >= 0) & (chosen.edges[0] // 2 == chosen.edges[1] // 2)
+    sticks = (chosen.edges[1] >= 0) & (chosen.contacts[0] == chosen.contacts[1])
     zero_vector = Vec3(zero, zero, zero)
     rows, b, unused = [], [], []
-    for slot, edge in enumerate(chosen.edges):
-        used = moves & (edge >= 0)
-        contact = jnp.maximum(edge, 0) // 2
+    for slot, number in enumerate(chosen.contacts):
+        used = moves & (number >= 0)
+        contact = jnp.maximum(number, 0)
         row, approach = dynamic_index(problem.normal, contact), dynamic_index(problem.approach, contact)
         condition = approach.x
         if slot == 1:

@@ -33,9 +33,9 @@ class Status(IntEnum):
         JAMMED: No twist satisfies every contact.
         NOT_CONVERGED: No answer was found. In rollouts also: no answer leaves every finger outside the slider, however
             small the parts into which the step was divided. The slider is left where it is.
-        GRASPED: Jammed with every finger on the slider (rollouts only).
-        OVERLAPPING: The hand is too deep inside the slider for contact to mean anything. The slider is left where it is
-            (rollouts only).
+        GRASPED: Jammed with every finger and no fixture on the slider (rollouts only).
+        OVERLAPPING: The hand or a fixture is too deep inside the slider for contact to mean anything. The slider is
+            left where it is (rollouts only).
         INVALID: An input was NaN, infinite or outside its domain, and could not be refused because it was traced. The
             slider is left where it is.
     """

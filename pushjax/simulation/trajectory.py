@@ -20,9 +20,9 @@ class Step(eqx.Module):
     A contact without force is where its finger might touch next; if that is past the end of an edge, the point is off
     the outline.
 
-    Contacts are in the order of the fingers. A round finger has one contact, or two on an outline that is not convex. A
-    pad has two contacts in general, one on a disk, and three on a polygon that is not convex. The contacts of one
-    finger may change places from step to step.
+    Contacts are in the order of the fingers, and then of the fixtures. A round finger has one contact, or two on an
+    outline that is not convex. A pad has two contacts in general, one on a disk, and three on a polygon that is not
+    convex. A wall has two contacts, or one on a disk. The contacts of one finger may change places from step to step.
 
     The contact point moves in a straight line, and the rest of the slider turns about it. So the pose after the step
     agrees with the exponential of the twist to second order only. For a step that was divided
@@ -31,9 +31,9 @@ class Step(eqx.Module):
 
     MOVING, FREE, JAMMED and GRASPED promise a bound on the overlap after the step. The bound is the overlap before the
     step or, if that is more, a tenth of the largest displacement of the fingers in the step, but at least 1e-5 of the
-    surface's length. The exception is a hand with one contact: one round finger on a convex outline, or one pad on a
-    disk. Its overlap is recorded, but is not checked, and the step is not tried again. In all measurements, which were
-    made with a round finger, it was below the bound.
+    surface's length. The exception is a hand with one contact and no fixtures: one round finger on a convex outline, or
+    one pad on a disk. Its overlap is recorded, but is not checked, and the step is not tried again. In all
+    measurements, which were made with a round finger, it was below the bound.
 
     Attributes:
         pose: Pose of the slider after the step, (3,), world, m and rad.
@@ -44,8 +44,8 @@ class Step(eqx.Module):
         contact_normal: Unit normals of the contacts, into the slider, (contacts, 2), body frame. Not differentiated.
         mode: `ContactMode` of each contact, (contacts,).
         status: `Status` of the step.
-        overlap: Depth of the deepest finger in the slider after the step, m, computed from the whole outline; negative
-            where all are apart. Not differentiated.
+        overlap: Depth of the deepest finger or fixture in the slider after the step, m, computed from the whole
+            outline; negative where all are apart. Not differentiated.
     """
 
     pose: Float[Array, "3"]
@@ -63,7 +63,7 @@ class Trajectory(eqx.Module):
     """A push, step by step: the fields of `Step` with a leading axis of steps, and the configurations of the hand.
 
     At a jam the hand stops, within a sixteenth of a step before the jam. The status is then JAMMED, or GRASPED if every
-    finger holds the slider, at this step and at every step after it, and nothing moves any more.
+    finger and no fixture holds the slider, at this step and at every step after it, and nothing moves any more.
 
     Attributes:
         pose: Poses of the slider, (steps + 1, 3), world, m and rad; the first is the start.
