@@ -29,6 +29,10 @@ CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
+OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
+AROUND = (
+    8.0  # the cost to go is known up to this distance from the goal along x and y, in units of the surface's length
+)
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 LOST = 60.0  # control steps of a way that the table of ways does not have
 
@@ -147,8 +151,10 @@ class PushPlanner:
             return self._value
         if self._value is False:
             return None
-        reach = np.abs(self.vertices).max() / 2
-        low, high = self.workspace.slider_low + reach, self.workspace.slider_high - reach
+        half = np.abs(self.vertices).max() / 2  # the slider's origin is at least about this far from a wall
+        around = self.goal[:2] + AROUND * self.library.length * np.array([[-1.0], [1.0]])
+        low = np.maximum(self.workspace.slider_low + half, around[0])
+        high = np.minimum(self.workspace.slider_high - half, around[1])
         return cost_to_go(
             self.library,
             self.goal,
@@ -168,11 +174,8 @@ class PushPlanner:
 
         A row is a place of the finger around the slider; `place` is that of each entry.
         """
-        return (
-            self.pace.free_time(np.nan_to_num(self.roadmap.between(self.places), posinf=1e9))
-            .clip(max=LOST)
-            .astype(np.float32)
-        )
+        lengths = self.roadmap.between(self.places)
+        return np.where(np.isfinite(lengths), self.pace.free_time(lengths), LOST).astype(np.float32)
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -236,11 +239,9 @@ class PushPlanner:
         cost = way_time[self.push[entries]] + self.push_time[entries] + self._shortfall(score)
         cost = np.where(score > self.measure.enough, cost, np.inf)
         best = int(np.argmin(cost))
-        return (
-            Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
-            if np.isfinite(cost[best])
-            else None
-        )
+        if not np.isfinite(cost[best]):
+            return None
+        return Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
     def _shortfall(self, score: np.ndarray) -> np.ndarray:
         """Return control steps that stand for the risk of missing the goal by a push of a predicted score."""
@@ -270,9 +271,11 @@ class PushPlanner:
         entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
         reached = compose(here, self.library.relative[entries])
         outside = self.extent.outside(reached, self.workspace)
-        # a slider that is outside must come back
-        now = float(self.extent.outside(here, self.workspace))
-        good = outside <= max(0.0, now - 0.04 * self.library.length)
+        # a slider that is outside must come back, or at least not go farther if it cannot
+        now, some = float(self.extent.outside(here, self.workspace)), OUTSIDE * self.library.length
+        good = outside <= max(0.0, now - 2 * some)
+        if not good.any():
+            good = outside <= now + some
         return entries[good], reached[good]
 
     def _estimate(self, poses: np.ndarray, quick: bool) -> np.ndarray:
