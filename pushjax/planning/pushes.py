@@ -145,9 +145,8 @@ class Pushes(eqx.Module):
         """Return how far along its line the hand first touches, m; zero, abreast of the origin, if it never does."""
         rest = jnp.concatenate([angle[None], self.opening.astype(angle.dtype)])[: hand.dof - 2]
         centers = hand.poses(jnp.concatenate([line, rest]))[:, :2]
-        reach = radius + jnp.max(
-            hand.radius + jnp.sqrt(jnp.sum((centers - line[None]) ** 2, axis=1) + radius**2 * 1e-6)
-        )
+        # far enough for every finger to start outside; `radius` is that of points on the outline, not of its corners
+        reach = 2 * radius + jnp.max(hand.radius + jnp.max(jnp.abs(centers - line[None]), axis=1) * 2**0.5)
         outline, way = slider.shape.outline(), Vec2.of(2 * reach * ahead)
         fractions = [
             outline.sweep(Vec2.of(center - reach * ahead), way, finger.radius)  # pyright: ignore[reportAttributeAccessIssue]

@@ -138,28 +138,32 @@ class CrossEntropy(_Sampling):
         population: Number of samples around each candidate in each iteration.
         elites: Number of the best samples.
         width: Standard deviation of the first samples, in units of the objective's scale.
+        smoothing: Weight of the last standard deviation in the next one, so that it does not shrink too soon.
 
     Raises:
-        ValueError: If a number is not positive, or there are more elites than samples.
+        ValueError: If a number is not positive, there are more elites than samples, or the smoothing is outside [0, 1).
 
     Reference: Rubinstein & Kroese 2004.
     """
 
     iterations: int = 10
     population: int = 32
-    elites: int = 6
+    elites: int = 8
     width: float = 0.5
+    smoothing: float = 0.3
 
     def __check_init__(self):
         _check_sampling(self)
         check_count("elites", self.elites)
         if self.elites > self.population:
             raise ValueError(f"elites must be at most the population of {self.population}; got {self.elites}")
+        if not 0 <= self.smoothing < 1:
+            raise ValueError(f"smoothing must be at least 0 and below 1; got {self.smoothing!r}")
 
     def update(self, parameters, cost, deviation):
         order = np.argsort(cost, axis=1, kind="stable")[:, : self.elites]
         elites = np.take_along_axis(parameters, order[:, :, None], axis=1)
-        return elites.mean(axis=1), elites.std(axis=1)
+        return elites.mean(axis=1), (1 - self.smoothing) * elites.std(axis=1) + self.smoothing * deviation
 
 
 class MPPI(_Sampling):

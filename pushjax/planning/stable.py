@@ -181,7 +181,7 @@ def stable_push(
         >>> hand, there = pj.Hand.two_fingers(0.005), (0.1, 0.2, 1.0)
         >>> push = stable_push(jax.random.key(0), slider, hand, (0, 0, 0), there, model=model, opening=(0.04,))
         >>> push.status.name, push.dubins.word
-        ('FOUND', 'RSL')
+        ('FOUND', 'LSR')
     """
     contacts = stable_contacts(key, slider, hand, model=model, opening=opening, samples=samples, margin=margin)
     return shortest_push(contacts, start, goal, steps=steps, step=STEP * float(slider.surface.length))
