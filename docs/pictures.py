@@ -60,7 +60,7 @@ def grasp() -> plot.Animation:
         x, y, angle = squeeze.STARTS[start]
         pose = jnp.array([x, y, np.radians(angle)])
         grasps[name] = pj.rollout(slider, hand, path, pose=pose, friction=squeeze.FRICTION)
-    return plot.animate(block, hand, grasps)
+    return plot.animate(block, hand, grasps, friction=squeeze.FRICTION)
 
 
 def stochastic() -> plot.Animation:

@@ -92,7 +92,7 @@ def _draw(out: Path, block: pj.Polygon, hand: pj.Hand, grasps: dict[str, pj.Traj
     """Draw the four closings into the folder `out` and return the path of the picture."""
     from pushjax import plot
 
-    return [str(plot.save(plot.grasp_figure(block, hand, grasps), out / "squeeze.png"))]
+    return [str(plot.save(plot.grasp_figure(block, hand, grasps, friction=FRICTION), out / "squeeze.png"))]
 
 
 def summary(record: dict[str, Any]) -> str:
@@ -102,7 +102,7 @@ def summary(record: dict[str, Any]) -> str:
         x, y, theta = np.asarray(row["pose"], float)
         lines.append(
             f"  {row['name']:30} {row['outcome']:12} x = {1e3 * x:6.2f} mm, y = {1e3 * y:5.2f} mm, theta = "
-            f"{np.degrees(theta):6.2f} deg, opening {row['opening_mm']:5.2f} mm   {row['status']}"
+            f"{np.degrees(theta):6.2f} deg, opening {row['opening_mm']:5.2f} mm"
         )
     lines += [f"drew {path}" for path in record["pictures"]]
     return "\n".join(lines)

@@ -153,7 +153,7 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: 
 
     from pushjax import plot
 
-    title = f"{len(trajectory)} of {len(pushes)} pushes"
+    title = f"{len(pushes)} pushes" + (f", {len(trajectory)} drawn" if len(trajectory) < len(pushes) else "")
     cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), trajectory, title)
     with plt.rc_context(plot.STYLE):
         histograms, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
@@ -163,7 +163,8 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: 
             test = scipy.stats.normaltest(values)
             gaussian = values.mean(), values.std(ddof=1)
             plot.histogram_panel(axes, pushes.histogram(values, HISTOGRAM_BINS), label, gaussian=gaussian)
-            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f}, normal: p = {test.pvalue:.1g}")
+            unit = label.split(" / ")[1]
+            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f} {unit}; normal: p = {test.pvalue:.1g}")
         panels[0].legend()
         pictures = (cloud, "stochastic_push.png"), (histograms, "stochastic_push_histograms.png")
         return [str(plot.save(figure, out / name)) for figure, name in pictures]

@@ -18,6 +18,8 @@ from .pushes import RealPush as RealPush
 from .pushes import grasp_figure as grasp_figure
 from .pushes import push_figure as push_figure
 from .pushes import real_figure as real_figure
+from .squeeze import SqueezeForces as SqueezeForces
+from .squeeze import squeeze_forces as squeeze_forces
 from .style import BLACK as BLACK
 from .style import BLUE as BLUE
 from .style import GRAY as GRAY

@@ -16,12 +16,14 @@ from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.motion import Animation
-from pushjax.plot.parts import placed_outline, vertices
-from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, RED, STYLE, legend_below, panel_row
+from pushjax.plot.parts import centroids, placed_outline, vertices
+from pushjax.plot.squeeze import SQUEEZE_LABEL
+from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
 from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
 from pushjax.simulation.hand import Hand
 
 MAX_ARROW_LENGTH = 0.4  # length of the arrow of the largest force, in units of the slider's size
+SQUEEZE_LENGTH = 0.7  # length of the arrow of a unit of squeeze, in units of the slider's size
 MIN_FORCE = 1e-3  # weaker forces are not drawn, in units of the largest
 PANEL_WIDTH, EXTRA_HEIGHT = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
 LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
@@ -35,14 +37,16 @@ def animate(
     *,
     measured: Mapping[str, np.ndarray] | None = None,
     forces: bool = True,
+    friction: float | None = None,
     frames: int = 60,
     seconds: float = 4.0,
 ) -> Animation:
     """Animate pushes or grasps side by side.
 
-    Each panel shows the slider (its start in gray), the fingers, the trace of the slider's center, the contacts with
-    the forces on the slider as arrows, and the status and contact modes of the step in words. From a failed step on,
-    the words are its status and number, in red.
+    Each panel shows the slider (its start in gray), the fingers, the trace of the slider's centroid, the contacts
+    with the forces on the slider as arrows, and the status and contact modes of the step in words. From a failed step
+    on, the words are its status and number, in red. Where the hand stops because it holds the slider, the forces of the
+    squeeze are shown if `friction` is given.
 
     Args:
         shape: Outline of the slider.
@@ -52,6 +56,8 @@ def animate(
         measured: Poses (points, 3) by the name of a push, world, m and rad. They are drawn dashed over that push.
         forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
             the largest force.
+        friction: Coefficient of friction at the contacts, to show the forces that hold the slider at the end of a
+            grasp, per unit of squeeze (`pushjax.plot.squeeze`).
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.
 
@@ -69,7 +75,9 @@ def animate(
     unknown = sorted(set(measured_by_name) - set(by_name))
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
-    drawn = [drawn_push(shape, hand, push, measured_by_name.get(name), forces) for name, push in by_name.items()]
+    drawn = [
+        drawn_push(shape, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
+    ]
     fractions = _frame_fractions(drawn, frames)
     largest_force = max(track.largest_force for track in drawn)
     with plt.rc_context(STYLE):
@@ -80,7 +88,8 @@ def animate(
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         _share_limits(figure, all_axes, drawn)
-        _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force)
+        held = any(track.squeeze is not None for track in drawn)
+        _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force, held)
 
     def draw(frame: int) -> None:
         for panel in panels:
@@ -102,7 +111,7 @@ def animate_cloud(
 ) -> Animation:
     """Animate many pushes along one path at once.
 
-    The picture shows faint outlines of all pushes, the paths of their centers, the start, and the hand.
+    The picture shows faint outlines of all pushes, the paths of their centroids, the start, and the hand.
 
     Args:
         shape: Outline of the slider.
@@ -125,7 +134,7 @@ def animate_cloud(
         raise ValueError(
             f"trajectories have shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
         )
-    outline_points = placed_outline(vertices(shape), poses)
+    outline_points, positions = placed_outline(vertices(shape), poses), centroids(shape, poses)
     steps = _equally_spaced(poses.shape[1] - 1, frames).round().astype(int)
     opacity = float(np.clip(12 / len(poses), 0.05, 0.6))
     with plt.rc_context(STYLE):
@@ -133,7 +142,7 @@ def animate_cloud(
         outlines, paths = (LineCollection([], colors=BLUE, linewidths=w, alpha=opacity) for w in (0.8, 0.6))
         axes.add_collection(outlines)
         axes.add_collection(paths)
-        (centers,) = axes.plot([], [], ".", color=RED, ms=3, alpha=0.5, label="centers")
+        (points,) = axes.plot([], [], ".", color=RED, ms=3, alpha=0.5, label="centroids")
         axes.plot(*outline_points[0, 0].T, color=BLACK, lw=1.4, label="start")
         axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
         tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
@@ -144,8 +153,8 @@ def animate_cloud(
     def draw(frame: int) -> None:
         k = steps[frame]
         outlines.set_segments(list(outline_points[:, k]))
-        paths.set_segments(list(MM * poses[:, : k + 1, :2]))
-        centers.set_data(*(MM * poses[:, k, :2].T))
+        paths.set_segments(list(positions[:, : k + 1]))
+        points.set_data(*positions[:, k].T)
         for tip, finger in zip(tips, fingers, strict=True):
             tip.set_data(*finger[k].T)
 
@@ -169,7 +178,7 @@ class _Panel:
         self.weakest = MIN_FORCE * largest_force
         axes.plot(*track.outline[0].T, color=GRAY, lw=1.0, label="start")
         (self.outline,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
-        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its center")
+        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centroid")
         self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
         (self.measured,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
         (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
@@ -177,6 +186,12 @@ class _Panel:
         arrow_style: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
         arrow_style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
         self.arrows = axes.quiver(zero, zero, zero, zero, **arrow_style) if len(zero) else None
+        self.squeeze = None
+        if track.squeeze is not None:
+            tips, force = track.squeeze
+            force = SQUEEZE_LENGTH * size * force
+            squeeze_style: dict[str, Any] = arrow_style | {"color": PURPLE, "pivot": "tip"}
+            self.squeeze = axes.quiver(*tips.T, *force.T, **squeeze_style)
         above_axes: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
         self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above_axes)
 
@@ -199,6 +214,8 @@ class _Panel:
             tails, force = (np.where(is_acting[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
             self.arrows.set_offsets(tails)
             self.arrows.set_UVC(*(self.scale * force).T)
+        if self.squeeze is not None:
+            self.squeeze.set_visible(k > track.stopped)
 
 
 def _frame_fractions(drawn: list[DrawnPush], frames: int) -> np.ndarray:
@@ -241,10 +258,12 @@ def _set_limits(axes: Axes, points: list[np.ndarray]) -> None:
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
 
 
-def _draw_legend(figure: Figure, axes: Axes, show_measured: bool, largest_force: float) -> None:
-    """Draw one legend for all panels, without `show_measured` if nothing was measured."""
+def _draw_legend(figure: Figure, axes: Axes, show_measured: bool, largest_force: float, held: bool) -> None:
+    """Draw one legend for all panels, with the measured outlines and the squeeze only if there are any."""
     if largest_force > 0:
         axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest_force:.2g} N")
+    if held:
+        axes.plot([], [], color=PURPLE, lw=2.2, label=SQUEEZE_LABEL)
     handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
     shown = {label: handle for label, handle in handles.items() if show_measured or label != "measured"}
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(figure.axes) == 1 else 3)

@@ -6,23 +6,27 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.distributions import density_panel, traces
-from pushjax.plot.parts import hand_at, outline
+from pushjax.plot.parts import centroids, hand_at, outline
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 from pushjax.simulation.hand import Hand
 
 QUANTILES = (0.025, 0.5, 0.975)
+MOST_LINES = 200
+CELL = 1.0  # mm
 Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]  # ((n, n) of x, (n, n) of y), m; density (n, n), 1/mm²
 
 
 def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.ndarray, title: str = "") -> Figure:
-    """Draw many pushes that begin alike: the paths of the center, the start, and three of the ends.
+    """Draw many pushes that begin alike: the paths of the centroid, the start, and three of the ends.
 
     The three ends are those at the 2.5 %, 50 % and 97.5 % quantiles of the final angle. The hand is drawn at both ends
-    of its path.
+    of its path. Up to `MOST_LINES` paths are lines. Of more, lines would hide each other, so the color says how many
+    pass each place.
 
     Args:
         shape: Outline of the slider.
@@ -32,9 +36,14 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
         title: Title of the picture.
     """
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
+        figure, axes = plt.subplots(figsize=(6.0, 5.6), layout="constrained")
         trajectories = np.asarray(trajectories)
-        traces(axes, trajectories, alpha=_opacity(len(trajectories)))
+        paths = centroids(shape, trajectories)
+        if len(paths) > MOST_LINES:
+            _draw_counts(figure, axes, paths)
+        else:
+            traces(axes, paths / MM, alpha=_opacity(len(paths)))
+            axes.plot([], [], color=BLUE, lw=0.8, label="paths of the centroid")
         outline(axes, shape, trajectories[0, 0], BLACK, 1.4, label="start")
         order = np.argsort(trajectories[:, -1, 2])
         for quantile in QUANTILES:
@@ -44,10 +53,9 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
         fingers = np.asarray(hand.poses(jnp.asarray(path)))
         hand_at(axes, hand, fingers[0], BLACK, 1.0)
         hand_at(axes, hand, fingers[-1], RED, 1.0)
-        axes.plot([], [], color=BLUE, lw=0.8, label="paths of the center")
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=title)
         handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
-        axes.legend(handles.values(), handles.keys(), loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
         return figure
 
 
@@ -61,15 +69,15 @@ def capture_figure(
 ) -> Figure:
     """Draw many starts and which of them end as wanted (red, the others black), one panel per run.
 
-    Each panel shows the paths of the center. The hand is gray at its start, and blue at its end with one slider that it
-    caught.
+    Each panel shows the paths of the body origin. The hand is gray at its start, and blue at its end with one slider
+    that it caught.
 
     Args:
         shape: Outline of the slider.
         hand: The hand.
         path: (steps + 1, dof), configurations of the hand.
         runs: By name, the poses (pushes, steps + 1, 3), world, m and rad, and which pushes are wanted (pushes,).
-        density: Density of the wanted starts of the last run, for one more panel with the start centers of that run:
+        density: Density of the wanted starts of the last run, for one more panel with the start positions of that run:
             ((n, n) of x, (n, n) of y), m, and the density (n, n) there, 1/mm². None: no such panel.
         max_paths: Largest number of paths in each panel; the first ones are drawn.
     """
@@ -92,7 +100,7 @@ def capture_figure(
             name, (trajectories, wanted) = list(runs.items())[-1]
             starts = trajectories[:, 0, :2]
             density_panel(panels[0, -1], *density, starts[wanted], starts[~wanted])
-            panels[0, -1].set_title(f"start centers, {name}")
+            panels[0, -1].set_title(f"start positions, {name}")
         for color, label in ((RED, "end as wanted"), (BLACK, "do not")):
             panels[0, 0].plot([], [], color=color, label=label)
         legend_below(figure, panels[0, 0], columns=2)
@@ -100,10 +108,23 @@ def capture_figure(
 
 
 def _draw_paths(axes: Axes, trajectories: np.ndarray, wanted: np.ndarray) -> None:
-    """Draw the paths and the start centers, the wanted ones in red."""
+    """Draw the paths and the start positions of the body origin, the wanted ones in red."""
     for which, color in ((wanted, RED), (~wanted, BLACK)):
         traces(axes, trajectories[which], color, alpha=0.5)
         axes.plot(*(MM * trajectories[which, 0, :2].T), ".", color=color, ms=3)
+
+
+def _draw_counts(figure: Figure, axes: Axes, paths: np.ndarray) -> None:
+    """Draw how many of the paths (pushes, steps + 1, 2), mm, pass each cell of `CELL` mm, with a color bar."""
+    cells = np.floor(paths / CELL).astype(int)
+    first = cells.min(axis=(0, 1))
+    push = np.broadcast_to(np.arange(len(paths))[:, None, None], (*cells.shape[:2], 1))
+    passed = np.unique(np.concatenate([push, cells - first], axis=2).reshape(-1, 3), axis=0)[:, 1:]
+    counts = np.zeros(passed.max(axis=0) + 1)
+    np.add.at(counts, tuple(passed.T), 1)
+    edges = [CELL * (first[k] + np.arange(counts.shape[k] + 1)) for k in (0, 1)]
+    drawn = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, norm=LogNorm(1, len(paths)), cmap="Blues")
+    figure.colorbar(drawn, ax=axes, label="paths of the centroid / (1/mm²)", shrink=0.6)
 
 
 def _opacity(lines: int) -> float:

@@ -13,11 +13,11 @@ TICK = 1.6  # mm, length of a pose's tick
 
 
 def traces(axes: Axes, trajectories: np.ndarray, color: str = BLUE, alpha: float = 0.06) -> None:
-    """Draw the paths of the slider's origin, in mm.
+    """Draw the paths of the slider's body origin, or of another point of it, in mm.
 
     Args:
         axes: Axes to draw into.
-        trajectories: (n, steps + 1, 3), poses, m and rad, one trajectory per row.
+        trajectories: (n, steps + 1, 3), poses, m and rad, one trajectory per row; or positions (n, steps + 1, 2), m.
         color: Color of the lines.
         alpha: Opacity of the lines.
     """

@@ -38,6 +38,19 @@ def placed_outline(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return MM * np.stack([c * body_x - s * body_y + x, s * body_x + c * body_y + y], axis=-1)
 
 
+def centroids(shape: Shape, poses: np.ndarray) -> np.ndarray:
+    """Return where the centroid of a body is at each of several poses, in mm.
+
+    Args:
+        shape: The body.
+        poses: (..., 3), m and rad.
+
+    Returns:
+        (..., 2), mm.
+    """
+    return placed_outline(np.asarray(shape.centroid, float)[None], poses)[..., 0, :]
+
+
 def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float, **line: Any) -> None:
     """Draw a shape at a pose, in mm.
 

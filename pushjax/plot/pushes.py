@@ -13,10 +13,13 @@ from matplotlib.patches import Circle
 
 from pushjax.contact.status import Status
 from pushjax.geometry.shape import Shape
-from pushjax.plot.parts import hand_at, outline, placed_outline, vertices
+from pushjax.plot.parts import arrow, centroids, hand_at, outline, placed_outline, vertices
+from pushjax.plot.squeeze import SQUEEZE_LABEL, SqueezeForces, squeeze_forces
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, legend_of_moments, panel_row
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.trajectory import Trajectory
+
+ARROW_LENGTH = 0.7  # length of the arrow of a unit force, in units of the slider's size
 
 
 def push_figure(
@@ -24,7 +27,7 @@ def push_figure(
 ) -> Figure:
     """Draw pushes by one round finger, side by side.
 
-    Outline and finger are black at the start, red at the end, and gray between. The trace of the slider's center is
+    Outline and finger are black at the start, red at the end, and gray between. The trace of the slider's centroid is
     drawn too. The title of a push with a failed step says so.
 
     Args:
@@ -42,16 +45,23 @@ def push_figure(
                 color = BLACK if k == 0 else RED if k == shown[-1] else GRAY
                 outline(axes, shape, pose[k], color, 1.4 if color != GRAY else 0.8)
                 axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != GRAY, lw=0.8))
-            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.2, label="center of the slider")
+            axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.2, label="centroid of the slider")
             axes.set(title=_title_with_failure(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
         return figure
 
 
-def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], frames: int = 4) -> Figure:
+def grasp_figure(
+    shape: Shape,
+    hand: Hand,
+    grasps: Mapping[str, Trajectory],
+    frames: int = 4,
+    *,
+    friction: float | None = None,
+) -> Figure:
     """Draw grasps side by side.
 
-    Slider and fingers are black at the start, red at the end, and gray between. The trace of the slider's center is
+    Slider and fingers are black at the start, red at the end, and gray between. The trace of the slider's centroid is
     drawn too. The title of a grasp with a failed step says so. Pushes by any hand can also be drawn with it.
 
     Args:
@@ -59,7 +69,10 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
         hand: The hand.
         grasps: Trajectories by name.
         frames: Number of moments between start and end, among those in which the slider moves.
+        friction: Coefficient of friction at the contacts. With it, the forces by which the hand holds the slider at the
+            end are drawn, where it does, per unit of squeeze (`squeeze_forces`).
     """
+    held = False
     with plt.rc_context(STYLE):
         figure, all_axes = panel_row(len(grasps), 3.1, 3.9, shared=True)
         for axes, (name, grasp) in zip(all_axes, grasps.items(), strict=True):
@@ -74,11 +87,23 @@ def grasp_figure(shape: Shape, hand: Hand, grasps: Mapping[str, Trajectory], fra
                 width = 0.8 if color == GRAY else 1.4
                 outline(axes, shape, pose[k], color, width)
                 hand_at(axes, hand, fingers[k], color, width)
-            axes.plot(*(MM * pose[:, :2]).T, color=BLUE, lw=1.4, label="center of the slider", zorder=4)
+            axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.4, label="centroid of the slider", zorder=4)
+            squeeze = None if friction is None else squeeze_forces(shape, hand, grasp, friction)
+            if squeeze is not None:
+                _draw_squeeze(axes, squeeze, ARROW_LENGTH * float(np.ptp(vertices(shape), axis=0).max()))
+                held = True
             axes.set(title=_title_with_failure(name.replace(": ", ":\n"), grasp), xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
+        if held:
+            all_axes[0].plot([], [], color=ORANGE, lw=2.2, label=SQUEEZE_LABEL)
         legend_of_moments(figure, all_axes[0])
         return figure
+
+
+def _draw_squeeze(axes: Axes, squeeze: SqueezeForces, length: float) -> None:
+    """Draw the forces of a squeeze as arrows that end at the contacts; that of a unit force is `length` (m) long."""
+    for tip, tail in zip(MM * squeeze.point, MM * (squeeze.point - length * squeeze.force), strict=True):
+        arrow(axes, tail, tip, ORANGE, 2.0)
 
 
 def _title_with_failure(name: str, push: Trajectory) -> str:

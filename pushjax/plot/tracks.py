@@ -8,7 +8,8 @@ import numpy as np
 from pushjax.contact.status import ContactMode, Status
 from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import contact_forces
-from pushjax.plot.parts import SMOOTH_OUTLINE_POINTS, placed_outline, vertices
+from pushjax.plot.parts import SMOOTH_OUTLINE_POINTS, centroids, placed_outline, vertices
+from pushjax.plot.squeeze import squeeze_forces
 from pushjax.plot.style import MM
 from pushjax.simulation.hand import Hand, Pad
 from pushjax.simulation.trajectory import Trajectory
@@ -42,12 +43,16 @@ class DrawnPush(NamedTuple):
     Attributes:
         outline: (points, vertices, 2), outlines of the slider.
         fingers: For each finger its outlines, (points, vertices, 2).
-        center: (points, 2), centers of the slider.
+        center: (points, 2), centroids of the slider.
         measured: Measured outlines to draw over it, or None.
         contact: (points, contacts, 2), contacts of the step that led to each point.
         force: (points, contacts, 2), forces of that step, N.
         words: For each point the text that describes that step.
         failed: The first failed step, or -1.
+        squeeze: The forces that hold the slider from the step at which the hand stops, as the points (contacts, 2) in
+            mm and the forces (contacts, 2) per unit of squeeze; None where it is not held, or if they are not asked
+            for.
+        stopped: The step at which the hand stops, or -1.
     """
 
     outline: np.ndarray
@@ -58,6 +63,8 @@ class DrawnPush(NamedTuple):
     force: np.ndarray
     words: list[str]
     failed: int
+    squeeze: tuple[np.ndarray, np.ndarray] | None
+    stopped: int
 
     @property
     def largest_force(self) -> float:
@@ -65,7 +72,14 @@ class DrawnPush(NamedTuple):
         return float(np.max(np.linalg.norm(self.force, axis=-1), initial=0.0))
 
 
-def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray | None, forces: bool) -> DrawnPush:
+def drawn_push(
+    shape: Shape,
+    hand: Hand,
+    push: Animatable,
+    measured: np.ndarray | None,
+    forces: bool,
+    friction: float | None = None,
+) -> DrawnPush:
     """Convert a push to what is drawn.
 
     Args:
@@ -74,6 +88,7 @@ def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray 
         push: The push.
         measured: (points, 3), poses to draw over it, world, m and rad; or None.
         forces: Whether to draw contacts and forces.
+        friction: Coefficient of friction at the contacts, to draw the squeeze that holds the slider; or None.
 
     Raises:
         ValueError: If the push has another number of configurations than of poses.
@@ -83,12 +98,16 @@ def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray 
     if len(fingers[0]) != len(pose):
         raise ValueError(f"push has {len(pose)} poses, but {len(fingers[0])} configurations")
     contact, force, words = np.zeros((len(pose), 0, 2)), np.zeros((len(pose), 0, 2)), [""] * len(pose)
-    failed = -1
+    failed = stopped = -1
+    squeeze = None
     if isinstance(push, Trajectory):
         words = ["", *(_describe_step(int(s), m) for s, m in zip(push.status, np.asarray(push.mode), strict=True))]
         if forces:
             contact, force = _in_world(pose, *contact_forces(push))
-        failed = int(push.first_failure)
+        failed, stopped = int(push.first_failure), int(push.stopped)
+        if forces and friction is not None:
+            held = squeeze_forces(shape, hand, push, friction)
+            squeeze = None if held is None else (MM * held.point, held.force)
         if failed >= 0:  # what is drawn from here on is no answer
             name = _plain_name(Status(int(push.status[failed])))
             words = [*words[: failed + 1], *[f"{name} at step {failed}"] * (len(pose) - failed - 1)]
@@ -96,12 +115,14 @@ def drawn_push(shape: Shape, hand: Hand, push: Animatable, measured: np.ndarray 
     return DrawnPush(
         placed_outline(outline_points, pose),
         fingers,
-        MM * pose[:, :2],
+        centroids(shape, pose),
         measured_outlines,
         contact,
         force,
         words,
         failed,
+        squeeze,
+        stopped,
     )
 
 
@@ -131,7 +152,9 @@ def _describe_step(status: int, modes: np.ndarray) -> str:
 
 
 def _plain_name(member: ContactMode | Status) -> str:
-    """Return the name of a mode or status in lower case, with spaces."""
+    """Return the name of a mode or status in lower case, with spaces; a grasp may be flat or wedged, so it is held."""
+    if member is Status.GRASPED:
+        return "held by every finger"
     return member.name.lower().replace("_", " ")
 
 

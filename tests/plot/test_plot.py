@@ -60,7 +60,7 @@ def test_push_figure(block):
     figure = plot.push_figure(block, {"one": (push, path), "two": (slid(turn=-0.2), path)}, RADIUS, frames=3)
     legible(figure)
     assert [axes.get_title() for axes in figure.axes] == ["one", "two"]
-    assert legend(figure) == ["center of the slider", "start", "between", "end"]
+    assert legend(figure) == ["centroid of the slider", "start", "between", "end"]
     axes = figure.axes[0]
     for color, k in ((plot.BLACK, 0), (plot.RED, -1)):
         np.testing.assert_allclose(ends_of(axes, color)[0], in_world(push.pose[k]), atol=1e-9)
@@ -84,7 +84,7 @@ def test_grasp_figure(block):
     legible(figure)
     axes = figure.axes[0]
     assert axes.get_title() == "held:\naskew"
-    assert legend(figure) == ["center of the slider", "start", "between", "end"]
+    assert legend(figure) == ["centroid of the slider", "start", "between", "end"]
     drawn = ends_of(axes, plot.RED)
     np.testing.assert_allclose(drawn[0], in_world(grasp.pose[6]), atol=1e-9)
     assert [len(line) for line in drawn[:3]] == [5, 5, 5]  # slider and two pads

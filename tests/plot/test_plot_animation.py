@@ -111,7 +111,7 @@ def test_frames_show_the_push(block, finger, push):
         drawn, pose = lines(axes), np.asarray(push.pose[k])
         np.testing.assert_allclose(drawn["slider"], square(pose), atol=1e-9)
         np.testing.assert_allclose(drawn["start"], square(push.pose[0]), atol=1e-9)
-        np.testing.assert_allclose(drawn["its center"], MM * np.asarray(push.pose[: k + 1, :2]), atol=1e-9)
+        np.testing.assert_allclose(drawn["its centroid"], MM * np.asarray(push.pose[: k + 1, :2]), atol=1e-9)
         center = MM * np.asarray(push.configuration[k])
         np.testing.assert_allclose(np.linalg.norm(drawn["hand"] - center, axis=1), MM * RADIUS, atol=1e-9)
         status = pj.Status(int(push.status[k - 1])).name.lower()
@@ -129,7 +129,7 @@ def test_frames_show_the_push(block, finger, push):
         elif k == 0:
             assert np.isnan(np.ma.filled(arrows.get_offsets(), np.nan)).all()  # no arrow
     text = [entry.get_text() for entry in moving.figure.legends[0].get_texts()]
-    assert text == ["start", "slider", "its center", "hand", f"force on the slider, up to {largest:.2g} N"]
+    assert text == ["start", "slider", "its centroid", "hand", f"force on the slider, up to {largest:.2g} N"]
 
 
 def test_nothing_leaves_the_range_or_is_cut_off(block, finger, push):
@@ -207,7 +207,7 @@ def test_pads_and_words_of_several_contacts(block):
     assert pads[0][:, 1].min() == pytest.approx(MM * SIDE / 2, abs=1e-3)
     assert pads[1][:, 1].max() == pytest.approx(-MM * SIDE / 2, abs=1e-3)
     moving.draw(6)
-    assert axes.texts[0].get_text() == "grasped"
+    assert axes.texts[0].get_text() == "held by every finger"
     assert not axes.collections
 
 
@@ -219,13 +219,13 @@ def test_cloud(block, finger):
     moving = plot.animate_cloud(block, finger, path, poses, title="cloud", frames=5)
     (axes,) = moving.figure.axes
     assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == ("cloud", "x / mm", "y / mm")
-    assert [entry.get_text() for entry in moving.figure.legends[0].get_texts()] == ["centers", "start", "12 pushes"]
+    assert [entry.get_text() for entry in moving.figure.legends[0].get_texts()] == ["centroids", "start", "12 pushes"]
     for k in (1, 4):
         moving.draw(k)
         outlines, ways = axes.collections
         np.testing.assert_allclose(outlines.get_segments(), [square(pose) for pose in poses[:, k]], atol=1e-9)
         np.testing.assert_allclose(ways.get_segments(), MM * poses[:, : k + 1, :2])
-        np.testing.assert_allclose(lines(axes)["centers"], MM * poses[:, k, :2])
+        np.testing.assert_allclose(lines(axes)["centroids"], MM * poses[:, k, :2])
     with pytest.raises(ValueError, match=r"trajectories have shape \(12, 4, 3\); expected \(pushes, 5, 3\)"):
         plot.animate_cloud(block, finger, path, poses[:, :4])
 

@@ -56,8 +56,14 @@ def test_cloud_figure(block):
     legible(figure)
     (axes,) = figure.axes
     assert axes.get_title() == "40 pushes"
-    assert legend(axes) == ["start", "end, 2.5 and 97.5 % of θ", "median end", "paths of the center"]
-    np.testing.assert_allclose(axes.collections[0].get_segments(), MM * ways[..., :2])
+    assert legend(figure) == ["paths of the centroid", "start", "end, 2.5 and 97.5 % of θ", "median end"]
+    np.testing.assert_allclose(axes.collections[0].get_segments(), MM * ways[..., :2], atol=1e-9)
+    many = np.repeat(ways, 6, axis=0)
+    crowded, bar = plot.cloud_figure(block, pj.Hand.finger(RADIUS), path, many, "240 pushes").axes
+    counts = crowded.collections[0].get_array()
+    assert bar.get_ylabel() == "paths of the centroid / (1/mm²)"
+    assert counts.max() == 240  # where all begin
+    assert counts.min() % 6 == 0  # each way is there six times
     order = np.argsort(ways[:, -1, 2])
     drawn = [line for line in axes.lines if line.get_color() == plot.RED]
     for line, place in zip(drawn, (1, 20, 38), strict=True):
@@ -76,7 +82,7 @@ def test_capture_figure(block):
     figure = plot.capture_figure(block, pj.Hand.two_fingers(RADIUS), path, runs, density, max_paths=10)
     figure.canvas.draw()
     few, more, heat, bar = figure.axes
-    assert [axes.get_title() for axes in (few, more, heat)] == ["few", "more", "start centers, more"]
+    assert [axes.get_title() for axes in (few, more, heat)] == ["few", "more", "start positions, more"]
     assert legend(figure) == ["end as wanted", "do not"]
     assert [axes.get_xlabel() for axes in (few, more, heat)] == ["x / mm"] * 3
     assert bar.get_ylabel() == "density / (1/mm²)"
