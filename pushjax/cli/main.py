@@ -100,7 +100,8 @@ def _compute(command: Common) -> None:
         record = experiment.run(seed=command.seed, out=command.out, **settings)
     text = experiment.summary(record)
     print(text)
-    _write(record, text, command)
+    in_words = getattr(experiment, "figures", None)
+    _write(record, text, command, None if in_words is None else in_words(record))
 
 
 def _fetch(command: Data) -> None:
@@ -130,7 +131,7 @@ def data_folder(given: Path | None) -> Path:
     return folder
 
 
-def _write(record: dict[str, Any], text: str, command: Common) -> None:
+def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> None:
     """Write the record and, except for the demo, its page; then delete the cells that an interrupted run needs."""
     from pushjax._internal.cell_cache import CellCache
     from pushjax._internal.record import write_json
@@ -139,7 +140,7 @@ def _write(record: dict[str, Any], text: str, command: Common) -> None:
     json = command.json or command.out / f"{record['experiment']}.json"
     write_json(record, json)  # first, because it refuses what JSON cannot hold
     if not isinstance(command, Demo):
-        print(f"wrote {write_page(record, text, command.out / (record['experiment'] + '.html'))}")
+        print(f"wrote {write_page(record, text, command.out / (record['experiment'] + '.html'), figures)}")
     print(f"wrote {json}")
     CellCache.delete(record["experiment"], command.out)
 

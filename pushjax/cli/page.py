@@ -3,6 +3,7 @@
 import base64
 import html
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,26 +41,28 @@ summary {{ cursor: pointer; font-weight: 600; margin: .6rem 0; }}
 ABOUT = ("settings", "versions", "machine", "date")
 
 
-def write_page(record: dict[str, Any], text: str, path: Path) -> Path:
+def write_page(record: dict[str, Any], text: str, path: Path, figures: Sequence[tuple[str, str]] | None = None) -> Path:
     """Write a record and its pictures as one HTML page.
 
     Args:
         record: The record (see `result_record`). Its entry "pictures" lists files, whose content is embedded.
         text: The text that the command printed.
         path: The HTML file. Its folder is created.
+        figures: What the table of figures shows, as pairs of a name and a value in words. None: every entry of the
+            record, by its key.
 
     Returns:
         The path.
     """
     whole = json.loads(json.dumps(record, default=to_builtin))
-    figures = {name: value for name, value in whole.items() if name not in (*ABOUT, "pictures", "experiment")}
+    results = {name: value for name, value in whole.items() if name not in (*ABOUT, "pictures", "experiment")}
     pictures = "\n".join(_picture(Path(picture)) for picture in record.get("pictures", ()))
     page = TEMPLATE.format(
         title=html.escape(f"pushjax: {record['experiment']}"),
         text=html.escape(text),
         pictures=pictures,
-        figures=_table(figures),
-        settings=_table({name: whole[name] for name in ABOUT if name in whole}),
+        figures=_table(_leaves(results) if figures is None else figures),
+        settings=_table(_leaves({name: whole[name] for name in ABOUT if name in whole})),
         record=html.escape(json.dumps(whole, indent=1)),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,8 +75,7 @@ def _picture(path: Path) -> str:
     return f'<img src="data:image/png;base64,{data}" alt="{html.escape(path.stem.replace("_", " "))}">'
 
 
-def _table(tree: dict[str, Any]) -> str:
-    rows = list(_leaves(tree))
+def _table(rows: Iterable[tuple[str, str]]) -> str:
     cells = "".join(f"<tr><td>{html.escape(name)}</td><td>{html.escape(value)}</td></tr>" for name, value in rows)
     return f"<table>{cells}</table>"
 

@@ -136,6 +136,24 @@ def test_a_csv_tells_friction_and_inset(report):
     assert pj.Identified.load(record["identified"]).friction.shape == ()
 
 
+def test_the_page_has_words_and_units(report):
+    """The table of figures has no key of the record; the whole record is below it, as JSON."""
+    out, record = report
+    page = (out / "identify.html").read_text()
+    table = page[page.index("<summary>Figures") : page.index("<summary>Settings")]
+    assert "_mm" not in table
+    assert "rows[" not in table
+    for words in (
+        "coefficient of friction at the contact",
+        f"{record['rows'][1]['estimate']:.4g} mm; 90% interval",
+        f"Before any push was used, it was {record['expected_mm']:.2f} mm in the mean.",
+        f"The objects moved {record['no_motion_mm']:.1f} mm.",
+        "left out",
+    ):
+        assert words in table
+    assert "expected_mm" in page[page.index('<pre id="record">') :]
+
+
 def test_it_says_what_it_is_doing(report):
     """In a pipe, progress is printed as lines; a bar is for terminals."""
     out, _ = report

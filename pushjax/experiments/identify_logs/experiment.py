@@ -18,7 +18,7 @@ import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
-from pushjax.experiments.identify_logs import setting
+from pushjax.experiments.identify_logs import setting, words
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
 from pushjax.experiments.identify_logs.options import Options
 from pushjax.identification.noise import Noise, identify_noise
@@ -278,20 +278,11 @@ def summary(record: dict[str, Any]) -> str:
         f"limit surface: {record['surface_determined']:.1f} of the {record['surface_numbers']} numbers that its prior "
         "varies are determined",
         "",
-        f"deviation of predicted final poses: {record['mean_mm']:.2f} mm in the mean, {record['worst_mm']:.2f} mm at "
-        f"worst; as expected before any push, {record['expected_mm']:.2f} mm; the objects moved "
-        f"{record['no_motion_mm']:.1f} mm",
+        words.predicted(record),
         f"sigma: {record['sigma_mm']:.3g} mm; " + ("converged" if record["converged"] else "NOT converged"),
     ]
     if record["noise"] is not None:
-        noise = record["noise"]
-        friction = np.array2string(np.asarray(noise["friction"]), precision=3)
-        of_distance, of_turn = noise["relative_error"]
-        lines.append(
-            f"noise: dof {noise['surface_dof']:.0f}, friction {friction}, hand off by {noise['hand_offset_mm']:.2f} "
-            f"mm, poses by {noise['sigma_mm']:.2f} mm, {100 * of_distance:.1f} % of their distance and "
-            f"{100 * of_turn:.1f} % of their turn; energy score {noise['score_mm']:.2f} mm"
-        )
+        lines.append(f"noise: {words.noise(record['noise'])}")
     lines.append("interval: normal; profile: all else at its best; determined: how much of the doubt before is gone.")
     if record["failed_steps"]:
         lines.append(f"{record['failed_steps']} steps of the predicted pushes failed (see the JSON)")
