@@ -140,7 +140,9 @@ def engine() -> Any:
     return mujoco
 
 
-def build(scene: Scene, settings: Settings, timestep: float, conveyor: bool = True) -> Any:
+def build(
+    scene: Scene, settings: Settings, timestep: float, conveyor: bool = True, fixtures: tuple[str, ...] = ()
+) -> Any:
     """Build the MjModel of a push.
 
     In its world frame x is along the push, and the tip's center is at the origin when the push begins. Its qpos holds
@@ -151,6 +153,7 @@ def build(scene: Scene, settings: Settings, timestep: float, conveyor: bool = Tr
         settings: How MuJoCo computes.
         timestep: Timestep, s.
         conveyor: Whether the table moves under a tip that stands still. Otherwise the tip has a joint.
+        fixtures: Attributes of geoms that the slider touches, with the friction and the settings of the tip.
 
     Returns:
         The MjModel.
@@ -159,19 +162,23 @@ def build(scene: Scene, settings: Settings, timestep: float, conveyor: bool = Tr
     table = f'surfacevel="{-scene.speed:.9g} 0 0"' if conveyor else ""
     joint = '<joint type="slide" axis="1 0 0"/>' if not conveyor else ""
     body, mesh = slider_body(scene)
-    tip = pair("tip", "slider", scene.friction_tip, settings.normal, settings.tip_sliding, settings.impedance)
+    of_tip = scene.friction_tip, settings.normal, settings.tip_sliding, settings.impedance
+    contacts = "".join(
+        pair(name, "slider", *of_tip) for name in ("tip", *(f"fixture{k}" for k in range(len(fixtures))))
+    )
+    geoms = "".join(f'<geom name="fixture{k}" {each}/>' for k, each in enumerate(fixtures))
     text = f"""<mujoco>
       {options(settings, timestep)}
       <asset>{mesh}</asset>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
       <worldbody>
         <geom name="table" type="plane" size="1 1 .1" {table}/>
-        {body}
+        {body}{geoms}
         <body name="tip">{joint}<inertial mass="{TIP_MASS}" pos="0 0 0" diaginertia="1 1 1"/>
           <geom name="tip" type="sphere" size="{scene.tip_radius}"/>
         </body>
       </worldbody>
-      <contact>{supported(scene, settings)}{tip}</contact>
+      <contact>{supported(scene, settings)}{contacts}</contact>
     </mujoco>"""
     return mujoco.MjModel.from_xml_string(text)
 

@@ -274,3 +274,49 @@ def test_without_the_extra(monkeypatch):
 def test_scenes_that_cannot_be(wrong):
     with pytest.raises(ValueError, match="must be"):
         Scene(**wrong)
+
+
+# Fixtures as MuJoCo and pushjax have them, the slider's start pose, and the tip's travel; the tip moves along +x from
+# the origin. A wall on which the slider lies; a wall that it is pushed against and turns onto; a peg that turns it.
+AMONG_FIXTURES = {
+    "along a wall": (
+        ('type="box" size="0.5 0.1 0.1" pos="0 -0.165 0"', pj.Wall((0.0, -0.065), (0.0, 1.0), 0.25)),
+        (0.04975, -0.02, 0.0),
+        0.05,
+    ),
+    "onto a wall": (
+        ('type="box" size="0.1 0.5 0.1" pos="0.235 0 0"', pj.Wall((0.135, 0.0), (-1.0, 0.0), 0.25)),
+        (0.06, -0.02, 0.35),
+        0.04,
+    ),
+    "around a peg": (
+        ('type="cylinder" size="0.02 0.1" pos="0.14 0.035 0"', pj.Fixture(pj.Disk(0.02), (0.14, 0.035, 0.0), 0.25)),
+        (0.04975, 0.0, 0.0),
+        0.05,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", AMONG_FIXTURES)
+def test_pushes_among_fixtures_agree(name):
+    """The poses agree to what a quartic and soft contacts allow; without the fixture they are far apart."""
+    (geom, fixture), start, travel = AMONG_FIXTURES[name]
+    scene, settings = Scene(FOUR), Settings()
+    engine = pytest.importorskip("mujoco")
+    model = build(scene, settings, FINE, conveyor=False, fixtures=(geom,))
+    data = engine.MjData(model)
+    data.qpos[:3] = *start[:2], mujoco.settle(model, settings)[2]
+    data.qpos[3:7] = np.cos(start[2] / 2), 0, 0, np.sin(start[2] / 2)
+    for _ in range(round(travel / scene.speed / FINE)):
+        data.qvel[6] = scene.speed
+        engine.mj_step(model, data)
+    found = np.array([*data.qpos[:2], 2 * np.arctan2(data.qpos[6], data.qpos[3])])
+    support = pj.Support.points(np.array(FOUR))
+    slider = pj.Slider.on(pj.Polygon.rectangle(0.09, 0.09), support)
+    hand, path = pj.Hand.finger(scene.tip_radius), pj.line((0.0, 0.0), (float(data.qpos[7]), 0.0), steps=100)
+    ours, free = (
+        pj.rollout(slider, hand, path, pose=start, friction=0.25, fixtures=fixtures) for fixtures in ((fixture,), ())
+    )
+    assert np.all(np.isin(ours.status, [pj.Status.MOVING, pj.Status.FREE]))
+    assert error_mm(found[None], np.asarray(ours.pose[-1:])).max() < 1.5
+    assert error_mm(found[None], np.asarray(free.pose[-1:])).max() > 2.5
