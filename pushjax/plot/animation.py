@@ -5,7 +5,7 @@ side by side from start to end, even if one has more steps. The animation ends w
 for example because the hand jammed, and the last frame stays on the screen for a moment.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -16,14 +16,15 @@ from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.motion import Animation
-from pushjax.plot.parts import centroids, placed_outline, vertices
+from pushjax.plot.parts import centroids, draw_fixtures, placed_outline, vertices
 from pushjax.plot.squeeze import SQUEEZE_LABEL
 from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
 from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
+from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 
 MAX_ARROW_LENGTH = 0.4  # length of the arrow of the largest force, in units of the slider's size
-SQUEEZE_LENGTH = 0.7  # length of the arrow of a unit of squeeze, in units of the slider's size
+SQUEEZE_LENGTH = 0.45  # length of the arrow of a unit of squeeze, in units of the slider's size
 MIN_FORCE = 1e-3  # weaker forces are not drawn, in units of the largest
 PANEL_WIDTH, EXTRA_HEIGHT = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
 LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
@@ -38,6 +39,7 @@ def animate(
     measured: Mapping[str, np.ndarray] | None = None,
     forces: bool = True,
     friction: float | None = None,
+    fixtures: Sequence[Wall | Fixture] = (),
     frames: int = 60,
     seconds: float = 4.0,
 ) -> Animation:
@@ -58,6 +60,7 @@ def animate(
             the largest force.
         friction: Coefficient of friction at the contacts, to show the forces that hold the slider at the end of a
             grasp, per unit of squeeze (`pushjax.plot.squeeze`).
+        fixtures: Walls and bodies that do not move, in every panel.
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.
 
@@ -84,6 +87,7 @@ def animate(
         figure, all_axes = panel_row(len(drawn), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
         panels = [_Panel(axes, track, largest_force) for axes, track in zip(all_axes, drawn, strict=True)]
         for axes, name in zip(all_axes, by_name, strict=True):
+            draw_fixtures(axes, fixtures)
             axes.set_title(name, pad=18)  # leaves room for the words below it
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")

@@ -224,8 +224,8 @@ def test_cloud(block, finger):
         moving.draw(k)
         outlines, ways = axes.collections
         np.testing.assert_allclose(outlines.get_segments(), [square(pose) for pose in poses[:, k]], atol=1e-9)
-        np.testing.assert_allclose(ways.get_segments(), MM * poses[:, : k + 1, :2])
-        np.testing.assert_allclose(lines(axes)["centroids"], MM * poses[:, k, :2])
+        np.testing.assert_allclose(ways.get_segments(), MM * poses[:, : k + 1, :2], atol=1e-9)
+        np.testing.assert_allclose(lines(axes)["centroids"], MM * poses[:, k, :2], atol=1e-9)
     with pytest.raises(ValueError, match=r"trajectories have shape \(12, 4, 3\); expected \(pushes, 5, 3\)"):
         plot.animate_cloud(block, finger, path, poses[:, :4])
 
