@@ -32,7 +32,7 @@ def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, .
 
 
 @quick_jit
-def step(task: Environment, key: Array, state: TaskState, action: Array, params: Any) -> tuple[Any, ...]:
+def step(task: Environment, key: Array, state: TaskState, action: Any, params: Any) -> tuple[Any, ...]:
     """Take a step. Return the next key, observation, state, reward, terminated, truncated and info."""
     key, step_key = jax.random.split(key)
     observation, state, reward, terminated, info = task.step_env(step_key, state, action, params)
@@ -47,7 +47,7 @@ def start_all(task: Environment, keys: np.ndarray, params: Any, rows: Array | No
 
 @jit
 def step_all(
-    task: Environment, mode: str, keys: Array, states: TaskState, ended: Any, actions: Array, params: Any
+    task: Environment, mode: str, keys: Array, states: TaskState, ended: Any, actions: Any, params: Any
 ) -> tuple[tuple[Any, ...], tuple[Any, Any] | None]:
     """Take a step in all environments, and reset those that need it.
 
@@ -91,4 +91,6 @@ def merged(mask: np.ndarray, new: Any, old: Any) -> Any:
 
 @quick_jit
 def picture(task: Any, state: TaskState, action: Array | None, params: Any, size: int) -> Array:
-    return render(task.vertices(state, params), task.goal_vertices(params), state.hand, action, size=size)
+    """Return the picture of a state, with a cross at an action unless that is None."""
+    block, goal = task.vertices(state, params), task.goal_vertices(params)
+    return render(block, goal, state.hand, action, size=size, seams=getattr(params, "seams", ()))

@@ -320,10 +320,11 @@ def _reset_mask(options: dict[str, Any] | None, num_envs: int) -> np.ndarray:
     return mask
 
 
-def _actions(given: ArrayLike, space: Any) -> Array:
+def _actions(given: ArrayLike, space: Any) -> np.ndarray:
     """Return actions as an array of the shape and dtype of a space."""
-    actions = as_float(given, space.dtype, "action")
-    check_shape("action", actions, space.shape)
+    actions = np.asarray(given, space.dtype)
+    if actions.shape != space.shape:
+        raise ValueError(f"action has shape {actions.shape}; expected {space.shape}")
     return actions
 
 

@@ -183,10 +183,12 @@ def test_vector_goes_on_from_a_pickle(rng):
 
 # --- PushT ---
 
+QUICK = {"walls": False, "substeps": 1}  # compiles in half of the time
+
 
 @pytest.fixture(scope="module")
 def push_t():
-    return gymnasium.make("pushjax/PushT-v0", render_mode="rgb_array", render_size=96)
+    return gymnasium.make("pushjax/PushT-v0", render_mode="rgb_array", render_size=96, **QUICK)
 
 
 def test_gymnasiums_checks(push_t):
@@ -198,7 +200,7 @@ def test_gymnasiums_checks(push_t):
 
 def test_time_limit_is_that_of_make(push_t):
     assert push_t.spec.max_episode_steps == 300
-    short = gymnasium.make("pushjax/PushT-v0", max_episode_steps=2)
+    short = gymnasium.make("pushjax/PushT-v0", max_episode_steps=2, **QUICK)
     short.reset(seed=0)
     assert [short.step(np.array([20.0, 20.0]))[3] for _ in range(2)] == [False, True]
     many = gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, max_episode_steps=7)
@@ -213,7 +215,7 @@ def test_push_t_in_a_vector(push_t):
     row = np.array([[100.0, 100.0, 250.0, 300.0, 1.0], [0.0] * 5])
     at_goal = push_t.unwrapped.task.block_pose(push_t.unwrapped.task.state_of(np.array(goal), params), params)
     row[1] = [400.0, 100.0, *(2 * np.array(goal[2:4]) - np.asarray(at_goal)[:2]), np.pi / 4]
-    many = RecordVectorStatistics(gymnasium.make_vec("pushjax/PushT-v0", num_envs=2))
+    many = RecordVectorStatistics(gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, **QUICK))
     single = RecordEpisodeStatistics(push_t)
     first, _ = many.reset(seed=0, options={"reset_to_state": row})
     alone, _ = single.reset(seed=0, options={"reset_to_state": row[0]})
