@@ -1,16 +1,21 @@
 """The parts of pictures: outlines, fingers, arrows, centers of rotation. Most take SI units and draw in mm."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
+from matplotlib.patches import Polygon as PolygonPatch
 
 from pushjax.geometry.shape import Shape
-from pushjax.plot.style import MM, PURPLE
+from pushjax.plot.style import GRAY, MM, PURPLE
+from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Finger, Hand, Pad
 
 SMOOTH_OUTLINE_POINTS = 200  # points along a smooth outline
+FAR = 10.0  # m; to here a wall is drawn, which is beyond every picture
+FIXTURE = "0.88"  # color of fixtures
 
 
 def vertices(shape: Shape) -> np.ndarray:
@@ -85,6 +90,21 @@ def _draw_finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width
         outline(axes, finger.shape, pose, color, width)
     else:
         axes.add_patch(Circle(tuple(MM * pose[:2]), MM * float(finger.radius), color=color, fill=False, lw=width))
+
+
+def draw_fixtures(axes: Axes, fixtures: Sequence[Wall | Fixture]) -> None:
+    """Draw fixtures filled, in mm. Walls go across the picture, and do not extend the range that the axes show."""
+    low, high = (MM * FAR * sign for sign in (-1, 1))
+    for fixture in fixtures:
+        if isinstance(fixture, Wall):
+            point, normal = MM * np.asarray(fixture.point, float), np.asarray(fixture.normal, float)
+            along = np.array([normal[1], -normal[0]])
+            ends = point + np.outer([low, high], along)
+            corners = np.concatenate([ends, ends[::-1] + low * normal])
+        else:
+            corners = placed_outline(vertices(fixture.shape), np.asarray(fixture.pose))
+        patch = PolygonPatch(corners, facecolor=FIXTURE, edgecolor=GRAY, lw=0.8, zorder=0)
+        axes.add_artist(patch) if isinstance(fixture, Wall) else axes.add_patch(patch)
 
 
 def arrow(axes: Axes, tail: np.ndarray, tip: np.ndarray, color: str, width: float) -> None:

@@ -1,6 +1,6 @@
 """Pictures of single pushes and grasps, side by side: simulated ones, and real ones beside predictions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -13,9 +13,10 @@ from matplotlib.patches import Circle
 
 from pushjax.contact.status import Status
 from pushjax.geometry.shape import Shape
-from pushjax.plot.parts import arrow, centroids, hand_at, outline, placed_outline, vertices
+from pushjax.plot.parts import arrow, centroids, draw_fixtures, hand_at, outline, placed_outline, vertices
 from pushjax.plot.squeeze import SQUEEZE_LABEL, SqueezeForces, squeeze_forces
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, legend_of_moments, panel_row
+from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.trajectory import Trajectory
 
@@ -23,7 +24,12 @@ ARROW_LENGTH = 0.7  # length of the arrow of a unit force, in units of the slide
 
 
 def push_figure(
-    shape: Shape, pushes: Mapping[str, tuple[Trajectory, np.ndarray]], radius: float, frames: int = 5
+    shape: Shape,
+    pushes: Mapping[str, tuple[Trajectory, np.ndarray]],
+    radius: float,
+    frames: int = 5,
+    *,
+    fixtures: Sequence[Wall | Fixture] = (),
 ) -> Figure:
     """Draw pushes by one round finger, side by side.
 
@@ -32,20 +38,26 @@ def push_figure(
 
     Args:
         shape: Outline of the slider.
-        pushes: By name, a trajectory and the path (steps + 1, 2) of the finger's center, m.
+        pushes: By name, a trajectory and the path (steps + 1, 2) of the finger's center, m. After a jam the finger is
+            drawn where it stopped.
         radius: Radius of the finger, m.
         frames: Number of moments between start and end.
+        fixtures: Walls and bodies that do not move, in every panel.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = panel_row(len(pushes), 4.0, 4.2, shared=True)
         for axes, (name, (push, path)) in zip(all_axes, pushes.items(), strict=True):
-            pose, path = np.asarray(push.pose), np.asarray(path)
+            pose, stopped = np.asarray(push.pose), int(push.stopped)
+            path = np.asarray(path)[: stopped + 1] if stopped >= 0 else np.asarray(path)
             shown = np.unique(np.linspace(0, len(pose) - 1, frames + 2).round().astype(int))
             for k in [*shown[1:-1], shown[0], shown[-1]]:
                 color = BLACK if k == 0 else RED if k == shown[-1] else GRAY
                 outline(axes, shape, pose[k], color, 1.4 if color != GRAY else 0.8)
-                axes.add_patch(Circle(MM * path[k], MM * radius, color=color, fill=color != GRAY, lw=0.8))
+                axes.add_patch(
+                    Circle(MM * path[min(k, len(path) - 1)], MM * radius, color=color, fill=color != GRAY, lw=0.8)
+                )
             axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.2, label="centroid of the slider")
+            draw_fixtures(axes, fixtures)
             axes.set(title=_title_with_failure(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
         legend_of_moments(figure, all_axes[0])
         return figure

@@ -92,4 +92,4 @@ def legend_of_moments(figure: Figure, axes: Axes) -> None:
     """Draw the legend of pictures that show a push at its start, between, and at its end."""
     for color, label in ((BLACK, "start"), (GRAY, "between"), (RED, "end")):
         axes.plot([], [], color=color, label=label)
-    legend_below(figure, axes, columns=5)
+    legend_below(figure, axes, columns=5 if len(figure.axes) > 1 else 2)

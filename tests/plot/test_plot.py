@@ -224,3 +224,17 @@ def test_jam_figure(block):
     slope = (cone[:, 1] - cone[:, 0])[:, 1] / (cone[:, 1] - cone[:, 0])[:, 0]
     np.testing.assert_allclose(np.abs(slope), 0.4)
     np.testing.assert_allclose(axes.lines[-4].get_xydata(), MM * np.asarray(point))
+
+
+def test_fixtures_are_drawn_and_a_jammed_finger_stays_where_it_stopped(block):
+    """A block is pushed against a wall; the finger's path goes on through it."""
+    slider, hand = pj.Slider(block, pj.Ellipsoid(np.eye(3), 0.03)), pj.Hand.finger(RADIUS)
+    left = float(np.min(np.asarray(block.vertices)[:, 0]))
+    path = pj.line((left - RADIUS, 0.0), (left - RADIUS + 0.04, 0.0), 8)
+    fixtures = (pj.Wall((0.01 - left, 0.0), (-1.0, 0.0)), pj.Fixture(pj.Disk(0.01), (0.0, 0.2, 0.0)))
+    push = pj.rollout(slider, hand, path, pose=(0.0, 0.0, 0.0), friction=0.3, fixtures=fixtures)
+    axes = plot.push_figure(block, {"jam": (push, path)}, RADIUS, fixtures=fixtures).axes[0]
+    circles = [patch for patch in axes.patches if isinstance(patch, Circle)]
+    assert max(circle.center[0] for circle in circles) < 1e3 * (left - RADIUS + 0.0101)
+    assert axes.get_xlim()[1] < 200  # mm: the wall is drawn without extending the picture
+    assert axes.get_ylim()[1] > 209  # mm: the disk is in it
