@@ -99,7 +99,11 @@ def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: P
 
 def _describe_failure(error: Exception) -> str:
     """Return one line on what went wrong with a request."""
+    import requests
+
     response = getattr(error, "response", None)
     if response is not None:
         return f"the server answers {response.status_code} {response.reason}"
+    if type(error) in (requests.ConnectionError, requests.ConnectTimeout):  # its kinds, such as SSLError, say more
+        return "no connection to the server; is there a network, and does it let this address through?"
     return " ".join(str(error).split()) or type(error).__name__
