@@ -1,0 +1,205 @@
+"""Searches on functions whose minimum is known, and plans of pushes against simulations of their own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.planning import (
+    MPPI,
+    CrossEntropy,
+    Goal,
+    GradientRefinement,
+    Pushes,
+    PushPlanStatus,
+    Selection,
+    plan_pushes,
+    push_outcomes,
+)
+from pushjax.planning.search import Candidates, Objective
+
+KEY = jax.random.key(0)
+RADIUS, BLOCK = 0.005, pj.Polygon.rectangle(0.09, 0.06)
+HAND = pj.Hand.finger(RADIUS)
+MODEL = pj.FrictionModel(dof=50, friction=(0.2, 0.3))
+MINIMA = np.array([[1.0, -2.0, 0.5], [-3.0, 1.0, 2.0]])
+DEPTHS = np.array([1.0, 0.0])  # the second well is deeper
+
+
+def wells(parameters):
+    return np.min(((parameters[:, None] - MINIMA) ** 2).sum(axis=2) + DEPTHS, axis=1)
+
+
+def slopes(parameters):
+    which = np.argmin(((parameters[:, None] - MINIMA) ** 2).sum(axis=2) + DEPTHS, axis=1)
+    return wells(parameters), 2 * (parameters - MINIMA[which])
+
+
+OBJECTIVE = Objective(wells, slopes, np.ones(3))
+SEARCHES = [
+    CrossEntropy(iterations=25, width=1.0),
+    MPPI(iterations=40, width=1.0, temperature=0.1),
+    GradientRefinement(iterations=200, rate=0.1, keep=2),
+]
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda each: type(each).__name__)
+def test_both_minima_are_found(search):
+    """Each candidate is improved by itself, so the shallow well is not lost."""
+    start = Candidates.sorted(MINIMA + 0.7, wells(MINIMA + 0.7))
+    found, history = search(KEY, OBJECTIVE, start)
+    np.testing.assert_allclose(found.parameters, MINIMA[::-1], atol=0.05)
+    np.testing.assert_allclose(found.cost, wells(found.parameters))
+    assert np.all(np.diff(history) <= 0)
+    assert history[-1] == found.cost[0]
+    again, _ = search(KEY, OBJECTIVE, start)
+    np.testing.assert_array_equal(found.parameters, again.parameters)
+
+
+def test_selection_keeps_the_best():
+    parameters = np.random.default_rng(0).normal(size=(50, 3)) * 3
+    found, _ = Selection(5)(KEY, OBJECTIVE, Candidates(parameters, np.full(50, np.inf)))
+    np.testing.assert_array_equal(found.cost, np.sort(wells(parameters))[:5])
+
+
+@pytest.fixture(scope="module")
+def slider():
+    return pj.Slider.uniform(BLOCK, degree=2)
+
+
+@pytest.mark.parametrize("hand", [HAND, pj.Hand.two_fingers(RADIUS)], ids=["finger", "two fingers"])
+def test_a_push_starts_before_its_first_contact(slider, hand):
+    """Shapely: disks touch the block where the path is as long as the clearance, and not before."""
+    shapely = pytest.importorskip("shapely")
+    opening = (0.03,) if hand.dof == 4 else ()
+    pushes = Pushes(length=0.05, steps=30, clearance=0.01, opening=opening)
+    numbers = pushes.sample(KEY, 40)
+    pose = jnp.array([0.3, -0.1, 2.0])
+    paths = np.asarray(jax.jit(jax.vmap(lambda n: pushes.path(n, slider, hand, pose)))(jnp.asarray(numbers)))
+    block = shapely.Polygon(np.asarray(pj.se2.transform(pose, BLOCK.vertices)))
+    travelled = np.linalg.norm(paths[:, -1] - paths[:, 0], axis=1)
+    np.testing.assert_allclose(travelled, 0.01 + 0.05 * numbers[:, 2], rtol=1e-9)
+    at = np.array([*np.linspace(-0.2, 0.2, 81), 0.0, 0.0099, 0.01])  # m from the start, all along the line
+    along = (paths[:, -1:] - paths[:, :1]) / travelled[:, None, None]
+    placed = np.asarray(hand.poses(jnp.asarray(paths[:, :1] + at[:, None] * along)))[..., :2]
+    apart = shapely.distance(block, shapely.points(placed)).min(axis=-1) - RADIUS
+    touches = apart.min(axis=1) < -1e-3  # the other lines miss the block, or only graze it
+    assert touches.sum() > 25
+    assert np.all(apart[touches, -3:-1] > 0)
+    np.testing.assert_allclose(apart[touches, -1], 0, atol=1e-7)
+
+
+def test_a_bent_push_ends_where_a_straight_one_does(slider):
+    straight, bent = Pushes(length=0.05, steps=10), Pushes(length=0.05, steps=10, bends=2)
+    numbers = np.array([0.3, 0.1, 0.7])
+    pose = jnp.zeros(3)
+    line = np.asarray(straight.path(jnp.asarray(numbers), slider, HAND, pose))
+    level = np.asarray(bent.path(jnp.asarray([*numbers, 0.0, 0.0]), slider, HAND, pose))
+    curve = np.asarray(bent.path(jnp.asarray([*numbers, 0.4, -0.2]), slider, HAND, pose))
+    np.testing.assert_allclose(level, line, atol=1e-12)
+    np.testing.assert_allclose(curve[[0, -1]], line[[0, -1]], atol=1e-12)
+    # a cubic Bezier curve with its inner control points 0.4 and -0.2 of 35 mm aside, by de Casteljau
+    aside = np.cos(0.3) * (curve - line)[:, 1] - np.sin(0.3) * (curve - line)[:, 0]
+    t = np.linspace(0, 1, 11)
+    np.testing.assert_allclose(aside, 0.035 * (3 * t * (1 - t) ** 2 * 0.4 - 3 * t**2 * (1 - t) * 0.2), atol=1e-9)
+
+
+SETTINGS = {
+    "model": MODEL,
+    "pushes": Pushes(1, length=0.08, steps=8),
+    "samples": 16,
+    "candidates": 256,
+    "warm_up": (Selection(8), CrossEntropy(iterations=6, population=32)),
+    "search": (CrossEntropy(iterations=4, population=32),),
+}
+
+
+@pytest.fixture(scope="module")
+def easy(slider):
+    """A goal that one push reaches: the mean of where such a push ends."""
+    path = pj.line((-0.06, 0.0), (-0.03, 0.0), steps=8)[None]
+    done = push_outcomes(KEY, slider, HAND, np.zeros(3), path, model=MODEL)
+    return Goal(np.asarray(done.pose).mean(axis=0), length=slider.surface.length, position=0.008, angle=0.3)
+
+
+@pytest.fixture(scope="module")
+def plan(slider, easy):
+    return plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
+
+
+def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
+    assert plan.status is PushPlanStatus.FOUND
+    assert plan.success >= 0.9
+    assert np.all(np.diff(plan.history) <= 1e-9)
+    other = jax.random.key(7)
+    done = push_outcomes(other, slider, HAND, np.zeros(3), plan.path, model=MODEL)
+    assert not np.any(done.failed)
+    error = np.sqrt(0.25 / 256)  # largest standard error of a frequency
+    np.testing.assert_allclose(done.success(easy), plan.success, atol=4 * np.sqrt(2) * error)
+
+
+def test_outcomes_are_those_of_random_rollouts(slider, plan):
+    """`monte_carlo` of the same push, with its own keys: same mean and spread within their standard errors."""
+    done = pj.monte_carlo(jax.random.key(3), 1024, slider, HAND, plan.path[0], pose=np.zeros(3), model=MODEL)
+    ours = np.asarray(plan.outcomes.pose)
+    spread = done.pose.std(axis=0)
+    np.testing.assert_array_less(np.abs(ours.mean(axis=0) - done.pose.mean(axis=0)), 5 * spread / 16)
+    np.testing.assert_allclose(ours.std(axis=0), spread, rtol=0.35)
+
+
+def test_same_key_same_bits(slider, easy, plan):
+    again = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
+    np.testing.assert_array_equal(again.parameters, plan.parameters)
+    np.testing.assert_array_equal(again.outcomes.pose, plan.outcomes.pose)
+    np.testing.assert_array_equal(again.history, plan.history)
+
+
+@pytest.mark.long
+def test_gradients_refine_a_plan(slider, easy, plan):
+    """Through all rollouts, from the result of another search; what was found is never lost."""
+    refine = (*SETTINGS["search"], GradientRefinement(iterations=4, rate=0.01, keep=2))
+    refined = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS | {"search": refine})
+    assert len(refined.history) == len(plan.history) + 5
+    assert np.all(np.isfinite(refined.parameters))
+    assert refined.cost < plan.cost
+
+
+def test_a_belief_over_the_start(slider, easy, plan):
+    """The spread of the start is added to that of friction."""
+    belief = np.random.default_rng(0).normal(size=(16, 3)) * [0.0, 0.02, 0.0]
+    done = push_outcomes(KEY, slider, HAND, belief, plan.path, model=MODEL)
+    assert done.success(easy) < plan.success - 0.1
+
+
+def test_an_unreachable_goal_has_a_status(slider):
+    goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, position=0.008, angle=0.3)
+    plan = plan_pushes(KEY, slider, HAND, np.zeros(3), goal, **SETTINGS)
+    assert plan.status is PushPlanStatus.UNLIKELY
+    assert plan.success == 0
+
+
+def test_bad_input(slider, easy):
+    def plan(hand=HAND, start=(0, 0, 0), **settings):
+        return plan_pushes(KEY, slider, hand, start, easy, **SETTINGS | settings)
+
+    with pytest.raises(ValueError, match="candidates must be a whole number, at least 1; got 0"):
+        plan(candidates=0)
+    with pytest.raises(ValueError, match="samples must be a whole number, at least 1; got 0"):
+        plan(samples=0)
+    with pytest.raises(ValueError, match=r"start has shape \(2,\); expected \(3,\) or \(poses, 3\)"):
+        plan(start=(0, 0))
+    with pytest.raises(ValueError, match="success must be a probability; got 2"):
+        plan(success=2)
+    with pytest.raises(TypeError, match="hand: plans of pushes need round fingers; got a pad"):
+        plan(hand=pj.Hand.parallel_jaw(0.02, 0.01))
+    with pytest.raises(ValueError, match=r"opening has 0 number\(s\), which does not fit a hand of 4 coordinates"):
+        plan(hand=pj.Hand.two_fingers(RADIUS))
+    with pytest.raises(ValueError, match="resample_every must be None for a plan"):
+        plan(model=pj.FrictionModel(50, 0.3, resample_every=2))
+    with pytest.raises(ValueError, match="elites must be at most the population of 4; got 5"):
+        CrossEntropy(population=4, elites=5)
+    with pytest.raises(ValueError, match="rate must be positive and finite; got 0"):
+        GradientRefinement(rate=0)
+    with pytest.raises(ValueError, match="length must be positive"):
+        Pushes(length=0.0)
