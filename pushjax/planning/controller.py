@@ -32,6 +32,7 @@ ALONG = np.array([-0.2, -0.11, -0.06, -0.025, 0, 0.025, 0.06, 0.11, 0.2])
 ACROSS = np.array([-0.12, -0.055, -0.02, 0, 0.02, 0.055, 0.12])
 CORRECTED = 1.3  # the end is corrected from this distance on; longer pushes would be simulated too coarsely
 FINE, FULL = 0.25, 0.73  # the ends are this part as far apart at the end, and at FULL from there as far as above
+LATE = 1.5  # a push is over after its planned number of control steps, times this, and three
 SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
 
 
@@ -58,6 +59,7 @@ class Memory(NamedTuple):
         along: How far along the way the finger is, m.
         speed: Length of the last control step, m.
         velocity: Velocity of the finger by its own model, (2,), m/s.
+        taken: Number of control steps of the push that is going on.
         pushes: Number of pushes so far.
         waited: Number of control steps in which there was no push to make.
         status: Status of the last plan.
@@ -70,6 +72,7 @@ class Memory(NamedTuple):
     along: float
     speed: float
     velocity: np.ndarray
+    taken: int
     pushes: int
     waited: int
     status: PlanStatus
@@ -108,7 +111,7 @@ class PushController:
     def initial_memory(self) -> Memory:
         """Return the memory of the first control step; the finger is at rest."""
         zero = np.zeros(2)
-        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, PlanStatus.NO_PUSH)
+        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PlanStatus.NO_PUSH)
 
     def prepare(self) -> None:
         """Compile the program of the feedback, which is else compiled when it is first needed."""
@@ -156,7 +159,7 @@ class PushController:
             seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, memory.pushes))).ravel().tolist()
             shake = np.abs(np.random.default_rng(seed).normal(0, memory.pushes, len(self.planner.library.starts)))
         push = self.planner.choose(pose, state.position, shake)
-        planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0)
+        planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0, taken=0)
         if push.status.failed:
             return planned._replace(push=None)
         return planned._replace(push=push, end=push.end, pushes=memory.pushes + 1)
@@ -198,10 +201,12 @@ class PushController:
             end = self._corrected(state.position, pose, end, push)
         way = end - state.position
         left = float(np.linalg.norm(way))
-        if left < self.arrived:
+        # a finger that does not go where it should would try forever
+        late = memory.taken > LATE * pace.push_time(np.linalg.norm(push.end - push.start)) + 3
+        if left < self.arrived or late:
             return None, memory._replace(push=None, pushing=False, speed=0.0)
         speed = pace.next_speed(memory.speed, left, pace.push)
-        return state.position + way * (speed / left), memory._replace(end=end, speed=speed)
+        return state.position + way * (speed / left), memory._replace(end=end, speed=speed, taken=memory.taken + 1)
 
     def _corrected(self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush) -> np.ndarray:
         """Return the end, of those around `end`, from which the slider comes nearest to the push's target."""
