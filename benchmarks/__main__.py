@@ -56,7 +56,9 @@ MODULES = {
         "million_pushes",
         "numerics",
         "overlaps",
+        "robust_plans",
         "solvers",
+        "stable_pushes",
     )
 } | {"table1_causes": "robot.causes", "table1_spread": "robot.spread"}
 PICTURES = Path("pushjax-out")
