@@ -56,6 +56,7 @@ MODULES = {
         "million_pushes",
         "numerics",
         "overlaps",
+        "pusht",
         "robust_plans",
         "solvers",
         "stable_pushes",

@@ -23,6 +23,7 @@ from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.rollout import simulate
 from pushjax.simulation.trajectory import Trajectory
 from pushjax.tasks.conditional import where_needed
+from pushjax.tasks.frictionless import Frictionless
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate
 
 # In units of the surface's length: an overlap that is left as it is.
@@ -48,23 +49,20 @@ class Pushed(NamedTuple):
         return Pushed(push.pose[-1], push.configuration[-1], push.status)
 
 
-class _TouchedOnce(NamedTuple):
-    """A polygon that a finger touches in no more than one place, the nearest.
+class _TouchedOnce(Polygon):
+    """A polygon that a finger touches in no more than one place, the nearest, also if it is not convex."""
 
-    Attributes:
-        polygon: The polygon, convex or not.
-    """
-
-    polygon: Polygon
+    def __init__(self, polygon: Polygon):
+        self.vertices, self.convex = polygon.vertices, polygon.convex
 
     def outline(self) -> PolygonOutline:
-        return PolygonOutline(self.polygon.outline().edges, convex=True)
+        return PolygonOutline(super().outline().edges, convex=True)
 
 
 def control_step(
     polygon: Polygon,
     surface: LimitSurface,
-    friction: Float[Array, ""],
+    friction: Float[Array, ""] | None,
     hand: Hand,
     walls: tuple[Wall, ...],
     path: Float[Array, "steps+1 dof"],
@@ -78,7 +76,8 @@ def control_step(
     Args:
         polygon: Outline of the slider.
         surface: Its limit surface.
-        friction: Coefficient of friction between fingers and slider.
+        friction: Coefficient of friction between fingers and slider. None if there is none, and the surface is an
+            ellipsoid: programs are then smaller and faster.
         hand: The hand.
         walls: Walls, which the slider cannot pass.
         path: Configurations of the hand, world, m.
@@ -99,8 +98,10 @@ def _is_finger(hand: Hand) -> bool:
 
 def _simulated(shape, surface, friction, hand, walls, path, pose) -> Trajectory:
     """The push along the path. Arguments as in `control_step`."""
-    form = to_scalars(surface, jnp.broadcast_to(friction, (len(hand.fingers),)))
-    return simulate(shape, hand, path, pose, None, lambda step, pose: form, walls)
+    mu = jnp.zeros_like(pose[0]) if friction is None else friction
+    form = to_scalars(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
+    solver = Frictionless() if friction is None and not isinstance(shape, _TouchedOnce) else None
+    return simulate(shape, hand, path, pose, solver, lambda step, pose: form, walls)
 
 
 def _is_valid(

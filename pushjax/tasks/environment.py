@@ -50,7 +50,8 @@ class TaskParams(_Replaceable):
 
     Attributes:
         slider: The slider, m. The origin of its frame is the center of gravity.
-        friction: Coefficient of friction between fingers and slider, if `model` is None.
+        friction: Coefficient of friction between fingers and slider, if `model` is None; None for no friction under an
+            ellipsoid, for which there is a smaller and faster program.
         goal: Pose at the goal, in the frame that is observed, (3,), world, length unit of the task and rad.
         model: Distribution of the friction, drawn at each reset for the whole episode; None for none.
         surfaces: The distribution of limit surfaces that `model` has around that of the slider; None for none.
@@ -62,7 +63,7 @@ class TaskParams(_Replaceable):
     """
 
     slider: Slider
-    friction: Float[Array, ""]
+    friction: Float[Array, ""] | None
     goal: Float[Array, "3"]
     model: FrictionModel | None
     surfaces: SurfaceDistribution | None

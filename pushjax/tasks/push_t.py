@@ -66,11 +66,13 @@ class PushTParams(TaskParams):
 
     Attributes:
         origin: Origin of the block's body, to which observed poses refer, in the slider's frame, (2,), px.
+        corners: Corners of the block, in the slider's frame, (corners, 2), px.
         keypoints: Points of the observation "environment_state", in the slider's frame, (keypoints, 2), px.
         seams: Pairs of corners of the block between which images have a line.
     """
 
     origin: Float[Array, "2"]
+    corners: Float[Array, "corners 2"]
     keypoints: Float[Array, "keypoints 2"]
     seams: tuple[tuple[int, int], ...] = eqx.field(static=True)
 
@@ -143,7 +145,7 @@ class PushT(Environment):
                 quartic that is fitted to even pressure, and friction at the agent.
             block: The block, px. Its poses are those of its own frame. Default: the T.
             goal: Pose of the block at the goal, (3,), px and rad.
-            friction: Coefficient of friction between agent and block. Default: 0 for "pymunk", 0.3 for "table".
+            friction: Coefficient of friction between agent and block. Default: none for "pymunk", 0.3 for "table".
             model: Distribution of friction, drawn at each reset for the whole episode. The mean of the limit surfaces
                 is that of `physics`; `friction` is then not used.
             position_noise: Standard deviation of the noise on observed positions, px; None for none.
@@ -164,13 +166,13 @@ class PushT(Environment):
         if not max_steps_in_episode >= 1:
             raise ValueError(f"max_steps_in_episode must be at least 1; got {max_steps_in_episode!r}")
         slider, origin, keypoints = _block(block, physics, self.METERS)
-        if friction is None:
-            friction = TABLE_FRICTION if physics == "table" else 0.0
+        if friction is None and physics == "table":
+            friction = TABLE_FRICTION
         if model is not None:
             check_type("model", model, FrictionModel)
         return PushTParams(
             slider=slider,
-            friction=_checked("friction", friction, ()),
+            friction=None if friction is None else _checked("friction", friction, ()),
             goal=_checked("goal", goal, (3,), signed=True),
             model=model,
             surfaces=None if model is None else model.around(slider.surface),
@@ -180,6 +182,7 @@ class PushT(Environment):
             success_coverage=as_float(0.95),
             max_steps_in_episode=int(max_steps_in_episode),
             origin=origin,
+            corners=slider.shape.vertices / self.METERS,  # pyright: ignore[reportAttributeAccessIssue]
             keypoints=keypoints,
             seams=((7, 2),) if block is None else (),
         )
@@ -242,11 +245,11 @@ class PushT(Environment):
 
     def vertices(self, state: TaskState, params: PushTParams) -> Float[Array, "vertices 2"]:
         """Return the corners of the block, world, px."""
-        return _placed(params.slider.shape.vertices / self.METERS, state.pose)
+        return _placed(params.corners, state.pose)
 
     def goal_vertices(self, params: PushTParams) -> Float[Array, "vertices 2"]:
         """Return the corners of the block at the goal, world, px."""
-        return _placed(params.slider.shape.vertices / self.METERS - params.origin[None], params.goal)
+        return _placed(params.corners - params.origin[None], params.goal)
 
     def block_pose(self, state: TaskState, params: PushTParams) -> Float[Array, "3"]:
         """Return the pose of the block's own frame, world, px and rad."""

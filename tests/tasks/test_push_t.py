@@ -6,10 +6,33 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.tasks import PushT
+from pushjax.tasks import FiveValues, PushT
 
 BATCH = 64
 ENV = PushT()
+BOX = pj.Polygon.rectangle(80.0, 60.0)
+OPEN = PushT(walls=False)
+
+
+@pytest.fixture(scope="module")
+def box():
+    """Return the parameters of a box with random friction."""
+    return OPEN.params(block=BOX, model=pj.FrictionModel(dof=20, friction=(0.1, 0.5)))
+
+
+@pytest.fixture(scope="module")
+def box_steps():
+    """Return the compiled function that takes the control steps of one episode with a box, without resets."""
+
+    @jax.jit
+    def run(state, actions, params):
+        def one_step(state, action):
+            _, state, reward, _, info = OPEN.step_env(jax.random.key(0), state, action, params)
+            return state, (state, reward, info)
+
+        return jax.lax.scan(one_step, state, actions)
+
+    return run
 
 
 def starts(count=BATCH, seed=0, env=ENV):
@@ -65,6 +88,73 @@ def test_state_of_a_row():
     state = ENV.state_of([0.0, 10.0, 20.0, 30.0, 1.0])
     observed = ENV.observe(jax.random.key(0), state, None, ENV.default_params)
     assert np.allclose(observed, [0.0, 10.0, 57.866196, 50.686398, 1.0], atol=1e-4)
+
+
+# Steps of a box: its programs are small, because a finger touches a convex block in one place
+
+
+def test_five_values():
+    env = FiveValues(OPEN)
+    params = OPEN.params(block=BOX, max_steps_in_episode=1)
+    _, state = env.reset(jax.random.key(0), params)
+    observation, state, reward, done, _ = env.step(jax.random.key(1), state, jnp.array([9.0, 9.0]), params)
+    assert (observation.shape, reward.shape) == ((5,), ())
+    assert bool(done)
+    assert int(state.time) == 0
+    assert env.name == "PushT"
+
+
+def test_friction_is_drawn_at_the_reset(box, box_steps):
+    keys = jax.random.split(jax.random.key(0), 200)
+    _, states = jax.vmap(OPEN.reset, in_axes=(0, None))(keys, box)
+    friction = np.asarray(states.friction)
+    assert friction.min() > 0.1
+    assert friction.max() < 0.5
+    assert np.ptp(friction) > 0.35
+    assert len(np.unique(states.surface.A[:, 0, 0])) == 200
+    row = jnp.array([150.0, 240.0, 256.0, 256.0, 0.0])
+    actions = jnp.broadcast_to(jnp.array([250.0, 240.0]), (10, 2))
+    ends = []
+    for mu in (0.1, 0.5):  # the same surface, and a push off the center
+        state = OPEN.state_of(row, box).replace(surface=box.slider.surface, friction=jnp.asarray(mu))
+        last, _ = box_steps(state, actions, box)
+        ends.append(np.asarray(last.pose))
+    assert np.abs(ends[0] - ends[1]).max() > 0.05
+
+
+def test_derivatives_are_those_of_differences(box, box_steps):
+    """Of the coverage at the end, in the actions: a box is pushed to the goal, off its center."""
+    params = box.replace(goal=jnp.array([300.0, 262.0, 0.3]))
+    state = OPEN.state_of([150.0, 230.0, 256.0, 256.0, 0.1], params)
+    state = state.replace(surface=box.slider.surface, friction=jnp.asarray(0.3))
+    actions = jnp.array([[260.0, 240.0]] * 6)
+
+    def coverage(actions):
+        return box_steps(state, actions, params)[1][2]["coverage"][-1]
+
+    gradient = jax.jit(jax.grad(coverage))(actions)
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).max() > 1e-4
+    step = 0.5
+    direction = jax.random.normal(jax.random.key(0), (8, 6, 2))
+    for d in direction:
+        difference = (coverage(actions + step * d) - coverage(actions - step * d)) / (2 * step)
+        assert jnp.sum(gradient * d) == pytest.approx(float(difference), abs=0.05 * float(jnp.linalg.norm(gradient)))
+
+
+# The T of gym-pusht
+
+
+def test_parity_with_gym_pusht():
+    pytest.importorskip("gym_pusht")
+    pytest.importorskip("pymunk")
+    from benchmarks import pusht
+
+    found = pusht.compared(ENV, pusht.recorded(pusht.AT_ONCE, 30))
+    assert found["free"]["episodes"] > 40
+    assert found["free"]["within"] >= 0.9  # 1.5 px and 1 degree
+    assert found["free"]["coverage"][1] < 0.02
+    assert found["walls"]["within"] >= 0.7  # 3 px; few episodes meet a wall
 
 
 # Bad input

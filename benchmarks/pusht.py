@@ -1,0 +1,281 @@
+"""PushT beside gym-pusht: the same episodes in both, and control steps per second of CPU time.
+
+Needs gym-pusht: pip install 'gym-pusht==0.1.8' 'pymunk<7'. The episodes start at its own resets, and both get the same
+actions: positions 20 px ahead of the agent, toward a random point of the T. Speeds are of gym-pusht, of pymunk alone
+(no observation and no coverage) and of `pushjax.tasks.PushT` (observation, coverage, reward and automatic resets
+included), in one process.
+"""
+
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.tasks import PushT, TaskState
+
+AT_ONCE = 64  # episodes in one program
+SCATTER = 60.0  # px, standard deviation of where the agent is steered to, around the T's center of gravity
+AHEAD = 20.0  # px, how far ahead of the agent the action is: in the end the agent moves by half of it in a control step
+REACH = 2.5  # px, from the faces of the walls, where pymunk's margin still holds the T
+CONTROL_STEPS = 20  # of a timed program
+LIMITS = {"free": (1.5, 1.0), "walls": (3.0, np.inf)}  # px and degrees
+
+
+class Recorded(NamedTuple):
+    """Episodes of gym-pusht.
+
+    Attributes:
+        start: Rows as in its "state" observations, (episodes, 5).
+        actions: Actions, (steps, episodes, 2).
+        rows: Rows after each control step, (steps, episodes, 5).
+        coverage: Coverage after each control step, (steps, episodes).
+        at_wall: Whether the T has been within `REACH` of a wall, (episodes,).
+    """
+
+    start: np.ndarray
+    actions: np.ndarray
+    rows: np.ndarray
+    coverage: np.ndarray
+    at_wall: np.ndarray
+
+
+def run(
+    seeds: int = 200,
+    steps: int = 30,
+    substeps: tuple[int, ...] = (2,),
+    batch: int = 4096,
+    seed: int = 0,
+    progress: ProgressCallback = no_progress,
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,
+) -> dict[str, Any]:
+    """Compare PushT with gym-pusht.
+
+    Args:
+        seeds: Number of episodes.
+        steps: Control steps of an episode.
+        substeps: Steps of the simulator in a control step; several are compared.
+        batch: Number of environments that are timed together; 0 to time nothing.
+        seed: Seed of the first episode.
+        progress: Called with the number of parts done and their total.
+        keep: Called with the record so far.
+
+    Returns:
+        The record: a row for each number of substeps, and the speeds.
+    """
+    rows: list[dict[str, Any]] = []
+    speeds: dict[str, float] = {}
+    settings = {"seeds": seeds, "steps": steps, "substeps": substeps, "batch": batch, "seed": seed}
+    record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds)
+    parts = 1 + len(substeps) * (1 + bool(batch))
+    episodes = recorded(seeds, steps, seed)
+    progress(1, parts)
+    for count in substeps:
+        env = PushT(substeps=count)
+        rows.append({"substeps": count} | compared(env, episodes))
+        keep(record)
+        progress(1 + len(rows), parts)
+    if batch:
+        speeds |= {"gym-pusht": _gym_speed(True), "pymunk alone": _gym_speed(False)}
+        for k, count in enumerate(substeps):
+            speeds[f"pushjax, {count} substeps"] = _speed(PushT(substeps=count), batch)
+            keep(record)
+            progress(2 + len(rows) + k, parts)
+    return record
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return what the command prints."""
+    lines = []
+    for row in record["rows"]:
+        for kind in LIMITS:
+            part = row[kind]
+            lines.append(
+                f"{row['substeps']} substeps, {kind:6}{part['episodes']:4} episodes: position off by "
+                f"{part['position_px'][0]:.2f} px (median), {part['position_px'][1]:.2f} (90 %), angle "
+                f"{part['angle_deg'][0]:.2f}, {part['angle_deg'][1]:.2f}°, coverage {part['coverage'][1]:.3f} (90 %); "
+                f"{100 * part['within']:.1f} % within {LIMITS[kind][0]} px"
+            )
+        lines += [f"    farther off: {each}" for each in row["farther_off"]]
+    speeds = record["control_steps_per_second"]
+    return "\n".join(lines + [f"{name:24}{speed:12,.0f} control steps/s" for name, speed in speeds.items()])
+
+
+def recorded(seeds: int, steps: int, seed: int = 0) -> Recorded:
+    """Record episodes of gym-pusht, with actions at random around the T."""
+    env = make_gym()
+    starts, actions, rows, coverage, at_wall = [], [], [], [], []
+    for k in range(seeds):
+        rng = np.random.default_rng(seed + k)
+        starts.append(env.reset(seed=seed + k)[0])
+        near = _near_wall(env)
+        taken, seen, covered = [], [], []
+        for _ in range(steps):
+            taken.append(random_action(env, rng))
+            row, _, _, _, info = env.step(taken[-1])
+            seen.append(row)
+            covered.append(info["coverage"])
+            near |= _near_wall(env)
+        for kept, each in zip((actions, rows, coverage, at_wall), (taken, seen, covered, near), strict=True):
+            kept.append(each)
+    taken, seen, covered = (np.swapaxes(np.array(each), 0, 1) for each in (actions, rows, coverage))
+    return Recorded(np.array(starts), taken, seen, covered, np.array(at_wall))
+
+
+def make_gym() -> Any:
+    """Return gym-pusht's environment, without Gymnasium's wrappers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import gym_pusht.envs
+
+        return gym_pusht.envs.PushTEnv(obs_type="state")
+
+
+def random_action(env: Any, rng: np.random.Generator) -> np.ndarray:
+    """Return a position ahead of the agent, toward a random point around the T's center of gravity."""
+    center, agent = np.array(env.block.local_to_world(env.block.center_of_gravity)), np.array(env.agent.position)
+    way = center + SCATTER * rng.standard_normal(2) - agent
+    return np.clip(agent + AHEAD * way / np.linalg.norm(way), 0, 512)
+
+
+def _near_wall(env: Any) -> bool:
+    """Whether the T is within `REACH` of a wall."""
+    corners = env.get_keypoints(env._block_shapes)
+    return bool(corners.min() < 7 + REACH or corners.max() > 504 - REACH)
+
+
+@partial(jax.jit, static_argnums=0)
+def replayed(env: PushT, states: TaskState, actions: Array, params: Any) -> tuple[TaskState, Any]:
+    """Take the control steps of a batch of episodes, with automatic resets.
+
+    Args:
+        env: The environment.
+        states: States at the start.
+        actions: Actions, (steps, batch, 2).
+        params: Its parameters.
+
+    Returns:
+        The state after each control step, and all that `step` returned.
+    """
+    keys = jax.random.split(jax.random.key(0), actions.shape[:2])
+
+    def one_step(states: TaskState, at: tuple[Array, Array]):
+        out = jax.vmap(env.step, in_axes=(0, 0, 0, None))(at[0], states, at[1], params)
+        return out[1], (out[1], out)
+
+    return jax.lax.scan(one_step, states, (keys, actions))[1]
+
+
+def states_at(env: PushT, params: Any, rows: np.ndarray) -> TaskState:
+    """Return the states whose observations are the given rows, (batch, 5)."""
+    return jax.vmap(lambda row: env.state_of(row, params, position_first=False))(jnp.asarray(rows))
+
+
+def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
+    """Return how far the T ends from where it does in gym-pusht."""
+    count, params = len(episodes.start), env.default_params
+    padded = np.arange(-(-count // AT_ONCE) * AT_ONCE) % count
+    ends, coverages = [], []
+    for part in padded.reshape(-1, AT_ONCE):
+        states = jax.vmap(lambda row: env.state_of(row, params, position_first=False))(
+            jnp.asarray(episodes.start[part])
+        )
+        _, (_, _, _, _, _, info) = replayed(env, states, jnp.asarray(episodes.actions[:, part]), params)
+        ends.append(np.asarray(info["final_observation"])[-1])
+        coverages.append(np.asarray(info["coverage"])[-1])
+    end, wanted = np.concatenate(ends)[:count], episodes.rows[-1]
+    kept = episodes.coverage.max(0) <= 0.95  # the others were reset on the way
+    covered = np.abs(np.concatenate(coverages)[:count] - episodes.coverage[-1])
+    position = np.linalg.norm(end[:, 2:4] - wanted[:, 2:4], axis=1)
+    turn = np.degrees(np.abs((end[:, 4] - wanted[:, 4] + np.pi) % (2 * np.pi) - np.pi))
+    kinds = np.where(episodes.at_wall, "walls", "free")
+    found: dict[str, Any] = {"farther_off": []}
+    for kind, (pixels, degrees) in LIMITS.items():
+        chosen = kept & (kinds == kind)
+        within = (position <= pixels) & (turn <= degrees)
+        found[kind] = {
+            "episodes": int(chosen.sum()),
+            "within": float(within[chosen].mean()),
+            "position_px": np.quantile(position[chosen], [0.5, 0.9]).tolist(),
+            "angle_deg": np.quantile(turn[chosen], [0.5, 0.9]).tolist(),
+            "coverage": np.quantile(covered[chosen], [0.5, 0.9]).tolist(),
+        }
+        for k in np.flatnonzero(chosen & ~within):
+            cause = _cause(env, params, episodes, int(k))
+            off = f"{position[k]:.1f} px, {turn[k]:.1f}°"
+            found["farther_off"].append(f"episode {k}, {kind}: {off}: {cause}")
+    return found
+
+
+def _cause(env: PushT, params: Any, episodes: Recorded, k: int) -> str:
+    """Return why an episode differs: how it started, or what a shift of the start by 0.1 px does to it."""
+    starts = np.repeat(episodes.start[None, k], AT_ONCE, axis=0)
+    starts[:, 2:4] += 0.1 * np.random.default_rng(0).standard_normal((AT_ONCE, 2))
+    shape = env.default_params.slider.shape
+    states = states_at(env, params, starts)
+    angle = starts[0, 4]
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    offset = turn @ (starts[0, :2] - np.asarray(states.pose[0, :2], float)) * env.METERS
+    if float(shape.signed_distance(offset)) < 0.015:
+        return "the agent starts inside the T"
+    actions = np.repeat(episodes.actions[:, k, None], AT_ONCE, axis=1)
+    _, (_, _, _, _, _, info) = replayed(env, states, jnp.asarray(actions), params)
+    end = np.asarray(info["final_observation"])[-1, :, 2:4]
+    spread = np.linalg.norm(end - np.median(end, axis=0), axis=1).max()
+    return f"starts within 0.1 px of it end up to {spread:.1f} px apart"
+
+
+def _gym_speed(whole: bool, seconds: float = 3.0) -> float:
+    """Return control steps per second of CPU time of gym-pusht, or of its physics alone."""
+    env, rng, done = make_gym(), np.random.default_rng(0), 0
+    env.reset(seed=0)
+    start = time.process_time()
+    while time.process_time() - start < seconds:
+        if done % 300 == 299:
+            env.reset(seed=done)
+        action = random_action(env, rng)
+        if whole:
+            env.step(action)
+        else:
+            for _ in range(10):
+                force = env.k_p * (action - env.agent.position) - env.k_v * np.array(env.agent.velocity)
+                env.agent.velocity += force * env.dt
+                env.space.step(env.dt)
+        done += 1
+    return done / (time.process_time() - start)
+
+
+def _speed(env: PushT, batch: int) -> float:
+    """Return control steps per second of CPU time of a batch, in the median of several runs."""
+    params = env.default_params
+
+    @jax.jit
+    def program(key: Array, states: TaskState):
+        def one_step(states: TaskState, key: Array):
+            noise_key, step_key = jax.random.split(key)
+            scatter = SCATTER * jax.random.normal(noise_key, (batch, 2))
+            way = states.pose[:, :2] + scatter - states.hand
+            actions = states.hand + AHEAD * way / jnp.linalg.norm(way, axis=1, keepdims=True)
+            actions = jnp.clip(actions, 0, 512)
+            keys = jax.random.split(step_key, batch)
+            out = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
+            observation, states, reward, terminated, truncated, _ = out
+            return states, (jnp.sum(observation), jnp.sum(reward), jnp.sum(terminated | truncated))
+
+        return jax.lax.scan(one_step, states, jax.random.split(key, CONTROL_STEPS))
+
+    keys = jax.random.split(jax.random.key(0), batch)
+    states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)[1]
+    times = []
+    for k in range(8):
+        start = time.process_time()
+        states, _ = jax.block_until_ready(program(jax.random.key(k), states))
+        times.append(time.process_time() - start)
+    return batch * CONTROL_STEPS / float(np.median(times[2:]))
