@@ -1,0 +1,75 @@
+"""PushT in batches, with walls: finite steps, automatic resets, rewards, jams and starts that overlap."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+from benchmarks import pusht
+from pushjax.tasks import PushT
+
+BATCH, STEPS = pusht.AT_ONCE, 30
+ENV = PushT()
+PARAMS = ENV.default_params
+
+
+def test_steps_are_finite_and_episodes_follow_one_another():
+    keys = jax.random.split(jax.random.key(0), BATCH)
+    _, states = jax.vmap(ENV.reset, in_axes=(0, None))(keys, PARAMS)
+    space, finite = ENV.action_space(), True
+    for k in range(12):
+        actions = jax.vmap(space.sample)(jax.random.split(jax.random.key(k), STEPS * BATCH)).reshape(STEPS, BATCH, 2)
+        after, (observation, _, reward, terminated, truncated, info) = pusht.replayed(ENV, states, actions, PARAMS)
+        finite &= all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, observation, reward, info)))
+        assert np.array_equal(info["status"].sum(-1), np.full((STEPS, BATCH), ENV.substeps))
+        done = np.asarray(terminated | truncated)
+        assert np.array_equal(done, np.asarray(after.time) == 0)
+        kept = np.asarray(observation == info["final_observation"]).all(-1)
+        assert np.array_equal(kept, ~done)
+        assert np.asarray(truncated)[~done].sum() == 0
+        if k == 9:  # 300 control steps
+            assert done[-1].mean() > 0.9
+        states = jax.tree.map(lambda leaf: leaf[-1], after)
+    assert finite
+
+
+def test_reward_of_a_block_at_the_goal():
+    states = jax.vmap(lambda shift: ENV.state_of([50, 50, 256 + shift, 256, np.pi / 4], position_first=False))(
+        jnp.linspace(0.0, 40.0, BATCH)
+    )
+    actions = jnp.full((STEPS, BATCH, 2), 50.0)
+    _, (_, _, reward, terminated, _, info) = pusht.replayed(ENV, states, actions, PARAMS)
+    coverage = np.asarray(info["coverage"][0])
+    assert coverage[0] == pytest.approx(1, abs=1e-5)
+    assert (np.diff(coverage) < 0).all()
+    assert np.array_equal(terminated[0], coverage > 0.95)
+    assert np.allclose(reward[0], np.minimum(coverage / 0.95, 1), atol=1e-6)
+
+
+def test_a_block_at_a_wall_holds_the_agent_back():
+    """The bar of the T lies on the left wall, and the agent pushes the stem toward the wall."""
+    row = [200.0, 256.0, 7.0, 256.0, -np.pi / 2]
+    states = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), ENV.state_of(row, position_first=False)
+    )
+    actions = jnp.broadcast_to(jnp.array([20.0, 256.0]), (STEPS, BATCH, 2))
+    after, (*_, info) = pusht.replayed(ENV, states, actions, PARAMS)
+    assert np.allclose(after.pose[-1], states.pose, atol=0.5)
+    assert np.allclose(after.hand[-1], [7 + 120 + 15, 256], atol=1.0)
+    assert np.asarray(info["status"])[-1, :, pj.Status.JAMMED].min() > 0
+
+
+def test_overlapping_starts_come_apart():
+    """Agent inside the T, and T inside the walls, from the starts of gym-pusht and deeper."""
+    rows = np.random.default_rng(0).uniform([250, 250, 200, 200, -3], [262, 262, 312, 312, 3], (BATCH, 5))
+    rows[::2, 2] = -30
+    states = jax.vmap(ENV.state_of)(jnp.asarray(rows))
+    actions = jnp.full((STEPS, BATCH, 2), 256.0)
+    after, _ = pusht.replayed(ENV, states, actions, PARAMS)
+    shapely = pytest.importorskip("shapely")
+    last = jax.tree.map(lambda leaf: leaf[-1], after)
+    corners = np.asarray(jax.vmap(ENV.vertices, in_axes=(0, None))(last, PARAMS))
+    assert corners.min() > 6
+    for block, agent in zip(corners, np.asarray(last.hand), strict=True):
+        assert shapely.Polygon(block).distance(shapely.Point(agent)) > 13.5
