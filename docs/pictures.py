@@ -97,6 +97,8 @@ def real() -> Figure:
     if data is None:
         raise SystemExit("real: set PUSHJAX_DATA to the folder of real data")
     log, geometry = conditions.load(data / "three_point_push", *REAL), conditions.GEOMETRIES["measured"]
+    if log is None:
+        raise SystemExit(f"real: {data} has no log of {', '.join(map(str, REAL))}")
     pushes, block = conditions.recorded(log, geometry, STEPS), conditions.outline(log, geometry)
     slider = pj.Slider(block, conditions.ideal_surface(log, "quartic", jax.random.key(0)))
     hand = pj.Hand.finger(geometry.radius)

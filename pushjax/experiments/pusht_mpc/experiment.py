@@ -24,7 +24,7 @@ PUBLISHED = (
     {"policy": "diffusion policy (LeRobot, later card)", "success": 0.654, "episodes": 500, "sees": "pixels"},
     {"policy": "VQ-BeT (LeRobot)", "success": 0.638, "episodes": 500, "sees": "pixels"},
 )
-# The same rule: coverage above 0.95 within 300 steps, as the model cards of huggingface.co/lerobot give it.
+# The same rule: coverage above 0.95 within 300 steps. The first is on its model card (huggingface.co/lerobot).
 
 
 def run(
