@@ -30,9 +30,7 @@ CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second o
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
-AROUND = (
-    8.0  # the cost to go is known up to this distance from the goal along x and y, in units of the surface's length
-)
+AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 LOST = 60.0  # control steps of a way that the table of ways does not have
 

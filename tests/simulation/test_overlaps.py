@@ -389,5 +389,5 @@ def test_pictures_name_the_step_that_failed():
     words = [axes.texts[0] for axes in moving.figure.axes]
     assert words[0].get_text() == f"not converged at step {int(failing.first_failure)}"
     assert words[0].get_color() == RED
-    assert words[1].get_text().startswith("grasped")
+    assert words[1].get_text().startswith("held by every finger")
     plt.close("all")
