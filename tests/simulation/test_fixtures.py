@@ -92,21 +92,21 @@ def test_pushes_far_from_fixtures_are_those_without():
     np.testing.assert_array_equal(with_walls.status, without.status)
 
 
-def test_derivatives_by_a_wall_are_those_of_differences():
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.long)])
+def test_derivatives_by_a_wall_are_those_of_differences(mode):
     """A slider that is pushed flat along a wall and turns on its corner: by place, direction and friction of a wall."""
     path = straight((TOUCH, 0.012), (TOUCH + 0.02, 0.012))
 
     def last(numbers):
         wall = pj.Wall(numbers[:2], numbers[2:4], numbers[4])
-        return push(path, jnp.array([0.0, 0.0, -0.05]), 0.3, (wall, RIGHT)).pose[-1]
+        return push(path, jnp.array([0.0, 0.0, -0.05]), 0.3, (wall,)).pose[-1]
 
     numbers = jnp.array([0.0, -HALF[1] - 1e-3, 0.0, 1.0, 0.25])
-    forward, reverse = jax.jacfwd(last)(numbers), jax.jacrev(last)(numbers)
+    found = mode(last)(numbers)
     size = 1e-6
     differences = [(last(numbers + size * e) - last(numbers - size * e)) / (2 * size) for e in np.eye(5)]
-    np.testing.assert_allclose(forward, np.stack(differences, axis=1), rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-10)
-    assert float(jnp.max(jnp.abs(forward[:, 1]))) > 0.1
+    np.testing.assert_allclose(found, np.stack(differences, axis=1), rtol=1e-4, atol=1e-6)
+    assert float(jnp.max(jnp.abs(found[:, 1]))) > 0.1
 
 
 def test_traced_walls_that_are_not_valid_are_invalid():
@@ -150,10 +150,8 @@ def test_random_pushes_and_monte_carlo_take_fixtures():
     path, pose = straight((-0.07, 0.004), (0.0, -0.02)), jnp.zeros(3)
     model = pj.FrictionModel(dof=200, friction=(0.2, 0.3))
     key = jax.random.key(0)
-    many = pj.monte_carlo(key, 8, slider, hand, path, pose=pose, model=model, fixtures=(FLOOR, RIGHT), batch_size=8)
-    one = pj.random_rollout(
-        jax.random.fold_in(key, 3), slider, hand, path, pose=pose, model=model, fixtures=(FLOOR, RIGHT)
-    )
+    many = pj.monte_carlo(key, 8, slider, hand, path, pose=pose, model=model, fixtures=(FLOOR,), batch_size=8)
+    one = pj.random_rollout(jax.random.fold_in(key, 3), slider, hand, path, pose=pose, model=model, fixtures=(FLOOR,))
     np.testing.assert_allclose(many.pose[3], one.push.pose[-1], atol=1e-9)
     corners = np.asarray(slider.shape.vertices)
     for x, y, angle in np.asarray(many.pose):
@@ -163,5 +161,5 @@ def test_random_pushes_and_monte_carlo_take_fixtures():
 
 def test_one_step_takes_fixtures():
     ends = (TOUCH, 0.001), (TOUCH + 1e-3, 0.0009)
-    moved = pj.step(slider, hand, *ends, pose=(0.0, 0.0, 0.0), friction=0.3, fixtures=(FLOOR, RIGHT))
+    moved = pj.step(slider, hand, *ends, pose=(0.0, 0.0, 0.0), friction=0.3, fixtures=(FLOOR,))
     np.testing.assert_allclose(moved.pose, [1e-3, 0, 0], atol=1e-9)
