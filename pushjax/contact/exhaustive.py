@@ -48,7 +48,8 @@ class Exhaustive(ContactSolver):
     """Tries every set of cone edges: exact, at a fixed cost.
 
     A problem that it reports as JAMMED has no solution. In float32 this is wrong for a few of 100 000 problems, at the
-    border of a jam.
+    border of a jam. In either type it can be wrong where three contacts with parallel or concurrent normals slide and a
+    fourth just touches (see the header of this module).
     """
 
     def solve(self, problem: ScaledProblem) -> ScalarSolution:
