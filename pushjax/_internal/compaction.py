@@ -8,11 +8,12 @@ grows with the number of examples that need the computation.
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import update_if
+from pushjax._internal.xla import tree_where, update_if
 
 TILE = 128  # examples that are computed together on a CPU, so that their data stay in the cache
 # The same on an accelerator. There a tile costs the start of its kernels, whatever its size: on an H200, 100 000 grasps
@@ -44,6 +45,31 @@ def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: 
     @chosen.def_vmap
     def _(size, batched, needed, otherwise, args):
         return _batching_rule(compute, size, batched, needed, otherwise, args)
+
+    return chosen(needed, otherwise, args)
+
+
+def where_needed(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
+    """Return `compute(*args)` where `needed` holds, else `otherwise`.
+
+    In a batch, `compute` runs only for the examples that need it. For derivatives it runs for all of them.
+
+    Args:
+        needed: Whether this example needs the computation.
+        compute: Function of `args`. It must not close over anything that is batched or differentiated.
+        otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
+        *args: Arguments of `compute`, pytrees of arrays.
+    """
+
+    @eqx.filter_custom_jvp
+    def chosen(needed, otherwise, args):
+        return only_where(needed, compute, otherwise, *args)
+
+    @chosen.def_jvp
+    def _(primals, tangents):
+        return eqx.filter_jvp(
+            lambda needed, otherwise, args: tree_where(needed, compute(*args), otherwise), primals, tangents
+        )
 
     return chosen(needed, otherwise, args)
 

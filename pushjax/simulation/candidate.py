@@ -12,11 +12,11 @@ OUT_OF_REACH = 1e3  # m, distance of a candidate that does not exist; no finger 
 
 
 class FingerPose(NamedTuple):
-    """Pose of a finger in the slider's frame.
+    """Pose of a finger or a wall in the slider's frame.
 
     Attributes:
-        center: Center of the finger, m.
-        angle: Angle as the unit vector (cos, sin); None for a finger that never turns.
+        center: Center of the finger, or a point of the wall, m.
+        angle: Angle as the unit vector (cos, sin), which is the normal of a wall; None for a finger that never turns.
     """
 
     center: Vec2

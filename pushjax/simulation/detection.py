@@ -234,8 +234,8 @@ def _smooth_candidates(
 def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
     """Number of contacts that a finger or a wall may have; it is known before any value is.
 
-    A pad has two (one on a disk). On a polygon that is not convex it has three, since three contacts constrain every
-    motion in the plane.
+    A wall has two (one on a disk), and so has a pad. On a polygon that is not convex a pad has three, since three
+    contacts constrain every motion in the plane.
     """
     if isinstance(finger, Wall):
         return num_wall_contacts(outline)

@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from pushjax._internal.compaction import where_needed
 from pushjax._math.vec import Vec2, Vec3
+from pushjax.contact.frictionless import Frictionless
 from pushjax.contact.problem import to_scalars
 from pushjax.contact.status import Status
 from pushjax.friction.limit_surface import LimitSurface
@@ -22,8 +24,6 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.rollout import simulate
 from pushjax.simulation.trajectory import Trajectory
-from pushjax.tasks.conditional import where_needed
-from pushjax.tasks.frictionless import Frictionless
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate
 
 # In units of the surface's length: an overlap that is left as it is.

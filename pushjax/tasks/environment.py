@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape
+from pushjax._internal.compaction import where_needed
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
 from pushjax.friction.limit_surface import LimitSurface
@@ -22,7 +23,6 @@ from pushjax.friction.random import FrictionModel, SurfaceDistribution
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
-from pushjax.tasks.conditional import where_needed
 from pushjax.tasks.control_step import Pushed, control_step
 from pushjax.tasks.spaces import Space
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from pushjax._internal.compaction import where_needed
 from pushjax._internal.jit import jit, quick_jit
 from pushjax.contact.status import Status
-from pushjax.tasks.conditional import where_needed
 from pushjax.tasks.environment import Environment, TaskState
 from pushjax.tasks.render import render
 

@@ -15,7 +15,9 @@ from jaxtyping import Array, Float
 
 from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
 from pushjax.geometry.polygon import Polygon
+from pushjax.simulation.candidate import FingerPose, take
 from pushjax.simulation.fixtures import Wall
+from pushjax.simulation.wall_contact import wall_candidates
 
 # In units of the surface's length, about one pixel of PushT. Deeper overlaps are treated here.
 DEEP = 0.02
@@ -47,21 +49,10 @@ def overlap_of_finger(polygon: Polygon, radius: Scalar, center: Vec2, pose: Vec3
 def overlap_of_wall(polygon: Polygon, wall: Wall, pose: Vec3) -> Overlap:
     """Return the overlap of a wall and the slider, at the corner that is deepest behind the wall."""
     angle, normal = cos_sin(pose.z), Vec2.of(wall.normal)
-    height = normal.dot(pose.xy - Vec2.of(wall.point))
-    inward = normal.unrotate(angle)
-    lowest, corner = None, None
-    for row in polygon.vertices:
-        vertex = Vec2(row[0], row[1])
-        along = inward.dot(vertex)
-        if lowest is None or corner is None:
-            lowest, corner = along, vertex
-            continue
-        lower = along < lowest
-        lowest = jnp.where(lower, along, lowest)
-        corner = Vec2(jnp.where(lower, vertex.x, corner.x), jnp.where(lower, vertex.y, corner.y))
-    assert lowest is not None
-    assert corner is not None
-    return Overlap(-(height + lowest), corner.rotate(angle), normal)
+    seen = FingerPose((Vec2.of(wall.point) - pose.xy).unrotate(angle), normal.unrotate(angle))
+    corners = wall_candidates(polygon.outline(), seen)
+    deepest = take(corners, jnp.argmin(corners.distance))
+    return Overlap(-deepest.distance, deepest.point.rotate(angle), normal)
 
 
 def separate(

@@ -11,6 +11,7 @@ import numpy as np
 import pushjax as pj
 from pushjax.planning.finger_control import SpringDamper
 from pushjax.planning.pace import Pace
+from pushjax.planning.poses import to_world
 from pushjax.planning.workspace import Workspace
 from pushjax.tasks.push_t import AGENT_RADIUS, GOAL, SIZE, T_CENTER, T_LENGTH, T_VERTICES
 
@@ -44,9 +45,8 @@ def pace() -> Pace:
 
 def from_gym(position: np.ndarray, angle: float) -> np.ndarray:
     """Return the pose of the center of gravity, m and rad, for the position (px) and angle of gym-pusht's body."""
-    c, s = np.cos(angle), np.sin(angle)
-    (x, y), (px, py) = position, CENTER_OF_GRAVITY
-    return np.array([PIXEL * (x + c * px - s * py), PIXEL * (y + s * px + c * py), angle])
+    center = to_world(np.array([*position, angle]), np.array(CENTER_OF_GRAVITY))
+    return np.array([*(PIXEL * center), angle])
 
 
 def goal() -> np.ndarray:

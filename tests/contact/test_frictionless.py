@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linprog
 
 import pushjax as pj
-from pushjax.tasks.frictionless import Frictionless
+from pushjax.contact.frictionless import Frictionless
 from pushjax.testing.problems import random_contacts_problem
 
 PROBLEMS = 300
