@@ -1,5 +1,7 @@
 """Plans of pushes and grasps that reach a goal, also where friction is not known."""
 
+from pushjax.planning.between_pushes import FingerMotion as FingerMotion
+from pushjax.planning.between_pushes import finger_motion as finger_motion
 from pushjax.planning.controller import Observation as Observation
 from pushjax.planning.controller import PushController as PushController
 from pushjax.planning.costs import Clearance as Clearance
@@ -20,14 +22,14 @@ from pushjax.planning.finger_control import PositionControl as PositionControl
 from pushjax.planning.finger_control import SpringDamper as SpringDamper
 from pushjax.planning.goal import Goal as Goal
 from pushjax.planning.pace import Pace as Pace
-from pushjax.planning.plan import Outcomes as Outcomes
 from pushjax.planning.plan import PushPlan as PushPlan
 from pushjax.planning.plan import PushPlanStatus as PushPlanStatus
 from pushjax.planning.plan import plan_pushes as plan_pushes
-from pushjax.planning.plan import push_outcomes as push_outcomes
 from pushjax.planning.push_library import PushLibrary as PushLibrary
 from pushjax.planning.push_planner import PlanStatus as PlanStatus
 from pushjax.planning.push_planner import PushPlanner as PushPlanner
+from pushjax.planning.push_problem import Outcomes as Outcomes
+from pushjax.planning.push_problem import push_outcomes as push_outcomes
 from pushjax.planning.pushes import Pushes as Pushes
 from pushjax.planning.search import MPPI as MPPI
 from pushjax.planning.search import CrossEntropy as CrossEntropy

@@ -141,6 +141,18 @@ class Roadmap:
             corner = int(ways.previous[corner])
         return Way(to_world(pose, np.array(points[::-1])), float(ways.lengths[goal]), WayStatus.FOUND)
 
+    def retreat(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Way:
+        """Return the shortest straight way to where the finger has its clearance; only the start if it has it already.
+
+        Args:
+            start: Center of the finger, (2,), world, m.
+            pose: Pose of the polygon, (3,), m and rad.
+            workspace: Where the finger may be.
+        """
+        points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace)
+        length = float(np.linalg.norm(points[-1] - points[0])) if status == WayStatus.FOUND else np.inf
+        return Way(to_world(pose, points), length, status)
+
     def between(self, starts: np.ndarray) -> np.ndarray:
         """Return the lengths of the shortest ways from points to all goals, without limits of a workspace.
 

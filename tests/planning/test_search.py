@@ -137,6 +137,10 @@ def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
     assert not np.any(done.failed)
     error = np.sqrt(0.25 / 256)  # largest standard error of a frequency
     np.testing.assert_allclose(done.success(easy), plan.success, atol=4 * np.sqrt(2) * error)
+    approach, retreat = plan.ways
+    np.testing.assert_allclose(approach.points[-1], plan.path[0, 0], atol=1e-9)
+    np.testing.assert_allclose(retreat.points[0], plan.path[0, -1], atol=1e-9)
+    np.testing.assert_allclose(plan.pose[-1], np.mean(plan.outcomes.pose, axis=0), atol=0.01)
 
 
 def test_outcomes_are_those_of_random_rollouts(slider, plan):
@@ -191,6 +195,10 @@ def test_bad_input(slider, easy):
         plan(start=(0, 0))
     with pytest.raises(ValueError, match="success must be a probability; got 2"):
         plan(success=2)
+    with pytest.raises(ValueError, match=r"finger must not overlap the slider .*; got an overlap of 0\.015 m"):
+        plan(finger=(0.035, 0))
+    with pytest.raises(ValueError, match=r"finger has shape \(3,\); expected \(2,\)"):
+        plan(finger=(0, 0, 0))
     with pytest.raises(TypeError, match="hand: plans of pushes need round fingers; got a pad"):
         plan(hand=pj.Hand.parallel_jaw(0.02, 0.01))
     with pytest.raises(ValueError, match=r"opening has 0 number\(s\), which does not fit a hand of 4 coordinates"):

@@ -1,0 +1,182 @@
+"""Ways of a round finger from one planned push to the next, and its whole motion as points in time.
+
+After a push the slider is not exactly where it was predicted to be. The samples of the prediction tell how far any
+point of it may be displaced; that is largest at a vertex. A finger that keeps this distance beside its clearance from
+the predicted slider touches none of the samples. Where there is no such way, smaller distances are tried, and the
+samples that the finger would touch are counted.
+
+A way ends in a run-up: from where the finger has its full distance, straight ahead to where the push starts.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pushjax._internal.checks import check_positive
+from pushjax.planning.approach import Roadmap, Way, WayStatus, run_ups
+from pushjax.planning.clearance import point_clearance, segment_clearance
+from pushjax.planning.poses import to_body, to_world
+from pushjax.planning.workspace import Workspace
+
+SHARES = (
+    1.0,
+    0.9,
+    0.5,
+)  # of the samples, for which the finger keeps its distance, in the order of attempts
+TIGHT = 0.25  # of the clearance, with which the last attempt is made
+RUN_UPS = (1.0, 2.0, 4.0)  # longest run-ups, in units of the distance that the finger keeps
+TOUCH = 1e-4  # overlap that does not count as touching, in units of the finger's radius
+
+
+class WaysBetween(NamedTuple):
+    """Ways of a finger before, between and after pushes.
+
+    Attributes:
+        ways: A way to the start of each push, and the retreat after the last one, (pushes + 1).
+        touched: Whether the finger touches the slider on any way, for each sample of the prediction, (samples,).
+    """
+
+    ways: tuple[Way, ...]
+    touched: np.ndarray
+
+    @property
+    def status(self) -> WayStatus:
+        """FOUND, or why the first missing way is missing."""
+        return next((way.status for way in self.ways if way.status != WayStatus.FOUND), WayStatus.FOUND)
+
+
+class FingerMotion(NamedTuple):
+    """The motion of a finger through all pushes of a plan, straight from each point to the next.
+
+    Attributes:
+        time: Time at each point, (points,), s, from zero.
+        position: Center of the finger, (points, 2), world, m.
+        push: Number of the push that the finger makes up to each point, from one; zero between pushes, (points,).
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    push: np.ndarray
+
+
+def ways_between(
+    vertices: np.ndarray,
+    radius: float,
+    clearance: float,
+    paths: np.ndarray,
+    predicted: np.ndarray,
+    samples: np.ndarray,
+    start: np.ndarray | None = None,
+) -> WaysBetween:
+    """Find the ways of a finger to the start of each push, and away from the slider after the last one.
+
+    Args:
+        vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame, m.
+        radius: Radius of the finger, m.
+        clearance: Distance that the finger keeps from the slider, m.
+        paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
+        predicted: Predicted poses of the slider before the first push and after each, (pushes + 1, 3).
+        samples: Samples of these poses, (samples, pushes + 1, 3).
+        start: Where the finger is at first, (2,), world, m. None: where the run-up of the first push begins.
+
+    Returns:
+        The ways.
+    """
+    paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
+    ways, touched = [], np.zeros(len(samples), bool)
+    origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
+    for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
+        scatter = _displacement(vertices, pose, samples[:, k])
+        margins = [*(clearance + np.quantile(scatter, share) for share in SHARES), clearance, TIGHT * clearance]
+        tried = (_way(vertices, radius, margin, paths[k : k + 1], pose, origin) for margin in margins)
+        way = next((each for each in tried if each.status == WayStatus.FOUND), None)
+        if way is None:  # the last attempt is the least demanding, and tells why
+            way = _way(vertices, radius, margins[-1], paths[k : k + 1], pose, origin)
+        else:
+            touched |= _touches(vertices, radius, way.points, samples[:, k])
+        ways.append(way)
+    return WaysBetween(tuple(ways), touched)
+
+
+def finger_motion(ways: tuple[Way, ...], paths: np.ndarray, *, free: float, push: float) -> FingerMotion:
+    """Return the motion of a finger through all ways and pushes, at one speed in pushes and another between them.
+
+    Args:
+        ways: The ways: one to the start of each push, and the last retreat.
+        paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
+        free: Speed between pushes, m/s.
+        push: Speed in pushes, m/s.
+
+    Raises:
+        ValueError: For a speed that is not positive, and if a way was not found.
+    """
+    check_positive("free", free)
+    check_positive("push", push)
+    for k, way in enumerate(ways):
+        if way.status != WayStatus.FOUND:
+            raise ValueError(f"ways[{k}] must be a way that was found; its status is {way.status.name}")
+    position, number = [ways[0].points], [np.zeros(len(ways[0].points), int)]
+    for k, path in enumerate(np.asarray(paths, float)):
+        after = ways[k + 1].points[1:]
+        position += [path[1:], after]
+        number += [np.full(len(path) - 1, k + 1), np.zeros(len(after), int)]
+    points, pushes = np.concatenate(position), np.concatenate(number)
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    duration = length / np.where(pushes[1:] > 0, push, free)
+    return FingerMotion(np.concatenate([[0.0], np.cumsum(duration)]), points, pushes)
+
+
+def _way(
+    vertices: np.ndarray, radius: float, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
+) -> Way:
+    """Return the way to the start of the first of `paths`, or the retreat if there are none."""
+    if len(paths):
+        return _approach(vertices, radius, margin, paths[0], pose, origin)
+    if origin is None:
+        raise ValueError("a retreat begins where a push ends")
+    return Roadmap(vertices, radius, margin, np.zeros((0, 2))).retreat(origin, pose, Workspace.unlimited())
+
+
+def _approach(
+    vertices: np.ndarray, radius: float, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
+) -> Way:
+    """Return the way to the start of a push, with a run-up from where the finger has its full distance."""
+    first, second = to_body(pose, path[:2])
+    ahead = (second - first) / np.linalg.norm(second - first)
+    lengths = [
+        float(run_ups(vertices, radius, margin, first[None], ahead[None], part * (radius + margin))[0])
+        for part in RUN_UPS
+    ]
+    run_up = next((length for length in lengths if np.isfinite(length)), np.nan)
+    overlaps = point_clearance(vertices, first) < (1 - TOUCH) * radius
+    if np.isnan(run_up) or overlaps:
+        return Way(path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, WayStatus.GOAL_BLOCKED)
+    begin = (first - run_up * ahead)[None]
+    if origin is None:
+        way = Way(to_world(pose, begin), 0.0, WayStatus.FOUND)
+    else:
+        roadmap = Roadmap(vertices, radius, margin, begin)
+        way = roadmap.way(roadmap.ways(origin, pose, Workspace.unlimited()), 0, pose)
+    if way.status != WayStatus.FOUND or run_up == 0:
+        return way
+    return Way(np.concatenate([way.points, path[:1]]), way.length + run_up, WayStatus.FOUND)
+
+
+def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Return the largest displacement of any point of the slider from `pose`, for each sample, (samples,), m."""
+    moved = to_world(samples[:, None], vertices[None]) - to_world(pose, vertices)
+    return np.linalg.norm(moved, axis=-1).max(axis=1)
+
+
+def _touches(vertices: np.ndarray, radius: float, points: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """Return whether a finger touches the slider along a way, for each sample of its pose, (samples,).
+
+    A finger that has just pushed touches the slider, so there only what comes nearer counts.
+    """
+    placed = to_body(samples[:, None], points[None])  # (samples, points, 2)
+    apart = segment_clearance(vertices, placed[:, :-1], placed[:, 1:])
+    at_start = point_clearance(vertices, placed[:, 0])
+    allowed = np.full(apart.shape, radius)
+    if apart.shape[1]:
+        allowed[:, 0] = np.minimum(at_start, radius)
+    return np.any(apart < allowed - TOUCH * radius, axis=1)

@@ -1,0 +1,220 @@
+"""Simulation of pushes in a row under sampled friction: the problem that candidates of a search are evaluated on."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, check_shape, common_dtype
+from pushjax._internal.jit import jit
+from pushjax.friction.random import FrictionModel
+from pushjax.planning.costs import Cost, Risk
+from pushjax.planning.draws import draw_friction, mean_friction
+from pushjax.planning.goal import Goal
+from pushjax.planning.pushes import Pushes
+from pushjax.planning.search import Objective
+from pushjax.simulation.arguments import check_slider_and_hand
+from pushjax.simulation.fixtures import Fixtures
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.random_rollout import Draws, rollout_under_draws
+from pushjax.simulation.slider import Slider
+from pushjax.simulation.trajectory import Trajectory
+
+FAILURE = 1e3  # cost of a rollout that fails, such as a push that would start inside the slider
+BATCH = 256  # candidates that are evaluated in one call; fewer are padded, so that one program does for all
+TOGETHER = 2048  # rollouts that are computed together, so that their data stay in the cache
+
+
+class Outcomes(NamedTuple):
+    """Where pushes end under sampled friction.
+
+    Attributes:
+        poses: Poses of the slider before the first push and after each, (samples, pushes + 1, 3), world.
+        failed: Whether a rollout failed, (samples,).
+    """
+
+    poses: Float[Array, "samples pushes+1 3"]
+    failed: Bool[Array, "samples"]
+
+    @property
+    def pose(self) -> Float[Array, "samples 3"]:
+        """Final poses of the slider, (samples, 3), world."""
+        return self.poses[:, -1]
+
+    def success(self, goal: Goal) -> float:
+        """Return the fraction of the samples that reach a goal."""
+        return float(np.mean(np.asarray(goal.reached(self.pose)) & ~np.asarray(self.failed)))
+
+
+class PushProblem(eqx.Module):
+    """What candidates are evaluated on.
+
+    Attributes:
+        pushes: What the parameters mean.
+        slider: The slider.
+        hand: The hand.
+        start: Poses of the slider at the start, (samples, 3).
+        mean: Mean friction, in which the paths of later pushes are laid out.
+        draws: Sampled friction, one for each start.
+        cost: Cost of one sample.
+        risk: What it counts for all samples.
+        fixtures: What the slider may run into.
+    """
+
+    pushes: Any  # `Pushes`; None where nothing is searched, as for cost and risk
+    slider: Slider
+    hand: Hand
+    start: Float[Array, "samples 3"]
+    mean: Draws
+    draws: Draws
+    cost: Any
+    risk: Any
+    fixtures: Fixtures
+
+    def lay_out(self, parameters: Array) -> tuple[Float[Array, "pushes steps+1 dof"], Float[Array, "pushes+1 3"]]:
+        """Return the paths of all pushes, and the poses before the first and after each, under the mean friction."""
+        draw = jax.tree.map(lambda leaf: leaf[0], self.mean)
+
+        def push(pose: Array, numbers: Array) -> tuple[Array, tuple[Array, Array]]:
+            path = self.pushes.path(numbers, self.slider, self.hand, pose)
+            after = self.roll(draw, path, pose).pose[-1]
+            return after, (path, after)
+
+        start = jnp.mean(self.start, axis=0)
+        paths, poses = jax.lax.scan(push, start, parameters.reshape(self.pushes.count, -1))[1]
+        return paths, jnp.concatenate([start[None], poses])
+
+    def roll(self, draw: Draws, path: Array, pose: Array) -> Trajectory:
+        """Push once under sampled friction."""
+        return rollout_under_draws(draw, self.slider.shape, self.hand, path, pose, None, None, None, self.fixtures)
+
+    def rolls(self, draw: Draws, paths: Array, pose: Array) -> Trajectory:
+        """Push several times; the result has a leading axis of pushes."""
+
+        def push(pose: Array, path: Array) -> tuple[Array, Trajectory]:
+            done = self.roll(draw, path, pose)
+            return done.pose[-1], done
+
+        return jax.lax.scan(push, pose, paths)[1]
+
+    def judge(self, parameters: Array) -> Float[Array, ""]:
+        """Return the cost of one candidate."""
+        paths, _ = self.lay_out(parameters)
+
+        def sample(draw: Draws, pose: Array) -> tuple[Array, Array]:
+            done = self.rolls(draw, paths, pose)
+            return self.cost(done), jnp.any(done.failed)
+
+        costs, failed = jax.vmap(sample)(self.draws, self.start)
+        total = self.risk(costs) + FAILURE * jnp.mean(failed.astype(costs.dtype))
+        return jnp.where(jnp.isfinite(total), total, 2 * FAILURE)
+
+
+@jit
+def _costs(parameters: Array, problem: PushProblem) -> Array:
+    together = max(1, TOGETHER // len(problem.start))
+    return jax.lax.map(problem.judge, parameters, batch_size=min(together, len(parameters)))
+
+
+@jit
+def _costs_and_gradients(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
+    return jax.lax.map(jax.value_and_grad(problem.judge), parameters)
+
+
+@jit
+def lay_out(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
+    """Return the paths of one candidate, and the poses that they lead to; see `PushProblem.lay_out`."""
+    return problem.lay_out(parameters)
+
+
+@jit
+def simulated(paths: Array, problem: PushProblem) -> Outcomes:
+    """Simulate paths of pushes, (pushes, steps + 1, dof), in all samples."""
+
+    def sample(draw: Draws, pose: Array) -> Outcomes:
+        done = problem.rolls(draw, paths, pose)
+        return Outcomes(jnp.concatenate([pose[None], done.pose[:, -1]]), jnp.any(done.failed))
+
+    return jax.vmap(sample)(problem.draws, problem.start)
+
+
+def push_outcomes(
+    key: PRNGKeyArray,
+    slider: Slider,
+    hand: Hand,
+    start: ArrayLike,
+    path: ArrayLike,
+    *,
+    model: FrictionModel,
+    samples: int = 256,
+    fixtures: Fixtures = (),
+) -> Outcomes:
+    """Simulate pushes in a row under sampled friction. Each sample keeps its friction for all pushes.
+
+    Args:
+        key: PRNG key of everything random.
+        slider: The slider.
+        hand: The hand. It is put at the start of each path, wherever it was before.
+        start: Pose of the slider at the start, (3,), or samples of a belief, (poses, 3), world, m and rad.
+        path: Paths of the hand, (pushes, steps + 1, dof), world.
+        model: Distribution of limit surface and contact friction.
+        samples: Number of samples.
+        fixtures: Walls and fixed bodies that the slider may run into.
+
+    Returns:
+        The final poses.
+
+    Raises:
+        ValueError: For a count below one, and for a start or paths that are not finite or of another shape.
+        TypeError: For arguments of other types.
+    """
+    check_slider_and_hand(slider, hand)
+    problem = push_problem(key, slider, hand, start, model, samples, fixtures, None)
+    paths = as_float(path, problem.start.dtype, "path")
+    check_shape("path", paths, ("pushes", "steps + 1", hand.dof))
+    check_finite("path", paths)
+    return simulated(paths, problem)
+
+
+def push_problem(
+    key: PRNGKeyArray,
+    slider: Slider,
+    hand: Hand,
+    start: ArrayLike,
+    model: FrictionModel,
+    samples: int,
+    fixtures: Fixtures,
+    search: tuple[Pushes, Cost, Risk] | None,
+) -> PushProblem:
+    """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction."""
+    check_key(key)
+    dtype = common_dtype(slider, hand, start)
+    poses = as_float(start, dtype, "start")
+    if poses.ndim not in (1, 2) or poses.shape[-1] != 3 or not poses.size:
+        raise ValueError(f"start has shape {poses.shape}; expected (3,) or (poses, 3)")
+    check_finite("start", poses)
+    draws = draw_friction(key, slider.surface, model, samples)
+    poses = poses.reshape(-1, 3)[np.arange(samples) % (poses.size // 3)]
+    pushes, cost, risk = search or (None, None, None)
+    parts = (pushes, slider, hand, poses, mean_friction(slider.surface, model), draws, cost, risk, fixtures)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), PushProblem(*parts))
+
+
+def objective(problem: PushProblem) -> Objective:
+    """Return the cost of many candidates as a function on the host, computed in batches of one size."""
+    dtype = problem.start.dtype
+
+    def cost(parameters: np.ndarray) -> np.ndarray:
+        count = len(parameters)
+        padded = np.resize(parameters, (-(-count // BATCH) * BATCH, parameters.shape[1]))
+        parts = [_costs(jnp.asarray(part, dtype), problem) for part in np.split(padded, len(padded) // BATCH)]
+        return np.concatenate([np.asarray(part, np.float64) for part in parts])[:count]
+
+    def cost_and_gradient(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        costs, gradients = _costs_and_gradients(jnp.asarray(parameters, dtype), problem)
+        return np.asarray(costs, np.float64), np.asarray(gradients, np.float64)
+
+    return Objective(cost, cost_and_gradient, problem.pushes.scale)

@@ -1,0 +1,105 @@
+"""Ways of a finger between pushes, and its motion in time, judged by shapely."""
+
+import numpy as np
+import pytest
+
+from pushjax.planning import finger_motion
+from pushjax.planning.approach import WayStatus
+from pushjax.planning.between_pushes import ways_between
+from pushjax.planning.poses import compose, inverse, to_world
+
+shapely = pytest.importorskip("shapely")
+
+RADIUS, CLEARANCE, TRAVEL = 0.005, 0.008, 0.03
+SQUARE = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
+L = np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.12), (0, 0.12)])
+NOTCHED = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (0.1, 1), (0.1, 0), (-0.1, 0), (-0.1, 1), (-1, 1)], float)
+
+
+def translations(vertices, pushes, scatter):
+    """Pushes from random sides whose slider does not turn, as if the finger stuck to it, and samples around them."""
+    rng = np.random.default_rng(0)
+    polygon, pose = shapely.Polygon(vertices), np.array([0.2, -0.1, 1.0])
+    poses, paths = [pose], []
+    for _ in range(pushes):
+        ahead = np.array([np.cos(angle := rng.uniform(-np.pi, np.pi)), np.sin(angle)])
+        at = to_world(pose, polygon.centroid.coords[0])
+        line = at - np.linspace(0.3, 0.0, 3001)[:, None] * ahead
+        placed = shapely.Polygon(to_world(pose, vertices))
+        touch = line[np.argmax(shapely.distance(placed, shapely.points(line)) <= RADIUS)]
+        paths.append(touch + np.linspace(-CLEARANCE, TRAVEL, 9)[:, None] * ahead)
+        pose = pose + np.array([*(TRAVEL * ahead), 0.0])
+        poses.append(pose)
+    noise = scatter * rng.normal(size=(50, pushes + 1, 3)) * [1, 1, 20]
+    noise[:, 0] = 0
+    return np.array(paths), np.array(poses), np.array(poses) + noise
+
+
+@pytest.mark.parametrize("vertices", [SQUARE, L], ids=["square", "L"])
+@pytest.mark.parametrize("scatter", [0.0, 5e-4])
+def test_the_finger_touches_no_sample_between_pushes(vertices, scatter):
+    paths, poses, samples = translations(vertices, 12, scatter)
+    found = ways_between(vertices, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
+    assert found.status == WayStatus.FOUND
+    assert not found.touched.any()
+    for k, way in enumerate(found.ways):
+        if k:
+            np.testing.assert_allclose(way.points[0], paths[k - 1, -1], atol=1e-12)
+        if k < len(paths):
+            np.testing.assert_allclose(way.points[-1], paths[k, 0], atol=1e-12)
+        line = shapely.LineString(way.points)
+        for pose in [poses[k], *samples[:, k]]:
+            placed = shapely.Polygon(to_world(pose, vertices))
+            # a finger that has just pushed is in contact, and may overlap a sample by the scatter
+            begins = min(RADIUS, placed.distance(shapely.Point(way.points[0])))
+            assert placed.distance(line) >= begins - 1e-6
+            if k == len(paths):  # the retreat ends with the whole clearance, also from the samples
+                assert placed.distance(shapely.Point(way.points[-1])) >= RADIUS + CLEARANCE - 1e-6
+
+
+def test_what_would_be_touched_is_counted():
+    """Half of the samples are so far aside that the finger, on its way around the others, runs into some of them."""
+    paths, poses, _ = translations(SQUARE, 1, 0.0)
+    samples = np.repeat(poses[None], 40, axis=0)
+    samples[20:, 0, :2] += np.random.default_rng(1).uniform(-0.2, 0.2, (20, 2))
+    found = ways_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples, start=poses[0, :2] + [0.3, 0.3])
+    line = shapely.LineString(found.ways[0].points)
+    placed = [shapely.Polygon(to_world(pose, SQUARE)) for pose in samples[:, 0]]
+    np.testing.assert_array_equal(found.touched, [each.distance(line) < RADIUS for each in placed])
+    assert 0 < found.touched.sum() < 20
+
+
+def test_a_push_in_a_notch_that_the_finger_does_not_fit_into_has_no_way():
+    path = np.array([[(0.0, 0.02), (0.0, 0.0)]])
+    still = np.zeros((2, 3))
+    found = ways_between(NOTCHED, RADIUS, CLEARANCE, path, still, still[None], start=np.array([0.2, 0.2]))
+    assert found.status == WayStatus.GOAL_BLOCKED
+    with pytest.raises(ValueError, match=r"ways\[0\] must be a way that was found; its status is GOAL_BLOCKED"):
+        finger_motion(found.ways, path, free=0.1, push=0.02)
+
+
+def test_motion_has_the_speeds():
+    paths, poses, samples = translations(SQUARE, 4, 0.0)
+    ways = ways_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples).ways
+    motion = finger_motion(ways, paths, free=0.1, push=0.02)
+    speed = np.linalg.norm(np.diff(motion.position, axis=0), axis=1) / np.diff(motion.time)
+    np.testing.assert_allclose(speed, np.where(motion.push[1:] > 0, 0.02, 0.1))
+    assert motion.time[0] == 0
+    for k, path in enumerate(paths):
+        np.testing.assert_allclose(motion.position[motion.push == k + 1], path[1:], atol=1e-12)
+    assert np.sum(np.diff(motion.push) != 0) == 2 * len(paths)
+    whole = sum(way.length for way in ways) / 0.1 + len(paths) * (CLEARANCE + TRAVEL) / 0.02
+    assert motion.time[-1] == pytest.approx(whole)
+    with pytest.raises(ValueError, match="push must be positive; got 0"):
+        finger_motion(ways, paths, free=0.1, push=0.0)
+
+
+def test_ways_do_not_depend_on_the_frame():
+    paths, poses, samples = translations(L, 3, 3e-4)
+    moved = np.array([0.4, -0.3, 2.0])
+    there = [to_world(moved, paths), compose(moved, poses), compose(moved, samples)]
+    ways = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples).ways
+    again = ways_between(L, RADIUS, CLEARANCE, *there).ways
+    for here, other in zip(ways, again, strict=True):
+        assert other.length == pytest.approx(here.length, rel=1e-6)
+        np.testing.assert_allclose(to_world(inverse(moved), other.points), here.points, atol=1e-6)
