@@ -12,8 +12,9 @@ import tyro
 
 from pushjax._internal.options import cli_option
 from pushjax.experiments.identify_logs.options import Options
+from pushjax.experiments.plan.options import Options as PlanOptions
 
-COMMANDS = ("demo", "reproduce", "identify", "data")
+COMMANDS = ("demo", "reproduce", "identify", "plan", "data")
 DATA_SETS = ("triangle",)
 
 DataFolder = Annotated[Path | None, cli_option("FOLDER")]
@@ -271,6 +272,17 @@ class Identify(Options, Common):
 
 
 @dataclass
+class Plan(PlanOptions, Common):
+    """Plan pushes of a finger that bring a block from pose to pose, and write them as way points for a robot."""
+
+    module = "plan"
+
+    def settings(self) -> dict[str, Any]:
+        """Return the arguments of `run` that are its own."""
+        return {"options": PlanOptions(**{each.name: getattr(self, each.name) for each in fields(PlanOptions)})}
+
+
+@dataclass
 class Data:
     """Fetch recorded pushes from where they are published."""
 
@@ -284,5 +296,6 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]
     | Annotated[Identify, tyro.conf.subcommand("identify")]
+    | Annotated[Plan, tyro.conf.subcommand("plan")]
     | Annotated[Data, tyro.conf.subcommand("data")]
 )

@@ -1,4 +1,4 @@
-"""The command line: `pushjax demo`, `pushjax reproduce NAME`, `pushjax identify LOG…`, `pushjax data NAME`.
+"""The command line: `pushjax demo`, `reproduce NAME`, `identify LOG…`, `plan --goal X Y THETA`, `data NAME`.
 
 JAX is imported only once a command runs, so that `--help` and wrong options are answered at once.
 """

@@ -166,7 +166,7 @@ def test_defaults_are_those_of_the_experiment(kind):
 def test_help_and_wrong_words_do_not_import_jax():
     program = (
         "import sys; from pushjax.cli.main import main\n"
-        "for words in ('--help', 'reproduce table2 --help', 'identify --help', 'demmo', '--version'):\n"
+        "for words in ('--help', 'reproduce table2 --help', 'identify --help', 'plan --help', 'demmo', '--version'):\n"
         "    try: main(words.split())\n"
         "    except SystemExit: pass\n"
         "assert not {'jax', 'numpy', 'matplotlib', 'scipy'} & set(sys.modules), 'imported too much'"
@@ -178,7 +178,7 @@ def test_help_and_wrong_words_do_not_import_jax():
     ("words", "hint"),
     [
         (["demmo"], "no command 'demmo'; did you mean demo?"),
-        (["plan"], "no command 'plan'; there are demo, reproduce, identify, data"),
+        (["xyz"], "no command 'xyz'; there are demo, reproduce, identify, plan, data"),
         (["reproduce", "tabel2"], "no experiment 'tabel2'; did you mean table2?"),
         (["reproduce", "two_finger"], "no experiment 'two_finger'; did you mean two-finger?"),
         (["data", "triangel"], "no data set 'triangel'; did you mean triangle?"),
@@ -231,7 +231,7 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"pushjax {pj.__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["reproduce", "identify"])
+@pytest.mark.parametrize("command", ["reproduce", "identify", "plan"])
 def test_help_reads_well(command, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main([command, "--help"])

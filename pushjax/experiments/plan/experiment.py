@@ -1,0 +1,142 @@
+"""Plan pushes that bring a block from pose to pose, and write the motion of the finger for a robot.
+
+`way_points.csv` has the columns time (s), push, finger_x and finger_y (m, world), one row for each point. The finger
+goes straight from each point to the next. `push` is the number of the push that the finger makes up to that point, from
+one, and zero on its way between pushes.
+"""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import pushjax as pj
+from pushjax._internal.record import result_record
+from pushjax.experiments.identify_logs.setting import expected_surface, shape_of, support_of
+from pushjax.experiments.plan.options import Options
+from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
+from pushjax.planning.approach import WayStatus
+from pushjax.planning.clearance import outline_vertices, point_clearance
+from pushjax.planning.poses import to_body
+
+LONGEST = 2.5  # longest push, in units of the limit surface's length
+STEPS = 12  # of a push
+
+
+def run(options: Options, seed: int = 0, out: Path | None = None) -> dict[str, Any]:
+    """Plan the pushes, and write way points and picture.
+
+    Args:
+        options: The block, its poses, and friction.
+        seed: Seed of everything random.
+        out: Folder for the way points and the picture. None: neither.
+
+    Returns:
+        The record: status and probability of success of the plan, its paths and ways, predicted final poses and their
+        spread, and the files that were written.
+
+    Raises:
+        ValueError: For options that cannot be.
+    """
+    options.check()
+    shape, hand = shape_of(options.shape, []), pj.Hand.finger(options.radius)
+    _check_finger(shape, options)
+    support = support_of(options.support, shape, [])  # pyright: ignore[reportArgumentType]
+    degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
+    slider = pj.Slider(shape, expected_surface(support, degree, seed))
+    goal, plan = _plan(slider, hand, options, seed)
+    motion, files = None, []
+    if plan.status != PushPlanStatus.NO_WAY:
+        motion = finger_motion(plan.ways, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
+    if out is not None and motion is not None:
+        files.append(str(_write(out / "way_points.csv", motion)))
+    pictures = []
+    if out is not None:
+        from pushjax.experiments.plan.picture import draw
+
+        pictures.append(str(draw(slider, goal, plan, options, out / "plan.png")))
+    settings = {"seed": seed} | vars(options)
+    return result_record("plan", settings, **_figures(plan, goal, motion), files=files, pictures=pictures)
+
+
+def _check_finger(shape: pj.Shape, options: Options) -> None:
+    """Raise an error if the finger overlaps the block; nothing is compiled."""
+    if options.finger is None:
+        return
+    apart = point_clearance(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
+    if apart < options.radius:
+        raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
+
+
+def _plan(slider: pj.Slider, hand: pj.Hand, options: Options, seed: int) -> tuple[Goal, PushPlan]:
+    length = float(slider.surface.length)
+    position, angle = options.tolerance
+    goal = Goal(np.array(options.goal), position=position, angle=angle, length=length, symmetry=options.symmetry)
+    longest = LONGEST * length if options.longest is None else options.longest
+    ways: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
+    plan = plan_pushes(
+        jax.random.key(seed),
+        slider,
+        hand,
+        np.array(options.start),
+        goal,
+        model=pj.FrictionModel(options.dof, options.friction),
+        pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
+        success=options.success,
+        finger=options.finger,
+        **ways,
+    )
+    return goal, plan
+
+
+def _figures(plan: PushPlan, goal: Goal, motion: Any) -> dict[str, Any]:
+    """Return what the record says of a plan."""
+    final = np.asarray(plan.outcomes.pose, np.float64)
+    errors = np.asarray(goal.offset(final), np.float64)
+    spread = errors.std(axis=0)
+    return {
+        "status": plan.status.name,
+        "success": plan.success,
+        "samples": len(final),
+        "spread": {"x_mm": 1e3 * spread[0], "y_mm": 1e3 * spread[1], "theta_deg": np.degrees(spread[2])},
+        "path": plan.path,
+        "pose": plan.pose,
+        "ways": [
+            {"status": way.status.name, "points": way.points}
+            | ({"length": way.length} if way.status == WayStatus.FOUND else {})
+            for way in plan.ways
+        ],
+        "final_poses": final,
+        "duration_s": None if motion is None else float(motion.time[-1]),
+        "way_points": None if motion is None else len(motion.time),
+    }
+
+
+def _write(path: Path, motion: Any) -> Path:
+    """Write the motion of the finger, to the micrometer and the millisecond."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(("time", "push", "finger_x", "finger_y"))
+        for time, push, (x, y) in zip(motion.time, motion.push, motion.position, strict=True):
+            rows.writerow((f"{time:.3f}", int(push), f"{x:.6f}", f"{y:.6f}"))
+    return path
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return the text that the command prints for a record of `run`."""
+    spread, status = record["spread"], record["status"]
+    if status == PushPlanStatus.NO_WAY.name:
+        blocked = next(k for k, way in enumerate(record["ways"]) if way["status"] != WayStatus.FOUND.name)
+        words = f"no plan: the finger does not get to push {blocked + 1} ({record['ways'][blocked]['status']})"
+        return "\n".join([words, *(f"drew {path}" for path in record["pictures"])])
+    lines = [
+        f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
+        f"{record['samples']} samples of friction" + ("" if status == "FOUND" else ", less than asked for"),
+        f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
+        f"{spread['theta_deg']:.1f} deg",
+    ]
+    lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]
+    return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])

@@ -1,0 +1,75 @@
+"""The picture of a plan: the finger's pushes and ways, where the block is on the way, and where it may end."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+import pushjax as pj
+from pushjax import plot
+from pushjax.experiments.plan.options import Options
+from pushjax.planning import Goal, PushPlan
+
+DRAWN = 40  # predicted ends
+
+
+def draw(slider: pj.Slider, goal: Goal, plan: PushPlan, options: Options, path: Path) -> Path:
+    """Draw a plan, and the errors of its predicted ends, and return the path of the picture.
+
+    Args:
+        slider: The block.
+        goal: The goal.
+        plan: The plan.
+        options: Radius of the finger, and tolerances.
+        path: File of the picture.
+    """
+    with plt.rc_context(plot.STYLE):
+        figure, panels = plt.subplots(
+            1, 3, figsize=(12.5, 4.6), layout="constrained", gridspec_kw={"width_ratios": [2, 1, 1]}
+        )
+        _draw_plan(panels[0], slider, goal, plan, options)
+        errors = np.asarray(goal.offset(np.asarray(plan.outcomes.pose)), float)
+        _draw_positions(panels[1], errors, options.tolerance[0])
+        plot.histogram_panel(panels[2], np.degrees(errors[:, 2]), "error of the angle / °", bins=30)
+        for side in (-1, 1):
+            panels[2].axvline(side * np.degrees(options.tolerance[1]), color=plot.BLACK, lw=1, ls="--")
+        panels[0].set_title(f"{plan.status.name.replace('_', ' ').lower()}: {plan.success:.0%} succeed")
+        panels[2].set_title("angle at the end")
+        return plot.save(figure, path)
+
+
+def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, options: Options) -> None:
+    for pose in np.asarray(plan.outcomes.pose)[:DRAWN]:
+        plot.outline(axes, slider.shape, pose, plot.RED, 0.4, alpha=0.5)
+    axes.plot([], [], color=plot.RED, lw=0.8, label="predicted ends")
+    for number, pose in enumerate(np.asarray(plan.pose)):
+        color, label = (plot.BLACK, "start") if number == 0 else (plot.GRAY, "after each push" if number == 1 else None)
+        plot.outline(axes, slider.shape, pose, color, 1.2, label=label)
+    plot.outline(axes, slider.shape, np.asarray(goal.pose), plot.GREEN, 1.6, linestyle="--", label="goal")
+    for number, way in enumerate(plan.ways):
+        label = "between pushes" if number == 0 else None
+        axes.plot(*(plot.MM * way.points.T), color=plot.ORANGE, lw=0.9, ls="--", label=label)
+    for number, path in enumerate(np.asarray(plan.path)):
+        points = plot.MM * path
+        axes.plot(*points.T, color=plot.BLUE, lw=1.8, label="pushes of the finger" if number == 0 else None)
+        axes.annotate(
+            "", points[-1], points[-2], arrowprops={"arrowstyle": "-|>", "color": plot.BLUE, "shrinkA": 0, "shrinkB": 0}
+        )
+        axes.add_patch(Circle(tuple(points[0]), plot.MM * options.radius, color=plot.BLUE, fill=False, lw=0.9))
+        axes.annotate(
+            str(number + 1), points[0], xytext=(7, 7), textcoords="offset points", color=plot.BLUE, weight="bold"
+        )
+    axes.set(xlabel="x / mm", ylabel="y / mm")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.legend(fontsize=7, loc="best")
+
+
+def _draw_positions(axes: Axes, errors: np.ndarray, tolerance: float) -> None:
+    points = plot.MM * errors[:, :2]
+    axes.plot(*points.T, ".", color=plot.RED, ms=3)
+    axes.add_patch(Circle((0, 0), plot.MM * tolerance, color=plot.BLACK, fill=False, ls="--", lw=1))
+    reach = max(1.3 * plot.MM * tolerance, float(np.quantile(np.abs(points), 0.995)) * 1.05)
+    axes.set(xlabel="error of x / mm", ylabel="error of y / mm", xlim=(-reach, reach), ylim=(-reach, reach))
+    axes.set(aspect="equal", title="position at the end")

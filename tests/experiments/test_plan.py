@@ -1,0 +1,124 @@
+"""The command that plans pushes: its way points are replayed, and compared with the slider by shapely."""
+
+import csv
+import json
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.cli import main as cli
+from pushjax.experiments.plan import experiment
+from pushjax.planning import Goal, Outcomes, PushPlan, PushPlanStatus
+from pushjax.planning.between_pushes import ways_between
+from pushjax.planning.poses import to_world
+
+RADIUS, FRICTION = 0.005, 0.25
+BLOCK = 0.03 * np.array([(-1.5, -1), (1.5, -1), (1.5, 1), (-1.5, 1)])
+# one push under known friction; and three under random friction
+SIMPLE = ["--no-robust", "--pushes", "1", "--goal", "0.03", "0", "0", "--finger", "0.1", "-0.05", "--dof", "None"]
+SIMPLE += ["--friction", str(FRICTION), str(FRICTION)]
+ROBUST = ["--goal", "0.03", "0.02", "-0.4", "--symmetry", "2", "--finger", "-0.1", "0"]
+
+
+def push_through_the_middle(slider, hand, options, seed):
+    """A plan that needs no search: a push through the center of a symmetric block, which then only translates."""
+    path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
+    poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
+    samples = poses + np.array([0.0, 1.0])[:, None] * np.linspace(-1e-3, 1e-3, 20)[:, None, None]
+    between = ways_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
+    outcomes = Outcomes(samples, np.zeros(20, bool))
+    nothing = np.zeros(0)
+    return Goal(options.goal), PushPlan(
+        PushPlanStatus.FOUND, path, poses, between.ways, nothing, outcomes, 1.0, 0.0, nothing
+    )
+
+
+@pytest.fixture(
+    scope="module",
+    params=["without search", *(pytest.param(each, marks=pytest.mark.long) for each in (SIMPLE, ROBUST))],
+    ids=["without search", "simple", "robust"],
+)
+def planned(request, tmp_path_factory):
+    """Folder, record and way points of a plan."""
+    folder = tmp_path_factory.mktemp("plan")
+    np.savetxt(folder / "block.csv", BLOCK, delimiter=",")
+    with pytest.MonkeyPatch.context() as patch:
+        options = request.param
+        if options == "without search":
+            options = SIMPLE
+            patch.setattr(experiment, "_plan", push_through_the_middle)
+        cli.main(["plan", *options, "--shape", str(folder / "block.csv"), "--out", str(folder)])
+    rows = list(csv.DictReader((folder / "way_points.csv").open()))
+    points = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    return folder, json.loads((folder / "plan.json").read_text()), points
+
+
+def test_a_plan_is_found(planned):
+    folder, record, _ = planned
+    assert record["experiment"] == "plan"
+    assert record["success"] > 0.7
+    assert record["status"] == ("FOUND" if record["success"] >= 0.9 else "UNLIKELY")
+    assert matplotlib.image.imread(folder / "plan.png")[..., :3].std() > 0.02
+    assert (folder / "plan.html").read_text().count("data:image/png;base64,") == 1
+
+
+def test_the_finger_touches_nothing_between_pushes(planned):
+    shapely = pytest.importorskip("shapely")
+    _, record, points = planned
+    position = np.column_stack([points["finger_x"], points["finger_y"]])
+    pushes = len(record["path"])
+    ends = [0, *(np.flatnonzero(points["push"] == k + 1)[-1] for k in range(pushes))]
+    for k, pose in enumerate(record["pose"]):
+        stop = np.flatnonzero(points["push"] == k + 1)[0] if k < pushes else len(position)
+        way = shapely.LineString(position[ends[k] : stop])
+        block = shapely.Polygon(to_world(np.array(pose), BLOCK))
+        assert block.distance(way) > RADIUS - 2e-6  # way points are written in micrometers
+        assert block.distance(shapely.Point(way.coords[-1])) > RADIUS + 1e-3
+    np.testing.assert_allclose(position[0], record["settings"]["finger"], atol=1e-6)
+
+
+@pytest.mark.long
+def test_way_points_do_what_the_plan_says(planned):
+    """A rollout along all of them, ways included, ends where the plan does under the mean friction."""
+    _, record, points = planned
+    steps = 400 * len(record["path"])
+    slider = pj.Slider.uniform(pj.Polygon(BLOCK), degree=2)
+    path = pj.resample(np.column_stack([points["finger_x"], points["finger_y"]]), steps)
+    done = pj.rollout(slider, pj.Hand.finger(RADIUS), path, pose=np.array(record["pose"][0]), friction=FRICTION)
+    assert not np.any(done.failed)
+    np.testing.assert_allclose(done.pose[-1, :2], record["pose"][-1][:2], atol=2e-3)
+    np.testing.assert_allclose(done.pose[-1, 2], record["pose"][-1][2], atol=0.04)
+
+
+def test_time_is_that_of_the_speeds(planned):
+    _, record, points = planned
+    length = np.hypot(np.diff(points["finger_x"]), np.diff(points["finger_y"]))
+    speed = np.where(points["push"][1:] > 0, *reversed(record["settings"]["speed"]))
+    np.testing.assert_allclose(np.diff(points["time"]), length / speed, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "--goal: give the pose that is wanted"),
+        (["--goal", "0", "0", "90"], "--goal: the angle is in rad"),
+        (["--goal", "0", "nan", "0"], "--goal must be finite"),
+        (["--goal", "0", "0", "0", "--pushes", "0"], "--pushes must be at least 1; got 0"),
+        (["--goal", "0", "0", "0", "--friction", "0.3", "0.2"], "--friction must be lowest and highest"),
+        (["--goal", "0", "0", "0", "--dof", "2"], "--dof must be at least 3 for ellipsoid surfaces; got 2"),
+        (["--goal", "0", "0", "0", "--radius", "0"], "--radius must be positive, in m; got 0"),
+        (["--goal", "0", "0", "0", "--speed", "0.1", "-1"], "--speed must be positive; got 0.1 -1"),
+        (["--goal", "0", "0", "0", "--tolerance", "0", "1"], "--tolerance must be positive; got 0 1"),
+        (["--goal", "0", "0", "0", "--success", "2"], "--success must be a probability; got 2"),
+        (["--goal", "0", "0", "0", "--shape", "cube:1"], "--shape: expected rectangle:"),
+        (["--goal", "0", "0", "0", "--finger", "0", "0"], "--finger overlaps the block at its start, by 35 mm"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(options, message, capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.main(["plan", *options])
+    assert end.value.code == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"pushjax: {message}")
