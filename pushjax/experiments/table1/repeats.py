@@ -23,13 +23,13 @@ def noise_floor_mm(log: MitPushes) -> float | None:
     rows = log.repeats[log.fast.valid[log.repeats[:, 0]] & log.whole.valid[log.repeats[:, 1]]]
     if not len(rows):
         return None
-    fast, slow = _relative_motions(log.fast)[rows[:, 0]], _relative_motions(log.whole)[rows[:, 1]]
+    fast, slow = relative_motions(log.fast)[rows[:, 0]], relative_motions(log.whole)[rows[:, 1]]
     differences = np.asarray(pj.deviation(fast, slow, log.length), float)
     ratio = _mean_motion(log.middle, log.length) / _mean_motion(log.whole, log.length)
     return float(1e3 * differences.mean() / np.sqrt(2) * ratio)
 
 
-def _relative_motions(pushes: StraightPushes) -> np.ndarray:
+def relative_motions(pushes: StraightPushes) -> np.ndarray:
     """Return the end poses in the frames of the starts, (n, 3), in which repetitions are the same push."""
     return np.asarray(compose(inverse(pushes.start), pushes.end), float)
 
