@@ -36,6 +36,12 @@ from pushjax.planning.search import CrossEntropy as CrossEntropy
 from pushjax.planning.search import GradientRefinement as GradientRefinement
 from pushjax.planning.search import Search as Search
 from pushjax.planning.search import Selection as Selection
+from pushjax.planning.squeezes import SqueezeOutcomes as SqueezeOutcomes
+from pushjax.planning.squeezes import SqueezePlan as SqueezePlan
+from pushjax.planning.squeezes import Squeezes as Squeezes
+from pushjax.planning.squeezes import SqueezeStatus as SqueezeStatus
+from pushjax.planning.squeezes import plan_squeezes as plan_squeezes
+from pushjax.planning.squeezes import squeeze_outcomes as squeeze_outcomes
 from pushjax.planning.stable import StableContact as StableContact
 from pushjax.planning.stable import StablePush as StablePush
 from pushjax.planning.stable import StableStatus as StableStatus

@@ -1,5 +1,7 @@
 """The pose that a plan shall reach, and how far from it another pose is."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -75,14 +77,7 @@ class Goal(eqx.Module):
             check_shape(name, getattr(self, name), ())
             check_finite(name, getattr(self, name))
             check_positive(name, getattr(self, name))
-        if np.ndim(symmetry) == 0:  # pyright: ignore[reportArgumentType]
-            check_count("symmetry", symmetry)
-            symmetry = 2 * np.pi * np.arange(symmetry) / symmetry  # pyright: ignore
-        self.turns = as_float(symmetry, dtype, "symmetry")
-        check_shape("symmetry", self.turns, ("turns",))
-        check_finite("symmetry", self.turns)
-        if not len(self.turns):
-            raise ValueError("symmetry must have at least one turn, zero for a slider without symmetry; got none")
+        self.turns = symmetric_turns(symmetry, dtype)
 
     def offset(self, pose: ArrayLike) -> Float[Array, "*batch 3"]:
         """Return what is missing from the goal: the difference of the poses, with the smallest of the angles.
@@ -161,6 +156,28 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         return self.excess(pose) <= 1
+
+
+def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array, "turns"]:
+    """Return the turns after which a slider looks the same, (turns,), rad.
+
+    Args:
+        symmetry: Number of angles in a full turn at which it looks the same, or the turns.
+        dtype: Dtype of the result; by default that of `symmetry`.
+
+    Raises:
+        ValueError: For a number below one, and for turns of a wrong shape, that are not finite, or of which there are
+            none.
+    """
+    if np.ndim(symmetry) == 0:  # pyright: ignore[reportArgumentType]
+        check_count("symmetry", symmetry)
+        symmetry = 2 * np.pi * np.arange(symmetry) / symmetry  # pyright: ignore
+    turns = as_float(symmetry, dtype, "symmetry")
+    check_shape("symmetry", turns, ("turns",))
+    check_finite("symmetry", turns)
+    if not len(turns):
+        raise ValueError("symmetry must have at least one turn, zero for a slider without symmetry; got none")
+    return turns
 
 
 def norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
