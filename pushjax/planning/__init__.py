@@ -20,6 +20,9 @@ from pushjax.planning.dubins import DubinsPath as DubinsPath
 from pushjax.planning.dubins import dubins as dubins
 from pushjax.planning.finger_control import PositionControl as PositionControl
 from pushjax.planning.finger_control import SpringDamper as SpringDamper
+from pushjax.planning.friction_filter import BeliefStatus as BeliefStatus
+from pushjax.planning.friction_filter import FrictionBelief as FrictionBelief
+from pushjax.planning.friction_filter import FrictionFilter as FrictionFilter
 from pushjax.planning.goal import Goal as Goal
 from pushjax.planning.pace import Pace as Pace
 from pushjax.planning.plan import PushPlan as PushPlan

@@ -6,6 +6,8 @@ Going: the finger follows the way as fast as its speed limits allow. Each action
     first; a step that would come too near to the slider is shortened.
 Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
     that are seen; the end whose final pose is nearest to the target is taken.
+Learning: with a `FrictionFilter`, each control step of a push updates a belief about friction. Rollouts of the feedback
+    use its mean. If its samples are those of the planner's library, pushes are chosen by their weights.
 """
 
 from typing import NamedTuple
@@ -17,10 +19,12 @@ from jaxtyping import PRNGKeyArray
 from pushjax.planning.approach import Way, WayStatus
 from pushjax.planning.clearance import point_clearance
 from pushjax.planning.finger_control import FingerControl, FingerState
+from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 from pushjax.planning.poses import compose, inverse, to_body
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
 from pushjax.planning.push_planner import PlannedPush, PlanStatus, PushPlanner
 from pushjax.simulation.hand import Hand
+from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length
 ARRIVED = 0.007  # distance from a point at which the finger has arrived
@@ -33,6 +37,7 @@ ACROSS = np.array([-0.12, -0.055, -0.02, 0, 0.02, 0.055, 0.12])
 CORRECTED = 1.3  # the end is corrected from this distance on; longer pushes would be simulated too coarsely
 FINE, FULL = 0.25, 0.73  # the ends are this part as far apart at the end, and at FULL from there as far as above
 LATE = 1.5  # a push is over after its planned number of control steps, times this, and three
+LEARNING_STEPS = 5  # steps of the simulation of a control step that updates the belief about friction
 SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
 
 
@@ -63,6 +68,9 @@ class Memory(NamedTuple):
         pushes: Number of pushes so far.
         waited: Number of control steps in which there was no push to make.
         status: Status of the last plan.
+        belief: Belief about friction, or None.
+        last: What was seen one control step ago, if the finger was pushing then, or else None.
+        path: Path of the finger since then by its own model, (points, 2), world, m.
     """
 
     push: PlannedPush | None
@@ -76,6 +84,9 @@ class Memory(NamedTuple):
     pushes: int
     waited: int
     status: PlanStatus
+    belief: FrictionBelief | None = None
+    last: Observation | None = None
+    path: np.ndarray | None = None
 
 
 class PushController:
@@ -87,6 +98,12 @@ class PushController:
         friction: Coefficient of contact friction, as the library of the planner has it.
         feedback: Whether the end of a push is corrected while it runs.
         noise: Standard deviation of the positions that are seen, m.
+        friction_filter: How a belief about friction is updated by what is seen. None: `friction` is known.
+        prior: Belief before anything is seen. If the planner's library has as many samples, they must be the same: both
+            come from `draw_friction` with one key.
+
+    Raises:
+        ValueError: If one of `friction_filter` and `prior` is given without the other.
     """
 
     def __init__(
@@ -97,7 +114,12 @@ class PushController:
         friction: float = 0.0,
         feedback: bool = True,
         noise: float = 0.0,
+        friction_filter: FrictionFilter | None = None,
+        prior: FrictionBelief | None = None,
     ):
+        if (friction_filter is None) != (prior is None):
+            raise ValueError("friction_filter and prior must be given together")
+        self.friction_filter, self.prior = friction_filter, prior
         self.planner, self.control, self.friction, self.feedback = planner, control, friction, feedback
         self.hand = Hand.finger(planner.radius)
         self.length = planner.library.length
@@ -111,17 +133,19 @@ class PushController:
     def initial_memory(self) -> Memory:
         """Return the memory of the first control step; the finger is at rest."""
         zero = np.zeros(2)
-        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PlanStatus.NO_PUSH)
+        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PlanStatus.NO_PUSH, self.prior)
 
     def prepare(self) -> None:
-        """Compile the program of the feedback, which is else compiled when it is first needed."""
+        """Compile the programs of feedback and filter, which are else compiled when they are first needed."""
+        if self.friction_filter is not None and self.prior is not None:
+            self.friction_filter.update(self.prior, np.zeros(3), np.zeros((LEARNING_STEPS + 1, 2)), np.zeros(3))
         if self.feedback:
             far = self.planner.goal[:2] + 10 * self.length
             aim = np.zeros(2)
             push = PlannedPush(
                 PlanStatus.ONE_PUSH, Way(aim[None], 0.0, WayStatus.FOUND), aim, aim, self.planner.goal, 0.0
             )
-            self._corrected(far, self.planner.goal, far + 0.1 * self.length, push)
+            self._corrected(far, self.planner.goal, far + 0.1 * self.length, push, self.prior)
 
     def __call__(self, key: PRNGKeyArray, observation: Observation, memory: Memory) -> tuple[np.ndarray, Memory]:
         """Return the next action and the memory after it.
@@ -133,24 +157,40 @@ class PushController:
         """
         state = FingerState(np.asarray(observation.finger, float), memory.velocity)
         pose = np.asarray(observation.pose, float)
+        memory = self._learned(pose, memory)
         fresh = False
         for _ in range(3):  # a push may be over at once
             if memory.push is None:
                 memory, fresh = self._plan(key, state, pose, memory), True
                 if memory.push is None:
-                    return self._finish(state, state.position, memory._replace(waited=memory.waited + 1))
+                    return self._finish(state, pose, state.position, memory._replace(waited=memory.waited + 1))
             if not memory.pushing:
                 target, memory = self._go(state, pose, memory)
             else:
                 # the end of a push that has just been planned needs no correction
                 target, memory = self._push(state, pose, memory, correct=self.feedback and not fresh)
             if target is not None:
-                return self._finish(state, target, memory)
-        return self._finish(state, state.position, memory)
+                return self._finish(state, pose, target, memory)
+        return self._finish(state, pose, state.position, memory)
 
-    def _finish(self, state: FingerState, target: np.ndarray, memory: Memory) -> tuple[np.ndarray, Memory]:
+    def _finish(
+        self, state: FingerState, pose: np.ndarray, target: np.ndarray, memory: Memory
+    ) -> tuple[np.ndarray, Memory]:
         action = self.control.action(state, target)
-        return action, memory._replace(velocity=self.control.after(state, action).velocity)
+        memory = memory._replace(velocity=self.control.after(state, action).velocity, last=None)
+        if self.friction_filter is not None and memory.pushing:
+            path = np.concatenate([state.position[None], self.control.motion(state, action)])
+            memory = memory._replace(last=Observation(state.position, pose), path=path)
+        return action, memory
+
+    def _learned(self, pose: np.ndarray, memory: Memory) -> Memory:
+        """Update the belief by the motion since the last control step, if the finger was pushing."""
+        if self.friction_filter is None or memory.last is None or memory.path is None:
+            return memory
+        assert memory.belief is not None
+        points = np.round(np.linspace(0, len(memory.path) - 1, LEARNING_STEPS + 1)).astype(int)
+        belief = self.friction_filter.update(memory.belief, memory.last.pose, memory.path[points], pose)
+        return memory._replace(belief=belief)
 
     def _plan(self, key: PRNGKeyArray, state: FingerState, pose: np.ndarray, memory: Memory) -> Memory:
         """Plan a push. If there is none, `push` stays None."""
@@ -158,11 +198,19 @@ class PushController:
         if memory.pushes > SHAKE_AFTER:
             seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, memory.pushes))).ravel().tolist()
             shake = np.abs(np.random.default_rng(seed).normal(0, memory.pushes, len(self.planner.library.starts)))
-        push = self.planner.choose(pose, state.position, shake)
+        push = self._planner(memory.belief).choose(pose, state.position, shake)
         planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0, taken=0)
         if push.status.failed:
             return planned._replace(push=None)
         return planned._replace(push=push, end=push.end, pushes=memory.pushes + 1)
+
+    def _planner(self, belief: FrictionBelief | None) -> PushPlanner:
+        """Return the planner, with the weights of the belief if its samples are those of the library."""
+        if belief is None or len(belief.weight) != len(self.planner.sampled.outcomes):
+            return self.planner
+        if belief.status == BeliefStatus.PRIOR:
+            return self.planner
+        return self.planner.reweighted(np.asarray(belief.weight))
 
     def _go(self, state: FingerState, pose: np.ndarray, memory: Memory) -> tuple[np.ndarray | None, Memory]:
         """Return the next target on the way to a push, or None if the push begins or must be planned anew."""
@@ -198,7 +246,7 @@ class PushController:
         assert push is not None
         end = memory.end
         if correct and np.linalg.norm(end - state.position) < CORRECTED * self.length:
-            end = self._corrected(state.position, pose, end, push)
+            end = self._corrected(state.position, pose, end, push, memory.belief)
         way = end - state.position
         left = float(np.linalg.norm(way))
         # a finger that does not go where it should would try forever
@@ -208,7 +256,9 @@ class PushController:
         speed = pace.next_speed(memory.speed, left, pace.push)
         return state.position + way * (speed / left), memory._replace(end=end, speed=speed, taken=memory.taken + 1)
 
-    def _corrected(self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush) -> np.ndarray:
+    def _corrected(
+        self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
+    ) -> np.ndarray:
         """Return the end, of those around `end`, from which the slider comes nearest to the push's target."""
         way = end - finger
         left = float(np.linalg.norm(way))
@@ -217,9 +267,11 @@ class PushController:
         scale = min(1.0, FINE + left / (FULL * self.length) * (1 - FINE))
         ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)
         paths = finger + (ends - finger)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
-        poses, _ = simulate_pushes(
-            self.planner.slider, self.hand, paths, np.broadcast_to(pose, (len(ends), 3)), self.friction
-        )
+        slider, friction = self.planner.slider, self.friction
+        if belief is not None:
+            surface, mu = _mean(belief)
+            slider, friction = Slider(slider.shape, surface), float(mu)
+        poses, _ = simulate_pushes(slider, self.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
         final = poses[:, -1].astype(float)
         features = self.planner.library.features
         missed = np.linalg.norm(features(final) - features(push.target), axis=1)
@@ -228,3 +280,6 @@ class PushController:
             score = self.planner.measure(compose(inverse(self.planner.goal), final))
             cost = 7.3 * (1 - score) + 0.1 * cost
         return ends[np.argmin(cost)]
+
+
+_mean = jax.jit(FrictionBelief.mean)

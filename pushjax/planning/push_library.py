@@ -12,7 +12,7 @@ changed by a motion of the world, so it is the distance of the final pose from t
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -25,6 +25,7 @@ import pushjax
 from pushjax._internal.checks import check_count, check_type
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.clearance import offset_curve, outline_vertices
+from pushjax.planning.draws import draw_friction
 from pushjax.planning.poses import compose, inverse, pose_features
 from pushjax.planning.push_batch import simulate_pushes
 from pushjax.simulation.hand import Hand
@@ -85,7 +86,7 @@ class PushLibrary:
             model: Distribution of friction. If it is given, `friction` is not used.
             samples: Number of draws from `model`. All pushes share them, so that differences between pushes are not
                 due to the draws.
-            key: Key of the draws.
+            key: Key of the draws, which are those of `draw_friction`.
 
         Returns:
             The library.
@@ -136,9 +137,9 @@ class PushLibrary:
         else:
             if key is None:
                 raise ValueError("key: draws from a FrictionModel need a PRNG key; got None")
-            drawn, mu = jax.vmap(lambda each: model.sample(each, slider.surface))(jax.random.split(key, samples))
-            surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k], drawn) for k in range(samples)]
-            mus = np.asarray(mu).tolist()
+            draws = draw_friction(key, slider.surface, model, samples)
+            surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k, 0], draws.surface) for k in range(samples)]
+            mus = np.asarray(draws.friction[:, 0]).tolist()
         outcomes, valid = [], np.ones((pushes, steps + 1), bool)
         for surface, mu in zip(surfaces, mus, strict=True):
             poses, good = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
@@ -194,7 +195,7 @@ class PushLibrary:
 
     @cached_property
     def relative(self) -> np.ndarray:
-        """Relative poses of the entries in the first sample, (entries, 3)."""
+        """Relative poses of the entries in the first sample, (entries, 3); `averaged` has the means in its only one."""
         return np.ascontiguousarray(self.outcomes[0][tuple(self.entries.T)])
 
     @cached_property
@@ -206,13 +207,38 @@ class PushLibrary:
         """Return `pose_features` about this slider's centroid, (..., 4)."""
         return pose_features(poses, self.center, self.length)
 
-    def final_spread(self) -> np.ndarray:
+    def averaged(self, weight: np.ndarray | None = None) -> "PushLibrary":
+        """Return the library whose only sample is the mean outcome of each push.
+
+        Args:
+            weight: Weights of the samples, (samples,), which add up to one. None: all alike.
+        """
+        if len(self.outcomes) == 1:
+            return self
+        mean = np.tensordot(self._weights(weight), self.outcomes, 1)
+        return replace(self, outcomes=mean[None])
+
+    def final_spread(self, weight: np.ndarray | None = None) -> np.ndarray:
         """Return how much the outcomes scatter over the samples: the root mean square distance, (pushes, lengths), m.
 
         The distance of a sample from the mean is that of `pose_features`.
+
+        Args:
+            weight: Weights of the samples, as in `averaged`.
         """
-        features = self.features(self.outcomes)
-        return np.sqrt(((features - features.mean(0)) ** 2).sum(-1).mean(0))
+        weights, mean, square = self._weights(weight), 0.0, 0.0
+        first = self.features(self.outcomes[0])
+        for each, outcome in zip(weights, self.outcomes, strict=True):
+            apart = self.features(outcome) - first
+            mean, square = mean + each * apart, square + each * apart**2
+        return np.sqrt(np.maximum(np.sum(square - mean**2, axis=-1), 0.0))
+
+    def _weights(self, weight: np.ndarray | None) -> np.ndarray:
+        count = len(self.outcomes)
+        weights = np.full(count, 1 / count, np.float32) if weight is None else np.asarray(weight, np.float32)
+        if weights.shape != (count,):
+            raise ValueError(f"weight has shape {weights.shape}; expected ({count},), the samples of the library")
+        return weights
 
     def poses_reaching(self, goal: np.ndarray) -> np.ndarray:
         """Return the pose from which each entry reaches a goal, (entries, 3), m and rad.

@@ -8,6 +8,7 @@ Two pushes: the poses that promising first pushes lead to are looked up in the s
 Farther away: the push with that least sum.
 """
 
+from copy import copy
 from enum import IntEnum
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -32,6 +33,7 @@ BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
 AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
+RETRY = 10.0  # control steps of another push, if the last one misses the goal
 LOST = 60.0  # control steps of a way that the table of ways does not have
 
 
@@ -110,6 +112,9 @@ class PushPlanner:
         measure: Score of final poses. None: the slider must cover 95 % of the goal.
         look_ahead: Whether to consider plans of two pushes.
         value: Cost to go. None: it is computed when it is first needed. False: the distance to the goal instead.
+        retry: If the library has several samples of friction: control steps that a last push costs more, times the
+            probability that it misses the goal. Other pushes are chosen by their mean outcome, because the next push
+            is planned from where they end.
     """
 
     def __init__(
@@ -124,12 +129,15 @@ class PushPlanner:
         measure: Measure | None = None,
         look_ahead: bool = True,
         value: CostToGo | bool | None = None,
+        retry: float = RETRY,
     ):
-        self.slider, self.radius, self.library = slider, radius, library
+        self.slider, self.radius, self.sampled, self.retry = slider, radius, library, retry
         self.goal, self.workspace, self.pace = np.asarray(goal, float), workspace, pace
         self.vertices, length = outline_vertices(slider.shape), library.length
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
+        self._weigh(None)
+        library = self.library
         starts = library.starts[:, :2]
         self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
         self.usable = np.isfinite(self.run_up)
@@ -141,6 +149,20 @@ class PushPlanner:
         self.ends = (starts[push] + self.travel[:, None] * library.directions[push]).astype(np.float32)
         self.coarse = np.flatnonzero((index % STRIDE == 0) & self.usable[push])
         self._value = value
+
+    def reweighted(self, weight: np.ndarray) -> "PushPlanner":
+        """Return a planner with other weights of the library's samples. It keeps the tables, and the cost to go.
+
+        Args:
+            weight: Weights of the samples, (samples,), which add up to one.
+        """
+        other = copy(self)
+        other._weigh(weight)
+        return other
+
+    def _weigh(self, weight: np.ndarray | None) -> None:
+        """Set the mean outcomes of pushes by weights of the library's samples."""
+        self.weight, self.library = weight, self.sampled.averaged(weight)
 
     @cached_property
     def value(self) -> CostToGo | None:
@@ -232,19 +254,29 @@ class PushPlanner:
         entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
         if not len(entries):
             return None
-        errors = compose(inverse(relative), self.library.relative[entries])
-        score = self.measure(errors)
-        cost = way_time[self.push[entries]] + self.push_time[entries] + self._shortfall(score)
-        cost = np.where(score > self.measure.enough, cost, np.inf)
+        risk, good = self._risk(inverse(relative), entries)
+        cost = np.where(good, way_time[self.push[entries]] + self.push_time[entries] + risk, np.inf)
         best = int(np.argmin(cost))
         if not np.isfinite(cost[best]):
             return None
         return Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
-    def _shortfall(self, score: np.ndarray) -> np.ndarray:
-        """Return control steps that stand for the risk of missing the goal by a push of a predicted score."""
-        margin = self.measure.enough + 0.6 * (1 - self.measure.enough)
-        return 200 * np.maximum(margin - score, 0)
+    def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the control steps that stand for the risk of missing the goal, and whether the goal may be reached.
+
+        Args:
+            back: Pose of the slider before the push, relative to the goal, (3,) or (pushes, 3).
+            entries: Last pushes, (pushes,).
+        """
+        enough = self.measure.enough
+        score = self.measure(compose(back, self.library.relative[entries]))
+        if len(self.sampled.outcomes) == 1:
+            margin = enough + 0.6 * (1 - enough)
+            return 200 * np.maximum(margin - score, 0), score > enough
+        push, index = self.library.entries[entries].T
+        reached = self.measure(compose(back, self.sampled.outcomes[:, push, index])) > enough
+        chance = np.average(reached, axis=0, weights=self.weight)
+        return self.retry * (1 - chance), (chance > 0) | (score > enough)
 
     def _more_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> list[Candidate]:
         """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
@@ -296,9 +328,9 @@ class PushPlanner:
         starts = self.library.starts[self.push[second], :2].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
-        errors = compose(inverse(wanted[first]), self.library.relative[second])
+        risk, _ = self._risk(inverse(wanted[first]), second)
         between = self.after_push[self.place[entries[first]], self.push[second]]
-        total = spent[first] + between + self.push_time[second] + self._shortfall(self.measure(errors))
+        total = spent[first] + between + self.push_time[second] + risk
         total = np.where(allowed, total, np.inf)
         k = int(np.argmin(total))
         if not np.isfinite(total[k]):

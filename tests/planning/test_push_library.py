@@ -136,6 +136,16 @@ def test_random_friction(slider, library):
     at_end = loose.valid[:, -1]
     assert at_end.sum() >= 4
     assert (wide[at_end, -1] > 3 * narrow[at_end, -1]).all()
+    weight = np.random.default_rng(4).dirichlet(np.ones(12))
+    mean = np.average(loose.outcomes.astype(float), axis=0, weights=weight)
+    np.testing.assert_allclose(loose.averaged(weight).outcomes[0], mean, atol=1e-5)
+    features = loose.features(loose.outcomes.astype(float))
+    about = features - np.average(features, axis=0, weights=weight)
+    wanted = np.sqrt(np.average((about**2).sum(-1), axis=0, weights=weight))
+    np.testing.assert_allclose(loose.final_spread(weight), wanted, atol=1e-4 * loose.length)
+    assert loose.final_spread(np.eye(12)[3]).max() < 1e-4 * loose.length
+    with pytest.raises(ValueError, match="weight"):
+        loose.averaged(np.ones(3) / 3)
     with pytest.raises(ValueError, match="key"):
         PushLibrary.simulate(slider, hand, starts, directions, model=pj.FrictionModel(10, 0.2), samples=2)
 

@@ -14,6 +14,7 @@ from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.controller import Observation, PushController
 from pushjax.planning.coverage_table import CoverageTable
 from pushjax.planning.finger_control import FingerState, PositionControl
+from pushjax.planning.friction_filter import FrictionBelief, FrictionFilter
 from pushjax.planning.pace import Pace
 from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_batch import LEG, simulate_pushes
@@ -42,11 +43,16 @@ class Outcome(NamedTuple):
     covered: float
     steps: int
     pushes: int
+    belief: FrictionBelief | None
 
 
-def play(made, seed, steps=150):
-    """Play one episode in a plant of this library's rollouts, from a random start without overlap."""
-    rng, slider, hand = np.random.default_rng(seed), made.planner.slider, pj.Hand.finger(RADIUS)
+def play(made, seed, steps=150, slider=None, friction=None):
+    """Play one episode in a plant of this library's rollouts, from a random start without overlap.
+
+    Limit surface and friction of the plant are those of the model, if they are not given.
+    """
+    rng, hand = np.random.default_rng(seed), pj.Hand.finger(RADIUS)
+    slider, friction = slider or made.planner.slider, made.friction if friction is None else friction
     while True:
         pose = np.array([*rng.uniform(0.12, 0.38, 2), rng.uniform(-3, 3)])
         finger = rng.uniform(0.05, 0.45, 2)
@@ -56,12 +62,12 @@ def play(made, seed, steps=150):
     for step in range(steps):
         action, memory = made(jax.random.key(seed), Observation(finger, pose), memory)
         path = finger + np.linspace(0, 1, LEG + 1)[:, None] * (action - finger)
-        poses, _ = simulate_pushes(slider, hand, path[None], pose[None], made.friction)
+        poses, _ = simulate_pushes(slider, hand, path[None], pose[None], friction)
         pose, finger = poses[0, -1].astype(float), action
         covered = float(made.planner.measure(compose(inverse(GOAL), pose)))
         if covered > ENOUGH:
-            return Outcome(covered, step + 1, memory.pushes)
-    return Outcome(covered, steps, memory.pushes)
+            return Outcome(covered, step + 1, memory.pushes, memory.belief)
+    return Outcome(covered, steps, memory.pushes, memory.belief)
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +81,43 @@ def test_a_rectangle_gets_to_the_goal(rectangle):
     outcomes = [play(rectangle, seed) for seed in range(8)]
     assert all(each.covered > ENOUGH for each in outcomes), outcomes
     assert np.median([each.steps for each in outcomes]) < 60
+
+
+@pytest.fixture(scope="module")
+def adapting(rectangle):
+    """A controller for the same rectangle that does not know its friction."""
+    slider, model, key = rectangle.planner.slider, pj.FrictionModel(20, (0.05, 0.5)), jax.random.key(5)
+    pushes = PushLibrary.build(slider, RADIUS, contacts=60, angles=5, model=model, samples=12, key=key)
+    planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
+    learning = FrictionFilter(slider, rectangle.hand, model, samples=12, effective=2.0)
+    prior = learning.init(key)
+    return PushController(planner, PositionControl(), friction=0.3, friction_filter=learning, prior=prior)
+
+
+def test_an_adapting_controller_finds_the_friction_of_the_plant(adapting):
+    """The plants have samples of the library; each of them comes to have most of the weight."""
+    found = []
+    for seed, sample in enumerate((2, 8)):
+        surface, mu = jax.tree.map(lambda leaf, k=sample: leaf[k], (adapting.prior.surface, adapting.prior.friction))
+        outcome = play(adapting, seed, slider=pj.Slider(adapting.planner.slider.shape, surface), friction=float(mu))
+        assert outcome.covered > ENOUGH
+        found.append(float(outcome.belief.weight[sample]))
+    assert min(found) > 0.4, found
+
+
+def test_weights_choose_among_the_samples_of_a_library(adapting):
+    """With all weight on one sample, pushes are chosen as from a library of that sample alone."""
+    planner, pose, finger = adapting.planner, np.array([0.38, 0.12, -2.0]), np.array([0.1, 0.4])
+    one = planner.reweighted(np.eye(12)[3])
+    np.testing.assert_allclose(one.library.relative, planner.sampled.outcomes[3][planner.sampled.valid], atol=1e-6)
+    assert one.value is planner.value
+    targets = [each.choose(pose, finger).target for each in (one, planner.reweighted(np.eye(12)[4]))]
+    assert not np.allclose(*targets)
+
+
+def test_a_filter_needs_a_prior(adapting):
+    with pytest.raises(ValueError, match="prior"):
+        PushController(adapting.planner, PositionControl(), prior=adapting.prior)
 
 
 def test_one_push_where_one_is_enough(rectangle):

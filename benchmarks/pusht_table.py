@@ -1,0 +1,190 @@
+"""PushT with real friction that the planner does not know: nominal, robust and adapting controllers.
+
+The plant is `pushjax.tasks.PushT` with the physics "table": in each episode the limit surface is another quartic around
+that of even pressure, and the friction of the finger is another too. An episode succeeds by the rule of gym-pusht: the
+T covers more than 95 % of the goal within 300 control steps. All controllers see exact poses, play the same episodes,
+and correct pushes while they run, unless `--no-feedback` is given.
+
+- `nominal`: plans and corrects with the mean friction.
+- `robust`: plans with the mean outcomes of pushes under samples of friction, and prefers last pushes that reach the
+  goal under many of them.
+- `adapting`: the same, and a filter weights the samples by the motions that are seen.
+"""
+
+import time
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+import pushjax as pj
+from pushjax._internal.checks import check_count
+from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.record import result_record
+from pushjax.experiments.pusht_mpc import setting
+from pushjax.experiments.pusht_mpc.player import cache_folder
+from pushjax.planning import CoverageTable, PushController, PushLibrary, PushPlanner
+from pushjax.planning.controller import Observation
+from pushjax.planning.friction_filter import FrictionFilter
+from pushjax.planning.push_library import digest, fan
+from pushjax.tasks import PushT
+
+Controller = Literal["nominal", "robust", "adapting"]
+CONTROLLERS: tuple[Controller, ...] = ("nominal", "robust", "adapting")
+SUBSTEPS = 10  # of the plant
+HAND = pj.Hand.finger(setting.FINGER_RADIUS)
+ERROR, RELATIVE_ERROR = 5e-4, 0.1  # of a motion, for the filter, m; the plant has no noise, but the model is coarser
+
+
+@dataclass
+class Episode:
+    """One episode: whether it succeeded, its number of control steps and of pushes, and processor times, s."""
+
+    success: bool = False
+    steps: int = 0
+    pushes: int = 0
+    coverage: float = 0.0
+    seconds: list[float] = field(default_factory=list)
+
+
+def run(
+    episodes: int = 100,
+    samples: int = 32,
+    dof: float = 20.0,
+    friction: tuple[float, float] = (0.15, 0.45),
+    feedback: bool = True,
+    controller: tuple[Controller, ...] = CONTROLLERS,
+    seed: int = 0,
+    progress: ProgressCallback = no_progress,
+) -> dict[str, Any]:
+    """Play episodes of PushT whose friction is not known.
+
+    Args:
+        episodes: Number of episodes of each controller.
+        samples: Number of samples of friction of the library and of the filter.
+        dof: Degrees of freedom of the limit surface.
+        friction: Lowest and highest coefficient of friction of the finger.
+        feedback: Whether pushes are corrected while they run.
+        controller: Which controllers.
+        seed: Seed of the first episode.
+        progress: Called with the number of episodes done and their total.
+
+    Returns:
+        The record, with a row for each controller.
+    """
+    check_count("episodes", episodes)
+    model = pj.FrictionModel(dof, friction, "sum_of_squares")
+    env = PushT(substeps=SUBSTEPS)
+    params = env.params("table", model=model)
+    step, played, rows = jax.jit(env.step_env), {}, []
+    for name in controller:
+        began = time.process_time()
+        made = _controller(name, params.slider, model, samples, feedback)
+        setup = time.process_time() - began
+        each = []
+        for k in range(episodes):
+            each.append(_play(env, step, params, made, seed + k))
+            progress(len(played) * episodes + k + 1, len(controller) * episodes)
+        played[name] = each
+        rows.append(_row(name, each, played.get("nominal"), setup))
+    settings = {"episodes": episodes, "samples": samples, "dof": dof, "friction": friction}
+    return result_record("pusht-table", settings | {"feedback": feedback, "seed": seed}, rows=rows)
+
+
+def _controller(
+    name: Controller, slider: pj.Slider, model: pj.FrictionModel, samples: int, feedback: bool
+) -> PushController:
+    """Build a controller. Libraries of pushes are kept in the user's cache folder."""
+    key, mean = jax.random.key(10**6), float(np.mean(np.asarray(model.friction)))
+    starts, directions = fan(slider, setting.FINGER_RADIUS)
+    known: dict[str, Any] = {"friction": mean}
+    if name != "nominal":
+        known = {"model": model, "samples": samples, "key": key}
+    wanted = digest(slider, HAND, starts, directions, **known)
+    path = cache_folder() / f"pushes-{wanted[:16]}.npz"
+    if path.exists():
+        library = PushLibrary.load(path, wanted)
+    else:
+        library = PushLibrary.simulate(slider, HAND, starts, directions, **known)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        library.save(path)
+    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
+    measure = CoverageTable(vertices, library.center, library.length, setting.ENOUGH)
+    planner = PushPlanner(
+        slider,
+        setting.FINGER_RADIUS,
+        library,
+        setting.goal(),
+        setting.workspace(),
+        setting.pace(),
+        measure=measure,
+    )
+    planner.prepare()
+    learning = {}
+    if name == "adapting":
+        settings = FrictionFilter(slider, HAND, model, samples=samples, error=ERROR, relative_error=RELATIVE_ERROR)
+        learning = {"friction_filter": settings, "prior": settings.init(key)}
+    made = PushController(planner, setting.finger_control(), friction=mean, feedback=feedback, **learning)
+    made.prepare()
+    return made
+
+
+def _play(env: PushT, step: Any, params: Any, made: PushController, seed: int) -> Episode:
+    """Play one episode; the start and the friction follow from the seed."""
+    key = jax.random.key(seed)
+    _, state = env.reset(key, params)
+    memory, episode = made.initial_memory(), Episode()
+    while episode.steps < setting.STEPS:
+        pose = np.asarray(state.pose, float) * [setting.PIXEL, setting.PIXEL, 1]
+        began = time.process_time()
+        seen = Observation(setting.PIXEL * np.asarray(state.hand, float), pose)
+        action, memory = made(key, seen, memory)
+        episode.seconds.append(time.process_time() - began)
+        _, state, _, done, info = step(key, state, np.asarray(action / setting.PIXEL, np.float32), params)
+        episode.steps += 1
+        episode.coverage = float(info["coverage"])
+        if bool(done):
+            episode.success = episode.coverage > setting.ENOUGH
+            break
+    episode.pushes = memory.pushes
+    return episode
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a probability, from the number of successes."""
+    z, share = 1.959964, successes / count
+    center, width = share + z**2 / (2 * count), z * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    return float((center - width) / (1 + z**2 / count)), float((center + width) / (1 + z**2 / count))
+
+
+def _row(name: str, played: list[Episode], nominal: list[Episode] | None, setup: float) -> dict[str, Any]:
+    """Return the figures of a controller; those that failed count with the steps that they took."""
+    steps, successes = np.array([each.steps for each in played], float), sum(each.success for each in played)
+    times = np.concatenate([each.seconds for each in played])
+    row: dict[str, Any] = {"controller": name, "episodes": len(played), "successes": successes}
+    row |= {"success_ci95": wilson(successes, len(played)), "steps_mean": float(steps.mean())}
+    row |= {"steps_median": float(np.median(steps)), "steps_95": float(np.percentile(steps, 95))}
+    row |= {"pushes_mean": float(np.mean([each.pushes for each in played])), "setup_processor_s": setup}
+    row |= {"step_ms": 1e3 * float(times.mean()), "step_95_ms": 1e3 * float(np.percentile(times, 95))}
+    row["steps"] = steps.tolist()
+    if nominal is not None and name != "nominal":
+        less = np.array([each.steps for each in nominal]) - steps
+        row |= {"fewer_steps": float(less.mean()), "fewer_steps_error": float(less.std(ddof=1) / np.sqrt(len(less)))}
+    return row
+
+
+def summary(record: dict[str, Any]) -> str:
+    """Return the text that the command prints."""
+    lines = [
+        f"{'controller':12}{'success':>28}{'steps (median, mean, 95 %)':>28}{'pushes':>8}{'fewer steps':>16}{'ms':>6}"
+    ]
+    for row in record["rows"]:
+        low, high = row["success_ci95"]
+        success = f"{row['successes']} of {row['episodes']} ({low:.3f} to {high:.3f})"
+        steps = f"{row['steps_median']:g}, {row['steps_mean']:.1f}, {row['steps_95']:.0f}"
+        fewer = f"{row['fewer_steps']:.1f} ± {row['fewer_steps_error']:.1f}" if "fewer_steps" in row else ""
+        lines.append(
+            f"{row['controller']:12}{success:>28}{steps:>28}{row['pushes_mean']:8.1f}{fewer:>16}{row['step_ms']:6.0f}"
+        )
+    return "\n".join(lines)

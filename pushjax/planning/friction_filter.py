@@ -1,0 +1,248 @@
+"""Friction from what is seen: samples of friction, weighted by how well they explain the motions of the slider.
+
+It is a particle filter. Each sample is a limit surface and a coefficient of contact friction, drawn from a
+`FrictionModel`. A motion that is seen, from one pose to another along a path of the hand, is simulated under each
+sample. The likelihood of the pose that is seen after it is Student's distribution about the simulated pose. Its scale
+combines the error of poses and a fraction of the motion, for what no sample can explain: contact points, and friction
+that varies over the table.
+
+A few samples never contain the truth. If each were judged by the whole evidence, soon one would carry all the weight,
+however wrong it is. So the likelihood of all motions together is taken to the largest power, up to one, that leaves a
+number of effective samples (tempering). Samples are not drawn again. Friction is constant, and draws that are new
+know nothing of the motions before them: with resampling, intervals are far too narrow.
+
+A limit surface and its multiples move a slider alike. So poses say nothing about the scale of the surface.
+
+Reference: Gordon, Salmond & Smith 1993, the particle filter; Neal 2001, tempering.
+"""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_count,
+    check_finite,
+    check_non_negative,
+    check_positive,
+    check_shape,
+    check_type,
+    concrete,
+)
+from pushjax._internal.jit import quick_jit
+from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.random import FrictionModel
+from pushjax.planning.draws import draw_friction
+from pushjax.simulation.hand import Hand
+from pushjax.simulation.rollout import rollout
+from pushjax.simulation.slider import Slider
+
+STUDENT_DOF = 4.0  # of the errors: a motion that is far off makes no weight vanish for good
+POWERS = 2.0 ** -np.arange(0, 12.5, 0.5)  # of the likelihood
+LOST = 10.0  # scales of the error beyond which a motion is not explained by a sample
+
+
+class BeliefStatus(IntEnum):
+    """What the last motion did to a belief.
+
+    Attributes:
+        PRIOR: Nothing was seen yet.
+        UPDATED: The weights were updated.
+        UNEXPLAINED: No sample explains the motion, or a number was not finite. The belief is as it was.
+    """
+
+    PRIOR = 0
+    UPDATED = 1
+    UNEXPLAINED = 2
+
+
+class FrictionBelief(NamedTuple):
+    """Weighted samples of friction.
+
+    Attributes:
+        surface: Limit surfaces, with a leading axis of samples.
+        friction: Coefficients of contact friction, (samples,).
+        evidence: Log likelihood of the motions that were seen so far, (samples,).
+        weight: Weights, (samples,), which add up to one.
+        status: `BeliefStatus` of the last motion.
+    """
+
+    surface: LimitSurface
+    friction: Float[Array, "samples"]
+    evidence: Float[Array, "samples"]
+    weight: Float[Array, "samples"]
+    status: Int[Array, ""]
+
+    def mean(self) -> tuple[LimitSurface, Float[Array, ""]]:
+        """Return the weighted means of the limit surfaces and of the coefficients of friction."""
+        return jax.tree.map(lambda leaf: jnp.tensordot(self.weight, leaf, 1), (self.surface, self.friction))
+
+    def effective(self) -> Float[Array, ""]:
+        """Return the number of samples of equal weight that would be as good (Kish's effective sample size)."""
+        return _effective(self.weight)
+
+    def drawn(self, key: PRNGKeyArray, count: int) -> tuple[LimitSurface, Float[Array, "count"]]:
+        """Draw samples by their weights.
+
+        Args:
+            key: PRNG key.
+            count: Number of draws.
+
+        Returns:
+            Limit surfaces with a leading axis of draws, and coefficients of friction, (count,).
+        """
+        rows = _systematic(key, self.weight, count)
+        return jax.tree.map(lambda leaf: leaf[rows], (self.surface, self.friction))
+
+
+class FrictionFilter(eqx.Module):
+    """Settings of the filter.
+
+    `init` and `update` are pure functions, compiled, and may be part of other programs and of batches.
+
+    Args:
+        slider: The slider; its surface is the mean of the sampled surfaces.
+        hand: The hand.
+        model: Distribution of friction; its `resample_every` must be None.
+        samples: Number of samples.
+        effective: Number of effective samples that tempering leaves.
+        error: Standard deviation of the error of a motion that is seen, in x, y and length * theta, m. It includes the
+            errors of both poses.
+        relative_error: Further error, as a fraction of the motion.
+
+    Raises:
+        ValueError: If a number is out of its range.
+        TypeError: If an argument is of another type.
+    """
+
+    slider: Slider
+    hand: Hand
+    model: FrictionModel
+    effective: Float[Array, ""]
+    error: Float[Array, ""]
+    relative_error: Float[Array, ""]
+    samples: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        slider: Slider,
+        hand: Hand,
+        model: FrictionModel,
+        *,
+        samples: int = 128,
+        effective: ArrayLike = 6.0,
+        error: ArrayLike = 5e-4,
+        relative_error: ArrayLike = 0.05,
+    ):
+        check_type("slider", slider, Slider)
+        check_type("hand", hand, Hand)
+        check_type("model", model, FrictionModel)
+        check_count("samples", samples)
+        self.slider, self.hand, self.model, self.samples = slider, hand, model, samples
+        numbers = {"effective": effective, "error": error, "relative_error": relative_error}
+        for name, value in numbers.items():
+            number = as_float(value, slider.surface.length.dtype, name)
+            check_shape(name, number, ())
+            check_finite(name, number)
+            (check_non_negative if name == "relative_error" else check_positive)(name, number)
+            setattr(self, name, number)
+        most = concrete(self.effective)
+        if most is not None and not 1 <= most <= samples:
+            raise ValueError(f"effective must be from 1 to the number of samples, {samples}; got {effective!r}")
+
+    def init(self, key: PRNGKeyArray) -> FrictionBelief:
+        """Draw the samples of `draw_friction` with this key, with equal weights."""
+        draws = draw_friction(key, self.slider.surface, self.model, self.samples)
+        surface, friction = jax.tree.map(lambda leaf: leaf[:, 0], (draws.surface, draws.friction))
+        weight = jnp.full((self.samples,), 1 / self.samples, self.error.dtype)
+        status = jnp.asarray(BeliefStatus.PRIOR, jnp.int32)
+        return FrictionBelief(surface, friction, jnp.zeros_like(weight), weight, status)
+
+    def update(self, belief: FrictionBelief, before: ArrayLike, path: ArrayLike, after: ArrayLike) -> FrictionBelief:
+        """Update a belief by a motion that was seen.
+
+        Args:
+            belief: The belief.
+            before: Pose of the slider that was seen at the start, (3,), world, m and rad.
+            path: Configurations of the hand in between, (steps + 1, dof), world, m.
+            after: Pose of the slider that was seen at the end, (3,), world, m and rad.
+
+        Returns:
+            The belief after it; its status says what was done.
+
+        Raises:
+            ValueError: If a shape is wrong.
+        """
+        dtype = self.error.dtype
+        start, end = as_float(before, dtype, "before"), as_float(after, dtype, "after")
+        check_shape("before", start, (3,))
+        check_shape("after", end, (3,))
+        hand_path = as_float(path, dtype, "path")
+        check_shape("path", hand_path, ("steps + 1", self.hand.dof))
+        return _update(self, belief, start, hand_path, end)
+
+
+@quick_jit
+def _update(
+    settings: FrictionFilter, belief: FrictionBelief, before: Array, path: Array, after: Array
+) -> FrictionBelief:
+    finite = jnp.all(jnp.isfinite(before)) & jnp.all(jnp.isfinite(after)) & jnp.all(jnp.isfinite(path))
+    squared = jnp.where(finite, _squared_errors(settings, belief, before, path, after), jnp.inf)
+    simulated = jnp.isfinite(squared)
+    likelihood = -(STUDENT_DOF + 3) / 2 * jnp.log1p(jnp.where(simulated, squared, 0.0) / STUDENT_DOF)
+    evidence = belief.evidence + jnp.where(simulated, likelihood, -jnp.inf)
+    possible = jnp.any(squared < LOST**2) & jnp.any(jnp.isfinite(evidence))
+    evidence = jnp.where(possible, evidence, belief.evidence)
+    weight = jnp.where(possible, _tempered(jnp.where(possible, evidence, 0.0), settings.effective), belief.weight)
+    status = jnp.where(possible, BeliefStatus.UPDATED, BeliefStatus.UNEXPLAINED).astype(jnp.int32)
+    return FrictionBelief(belief.surface, belief.friction, evidence, weight, status)
+
+
+def _tempered(evidence: Float[Array, "samples"], effective: Float[Array, ""]) -> Float[Array, "samples"]:
+    """Return weights from the largest of `POWERS` of the likelihood that leaves enough effective samples."""
+    weights = jax.nn.softmax(jnp.asarray(POWERS, evidence.dtype)[:, None] * evidence[None], axis=1)
+    enough = jax.vmap(_effective)(weights) >= effective
+    return weights[jnp.where(jnp.any(enough), jnp.argmax(enough), len(POWERS) - 1)]
+
+
+def _effective(weight: Float[Array, "samples"]) -> Float[Array, ""]:
+    return 1 / jnp.maximum(jnp.sum(weight**2), jnp.finfo(weight.dtype).tiny)
+
+
+def _squared_errors(
+    settings: FrictionFilter, belief: FrictionBelief, before: Array, path: Array, after: Array
+) -> Float[Array, "samples"]:
+    """Return the squared distance of the simulated from the seen pose under each sample, in scales of the error.
+
+    It is infinite where the simulation failed.
+    """
+
+    length = settings.slider.surface.length
+    scale = settings.error**2 + settings.relative_error**2 * _distance_squared(before, after, length)
+
+    def squared_error(surface: LimitSurface, mu: Array) -> Float[Array, ""]:
+        push = rollout(Slider(settings.slider.shape, surface), settings.hand, path, pose=before, friction=mu)
+        return jnp.where(jnp.any(push.failed), jnp.inf, _distance_squared(push.pose[-1], after, length) / scale)
+
+    return jax.vmap(squared_error)(belief.surface, belief.friction)
+
+
+def _distance_squared(a: Float[Array, "3"], b: Float[Array, "3"], length: Array) -> Float[Array, ""]:
+    """Return the squared distance of two poses, m^2; an angle counts with its smaller way round."""
+    x, y, theta = a - b
+    turn = theta - 2 * jnp.pi * jnp.round(theta / (2 * jnp.pi))
+    return x**2 + y**2 + (length * turn) ** 2
+
+
+def _systematic(key: PRNGKeyArray, weight: Float[Array, "samples"], count: int) -> Int[Array, "count"]:
+    """Return indices such that each appears within one of `count` times its weight."""
+    places = (jax.random.uniform(key, (), weight.dtype) + jnp.arange(count, dtype=weight.dtype)) / count
+    rows = jnp.searchsorted(jnp.cumsum(weight), places)
+    return jnp.minimum(rows, weight.shape[0] - 1)
