@@ -59,6 +59,7 @@ MODULES = {
         "pusht",
         "robust_plans",
         "solvers",
+        "squeezes",
         "stable_pushes",
     )
 } | {"table1_causes": "robot.causes", "table1_spread": "robot.spread"}
