@@ -1,13 +1,14 @@
 """Draw the pictures and animations of the documentation.
 
-    python docs/pictures.py [push grasp stochastic limit_surfaces motion_cone real] [--to FOLDER] [--suffix .gif]
+    python docs/pictures.py [push grasp stochastic pusht limit_surfaces motion_cone real] [--to FOLDER] [--suffix .gif]
 
-Without a name, all are drawn; this takes two minutes, most of it for compiling. `real` needs PUSHJAX_DATA and is left
-out without it.
+Without a name, all are drawn; this takes three minutes, most of it for compiling. `real` needs PUSHJAX_DATA and `pusht`
+needs gym-pusht; without, they are left out.
 """
 
 import argparse
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 
 import matplotlib as mpl
@@ -74,6 +75,13 @@ def stochastic() -> plot.Animation:
     return plot.animate_cloud(slider.shape, hand, path, np.asarray(many.trajectory), title=title)
 
 
+def pusht() -> plot.Animation:
+    """Draw PushT in gym-pusht, solved by the planner of `pushjax reproduce pusht-mpc`."""
+    import pusht_picture  # beside this file
+
+    return pusht_picture.animation()
+
+
 def limit_surfaces() -> Figure:
     """Draw the ellipsoid and the quartic of a square on four corners, with the twists of wrenches as arrows."""
     block = pj.Polygon.rectangle(demo.SIDE, demo.SIDE)
@@ -117,7 +125,12 @@ def real() -> Figure:
     return plot.real_figure(block, shown, hand)
 
 
-MOVING: dict[str, Callable[[], plot.Animation]] = {"push": push, "grasp": grasp, "stochastic": stochastic}
+MOVING: dict[str, Callable[[], plot.Animation]] = {
+    "push": push,
+    "grasp": grasp,
+    "stochastic": stochastic,
+    "pusht": pusht,
+}
 STILL: dict[str, Callable[[], Figure]] = {
     "limit_surfaces": limit_surfaces,
     "motion_cone": motion_cone,
@@ -134,7 +147,7 @@ def main() -> None:
     unknown = [name for name in arguments.names if name not in MOVING | STILL]
     if unknown:
         parser.error(f"no picture is named {', '.join(unknown)}; there are {', '.join(MOVING | STILL)}")
-    without = [] if find_data() else ["real"]
+    without = ([] if find_data() else ["real"]) + ([] if find_spec("gym_pusht") else ["pusht"])
     for name in arguments.names or [name for name in MOVING | STILL if name not in without]:
         suffix = arguments.suffix if name in MOVING else ".png"
         path = plot.save((MOVING | STILL)[name](), arguments.to / f"{name}{suffix}")
