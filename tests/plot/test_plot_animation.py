@@ -322,7 +322,8 @@ def test_pictures_of_the_documentation(capsys, monkeypatch, tmp_path):
     with pytest.raises(SystemExit):
         pictures.main()
     last = capsys.readouterr().err.splitlines()[-1]
-    assert "no picture is named pusch; there are push, grasp, stochastic, pusht, limit_surfaces, motion_cone, real" in last
+    names = "push, grasp, stochastic, pusht, limit_surfaces, motion_cone, real"
+    assert f"no picture is named pusch; there are {names}" in last
     monkeypatch.setattr(pictures, "MOVING", {"push": lambda: plot.animate(PLAIN, pj.Hand.finger(RADIUS), recorded(4))})
     monkeypatch.setattr(pictures, "STILL", {})
     monkeypatch.setattr("sys.argv", ["pictures.py", "--to", str(tmp_path), "--suffix", ".html"])
