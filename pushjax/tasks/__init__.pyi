@@ -2,7 +2,13 @@ from .environment import Environment as Environment
 from .environment import FiveValues as FiveValues
 from .environment import TaskParams as TaskParams
 from .environment import TaskState as TaskState
+from .push_along_wall import PushAlongWall as PushAlongWall
+from .push_box import PushBox as PushBox
 from .push_t import PushT as PushT
 from .push_t import PushTParams as PushTParams
+from .push_two_fingers import PushTwoFingers as PushTwoFingers
 from .spaces import Box as Box
 from .spaces import Dict as Dict
+from .squeeze import Squeeze as Squeeze
+from .table_task import TableParams as TableParams
+from .table_task import TableTask as TableTask

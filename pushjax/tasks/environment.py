@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape
 from pushjax._internal.compaction import where_needed
@@ -24,6 +24,7 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.control_step import Pushed, control_step
+from pushjax.tasks.parts import with_noise
 from pushjax.tasks.spaces import Space
 
 
@@ -57,7 +58,7 @@ class TaskParams(_Replaceable):
         surfaces: The distribution of limit surfaces that `model` has around that of the slider; None for none.
         position_noise: Standard deviation of the noise on observed positions, length unit of the task; None for none.
         angle_noise: Standard deviation of the noise on the observed angle, rad; None for none.
-        action_noise: Standard deviation of the noise on actions, length unit of the task; None for none.
+        action_noise: Standard deviation of the noise on actions, in their unit; None for none.
         success_coverage: Coverage of the goal above which an episode terminates.
         max_steps_in_episode: Number of control steps after which an episode is truncated.
     """
@@ -102,7 +103,8 @@ class Environment(ABC):
     """An environment with the interface of gymnax 1.x.
 
     `reset` and `step` are compiled; under `jit` and `vmap` they are part of the surrounding program. A task defines
-    `default_params`, `draw_start`, `walk`, `goal_coverage`, `observe` and the spaces.
+    `default_params`, `draw_start`, `walk`, `goal_coverage`, `observe` and the spaces. It may define other `measures`
+    and another `reward`.
     """
 
     METERS: ClassVar[float] = 1.0  # m, length unit of the task
@@ -162,6 +164,29 @@ class Environment(ABC):
         """Return the walls that the slider may touch in a control step, m."""
         return ()
 
+    def measures(self, state: TaskState, params: Any) -> dict[str, Array]:
+        """Return what `info` says about a state: "coverage" of the goal, and whether that "is_success"."""
+        coverage = self.goal_coverage(state, params)
+        return {"coverage": coverage, "is_success": coverage > params.success_coverage}
+
+    def reward(self, state: TaskState, measures: dict[str, Array], params: Any) -> Float[Array, ""]:
+        """Return the reward of a control step that ends in a state with these `measures`."""
+        return jnp.clip(measures["coverage"] / params.success_coverage, 0, 1)
+
+    def picture(self, state: TaskState, action: Array | None, params: Any, size: int) -> UInt8[Array, "size size 3"]:
+        """Return a picture of a state, `size` pixels wide and high.
+
+        Args:
+            state: The state.
+            action: The action that led to it; None for none.
+            params: The parameters.
+            size: Width and height.
+
+        Raises:
+            NotImplementedError: If the task has no pictures.
+        """
+        raise NotImplementedError(f"{self.name} has no pictures")
+
     def reset(self, key: PRNGKeyArray, params: Any = None) -> tuple[Any, TaskState]:
         """Start an episode.
 
@@ -216,16 +241,16 @@ class Environment(ABC):
             params: The parameters.
 
         Returns:
-            Observation, state, reward, whether the episode terminated, and a dictionary. It has the "coverage" of the
-            goal, whether that "is_success", and "status", the number of steps of the simulator with each `Status`,
-            (7,). A step that is JAMMED stops the hand for the rest of the control step; the slider stays.
+            Observation, state, reward, whether the episode terminated, and a dictionary. It has the `measures` of the
+            state, among them the "coverage" of the goal and "is_success", and "status", the number of steps of the
+            simulator with each `Status`, (7,). A step that is JAMMED stops the hand for the rest of the control step;
+            the slider stays.
         """
         key_action, key_observation = jax.random.split(key)
-        target = as_float(action, state.hand.dtype, "action")
-        check_shape("action", target, self.action_space(params).shape)
-        if params.action_noise is not None:
-            target = target + params.action_noise * jax.random.normal(key_action, target.shape, target.dtype)
-        path, velocity = self.walk(state, target)
+        given = as_float(action, state.hand.dtype, "action")
+        check_shape("action", given, self.action_space(params).shape)
+        command = with_noise(key_action, given, params.action_noise)
+        path, velocity = self.walk(state, command)
         pushed = self._pushed(state, path, params)
         stopped = jnp.any((pushed.status == Status.JAMMED) | (pushed.status == Status.GRASPED))
         new_state = state.replace(
@@ -234,12 +259,11 @@ class Environment(ABC):
             velocity=jnp.where(stopped, 0.0, velocity),
             time=state.time + 1,
         )
-        coverage = self.goal_coverage(new_state, params)
-        success = coverage > params.success_coverage
-        reward = jnp.clip(coverage / params.success_coverage, 0, 1)
+        measures = self.measures(new_state, params)
+        reward = self.reward(new_state, measures, params)
         counts = jnp.stack([jnp.sum(pushed.status == status, dtype=jnp.int32) for status in Status])
-        info = {"coverage": coverage, "is_success": success, "status": counts}
-        return self.observe(key_observation, new_state, target, params), new_state, reward, success, info
+        observation = self.observe(key_observation, new_state, command, params)
+        return observation, new_state, reward, measures["is_success"], measures | {"status": counts}
 
     def _pushed(self, state: TaskState, path: Array, params: Any) -> Pushed:
         """What the hand's path leaves, m."""
@@ -255,8 +279,8 @@ class Environment(ABC):
         )
 
     def is_terminated(self, state: TaskState, params: Any) -> Bool[Array, ""]:
-        """Whether the slider covers the goal."""
-        return self.goal_coverage(state, params) > params.success_coverage
+        """Whether the task is done."""
+        return self.measures(state, params)["is_success"]
 
     def is_truncated(self, state: TaskState, params: Any) -> Bool[Array, ""]:
         """Whether the time limit is reached."""

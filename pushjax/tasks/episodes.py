@@ -11,7 +11,6 @@ from pushjax._internal.compaction import where_needed
 from pushjax._internal.jit import jit, quick_jit
 from pushjax.contact.status import Status
 from pushjax.tasks.environment import Environment, TaskState
-from pushjax.tasks.render import render
 
 
 @quick_jit
@@ -23,11 +22,7 @@ def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, .
         at_row = task.state_of(row, params)
         state = state.replace(pose=at_row.pose, hand=at_row.hand)
         observation = task.observe(noise_key, state, None, params)
-    info = {
-        "coverage": task.goal_coverage(state, params),
-        "is_success": task.is_terminated(state, params),
-        "status": jnp.zeros(len(Status), jnp.int32),
-    }
+    info = task.measures(state, params) | {"status": jnp.zeros(len(Status), jnp.int32)}
     return key, observation, state, info
 
 
@@ -90,7 +85,6 @@ def merged(mask: np.ndarray, new: Any, old: Any) -> Any:
 
 
 @quick_jit
-def picture(task: Any, state: TaskState, action: Array | None, params: Any, size: int) -> Array:
-    """Return the picture of a state, with a cross at an action unless that is None."""
-    block, goal = task.vertices(state, params), task.goal_vertices(params)
-    return render(block, goal, state.hand, action, size=size, seams=getattr(params, "seams", ()))
+def picture(task: Environment, state: TaskState, action: Array | None, params: Any, size: int) -> Array:
+    """Return the picture of a state."""
+    return task.picture(state, action, params, size)

@@ -1,7 +1,7 @@
 """The tasks as environments of Gymnasium, one or many. Needs Gymnasium 1.1 or later: `pip install '.[gym]'`.
 
-An import registers "pushjax/PushT-v0", with which `gymnasium.make` and `gymnasium.make_vec` work. Without the import,
-"pushjax.tasks.gym:pushjax/PushT-v0" does the same.
+An import registers "pushjax/PushT-v0" and the other tasks, with which `gymnasium.make` and `gymnasium.make_vec` work.
+Without the import, "pushjax.tasks.gym:pushjax/PushT-v0" does the same.
 
 Batches are computed by one compiled step. They start, step and end as those of Gymnasium's `SyncVectorEnv` over single
 environments, with the same random numbers.
@@ -29,17 +29,23 @@ except ImportError as error:
     raise ImportError(f"pushjax.tasks.gym needs Gymnasium 1.1 or later: pip install '.[gym]' ({error})") from None
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-REGISTERED = ("PushT",)
+REGISTERED = {
+    "PushT": 300,
+    "PushBox": 100,
+    "PushAlongWall": 100,
+    "PushTwoFingers": 100,
+    "Squeeze": 100,
+}  # control steps
 
 
 class TaskEnv(gymnasium.Env):
     """A task as an environment of Gymnasium.
 
-    `info` has the "coverage" of the goal, whether that "is_success", and "status", the number of steps of the simulator
-    with each `Status`. After a reset the last is zero.
+    `info` has the `measures` of the task, among them the "coverage" of the goal and "is_success"; and "status", the
+    number of steps of the simulator with each `Status`. After a reset the last is zero.
 
-    An environment that `gymnasium.make` returns is truncated after the `max_episode_steps` given there, 300 by default.
-    Otherwise `max_steps_in_episode` of the parameters counts.
+    An environment that `gymnasium.make` returns is truncated after the `max_episode_steps` given there, which is 300 by
+    default for "PushT" and 100 for the others. Otherwise `max_steps_in_episode` of the parameters counts.
 
     Args:
         task: The task, or the name of one in `pushjax.tasks`.
@@ -358,11 +364,11 @@ def _final(observations: Any, info: dict[str, Array], ended: np.ndarray) -> dict
     return {"final_obs": final, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}
 
 
-for _name in REGISTERED:
+for _name, _steps in REGISTERED.items():
     gymnasium.register(
         f"pushjax/{_name}-v0",
         entry_point="pushjax.tasks.gym:TaskEnv",
         vector_entry_point="pushjax.tasks.gym:TaskVectorEnv",
-        max_episode_steps=300,
+        max_episode_steps=_steps,
         kwargs={"task": _name},
     )

@@ -23,15 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_finite,
-    check_non_negative,
-    check_shape,
-    check_type,
-)
-from pushjax._math.vec import Vec2, cos_sin
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, check_type
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.random import FrictionModel
 from pushjax.geometry.intersection import intersection_area
@@ -40,6 +32,8 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.environment import Environment, TaskParams, TaskState
+from pushjax.tasks.parts import placed, shared_params, with_noise
+from pushjax.tasks.render import render
 from pushjax.tasks.spaces import Box, Dict, Space
 
 Observation = Literal["state", "environment_state_agent_pos", "pixels", "pixels_agent_pos"]
@@ -163,24 +157,12 @@ class PushT(Environment):
         """
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be of {', '.join(get_args(Physics))}; got {physics!r}")
-        if not max_steps_in_episode >= 1:
-            raise ValueError(f"max_steps_in_episode must be at least 1; got {max_steps_in_episode!r}")
         slider, origin, keypoints = _block(block, physics, self.METERS)
         if friction is None and physics == "table":
             friction = TABLE_FRICTION
-        if model is not None:
-            check_type("model", model, FrictionModel)
+        noise = {"position_noise": position_noise, "angle_noise": angle_noise, "action_noise": action_noise}
         return PushTParams(
-            slider=slider,
-            friction=None if friction is None else _checked("friction", friction, ()),
-            goal=_checked("goal", goal, (3,), signed=True),
-            model=model,
-            surfaces=None if model is None else model.around(slider.surface),
-            position_noise=None if position_noise is None else _checked("position_noise", position_noise, ()),
-            angle_noise=None if angle_noise is None else _checked("angle_noise", angle_noise, ()),
-            action_noise=None if action_noise is None else _checked("action_noise", action_noise, ()),
-            success_coverage=as_float(0.95),
-            max_steps_in_episode=int(max_steps_in_episode),
+            **shared_params(slider, goal, friction, model, noise, 0.95, max_steps_in_episode),
             origin=origin,
             corners=slider.shape.vertices / self.METERS,  # pyright: ignore[reportAttributeAccessIssue]
             keypoints=keypoints,
@@ -245,15 +227,15 @@ class PushT(Environment):
 
     def vertices(self, state: TaskState, params: PushTParams) -> Float[Array, "vertices 2"]:
         """Return the corners of the block, world, px."""
-        return _placed(params.corners, state.pose)
+        return placed(params.corners, state.pose)
 
     def goal_vertices(self, params: PushTParams) -> Float[Array, "vertices 2"]:
         """Return the corners of the block at the goal, world, px."""
-        return _placed(params.corners - params.origin[None], params.goal)
+        return placed(params.corners - params.origin[None], params.goal)
 
     def block_pose(self, state: TaskState, params: PushTParams) -> Float[Array, "3"]:
         """Return the pose of the block's own frame, world, px and rad."""
-        return jnp.concatenate([_placed(params.origin[None], state.pose)[0], state.pose[2:]])
+        return jnp.concatenate([placed(params.origin[None], state.pose)[0], state.pose[2:]])
 
     def goal_coverage(self, state: TaskState, params: PushTParams) -> Float[Array, ""]:
         """Return which fraction of the block's area lies on the goal."""
@@ -266,12 +248,14 @@ class PushT(Environment):
             pose = self.block_pose(state, params)
             return jnp.concatenate([state.hand, pose[:2], jnp.mod(pose[2:], 2 * jnp.pi)])
         if self.observation == "environment_state_agent_pos":
-            return {"environment_state": _placed(params.keypoints, state.pose).ravel(), "agent_pos": state.hand}
-        from pushjax.tasks.render import render
-
-        block, goal = self.vertices(state, params), self.goal_vertices(params)
-        pixels = render(block, goal, state.hand, size=self.image_size, seams=params.seams)
+            return {"environment_state": placed(params.keypoints, state.pose).ravel(), "agent_pos": state.hand}
+        pixels = self.picture(state, None, params, self.image_size)
         return pixels if self.observation == "pixels" else {"pixels": pixels, "agent_pos": state.hand}
+
+    def picture(self, state: TaskState, action: Array | None, params: PushTParams, size: int) -> Array:
+        """Return a picture of a state in the colors of gym-pusht, with a cross at the action."""
+        block, goal = self.vertices(state, params), self.goal_vertices(params)
+        return render(block, goal, state.hand, action, size=size, seams=params.seams)
 
     def state_of(
         self, observation: ArrayLike, params: PushTParams | None = None, *, position_first: bool = True
@@ -294,7 +278,7 @@ class PushT(Environment):
         check_shape("observation", row, (5,))
         check_finite("observation", row)
         angle = 0 * row[4:] if position_first else row[4:]
-        center = _placed(-params.origin[None], jnp.concatenate([row[2:4], angle]))[0]
+        center = placed(-params.origin[None], jnp.concatenate([row[2:4], angle]))[0]
         pose = jnp.concatenate([center, row[4:]])
         return TaskState(pose, row[:2], jnp.zeros_like(row[:2]), jnp.zeros((), jnp.int32))
 
@@ -332,30 +316,10 @@ def _gyration_radius(shape: Polygon) -> float:
     return float(np.sqrt(second_moment / (np.sum(cross) / 2)))
 
 
-def _checked(name: str, value: ArrayLike, shape: tuple[int, ...], *, signed: bool = False) -> Array:
-    """Return an argument as an array that is finite and, unless `signed`, not negative."""
-    array = as_float(value, name=name)
-    check_shape(name, array, shape)
-    check_finite(name, array)
-    if not signed:
-        check_non_negative(name, array)
-    return array
-
-
-def _placed(points: Float[Array, "points 2"], pose: Float[Array, "3"]) -> Float[Array, "points 2"]:
-    """Return points of a body at a pose, world."""
-    angle = cos_sin(pose[2])
-    x, y = Vec2(points[:, 0], points[:, 1]).rotate(angle)
-    return jnp.stack([pose[0] + x, pose[1] + y], axis=1)
-
-
 def _as_observed(key: PRNGKeyArray, state: TaskState, params: PushTParams) -> TaskState:
     """Return the state with the noise of observations."""
-    position_key, angle_key = jax.random.split(key)
-    pose, hand, dtype = state.pose, state.hand, state.pose.dtype
-    if params.position_noise is not None:
-        noise = params.position_noise * jax.random.normal(position_key, (4,), dtype)
-        pose, hand = pose.at[:2].add(noise[:2]), hand + noise[2:]
-    if params.angle_noise is not None:
-        pose = pose.at[2].add(params.angle_noise * jax.random.normal(angle_key, (), dtype))
-    return state.replace(pose=pose, hand=hand)
+    block_key, angle_key, hand_key = jax.random.split(key, 3)
+    position = with_noise(block_key, state.pose[:2], params.position_noise)
+    angle = with_noise(angle_key, state.pose[2:], params.angle_noise)
+    hand = with_noise(hand_key, state.hand, params.position_noise)
+    return state.replace(pose=jnp.concatenate([position, angle]), hand=hand)

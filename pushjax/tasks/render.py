@@ -1,4 +1,4 @@
-"""Pictures of a block, its goal and a round agent, in the colors and the layout of gym-pusht.
+"""Pictures of a block, its goal and what pushes it, in the colors and the layout of gym-pusht.
 
 A pixel is drawn from the signed distances of its center. Edges are soft over one pixel of the workspace. In gym-pusht
 they are as soft, because it draws the workspace with hard edges and then resizes the picture linearly.
@@ -12,6 +12,9 @@ from jaxtyping import Array, UInt8
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_shape, common_dtype
 from pushjax._internal.jit import quick_jit
+from pushjax.simulation.fixtures import Wall
+from pushjax.simulation.hand import Hand, RoundFinger
+from pushjax.tasks.parts import placed
 
 WORKSPACE = 512.0  # side of the drawn square, px
 WALL_LOW, WALL_HIGH = 5.0, 506.0  # center lines of the walls, px
@@ -77,9 +80,7 @@ def _render(
     vertices: Array, goal: Array, agent: Array, action: Array | None, size: int, seams: tuple[tuple[int, int], ...]
 ) -> Array:
     pixels = _Pixels.of(size, vertices.dtype)
-    inside, from_line = _outline(pixels, goal)
-    depth = jnp.where(inside, from_line, -from_line)
-    picture = _Picture.blank(size, vertices.dtype).layer(LIGHT_GREEN, depth + 0.5)
+    picture = _Picture.blank(size, vertices.dtype).polygon(pixels, goal, LIGHT_GREEN)
     picture = picture.layer(LIGHT_GRAY, LINE_HALF_WIDTH - pixels.from_walls())
     from_agent = jnp.hypot(pixels.x - agent[0], pixels.y - agent[1])
     picture = picture.layer(ROYAL_BLUE, AGENT_RADIUS - from_agent)
@@ -92,6 +93,45 @@ def _render(
         across = _squared_distance(pixels, (x - MARKER_ARM, y), (x + MARKER_ARM, y))
         along = _squared_distance(pixels, (x, y - MARKER_ARM), (x, y + MARKER_ARM))
         picture = picture.layer(RED, MARKER_HALF_WIDTH - jnp.sqrt(jnp.minimum(across, along)))
+    return picture.rgb()
+
+
+@quick_jit
+def render_table(
+    vertices: Array, goal: Array, hand: Hand, configuration: Array, walls: tuple[Wall, ...], width: float, size: int
+) -> Array:
+    """Draw a table from above, with x to the right and y up, and its origin in the middle.
+
+    Args:
+        vertices: Vertices of the block, shape (vertices, 2), m.
+        goal: Vertices of the goal, shape (goal_vertices, 2), m.
+        hand: The hand.
+        configuration: Its configuration, shape (dof,), m.
+        walls: The walls, m.
+        width: Width of what is drawn, m.
+        size: Width and height of the picture in pixels.
+
+    Returns:
+        The picture, shape (size, size, 3), RGB, rows from the top.
+    """
+    pixels, scale = _Pixels.of(size, vertices.dtype), WORKSPACE / width
+
+    def drawn(points: Array) -> Array:
+        return WORKSPACE / 2 + scale * points * jnp.array([[1.0, -1.0]], points.dtype)
+
+    picture = _Picture.blank(size, vertices.dtype).polygon(pixels, drawn(goal), LIGHT_GREEN)
+    for wall in walls:
+        along, into = width * jnp.array([-wall.normal[1], wall.normal[0]]), -width * wall.normal
+        behind = jnp.stack([along, -along, into - along, into + along]) + wall.point[None]
+        picture = picture.polygon(pixels, drawn(behind), LIGHT_GRAY)
+    picture = picture.polygon(pixels, drawn(vertices), LIGHT_SLATE_GRAY_FILL, LIGHT_SLATE_GRAY)
+    for finger, pose in zip(hand.fingers, hand.poses(configuration[None])[0], strict=True):
+        if isinstance(finger, RoundFinger):
+            x, y = drawn(pose[None, :2])[0]
+            depth = scale * finger.radius - jnp.hypot(pixels.x - x, pixels.y - y)
+            picture = picture.layer(ROYAL_BLUE, depth).layer(ROYAL_BLUE_FILL, depth - LINE_HALF_WIDTH)
+        else:
+            picture = picture.polygon(pixels, drawn(placed(finger.shape.vertices, pose)), ROYAL_BLUE_FILL, ROYAL_BLUE)
     return picture.rgb()
 
 
@@ -170,6 +210,12 @@ class _Picture(NamedTuple):
         """
         alpha = jnp.clip(depth + 0.5, 0, 1)
         return _Picture(*(old + (new - old) * alpha for old, new in zip(self, color, strict=True)))
+
+    def polygon(self, pixels: _Pixels, vertices: Array, color: Color, line: Color | None = None) -> "_Picture":
+        """Draw a polygon, with an outline of another color if that is given. The vertices have shape (vertices, 2)."""
+        inside, from_line = _outline(pixels, vertices)
+        picture = self.layer(color, jnp.where(inside, from_line, -from_line) + 0.5)
+        return picture if line is None else picture.layer(line, LINE_HALF_WIDTH - from_line)
 
     def rgb(self) -> Array:
         """Return the picture as 8-bit integers, shape (size, size, 3)."""

@@ -259,7 +259,11 @@ def test_goes_on_from_a_pickle(push_t):
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"task": "PushP"}, ValueError, "task must be of PushT; got 'PushP'"),
+        (
+            {"task": "PushP"},
+            ValueError,
+            "task must be of PushT, PushBox, PushAlongWall, PushTwoFingers, Squeeze; got 'PushP'",
+        ),
         ({"task": 3}, TypeError, "task: expected a Environment; got a int"),
         ({"task": Walk(), "substeps": 2}, TypeError, "substeps: options go with the name of a task"),
         ({"observation": "pixel"}, ValueError, "observation must be of state"),

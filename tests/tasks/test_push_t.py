@@ -170,7 +170,7 @@ def test_parity_with_gym_pusht():
         (lambda: ENV.params(goal=(1.0, 2.0)), r"goal has shape \(2,\)"),
         (lambda: ENV.params(friction=-0.1), "friction must not be negative"),
         (lambda: ENV.params(action_noise=np.nan), "action_noise must be finite"),
-        (lambda: ENV.params(max_steps_in_episode=0), "max_steps_in_episode must be at least 1"),
+        (lambda: ENV.params(max_steps_in_episode=0), "max_steps_in_episode must be a whole number, at least 1"),
         (lambda: ENV.state_of([1.0, 2.0]), r"observation has shape \(2,\)"),
         (lambda: ENV.state_of([1.0, 2.0, 3.0, 4.0, np.inf]), "observation must be finite"),
     ],

@@ -1,0 +1,80 @@
+"""Parts that tasks share: checked parameters, noise, and points of bodies."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_count,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    check_type,
+)
+from pushjax._math.vec import Vec2, cos_sin
+from pushjax.friction.random import FrictionModel
+from pushjax.simulation.slider import Slider
+
+
+def shared_params(
+    slider: Slider,
+    goal: ArrayLike,
+    friction: ArrayLike | None,
+    model: FrictionModel | None,
+    noise: dict[str, ArrayLike | None],
+    success_coverage: ArrayLike,
+    max_steps_in_episode: int,
+) -> dict[str, Any]:
+    """Return the fields of `TaskParams`, checked.
+
+    Args:
+        slider: The slider, m.
+        goal: Pose at the goal, (3,).
+        friction: Coefficient of friction between fingers and slider; None for no friction.
+        model: Distribution of the friction; None for none.
+        noise: Standard deviations by the name of their field; None for none.
+        success_coverage: Coverage of the goal above which an episode terminates.
+        max_steps_in_episode: Number of control steps after which an episode is truncated.
+
+    Raises:
+        ValueError: For a wrong shape, a value that is not finite, a negative one but in `goal`, a limit of steps that
+            is not positive, or a model that the limit surface does not allow (`FrictionModel.around`).
+        TypeError: If `model` is no `FrictionModel`.
+    """
+    check_count("max_steps_in_episode", max_steps_in_episode)
+    if model is not None:
+        check_type("model", model, FrictionModel)
+    return {
+        "slider": slider,
+        "friction": None if friction is None else checked("friction", friction, ()),
+        "goal": checked("goal", goal, (3,), signed=True),
+        "model": model,
+        "surfaces": None if model is None else model.around(slider.surface),
+        "success_coverage": checked("success_coverage", success_coverage, ()),
+        "max_steps_in_episode": int(max_steps_in_episode),
+    } | {name: None if value is None else checked(name, value, ()) for name, value in noise.items()}
+
+
+def checked(name: str, value: ArrayLike, shape: tuple[int, ...], *, signed: bool = False) -> Array:
+    """Return an argument as an array that is finite and, unless `signed`, not negative."""
+    array = as_float(value, name=name)
+    check_shape(name, array, shape)
+    check_finite(name, array)
+    if not signed:
+        check_non_negative(name, array)
+    return array
+
+
+def with_noise(key: PRNGKeyArray, values: Array, deviation: Array | None) -> Array:
+    """Return values with normal noise of this standard deviation; None for none."""
+    return values if deviation is None else values + deviation * jax.random.normal(key, values.shape, values.dtype)
+
+
+def placed(points: Float[Array, "points 2"], pose: Float[Array, "3"]) -> Float[Array, "points 2"]:
+    """Return points of a body at a pose, world."""
+    x, y = Vec2(points[:, 0], points[:, 1]).rotate(cos_sin(pose[2]))
+    return jnp.stack([pose[0] + x, pose[1] + y], axis=1)
