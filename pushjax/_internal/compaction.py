@@ -3,15 +3,18 @@
 `vmap` turns a condition into a selection: both branches are computed for every example of the batch. Here the examples
 that need the computation are gathered into tiles, computed tile by tile, and scattered back. So the cost of a batch
 grows with the number of examples that need the computation.
+
+A tile takes as long as its slowest example. Where examples take different numbers of rounds (`Rounds`), an example that
+has ended gives its place in the tile to the next one, so the cost grows with the number of rounds of all examples.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.xla import tree_where, update_if
 
@@ -19,6 +22,30 @@ TILE = 128  # examples that are computed together on a CPU, so that their data s
 # The same on an accelerator. There a tile costs the start of its kernels, whatever its size: on an H200, 100 000 grasps
 # take 10 s in tiles of 128 and a quarter of a second in tiles of 8192.
 ACCELERATOR_TILE = 1 << 17
+
+
+PLACES = 256  # examples that advance together in `Rounds` on a CPU, where each round takes the start of its kernels
+
+
+class Rounds(NamedTuple):
+    """A computation of a number of rounds that differs between examples.
+
+    It is `state = begin(*args)`, then `state = advance(state, *args)` while `is_ongoing(state, *args)`, and then
+    `finish(state, *args)`. If it is over at once, `advance` must not change the result, because in a batch it is called
+    anyway.
+    """
+
+    begin: Callable[..., Any]
+    advance: Callable[..., Any]
+    is_ongoing: Callable[..., Bool[Array, ""]]
+    finish: Callable[..., Any]
+
+    def __call__(self, *args: Any) -> Any:
+        """Compute one example."""
+        state = jax.lax.while_loop(
+            lambda state: self.is_ongoing(state, *args), lambda state: self.advance(state, *args), self.begin(*args)
+        )
+        return self.finish(state, *args)
 
 
 def tile_size() -> int:
@@ -33,7 +60,7 @@ def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: 
 
     Args:
         needed: Whether this example needs the computation.
-        compute: Function of `args`. It must not close over anything that is batched.
+        compute: Function of `args`, which may be `Rounds`. It must not close over anything that is batched.
         otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
         *args: Arguments of `compute`, pytrees of arrays.
     """
@@ -49,7 +76,13 @@ def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: 
     return chosen(needed, otherwise, args)
 
 
-def where_needed(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
+def where_needed(
+    needed: Bool[Array, ""],
+    compute: Callable[..., Any],
+    otherwise: Any,
+    *args: Any,
+    rounds: Rounds | None = None,
+) -> Any:
     """Return `compute(*args)` where `needed` holds, else `otherwise`.
 
     In a batch, `compute` runs only for the examples that need it. For derivatives it runs for all of them.
@@ -59,11 +92,12 @@ def where_needed(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise
         compute: Function of `args`. It must not close over anything that is batched or differentiated.
         otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
         *args: Arguments of `compute`, pytrees of arrays.
+        rounds: The same function, which is used where nothing is differentiated.
     """
 
     @eqx.filter_custom_jvp
     def chosen(needed, otherwise, args):
-        return only_where(needed, compute, otherwise, *args)
+        return only_where(needed, rounds or compute, otherwise, *args)
 
     @chosen.def_jvp
     def _(primals, tangents):
@@ -98,6 +132,8 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
 
     @jax.custom_batching.custom_vmap
     def batch(needed, otherwise, args):
+        if isinstance(compute, Rounds):
+            return _compute_in_rounds(compute, args_batched, needed, otherwise, args)
         return _compute_in_tiles(compute, args_batched, needed, otherwise, args)
 
     @batch.def_vmap
@@ -136,24 +172,78 @@ def _compute_in_tiles(compute: Callable[..., Any], args_batched: Any, needed, ot
         otherwise: Results of the other examples, each leaf batched on axis 0.
         args: Arguments of `compute`.
     """
-    batch = needed.shape[0]
-    tile = min(tile_size(), batch)
+    tile = min(tile_size(), needed.shape[0])
     needed_count = jnp.sum(needed.astype(jnp.int32))
-    # Indices of the examples that need the computation, then `batch`, which is out of range, as padding. A padded entry
-    # of a tile computes the last example again (`rows`), and the scatter to `positions` drops its result.
-    indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
-    axes = jax.tree.map(lambda batched_leaf: 0 if batched_leaf else None, args_batched)
+    indices, args_at, axes = _gathering(needed, tile, args, args_batched)
 
     def next_tile(state):
         begin, results = state
         positions = jax.lax.dynamic_slice(indices, (begin,), (tile,))
-        rows = jnp.minimum(positions, batch - 1)
-        tile_args = jax.tree.map(lambda x, batched_leaf: x[rows] if batched_leaf else x, args, args_batched)
-        tile_results = jax.vmap(compute, in_axes=axes, axis_size=tile)(*tile_args)
-        results = jax.tree.map(
-            lambda all_rows, tile_rows: all_rows.at[positions].set(tile_rows, mode="drop"), results, tile_results
-        )
-        return begin + tile, results
+        tile_results = jax.vmap(compute, in_axes=axes, axis_size=tile)(*args_at(positions))
+        return begin + tile, _written(results, positions, tile_results)
 
     initial = jnp.zeros((), jnp.int32), otherwise
     return jax.lax.while_loop(lambda state: state[0] < needed_count, next_tile, initial)[1]
+
+
+def _compute_in_rounds(rounds: Rounds, args_batched: Any, needed, otherwise, args):
+    """Return the results of a batch, in which examples that have ended give their places to the next ones.
+
+    Args:
+        rounds: The computation.
+        args_batched: As in `_compute_in_tiles`, like the other arguments.
+        needed: (batch,), which examples need the computation.
+        otherwise: Results of the other examples, each leaf batched on axis 0.
+        args: Arguments of the computation.
+    """
+    batch = needed.shape[0]
+    places = min(PLACES if jax.default_backend() == "cpu" else ACCELERATOR_TILE, batch)
+    indices, args_at, axes = _gathering(needed, places, args, args_batched)
+    example_shapes = jax.eval_shape(rounds.begin, *jax.tree.map(lambda x, b: x[0] if b else x, args, args_batched))
+    blank = jax.tree.map(lambda leaf: jnp.zeros((batch, *leaf.shape), leaf.dtype), example_shapes)
+    first_states = _compute_in_tiles(rounds.begin, args_batched, needed, blank, args)
+
+    def states_at(positions):
+        return jax.tree.map(lambda leaf: leaf[jnp.minimum(positions, batch - 1)], first_states)
+
+    def vmapped(function):
+        return jax.vmap(function, in_axes=(0, *axes), axis_size=places)
+
+    def next_round(carry):
+        positions, begun, states, results = carry
+        place_args = args_at(positions)
+        states = vmapped(rounds.advance)(states, *place_args)
+        ended = ~vmapped(rounds.is_ongoing)(states, *place_args)
+        finished = vmapped(rounds.finish)(states, *place_args)
+        results = _written(results, jnp.where(ended, positions, batch), finished)
+        following = begun + jnp.cumsum(ended, dtype=jnp.int32) - 1
+        positions = jnp.where(ended, indices[jnp.minimum(following, len(indices) - 1)], positions)
+        states = jax.vmap(tree_where)(ended, states_at(positions), states)
+        return positions, begun + jnp.sum(ended, dtype=jnp.int32), states, results
+
+    positions = indices[:places]
+    initial = positions, jnp.asarray(places, jnp.int32), states_at(positions), otherwise
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0] < batch), next_round, initial)[3]
+
+
+def _gathering(needed: Bool[Array, " batch"], tile: int, args: Any, args_batched: Any):
+    """How the examples that need a computation are gathered.
+
+    Returns:
+        The indices of these examples, then `batch`, which is out of range, as padding, (batch + tile,); a function that
+        gives the arguments of the examples at some positions, (tile,); and the arguments' axes for `vmap`. At a padded
+        position the arguments are those of the last example.
+    """
+    batch = needed.shape[0]
+    indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
+
+    def args_at(positions):
+        rows = jnp.minimum(positions, batch - 1)
+        return jax.tree.map(lambda x, batched_leaf: x[rows] if batched_leaf else x, args, args_batched)
+
+    return indices, args_at, jax.tree.map(lambda batched_leaf: 0 if batched_leaf else None, args_batched)
+
+
+def _written(results: Any, positions: Int[Array, " tile"], rows: Any) -> Any:
+    """Return the results with rows of a tile at the given positions; those that are out of range are dropped."""
+    return jax.tree.map(lambda all_rows, new: all_rows.at[positions].set(new, mode="drop"), results, rows)

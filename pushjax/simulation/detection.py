@@ -239,10 +239,22 @@ def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
     """
     if isinstance(finger, Wall):
         return num_wall_contacts(outline)
-    zero = jnp.zeros(())
-    still = Vec2(zero, zero)
-    candidates = jax.eval_shape(lambda: contact_candidates(finger, outline, FingerPose(still, still), still, zero))
-    return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
+    leaves, structure = jax.tree.flatten((finger, outline))
+    return _num_contacts(structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+
+
+@functools.lru_cache(maxsize=256)  # a trace of a step asks for it dozens of times
+def _num_contacts(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], jnp.dtype], ...]) -> int:
+    """Number of contacts of a finger on an outline, whose arrays have the given shapes and dtypes."""
+
+    def candidates_of(bodies):
+        zero = jnp.zeros(())
+        still = Vec2(zero, zero)
+        return contact_candidates(*bodies, FingerPose(still, still), still, zero)
+
+    bodies = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    candidates = jax.eval_shape(candidates_of, bodies)
+    return (3 if is_nonconvex_polygon(bodies[1]) else 2) if isinstance(candidates, Candidate) else len(candidates)
 
 
 def is_nonconvex_polygon(outline: Outline) -> bool:

@@ -43,7 +43,7 @@ from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import ScalarStep, step_in_scalars
-from pushjax.simulation.substeps import hand_stops, simulate_in_substeps
+from pushjax.simulation.substeps import DividedPush, hand_stops, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 
 
@@ -219,21 +219,13 @@ def simulate(
             All surfaces must have the same length.
         fixtures: Walls and bodies that the slider may touch.
     """
-    outline, poses, steps = shape.outline(), hand.poses(path), len(path) - 1
-    start, fixed = Vec3.of(pose), fixture_motions(fixtures)
-    if fixtures:
-        friction_at = _friction_among(fixtures, friction_at)
-
-    def motions_at(step: Array, mu: Array):
-        before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
-        return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
-
-    if not fixed and sum(num_contacts(finger, outline) for finger in hand.fingers) == 1:
-        records = _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at)
+    push, start, steps = divided_push(shape, hand, path, solver, friction_at, fixtures), Vec3.of(pose), len(path) - 1
+    if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
+        records = _simulate_one_contact(push, start)
         fraction = jnp.zeros_like(start.x)
     else:
-        records, fraction = simulate_in_substeps(outline, steps, motions_at, solver, start, friction_at, fixed)
-    results = to_arrays(records, friction_at(jnp.zeros((), jnp.int32), start)[0].length)
+        records, fraction = simulate_in_substeps(push, start)
+    results = to_arrays(records, push.friction_at(jnp.zeros((), jnp.int32), start)[0].length)
     stop_step = first_true(hand_stops(results.status))
     last_done = jnp.where(stop_step >= 0, stop_step, steps)
     index = jnp.arange(steps + 1)
@@ -245,6 +237,26 @@ def simulate(
     poses = jnp.concatenate([pose[None], results.pose])
     other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
     return Trajectory(pose=poses, configuration=configuration, **other_fields)
+
+
+def divided_push(
+    shape: Shape,
+    hand: Hand,
+    path: Array,
+    solver: ContactSolver | StickingSolver | None,
+    friction_at: FrictionAt,
+    fixtures: Fixtures = (),
+) -> DividedPush:
+    """Return a push of which parts of steps can be tried. Arguments as in `simulate`."""
+    poses = hand.poses(path)
+    if fixtures:
+        friction_at = _friction_among(fixtures, friction_at)
+
+    def motions_at(step: Array, mu: Array):
+        before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
+        return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
+
+    return DividedPush(shape.outline(), len(path) - 1, motions_at, solver, friction_at, fixture_motions(fixtures))
 
 
 def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
@@ -260,11 +272,12 @@ def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
     return friction_if_valid
 
 
-def _simulate_one_contact(outline, steps, motions_at, solver, start, friction_at) -> ScalarStep:
+def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
     """Return the records of all steps of a hand with one contact: a round finger on a convex outline, a pad on a disk.
 
     Such steps are not divided: their overlap is recorded but not checked. Arguments as in `simulate_in_substeps`.
     """
+    outline, steps, motions_at, solver, friction_at = push[:5]
 
     def body(pose: Vec3, step: Array):
         form, mu = friction_at(step, pose)

@@ -27,9 +27,9 @@ from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.xla import compute_once, decide, tree_where
-from pushjax._math.vec import Scalar, Vec3
+from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.scaled_problem import ContactSolver
-from pushjax.contact.status import Status
+from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
@@ -85,79 +85,103 @@ class PushState(NamedTuple):
     accepted_parts: ScalarStep
 
 
-def simulate_in_substeps(
-    outline: Outline,
-    steps: int,
-    motions_at: Callable[[Int[Array, ""], Array], tuple[FingerMotion, ...]],
-    solver: ContactSolver | StickingSolver | None,
-    pose: Vec3,
-    friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]],
-    fixtures: tuple[FingerMotion, ...] = (),
-) -> tuple[ScalarStep, Scalar]:
-    """Roll out a path, dividing steps where necessary.
+class DividedPush(NamedTuple):
+    """A push in whose rounds parts of its steps are tried: what is the same in all of them.
 
-    Args:
+    Attributes:
         outline: The slider's outline.
         steps: Number of steps of the path.
         motions_at: Function that gives the motion of the fingers over a step, from its index and the friction of each
             finger.
         solver: Solver of contact problems; None for the default.
-        pose: Pose of the slider at the start, world.
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
         fixtures: Fixtures as fingers that stay where they are.
-
-    Returns:
-        The stacked records of all steps; and, if the hand was stopped, the fraction of its last step that it did.
     """
-    first = jnp.zeros((), jnp.int32)
-    form, mu = friction_at(first, pose)
-    motions = motions_at(first, mu)
-    max_trials = TRIALS_PER_STEP * steps + EXTRA_TRIALS
-    overlap = max_penetration(outline, motions + fixtures, pose, 0.0)
-    zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
-    zero_status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
-    urgency = initial_urgency([num_contacts(motion.finger, outline) for motion in motions + fixtures], pose.x)
-    idle_record = _idle_record(form, outline, motions, solver, pose, urgency, fixtures)
-    initial_state = PushState(
-        pose, pose, first, zero, one, no, no, urgency, zero_status, overlap, zero_status, zero_status, no, idle_record
-    )
 
-    def next_trial(state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
-        form, mu = friction_at(state.step, state.origin)
-        motions = motions_at(state.step, mu)
+    outline: Outline
+    steps: int
+    motions_at: Callable[[Int[Array, ""], Array], tuple[FingerMotion, ...]]
+    solver: ContactSolver | StickingSolver | None
+    friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]]
+    fixtures: tuple[FingerMotion, ...] = ()
+
+    @property
+    def max_trials(self) -> int:
+        """Number of trials after which the steps that are left are NOT_CONVERGED."""
+        return TRIALS_PER_STEP * self.steps + EXTRA_TRIALS
+
+    def first_state(self, pose: Vec3) -> PushState:
+        """Return the state before the first trial, with the slider at `pose`, world."""
+        first = jnp.zeros((), jnp.int32)
+        motions = self.motions_at(first, self.friction_at(first, pose)[1])
+        overlap = max_penetration(self.outline, motions + self.fixtures, pose, 0.0)
+        zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
+        status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+        counts = self._counts(motions)
+        urgency, idle = initial_urgency(counts, pose.x), _idle_record(pose, sum(counts))
+        return PushState(pose, pose, first, zero, one, no, no, urgency, status, overlap, status, status, no, idle)
+
+    def trial(self, state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
+        """Try the next part of a step.
+
+        Returns:
+            The state after it; and of the step the record, whether it ended, and its index.
+        """
+        form, mu = self.friction_at(state.step, state.origin)
+        motions = self.motions_at(state.step, mu)
         reach, tolerance = holding_distance(motions, form.length), allowed_penetration(motions, form.length)
         part = tuple(motion.part(state.done, state.part) for motion in motions)
-        ongoing = state.step < steps
         record, urgency_after = step_in_scalars(
             form,
-            outline,
+            self.outline,
             part,
-            solver,
+            self.solver,
             state.pose,
             state.overlap,
             reach,
             state.urgency,
-            ongoing,
-            fixtures,
+            state.step < self.steps,
+            self.fixtures,
             state.swaps == 0,
         )
-        next_state, end_of_step = _next_state(state, record, urgency_after, outline, part + fixtures, tolerance, steps)
+        next_state, end_of_step = _next_state(
+            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, self.steps
+        )
+        urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
             next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, urgency_after, urgency))
         return next_state, end_of_step
+
+    def _counts(self, motions: tuple[FingerMotion, ...]) -> list[int]:
+        """Number of contacts of each finger and fixture."""
+        return [num_contacts(motion.finger, self.outline) for motion in motions + self.fixtures]
+
+
+def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Scalar]:
+    """Roll out a path, dividing steps where necessary.
+
+    Args:
+        push: The push.
+        pose: Pose of the slider at the start, world.
+
+    Returns:
+        The stacked records of all steps; and, if the hand was stopped, the fraction of its last step that it did.
+    """
+    initial_state = push.first_state(pose)
+    idle_record = initial_state.accepted_parts
 
     def skipped(state: PushState):
         return state, (idle_record, jnp.zeros((), bool), state.step)
 
     def trial_of_batch(state: PushState, _):
-        any_ongoing = eqxi.unvmap_any(state.step < steps)
-        return jax.lax.cond(any_ongoing, next_trial, skipped, state)
+        any_ongoing = eqxi.unvmap_any(state.step < push.steps)
+        return jax.lax.cond(any_ongoing, push.trial, skipped, state)
 
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
     trial_of_batch = jax.checkpoint(trial_of_batch, prevent_cse=False, policy=save_search_results)
-    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, length=max_trials)
-    return _records_of_steps(records, ends, step, steps, last, idle_record), last.done
+    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, length=push.max_trials)
+    return _records_of_steps(records, ends, step, push.steps, last, idle_record), last.done
 
 
 def _records_of_steps(
@@ -321,10 +345,11 @@ def _resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
     return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
-def _idle_record(form, outline, motions, solver, pose, urgency, fixtures) -> ScalarStep:
-    """Record of a step in which nothing pushes, in the shapes and dtypes that `step_in_scalars` gives."""
-    shapes = jax.eval_shape(
-        lambda: step_in_scalars(form, outline, motions, solver, pose, pose.x, pose.x, urgency, True, fixtures)[0]
-    )
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return _resting(blank, pose)
+def _idle_record(pose: Vec3, contacts: int) -> ScalarStep:
+    """Record of a step in which nothing pushes."""
+    zero = jnp.zeros_like(pose.x)
+    still, no_points = Vec3(zero, zero, zero), jnp.zeros((contacts, 2), zero.dtype)
+    mode = jnp.full((), ContactMode.SEPARATED, jnp.int8)
+    status = jnp.full((), Status.FREE, jnp.int8)
+    forces, modes = (Vec2(zero, zero),) * contacts, (mode,) * contacts
+    return ScalarStep(pose, still, still, forces, no_points, no_points, modes, status, zero)

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.compaction import where_needed
-from pushjax._math.vec import Vec2, Vec3
+from pushjax._internal.compaction import Rounds, where_needed
+from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.frictionless import Frictionless
 from pushjax.contact.problem import to_scalars
 from pushjax.contact.status import Status
@@ -22,7 +22,8 @@ from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.simulation.finger_motion import DEPTH_PER_DISPLACEMENT
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.simulation.rollout import simulate
+from pushjax.simulation.rollout import FrictionAt, divided_push, simulate
+from pushjax.simulation.substeps import DividedPush, PushState
 from pushjax.simulation.trajectory import Trajectory
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate
 
@@ -85,10 +86,13 @@ def control_step(
     """
     if not _is_finger(hand):
         return Pushed.of(_simulated(polygon, surface, friction, hand, walls, path, pose))
-    push = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
-    valid = jax.lax.stop_gradient(_is_valid(push, polygon, surface, walls, path))
     args = polygon, surface, friction, hand, walls, path, pose
-    return where_needed(~valid, _with_all_contacts, Pushed.of(push), *args)
+    once = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
+    valid = jax.lax.stop_gradient(_is_valid(once, polygon, surface, walls, path))
+    deep = ~valid & jax.lax.stop_gradient(_depth_at_start(*args) > DEEP * surface.length)
+    in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
+    push = where_needed(~valid & ~deep, _with_all_contacts, Pushed.of(once), *args, rounds=in_rounds)
+    return where_needed(deep, _separated, push, *args)
 
 
 def _is_finger(hand: Hand) -> bool:
@@ -98,10 +102,16 @@ def _is_finger(hand: Hand) -> bool:
 
 def _simulated(shape, surface, friction, hand, walls, path, pose) -> Trajectory:
     """The push along the path. Arguments as in `control_step`."""
-    mu = jnp.zeros_like(pose[0]) if friction is None else friction
+    solver, friction_at = _contact_model(shape, surface, friction, hand, path)
+    return simulate(shape, hand, path, pose, solver, friction_at, walls)
+
+
+def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless | None, FrictionAt]:
+    """The solver of contact problems, and limit surface and friction of a step. Arguments as in `control_step`."""
+    mu = jnp.zeros_like(path[0, 0]) if friction is None else friction
     form = to_scalars(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
     solver = Frictionless() if friction is None and not isinstance(shape, _TouchedOnce) else None
-    return simulate(shape, hand, path, pose, solver, lambda step, pose: form, walls)
+    return solver, lambda step, pose: form
 
 
 def _is_valid(
@@ -117,14 +127,68 @@ def _is_valid(
 
 
 @jax.jit  # saves tracing time: loops trace their bodies several times
-def _with_all_contacts(polygon, surface, friction, hand, walls, path, pose) -> Pushed:
-    """The control step in full. Arguments as in `control_step`."""
-    push = Pushed.of(_simulated(polygon, surface, friction, hand, walls, path, pose))
-    start, radius = Vec3.of(pose), hand.fingers[0].radius
-    depth = overlap_of_finger(polygon, radius, Vec2.of(path[0]), start).depth
+def _with_all_contacts(*args) -> Pushed:
+    """The control step with all contacts. Arguments as in `control_step`, like those of the functions that follow."""
+    return Pushed.of(_simulated(*args))
+
+
+def _depth_at_start(polygon, surface, friction, hand, walls, path, pose) -> Scalar:
+    """Depth of the deepest overlap at the start, m."""
+    start = Vec3.of(pose)
+    depth = overlap_of_finger(polygon, hand.fingers[0].radius, Vec2.of(path[0]), start).depth
     for wall in walls:
         depth = jnp.maximum(depth, overlap_of_wall(polygon, wall, start).depth)
-    deep = jax.lax.stop_gradient(depth > DEEP * surface.length)
-    separated = separate(polygon, surface.length, radius, walls, path, pose)
-    overlapping = Pushed(separated, path[-1], jnp.full_like(push.status, Status.OVERLAPPING))
-    return jax.tree.map(lambda a, b: jnp.where(deep, a, b), overlapping, push)
+    return depth
+
+
+def _separated(polygon, surface, friction, hand, walls, path, pose) -> Pushed:
+    """The control step of a slider that overlaps something deeply."""
+    end = separate(polygon, surface.length, hand.fingers[0].radius, walls, path, pose)
+    return Pushed(end, path[-1], jnp.full(len(path) - 1, Status.OVERLAPPING, jnp.int8))
+
+
+class _Progress(NamedTuple):
+    """State of a control step between two trials of parts of its steps.
+
+    Attributes:
+        push: The push.
+        trials: Number of trials so far.
+        status: Status of the steps that are done, (steps,); -1 for the others.
+    """
+
+    push: PushState
+    trials: Int[Array, ""]
+    status: Int[Array, "steps"]
+
+
+def _divided(polygon, surface, friction, hand, walls, path, pose) -> DividedPush:
+    """The push with all contacts."""
+    solver, friction_at = _contact_model(polygon, surface, friction, hand, path)
+    return divided_push(polygon, hand, path, solver, friction_at, walls)
+
+
+@jax.jit
+def _begin(*args) -> _Progress:
+    state = _divided(*args).first_state(Vec3.of(args[-1]))
+    return _Progress(state, jnp.zeros((), jnp.int32), jnp.full(len(args[-2]) - 1, -1, jnp.int8))
+
+
+@jax.jit
+def _advance(progress: _Progress, *args) -> _Progress:
+    state, (record, ended, step) = _divided(*args).trial(progress.push)
+    status = progress.status.at[jnp.where(ended, step, len(progress.status))].set(record.status, mode="drop")
+    return _Progress(state, progress.trials + 1, status)
+
+
+def _is_ongoing(progress: _Progress, *args) -> Bool[Array, ""]:
+    push = _divided(*args)
+    return (progress.push.step < push.steps) & (progress.trials < push.max_trials)
+
+
+def _finish(progress: _Progress, *args) -> Pushed:
+    path, last, steps = args[-2], progress.push, len(progress.status)
+    unfinished = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED)
+    status = jnp.where(progress.status < 0, unfinished, progress.status).astype(jnp.int8)
+    step = jnp.where(last.stop_status != 0, jnp.sum(progress.status >= 0) - 1, steps)
+    before, after = path[step], path[jnp.minimum(step + 1, steps)]
+    return Pushed(last.pose.array(), before + last.done * (after - before), status)

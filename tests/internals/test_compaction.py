@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pushjax._internal.compaction import TILE, only_where
+from pushjax._internal.compaction import PLACES, TILE, Rounds, only_where, where_needed
 
 
 def work(x, shared):
@@ -56,3 +56,65 @@ def test_a_batch_of_batches(axes, inner):
 def test_one_alone():
     same(chosen(jnp.asarray(True), jnp.float32(3), jnp.float32(1)), {"square": 10, "sign": 1})
     same(chosen(jnp.asarray(False), jnp.float32(3), jnp.float32(1)), {"square": 3, "sign": 0})
+
+
+# Collatz sequences: their lengths differ widely between neighbors.
+collatz = Rounds(
+    begin=lambda start, limit: (start, jnp.zeros((), jnp.int32)),
+    advance=lambda state, start, limit: (jnp.where(state[0] % 2 == 0, state[0] // 2, 3 * state[0] + 1), state[1] + 1),
+    is_ongoing=lambda state, start, limit: (state[0] != 1) & (state[1] < limit),
+    finish=lambda state, start, limit: {"rounds": state[1], "last": state[0] + 0 * start},
+)
+
+
+def collatz_of(start, limit):
+    rounds = 0
+    while True:
+        start, rounds = (start // 2 if start % 2 == 0 else 3 * start + 1), rounds + 1
+        if start == 1 or rounds >= limit:
+            return rounds, start
+
+
+def rounds_of(needed, start, limit):
+    return only_where(needed, collatz, {"rounds": jnp.zeros((), jnp.int32), "last": start}, start, limit)
+
+
+@pytest.mark.parametrize("size", [1, 3, PLACES, PLACES + 1, 3 * PLACES + 7])
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_rounds_of_different_numbers(size, share):
+    rng = np.random.default_rng(size)
+    start, needed = rng.integers(2, 1000, size).astype(np.int32), rng.random(size) < share
+    found = jax.jit(jax.vmap(rounds_of, in_axes=(0, 0, None)))(needed, start, np.int32(90))
+    wanted = [collatz_of(int(x), 90) if n else (0, x) for x, n in zip(start, needed, strict=True)]
+    same(found, {"rounds": [w[0] for w in wanted], "last": [w[1] for w in wanted]})
+
+
+def test_rounds_in_batches_of_batches_and_alone():
+    rng = np.random.default_rng(1)
+    start, needed, limit = rng.integers(2, 1000, (5, 70)), rng.random((5, 70)) < 0.5, np.array([3, 9, 20, 40, 90])
+    found = jax.vmap(jax.vmap(rounds_of, in_axes=(0, 0, None)))(needed, start, limit)
+    for k in (0, 4):
+        one = rounds_of(needed[k, 7], jnp.asarray(start[k, 7]), limit[k])
+        same(one, {name: found[name][k, 7] for name in one})
+    wanted = [[collatz_of(x, n)[0] for x in row] for row, n in zip(start, limit, strict=True)]
+    np.testing.assert_array_equal(found["rounds"], np.where(needed, wanted, 0))
+
+
+def test_rounds_do_not_change_derivatives():
+    """Derivatives are those of the plain function; the value is that of the rounds."""
+    halve = Rounds(
+        begin=lambda x: x,
+        advance=lambda state, x: state / 2,
+        is_ongoing=lambda state, x: jnp.abs(state) > 1,
+        finish=lambda state, x: state,
+    )
+
+    def plain(x):
+        return x / 2 ** jax.lax.stop_gradient(jnp.ceil(jnp.log2(jnp.abs(x))))
+
+    def chosen_of(x):
+        return where_needed(jnp.abs(x) > 1, plain, x, x, rounds=halve)
+
+    x = jnp.array([0.3, 3.0, -5.0, 40.0])
+    np.testing.assert_allclose(jax.vmap(chosen_of)(x), jax.vmap(lambda x: jnp.where(jnp.abs(x) > 1, plain(x), x))(x))
+    np.testing.assert_allclose(jax.vmap(jax.grad(chosen_of))(x), [1, 1 / 4, 1 / 8, 1 / 64])
