@@ -61,7 +61,10 @@ class Wall(eqx.Module):
         known = concrete(direction)
         if known is not None and not np.any(known):
             raise ValueError("normal must not be zero; it is the direction from the wall into the free space")
-        self.normal = direction / jnp.linalg.norm(direction)
+        squared = jnp.sum(direction**2)
+        has_length = squared > 0
+        # a traced normal of length zero becomes NaN, which makes every step INVALID, but its derivative is zero
+        self.normal = jnp.where(has_length, direction / jnp.sqrt(jnp.where(has_length, squared, 1.0)), jnp.nan)
         self.friction = _checked_friction(friction, dtype)
 
 

@@ -15,6 +15,7 @@ TOUCH = -HALF[0] - FINGER  # x of a finger that touches the rectangle from the l
 slider = pj.Slider(pj.Polygon.rectangle(2 * HALF[0], 2 * HALF[1]), pj.Ellipsoid(np.eye(3), LENGTH))
 hand = pj.Hand.finger(FINGER)
 FLOOR, RIGHT = pj.Wall((0.0, -HALF[1]), (0.0, 1.0)), pj.Wall((0.06, 0.0), (-1.0, 0.0))
+FAR = pj.Wall((3.0, 0.0), (-1.0, 0.0))
 
 
 @jax.jit
@@ -85,8 +86,7 @@ def test_the_order_of_fixtures_does_not_matter():
 
 def test_pushes_far_from_fixtures_are_those_without():
     path = straight((-0.07, 0.004), (0.0, 0.004))
-    far = (pj.Wall((0.0, -3.0), (0.0, 1.0)), pj.Wall((3.0, 0.0), (-1.0, 0.0)))
-    with_walls = push(path, jnp.zeros(3), 0.3, far)
+    with_walls = push(path, jnp.zeros(3), 0.3, (pj.Wall((0.0, -3.0), (0.0, 1.0)), FAR))
     without = pj.rollout(slider, hand, path, pose=jnp.zeros(3), friction=0.3)
     np.testing.assert_allclose(with_walls.pose, without.pose, atol=1e-12)
     np.testing.assert_array_equal(with_walls.status, without.status)
@@ -99,7 +99,7 @@ def test_derivatives_by_a_wall_are_those_of_differences(mode):
 
     def last(numbers):
         wall = pj.Wall(numbers[:2], numbers[2:4], numbers[4])
-        return push(path, jnp.array([0.0, 0.0, -0.05]), 0.3, (wall,)).pose[-1]
+        return push(path, jnp.array([0.0, 0.0, -0.05]), 0.3, (wall, FAR)).pose[-1]
 
     numbers = jnp.array([0.0, -HALF[1] - 1e-3, 0.0, 1.0, 0.25])
     found = mode(last)(numbers)
@@ -146,17 +146,41 @@ def test_wrong_arguments_are_refused():
         pj.rollout(slider, hand, path, **settings, fixtures=(pj.Wall((0.0, -0.01), (0.0, 1.0)),))
 
 
-def test_random_pushes_and_monte_carlo_take_fixtures():
-    path, pose = straight((-0.07, 0.004), (0.0, -0.02)), jnp.zeros(3)
-    model = pj.FrictionModel(dof=200, friction=(0.2, 0.3))
-    key = jax.random.key(0)
-    many = pj.monte_carlo(key, 8, slider, hand, path, pose=pose, model=model, fixtures=(FLOOR,), batch_size=8)
-    one = pj.random_rollout(jax.random.fold_in(key, 3), slider, hand, path, pose=pose, model=model, fixtures=(FLOOR,))
-    np.testing.assert_allclose(many.pose[3], one.push.pose[-1], atol=1e-9)
+MODEL = pj.FrictionModel(dof=200, friction=(0.2, 0.3))
+TOWARD_FLOOR = straight((-0.07, 0.004), (0.0, -0.02))
+
+
+def many_pushes():
+    return pj.monte_carlo(
+        jax.random.key(0),
+        8,
+        slider,
+        hand,
+        TOWARD_FLOOR,
+        pose=jnp.zeros(3),
+        model=MODEL,
+        fixtures=(FLOOR,),
+        batch_size=8,
+    )
+
+
+def test_monte_carlo_takes_fixtures():
     corners = np.asarray(slider.shape.vertices)
-    for x, y, angle in np.asarray(many.pose):
+    for x, y, angle in np.asarray(many_pushes().pose):
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
         assert np.min((corners @ turn.T + [x, y])[:, 1]) > -HALF[1] - 1e-4
+
+
+@pytest.mark.long
+def test_random_pushes_are_those_of_monte_carlo():
+    key = jax.random.fold_in(jax.random.key(0), 3)
+    one = pj.random_rollout(key, slider, hand, TOWARD_FLOOR, pose=jnp.zeros(3), model=MODEL, fixtures=(FLOOR,))
+    np.testing.assert_allclose(many_pushes().pose[3], one.push.pose[-1], atol=1e-9)
+
+
+def test_a_normal_of_length_zero_has_the_derivative_zero():
+    derivative = jax.jacobian(lambda normal: pj.Wall((0.0, 0.0), normal).normal)
+    np.testing.assert_array_equal(jax.jit(derivative)(jnp.zeros(2)), np.zeros((2, 2)))
 
 
 def test_one_step_takes_fixtures():

@@ -142,21 +142,6 @@ def test_derivatives_are_those_of_differences(box, box_steps):
         assert jnp.sum(gradient * d) == pytest.approx(float(difference), abs=0.05 * float(jnp.linalg.norm(gradient)))
 
 
-# The T of gym-pusht
-
-
-def test_parity_with_gym_pusht():
-    pytest.importorskip("gym_pusht")
-    pytest.importorskip("pymunk")
-    from benchmarks import pusht
-
-    found = pusht.compared(ENV, pusht.recorded(pusht.AT_ONCE, 30))
-    assert found["free"]["episodes"] > 40
-    assert found["free"]["within"] >= 0.9  # 1.5 px and 1 degree
-    assert found["free"]["coverage"][1] < 0.02
-    assert found["walls"]["within"] >= 0.7  # 3 px; few episodes meet a wall
-
-
 # Bad input
 
 

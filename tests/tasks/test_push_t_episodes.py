@@ -1,4 +1,7 @@
-"""PushT in batches, with walls: finite steps, automatic resets, rewards, jams and starts that overlap."""
+"""PushT in batches, with walls: parity with gym-pusht, finite steps, automatic resets, rewards, jams and overlaps.
+
+All tests run one program.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -73,3 +76,13 @@ def test_overlapping_starts_come_apart():
     assert corners.min() > 6
     for block, agent in zip(corners, np.asarray(last.hand), strict=True):
         assert shapely.Polygon(block).distance(shapely.Point(agent)) > 13.5
+
+
+def test_parity_with_gym_pusht():
+    pytest.importorskip("gym_pusht")
+    pytest.importorskip("pymunk")
+    found = pusht.compared(ENV, pusht.recorded(BATCH, STEPS))
+    assert found["free"]["episodes"] > 40
+    assert found["free"]["within"] >= 0.9  # 1.5 px and 1 degree
+    assert found["free"]["coverage"][1] < 0.02
+    assert found["walls"]["within"] >= 0.7  # 3 px; few episodes meet a wall
