@@ -9,6 +9,7 @@ and correct pushes while they run, unless `--no-feedback` is given.
 - `robust`: plans with the mean outcomes of pushes under samples of friction, and prefers last pushes that reach the
   goal under many of them.
 - `adapting`: the same, and a filter weights the samples by the motions that are seen.
+- `known`: plans and corrects with the true friction, for which it simulates all pushes again in each episode.
 """
 
 import time
@@ -26,11 +27,12 @@ from pushjax.experiments.pusht_mpc import setting
 from pushjax.experiments.pusht_mpc.player import cache_folder
 from pushjax.planning import CoverageTable, PushController, PushLibrary, PushPlanner
 from pushjax.planning.controller import Observation
+from pushjax.planning.cost_to_go import CostToGo
 from pushjax.planning.friction_filter import FrictionFilter
 from pushjax.planning.push_library import digest, fan
 from pushjax.tasks import PushT
 
-Controller = Literal["nominal", "robust", "adapting"]
+Controller = Literal["nominal", "robust", "adapting", "known"]
 CONTROLLERS: tuple[Controller, ...] = ("nominal", "robust", "adapting")
 SUBSTEPS = 10  # of the plant
 HAND = pj.Hand.finger(setting.FINGER_RADIUS)
@@ -84,7 +86,10 @@ def run(
         setup = time.process_time() - began
         each = []
         for k in range(episodes):
-            each.append(_play(env, step, params, made, seed + k))
+            key = jax.random.key(seed + k)
+            _, state = env.reset(key, params)
+            plays = _knowing(made, state) if name == "known" else made
+            each.append(_play(key, state, step, params, plays))
             progress(len(played) * episodes + k + 1, len(controller) * episodes)
         played[name] = each
         rows.append(_row(name, each, played.get("nominal"), setup))
@@ -98,42 +103,48 @@ def _controller(
     """Build a controller. Libraries of pushes are kept in the user's cache folder."""
     key, mean = jax.random.key(10**6), float(np.mean(np.asarray(model.friction)))
     starts, directions = fan(slider, setting.FINGER_RADIUS)
-    known: dict[str, Any] = {"friction": mean}
-    if name != "nominal":
-        known = {"model": model, "samples": samples, "key": key}
-    wanted = digest(slider, HAND, starts, directions, **known)
+    drawn: dict[str, Any] = {"friction": mean}
+    if name in ("robust", "adapting"):
+        drawn = {"model": model, "samples": samples, "key": key}
+    wanted = digest(slider, HAND, starts, directions, **drawn)
     path = cache_folder() / f"pushes-{wanted[:16]}.npz"
     if path.exists():
         library = PushLibrary.load(path, wanted)
     else:
-        library = PushLibrary.simulate(slider, HAND, starts, directions, **known)
+        library = PushLibrary.simulate(slider, HAND, starts, directions, **drawn)
         path.parent.mkdir(parents=True, exist_ok=True)
         library.save(path)
-    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
-    measure = CoverageTable(vertices, library.center, library.length, setting.ENOUGH)
-    planner = PushPlanner(
-        slider,
-        setting.FINGER_RADIUS,
-        library,
-        setting.goal(),
-        setting.workspace(),
-        setting.pace(),
-        measure=measure,
-    )
-    planner.prepare()
     learning = {}
     if name == "adapting":
         settings = FrictionFilter(slider, HAND, model, samples=samples, error=ERROR, relative_error=RELATIVE_ERROR)
         learning = {"friction_filter": settings, "prior": settings.init(key)}
+    planner = _planner(slider, library)
     made = PushController(planner, setting.finger_control(), friction=mean, feedback=feedback, **learning)
     made.prepare()
     return made
 
 
-def _play(env: PushT, step: Any, params: Any, made: PushController, seed: int) -> Episode:
-    """Play one episode; the start and the friction follow from the seed."""
-    key = jax.random.key(seed)
-    _, state = env.reset(key, params)
+def _planner(slider: pj.Slider, library: PushLibrary, value: CostToGo | None = None) -> PushPlanner:
+    """Return a planner whose tables are computed."""
+    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
+    measure = CoverageTable(vertices, library.center, library.length, setting.ENOUGH)
+    given = slider, setting.FINGER_RADIUS, library, setting.goal(), setting.workspace(), setting.pace()
+    planner = PushPlanner(*given, measure=measure, value=value)
+    planner.prepare()
+    return planner
+
+
+def _knowing(nominal: PushController, state: Any) -> PushController:
+    """Return a controller that knows the friction of an episode; it keeps the nominal cost to go."""
+    slider = pj.Slider(nominal.planner.slider.shape, state.surface)
+    library, friction = nominal.planner.library, float(state.friction)
+    true = PushLibrary.simulate(slider, HAND, library.starts, library.directions, friction=friction)
+    planner = _planner(slider, true, nominal.planner.value)
+    return PushController(planner, setting.finger_control(), friction=friction, feedback=nominal.feedback)
+
+
+def _play(key: Any, state: Any, step: Any, params: Any, made: PushController) -> Episode:
+    """Play one episode from a state."""
     memory, episode = made.initial_memory(), Episode()
     while episode.steps < setting.STEPS:
         pose = np.asarray(state.pose, float) * [setting.PIXEL, setting.PIXEL, 1]
