@@ -80,9 +80,11 @@ def ways_between(
         start: Where the finger is at first, (2,), world, m. None: where the run-up of the first push begins.
 
     Returns:
-        The ways.
+        The ways. There are none if there is neither a push nor a start.
     """
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
+    if start is None and not len(paths):
+        return WaysBetween((), np.zeros(len(samples), bool))
     ways, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
@@ -108,10 +110,12 @@ def finger_motion(ways: tuple[Way, ...], paths: np.ndarray, *, free: float, push
         push: Speed in pushes, m/s.
 
     Raises:
-        ValueError: For a speed that is not positive, and if a way was not found.
+        ValueError: For a speed that is not positive, if a way was not found, and if there is none.
     """
     check_positive("free", free)
     check_positive("push", push)
+    if not ways:
+        raise ValueError("ways must have one way to each push, and the last retreat; got none")
     for k, way in enumerate(ways):
         if way.status != WayStatus.FOUND:
             raise ValueError(f"ways[{k}] must be a way that was found; its status is {way.status.name}")

@@ -22,7 +22,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
 from pushjax.friction.random import FrictionModel
@@ -65,10 +65,10 @@ class PushPlan(NamedTuple):
 
     Attributes:
         status: Whether it is sure enough.
-        path: Paths of the hand, (pushes, steps + 1, dof), world.
+        path: Paths of the hand, (pushes, steps + 1, dof), world. Pushes that move the slider in no sample are left out.
         pose: Poses of the slider under the mean friction, before the first push and after each, (pushes + 1, 3), world.
         ways: Ways of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other hands.
-        parameters: Its parameters, as in `Pushes`, (size,).
+        parameters: Its parameters, as in `Pushes`, (size,), also of pushes that are left out.
         outcomes: Predicted poses under friction that the search has not seen.
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
             finger does not touch between pushes.
@@ -77,8 +77,8 @@ class PushPlan(NamedTuple):
     """
 
     status: PushPlanStatus
-    path: Float[Array, "pushes steps+1 dof"]
-    pose: Float[Array, "pushes+1 3"]
+    path: np.ndarray
+    pose: np.ndarray
     ways: tuple[Way, ...]
     parameters: np.ndarray
     outcomes: Outcomes
@@ -188,15 +188,15 @@ def _judged(
 ) -> PushPlan:
     """Predict where a candidate ends under unseen friction, and find the ways of the finger between its pushes."""
     path, poses = lay_out(jnp.asarray(parameters, problem.start.dtype), problem)
-    outcomes = simulated(path, unseen)
+    path, poses, outcomes = _without_idle(np.asarray(path), np.asarray(poses), simulated(path, unseen))
     good, ways, found = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed), (), True
     if _is_one_finger(problem.hand):
         between = ways_between(
             outline_vertices(problem.slider.shape),
             float(problem.hand.radius[0]),
             float(problem.pushes.clearance),
-            np.asarray(path),
-            np.asarray(poses),
+            path,
+            poses,
             np.asarray(outcomes.poses),
             finger,
         )
@@ -205,6 +205,14 @@ def _judged(
     status = PushPlanStatus.FOUND if probability >= success else PushPlanStatus.UNLIKELY
     status = status if found else PushPlanStatus.NO_WAY
     return PushPlan(status, path, poses, ways, parameters, outcomes, probability, cost, np.zeros(0))
+
+
+def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray, Outcomes]:
+    """Leave out the pushes that move the slider in no sample, nor under the mean friction."""
+    every = np.concatenate([poses[None], np.asarray(outcomes.poses)])
+    moves = np.any(np.diff(every, axis=1) != 0, axis=(0, 2))
+    keep = np.concatenate([[True], moves])
+    return path[moves], poses[keep], outcomes._replace(poses=outcomes.poses[:, keep])
 
 
 def _finger_at(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | None:

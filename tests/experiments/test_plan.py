@@ -1,6 +1,7 @@
 """The command that plans pushes: its way points are replayed, and compared with the slider by shapely."""
 
 import csv
+import itertools
 import json
 
 import matplotlib.image
@@ -10,7 +11,7 @@ import pytest
 import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.experiments.plan import experiment
-from pushjax.planning import Goal, Outcomes, PushPlan, PushPlanStatus
+from pushjax.planning import Outcomes, PushPlan, PushPlanStatus
 from pushjax.planning.between_pushes import ways_between
 from pushjax.planning.poses import to_world
 
@@ -22,7 +23,7 @@ SIMPLE += ["--friction", str(FRICTION), str(FRICTION)]
 ROBUST = ["--goal", "0.03", "0.02", "-0.4", "--symmetry", "2", "--finger", "-0.1", "0"]
 
 
-def push_through_the_middle(slider, hand, options, seed):
+def push_through_the_middle(slider, hand, goal, options, seed):
     """A plan that needs no search: a push through the center of a symmetric block, which then only translates."""
     path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
     poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
@@ -30,9 +31,7 @@ def push_through_the_middle(slider, hand, options, seed):
     between = ways_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
     outcomes = Outcomes(samples, np.zeros(20, bool))
     nothing = np.zeros(0)
-    return Goal(options.goal), PushPlan(
-        PushPlanStatus.FOUND, path, poses, between.ways, nothing, outcomes, 1.0, 0.0, nothing
-    )
+    yield PushPlan(PushPlanStatus.FOUND, path, poses, between.ways, nothing, outcomes, 1.0, 0.0, nothing)
 
 
 @pytest.fixture(
@@ -48,7 +47,7 @@ def planned(request, tmp_path_factory):
         options = request.param
         if options == "without search":
             options = SIMPLE
-            patch.setattr(experiment, "_plan", push_through_the_middle)
+            patch.setattr(experiment, "_plans", push_through_the_middle)
         cli.main(["plan", *options, "--shape", str(folder / "block.csv"), "--out", str(folder)])
     rows = list(csv.DictReader((folder / "way_points.csv").open()))
     points = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
@@ -97,6 +96,19 @@ def test_time_is_that_of_the_speeds(planned):
     length = np.hypot(np.diff(points["finger_x"]), np.diff(points["finger_y"]))
     speed = np.where(points["push"][1:] > 0, *reversed(record["settings"]["speed"]))
     np.testing.assert_allclose(np.diff(points["time"]), length / speed, atol=2e-3)
+
+
+def test_attempts_end_with_the_first_that_is_sure_enough():
+    def plans():
+        for status, success in ((2, 0.0), (1, 0.4), (1, 0.7), (0, 0.95), (0, 1.0)):
+            yield PushPlan(PushPlanStatus(status), None, None, (), None, None, success, 0.0, None)
+
+    counted = []
+    best = experiment._best(plans(), 5, lambda done, total: counted.append((done, total)))
+    assert best.success == 0.95
+    assert counted == [(1, 5), (2, 5), (3, 5), (4, 5)]
+    few = itertools.islice(plans(), 3)
+    assert experiment._best(few, 3, lambda done, total: None).success == 0.7
 
 
 @pytest.mark.parametrize(

@@ -176,6 +176,17 @@ def test_a_belief_over_the_start(slider, easy, plan):
     assert done.success(easy) < plan.success - 0.1
 
 
+def test_pushes_that_move_nothing_are_left_out(slider, easy):
+    """At the goal already, the best push is one that misses the block: the plan has none."""
+    here = Goal((0, 0, 0), length=slider.surface.length, position=0.008, angle=0.3)
+    plan = plan_pushes(KEY, slider, HAND, np.zeros(3), here, **SETTINGS)
+    assert plan.status is PushPlanStatus.FOUND
+    assert plan.success == 1
+    assert plan.path.shape[0] == len(plan.ways) == 0
+    np.testing.assert_array_equal(plan.pose, np.zeros((1, 3)))
+    assert plan.outcomes.poses.shape == (256, 1, 3)
+
+
 def test_an_unreachable_goal_has_a_status(slider):
     goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, position=0.008, angle=0.3)
     plan = plan_pushes(KEY, slider, HAND, np.zeros(3), goal, **SETTINGS)

@@ -6,6 +6,7 @@ one, and zero on its way between pushes.
 """
 
 import csv
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.experiments.identify_logs.setting import expected_surface, shape_of, support_of
 from pushjax.experiments.plan.options import Options
@@ -25,13 +27,16 @@ LONGEST = 2.5  # longest push, in units of the limit surface's length
 STEPS = 12  # of a push
 
 
-def run(options: Options, seed: int = 0, out: Path | None = None) -> dict[str, Any]:
+def run(
+    options: Options, seed: int = 0, out: Path | None = None, progress: ProgressCallback = no_progress
+) -> dict[str, Any]:
     """Plan the pushes, and write way points and picture.
 
     Args:
         options: The block, its poses, and friction.
         seed: Seed of everything random.
         out: Folder for the way points and the picture. None: neither.
+        progress: Called with the number of attempts done and their total.
 
     Returns:
         The record: status and probability of success of the plan, its paths and ways, predicted final poses and their
@@ -46,9 +51,12 @@ def run(options: Options, seed: int = 0, out: Path | None = None) -> dict[str, A
     support = support_of(options.support, shape, [])  # pyright: ignore[reportArgumentType]
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
     slider = pj.Slider(shape, expected_surface(support, degree, seed))
-    goal, plan = _plan(slider, hand, options, seed)
+    position, angle = options.tolerance
+    length, at = float(slider.surface.length), np.array(options.goal)
+    goal = Goal(at, position=position, angle=angle, length=length, symmetry=options.symmetry)
+    plan = _best(_plans(slider, hand, goal, options, seed), options.attempts, progress)
     motion, files = None, []
-    if plan.status != PushPlanStatus.NO_WAY:
+    if plan.status != PushPlanStatus.NO_WAY and plan.ways:
         motion = finger_motion(plan.ways, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
     if out is not None and motion is not None:
         files.append(str(_write(out / "way_points.csv", motion)))
@@ -70,25 +78,34 @@ def _check_finger(shape: pj.Shape, options: Options) -> None:
         raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
 
 
-def _plan(slider: pj.Slider, hand: pj.Hand, options: Options, seed: int) -> tuple[Goal, PushPlan]:
-    length = float(slider.surface.length)
-    position, angle = options.tolerance
-    goal = Goal(np.array(options.goal), position=position, angle=angle, length=length, symmetry=options.symmetry)
-    longest = LONGEST * length if options.longest is None else options.longest
-    ways: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
-    plan = plan_pushes(
-        jax.random.key(seed),
-        slider,
-        hand,
-        np.array(options.start),
-        goal,
-        model=pj.FrictionModel(options.dof, options.friction),
-        pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
-        success=options.success,
-        finger=options.finger,
-        **ways,
-    )
-    return goal, plan
+def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed: int) -> Iterator[PushPlan]:
+    """Yield the plan of each attempt."""
+    longest = LONGEST * float(slider.surface.length) if options.longest is None else options.longest
+    how: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
+    for attempt in range(options.attempts):
+        yield plan_pushes(
+            jax.random.fold_in(jax.random.key(seed), attempt),
+            slider,
+            hand,
+            np.array(options.start),
+            goal,
+            model=pj.FrictionModel(options.dof, options.friction),
+            pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
+            success=options.success,
+            finger=options.finger,
+            **how,
+        )
+
+
+def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) -> PushPlan:
+    """Return the first plan that is sure enough, or else the surest."""
+    made: list[PushPlan] = []
+    for plan in plans:
+        made.append(plan)
+        progress(len(made), attempts)
+        if plan.status == PushPlanStatus.FOUND:
+            break
+    return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_WAY, plan.success))
 
 
 def _figures(plan: PushPlan, goal: Goal, motion: Any) -> dict[str, Any]:
@@ -132,6 +149,9 @@ def summary(record: dict[str, Any]) -> str:
         blocked = next(k for k, way in enumerate(record["ways"]) if way["status"] != WayStatus.FOUND.name)
         words = f"no plan: the finger does not get to push {blocked + 1} ({record['ways'][blocked]['status']})"
         return "\n".join([words, *(f"drew {path}" for path in record["pictures"])])
+    if not len(record["path"]):
+        words = "no push is needed" if status == PushPlanStatus.FOUND.name else "no push that helps was found"
+        return "\n".join([f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"])
     lines = [
         f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
         f"{record['samples']} samples of friction" + ("" if status == "FOUND" else ", less than asked for"),

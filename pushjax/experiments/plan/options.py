@@ -52,6 +52,8 @@ class Options:
     """Plan for all of this friction. Without, for its mean: in a fifth of the time, but such plans fail more often."""
     success: float = 0.9
     """Probability of success that is asked for."""
+    attempts: int = 3
+    """Number of searches with different random numbers, until one finds a plan that is sure enough."""
 
     def check(self) -> None:
         """Check the options as far as that needs no JAX.
@@ -76,7 +78,7 @@ class Options:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise ValueError(f"--{name} must be positive, in m; got {value:g}")
-        for name in ("pushes", "symmetry"):
+        for name in ("pushes", "symmetry", "attempts"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} must be at least 1; got {getattr(self, name)}")
         low, high = self.friction
