@@ -84,13 +84,16 @@ def control_step(
         path: Configurations of the hand, world, m.
         pose: Pose of the slider at the start, world, m and rad.
     """
+    args, in_rounds = (
+        (polygon, surface, friction, hand, walls, path, pose),
+        Rounds(_begin, _advance, _is_ongoing, _finish),
+    )
     if not _is_finger(hand):
-        return Pushed.of(_simulated(polygon, surface, friction, hand, walls, path, pose))
-    args = polygon, surface, friction, hand, walls, path, pose
+        at_start = Pushed(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
+        return where_needed(jnp.ones((), bool), _with_all_contacts, at_start, *args, rounds=in_rounds)
     once = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
     valid = jax.lax.stop_gradient(_is_valid(once, polygon, surface, walls, path))
     deep = ~valid & jax.lax.stop_gradient(_depth_at_start(*args) > DEEP * surface.length)
-    in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
     push = where_needed(~valid & ~deep, _with_all_contacts, Pushed.of(once), *args, rounds=in_rounds)
     return where_needed(deep, _separated, push, *args)
 
