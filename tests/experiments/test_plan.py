@@ -98,6 +98,24 @@ def test_time_is_that_of_the_speeds(planned):
     np.testing.assert_allclose(np.diff(points["time"]), length / speed, atol=2e-3)
 
 
+def test_without_a_way_there_are_no_way_points(tmp_path, monkeypatch, capsys):
+    """Those of an earlier plan are deleted."""
+    (tmp_path / "way_points.csv").write_text("old")
+    notched = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (0.1, 1), (0.1, 0), (-0.1, 0), (-0.1, 1), (-1, 1)])
+
+    def into_the_notch(slider, hand, goal, options, seed):
+        path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
+        between = ways_between(notched, RADIUS, options.clearance, path, still, still[None])
+        outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
+        yield PushPlan(PushPlanStatus.NO_WAY, path, still, between.ways, nothing, outcomes, 0.0, 0.0, nothing)
+
+    monkeypatch.setattr(experiment, "_plans", into_the_notch)
+    cli.main(["plan", *SIMPLE, "--out", str(tmp_path)])
+    assert "no plan: the finger does not get to push 1 (GOAL_BLOCKED)" in capsys.readouterr().out
+    assert not (tmp_path / "way_points.csv").exists()
+    assert json.loads((tmp_path / "plan.json").read_text())["status"] == "NO_WAY"
+
+
 def test_attempts_end_with_the_first_that_is_sure_enough():
     def plans():
         for status, success in ((2, 0.0), (1, 0.4), (1, 0.7), (0, 0.95), (0, 1.0)):

@@ -23,6 +23,7 @@ from pushjax.planning.approach import WayStatus
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.poses import to_body
 
+FILE = "way_points.csv"
 LONGEST = 2.5  # longest push, in units of the limit surface's length
 STEPS = 12  # of a push
 
@@ -59,7 +60,9 @@ def run(
     if plan.status != PushPlanStatus.NO_WAY and plan.ways:
         motion = finger_motion(plan.ways, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
     if out is not None and motion is not None:
-        files.append(str(_write(out / "way_points.csv", motion)))
+        files.append(str(_write(out / FILE, motion)))
+    elif out is not None:
+        (out / FILE).unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
     pictures = []
     if out is not None:
         from pushjax.experiments.plan.picture import draw
@@ -151,7 +154,8 @@ def summary(record: dict[str, Any]) -> str:
         return "\n".join([words, *(f"drew {path}" for path in record["pictures"])])
     if not len(record["path"]):
         words = "no push is needed" if status == PushPlanStatus.FOUND.name else "no push that helps was found"
-        return "\n".join([f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"])
+        lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
+        return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])
     lines = [
         f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
         f"{record['samples']} samples of friction" + ("" if status == "FOUND" else ", less than asked for"),
