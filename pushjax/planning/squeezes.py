@@ -2,7 +2,8 @@
 
 A belief is a set of samples of the slider's pose. When a parallel jaw closes, every sample moves: the slider slides and
 turns until both pads hold it. So samples that were different become the same, up to the symmetry of the slider. After
-a squeeze the jaw opens, which moves nothing, and squeezes again from another side. Nothing is measured in between.
+a squeeze the jaw opens, which moves nothing, is lifted, and squeezes again from another side. Nothing is measured in
+between.
 
 All candidates for a squeeze are simulated from the same samples with the same friction. A squeeze costs the entropy of
 the poses that it leads to, and more if it leaves the slider outside of the jaw. The best few sequences are continued
@@ -135,7 +136,8 @@ class SqueezePlan(NamedTuple):
         status: Whether it is sure enough.
         jaws: Poses of the jaw in each squeeze, (squeezes, 3), world, m and rad.
         pose: The most likely pose of the slider at the end, (3,), world.
-        success: Predicted probability that the slider is held at the end, within the tolerances of `pose`.
+        success: Predicted probability that nothing fails, and the slider is held at the end, within the tolerances of
+            `pose`.
         entropy: Predicted entropy of the pose before the first squeeze and after each, (squeezes + 1,), nats.
         outcomes: Prediction for all samples of the belief, under friction that the search has not seen.
         history: Least cost after each squeeze in the search, (squeezes,).
@@ -223,7 +225,7 @@ def plan_squeezes(
     unseen = jax.random.fold_in(key, 1)
     outcomes = squeeze_outcomes(unseen, slider, hand, poses, jaws[0], model=model, squeezes=squeezes)
     center, near = most_likely(outcomes.poses[:, -1], turns, position, angle)
-    probability = float(np.mean(near & outcomes.held[:, -1]))
+    probability = float(np.mean(near & outcomes.held[:, -1] & ~outcomes.failed.any(axis=1)))
     known = entropy(np.moveaxis(outcomes.poses, 1, 0), turns, length, width)
     status = SqueezeStatus.FOUND if probability >= success else SqueezeStatus.UNLIKELY
     return SqueezePlan(status, jaws[0], outcomes.poses[center, -1], probability, known, outcomes, np.array(history))

@@ -131,6 +131,21 @@ def test_a_slider_that_is_not_held_costs(monkeypatch):
     assert plan.success == 1
 
 
+def test_a_squeeze_that_fails_is_no_success(monkeypatch):
+    """It costs more than any other, and what fails on the way is not known at the end."""
+
+    def squeeze(slider, hand, settings, draws, poses, jaws):
+        failed = (np.asarray(jaws)[:, 2] < 0.1) | (np.asarray(poses)[:, 0] > 0.004)
+        return 0 * np.asarray(poses), np.ones(len(poses), bool), failed
+
+    monkeypatch.setattr(squeezes, "_squeeze_rows", squeeze)
+    start = np.array([[0.0, 0, 0]] * 3 + [[0.005, 0, 0]])
+    plan = plan_squeezes(KEY, DISK, HAND, start, model=KNOWN, squeezes=Squeezes(0.08, angles=8), count=2, samples=4)
+    assert np.all(plan.jaws[:, 2] > 0.1)
+    assert plan.success == 0.75
+    assert plan.status is SqueezeStatus.UNLIKELY
+
+
 def test_offsets_are_along_the_pads():
     around = Squeezes(0.08, angles=2, offsets=(-0.01, 0.02)).around(np.array([0.1, 0.2]))
     np.testing.assert_allclose(
