@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import jax
 import numpy as np
+from scipy.stats import binomtest
 
 import pushjax as pj
 from pushjax._internal.checks import check_count
@@ -162,19 +163,13 @@ def _play(key: Any, state: Any, step: Any, params: Any, made: PushController) ->
     return episode
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a probability, from the number of successes."""
-    z, share = 1.959964, successes / count
-    center, width = share + z**2 / (2 * count), z * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
-    return float((center - width) / (1 + z**2 / count)), float((center + width) / (1 + z**2 / count))
-
-
 def _row(name: str, played: list[Episode], nominal: list[Episode] | None, setup: float) -> dict[str, Any]:
-    """Return the figures of a controller; those that failed count with the steps that they took."""
+    """Return the figures of a controller, with Wilson's interval. Failures count with the steps that they took."""
     steps, successes = np.array([each.steps for each in played], float), sum(each.success for each in played)
     times = np.concatenate([each.seconds for each in played])
+    interval = binomtest(successes, len(played)).proportion_ci(0.95, method="wilson")
     row: dict[str, Any] = {"controller": name, "episodes": len(played), "successes": successes}
-    row |= {"success_ci95": wilson(successes, len(played)), "steps_mean": float(steps.mean())}
+    row |= {"success_ci95": [float(interval.low), float(interval.high)], "steps_mean": float(steps.mean())}
     row |= {"steps_median": float(np.median(steps)), "steps_95": float(np.percentile(steps, 95))}
     row |= {"pushes_mean": float(np.mean([each.pushes for each in played])), "setup_processor_s": setup}
     row |= {"step_ms": 1e3 * float(times.mean()), "step_95_ms": 1e3 * float(np.percentile(times, 95))}
