@@ -17,7 +17,7 @@ from examples.push_box_policy import DISCOUNT, REWARD_SCALE, Policy
 from pushjax.tasks import PushBox, TableParams, TaskState
 from pushjax.tasks.control_step import Pushed
 
-ENVIRONMENTS, STEPS = 512, 16  # of one update
+ENVIRONMENTS = 512
 TRACE_DECAY = 0.95
 CRITIC_STEPS = 8
 ACTOR = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2e-3))
@@ -60,11 +60,11 @@ def start(key: PRNGKeyArray, params: TableParams) -> Learner:
 
 
 @eqx.filter_jit
-def update(learner: Learner, key: PRNGKeyArray, params: TableParams) -> tuple[Learner, Array]:
-    """Take control steps in all environments and improve the policy. Return the mean reward, too."""
+def update(learner: Learner, key: PRNGKeyArray, params: TableParams, horizon: int) -> tuple[Learner, Array]:
+    """Take `horizon` control steps in all environments and improve the policy. Return the mean reward, too."""
     act_key, reset_key = jax.random.split(key)
     policy, (actor, critic) = learner.policy, learner.optimizers
-    (_, (states, after, record)), gradient = _gradient(policy, learner, act_key, params)
+    (_, (states, after, record)), gradient = _gradient(policy, learner, act_key, params, horizon)
     changes, actor = ACTOR.update(gradient, actor)
     policy = eqx.apply_updates(policy, changes)
     policy, critic = _fit_values(policy, critic, record)
@@ -89,7 +89,7 @@ class Record(NamedTuple):
 
 
 @eqx.filter_value_and_grad(has_aux=True)
-def _gradient(policy: Policy, learner: Learner, key: PRNGKeyArray, params: TableParams):
+def _gradient(policy: Policy, learner: Learner, key: PRNGKeyArray, params: TableParams, horizon: int):
     def step(carry: tuple[TaskState, Array], key: PRNGKeyArray):
         states, observations = carry
         mean = jax.vmap(policy.mean)(observations)
@@ -101,8 +101,8 @@ def _gradient(policy: Policy, learner: Learner, key: PRNGKeyArray, params: Table
         return (states, after), Record(observations, REWARD_SCALE * reward, after, success)
 
     carry = learner.states, learner.observations
-    (states, after), record = jax.lax.scan(step, carry, jax.random.split(key, STEPS))
-    discounts = DISCOUNT ** jnp.arange(STEPS + 1)
+    (states, after), record = jax.lax.scan(step, carry, jax.random.split(key, horizon))
+    discounts = DISCOUNT ** jnp.arange(horizon + 1)
     # A step after success has nothing to gain, and its reward is about zero, as is the value.
     fixed = eqx.tree_at(lambda policy: policy.critic, policy, replace_fn=_without_derivatives)
     value = jax.vmap(fixed.value)(after) * discounts[-1]

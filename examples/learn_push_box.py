@@ -13,9 +13,10 @@ under friction that they have not seen. With --picture the learning curves of a 
 import argparse
 import json
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,11 +24,35 @@ import numpy as np
 from examples import analytic, evolution, ppo
 from examples.push_box_policy import EPISODE, KNOWN, RANDOM, TESTS, Friction, evaluate
 
-RUNS: dict[str, tuple[ModuleType, Friction, int]] = {  # learner, friction, control steps of an update
-    "PPO, random friction": (ppo, RANDOM, ppo.ENVIRONMENTS * ppo.STEPS),
-    "PPO, known friction": (ppo, KNOWN, ppo.ENVIRONMENTS * ppo.STEPS),
-    "analytic gradients, random friction": (analytic, RANDOM, analytic.ENVIRONMENTS * analytic.STEPS),
-    "evolution strategy, random friction": (evolution, RANDOM, 2 * evolution.PAIRS * EPISODE),
+
+class Run(NamedTuple):
+    """A way to learn.
+
+    Attributes:
+        start: Function from key and parameters to the learner before the first update.
+        update: Function from learner, key and parameters to the learner after an update.
+        friction: Friction in the training.
+        steps: Control steps of an update.
+    """
+
+    start: Callable[..., Any]
+    update: Callable[..., Any]
+    friction: Friction
+    steps: int
+
+
+PPO_STEPS = ppo.ENVIRONMENTS * ppo.STEPS
+RUNS = {
+    "PPO, random friction": Run(ppo.start, ppo.update, RANDOM, PPO_STEPS),
+    "PPO, known friction": Run(ppo.start, ppo.update, KNOWN, PPO_STEPS),
+    "evolution strategy, random friction": Run(
+        evolution.start, evolution.update, RANDOM, 2 * evolution.PAIRS * EPISODE
+    ),
+} | {
+    f"analytic gradients over {horizon} steps, random friction": Run(
+        analytic.start, partial(analytic.update, horizon=horizon), RANDOM, analytic.ENVIRONMENTS * horizon
+    )
+    for horizon in (4, 16)
 }
 CURVE_POINTS = 8
 
@@ -41,23 +66,25 @@ def train(name: str, seed: int, seconds: float) -> dict[str, Any]:
         seconds: Processor time of all updates together, without compilation and tests.
 
     Returns:
-        The record: the curve of the success under the friction of the training, and the tests.
+        The record: the curve (processor time, control steps, success under the friction of the training, and reward of
+        a control step), and the tests.
     """
-    learner_module, friction, steps_of_update = RUNS[name]
-    params, key = friction.params(), jax.random.key(seed)
-    learner = learner_module.start(key, params)
-    jax.block_until_ready(learner_module.update(learner, key, params))  # compiles
+    run = RUNS[name]
+    params, key = run.friction.params(), jax.random.key(seed)
+    learner = run.start(key, params)
+    _, reward = jax.block_until_ready(run.update(learner, key, params))  # compiles
     curve, used, updates = [], 0.0, 0
     while True:
         if used >= len(curve) * seconds / CURVE_POINTS:
             outcome = evaluate(learner.policy, jax.random.key(1000), params)
-            curve.append((used, updates * steps_of_update, float(np.mean(outcome.success))))
-            print(f"{name}, seed {seed}: {used:.0f} s, {updates} updates, success {curve[-1][2]:.3f}", flush=True)
+            curve.append((used, updates * run.steps, float(np.mean(outcome.success)), float(reward)))
+            said = f"{updates} updates, reward {curve[-1][3]:.3f}, success {curve[-1][2]:.3f}"
+            print(f"{name}, seed {seed}: {used:.0f} s, {said}", flush=True)
         if used >= seconds:
             break
         begin = time.process_time()
         key, update_key = jax.random.split(key)
-        learner, _ = jax.block_until_ready(learner_module.update(learner, update_key, params))
+        learner, reward = jax.block_until_ready(run.update(learner, update_key, params))
         used, updates = used + time.process_time() - begin, updates + 1
     tests = {}
     for test, tested in TESTS.items():
@@ -113,8 +140,8 @@ def main() -> None:
     arguments = parser.parse_args()
     records = json.loads(arguments.to.read_text()) if arguments.to.exists() else []
     done = {(record["run"], record["seed"]) for record in records}
-    for seed in range(arguments.seeds):
-        for name in arguments.runs:
+    for name in arguments.runs:
+        for seed in range(arguments.seeds):
             if (name, seed) not in done:
                 records.append(train(name, seed, arguments.seconds))
                 arguments.to.write_text(json.dumps(records))
