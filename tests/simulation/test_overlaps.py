@@ -29,7 +29,7 @@ STARTS = 60
     [
         pytest.param("jaw", "T", 300, np.float64, marks=pytest.mark.long),
         ("jaw", "U", 60, np.float32),
-        ("two", "T", 60, np.float32),
+        pytest.param("two", "T", 60, np.float32, marks=pytest.mark.long),
         pytest.param("two", "bean", 300, np.float32, marks=pytest.mark.long),
     ],
 )
