@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, check_shape, common_dtype
-from pushjax._internal.jit import jit
+from pushjax._internal.jit import jit, quick_jit
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.costs import Cost, Risk
 from pushjax.planning.draws import draw_friction, mean_friction
@@ -124,13 +124,13 @@ def _costs_and_gradients(parameters: Array, problem: PushProblem) -> tuple[Array
     return jax.lax.map(jax.value_and_grad(problem.judge), parameters)
 
 
-@jit
+@quick_jit
 def lay_out(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
     """Return the paths of one candidate, and the poses that they lead to; see `PushProblem.lay_out`."""
     return problem.lay_out(parameters)
 
 
-@jit
+@quick_jit
 def simulated(paths: Array, problem: PushProblem) -> Outcomes:
     """Simulate paths of pushes, (pushes, steps + 1, dof), in all samples."""
 
