@@ -1,13 +1,12 @@
 """Learn to push a block to a pose, with and without random friction, with and without derivatives of the simulator.
 
-    python -m examples.learn_push_box --to learning.json [--seconds 75] [--seeds 3] [--picture learning.png]
+    python -m examples.learn_push_box --to learning.json [--seconds 50] [--seeds 3] [--picture learning.png]
 
-trains policies for `pushjax.tasks.PushBox` with three learners and the same processor time for each, and tests them
+trains policies for `pushjax.tasks.PushBox` with two learners and the same processor time for each, and tests them
 under friction that they have not seen. With --picture the learning curves of a file are drawn.
 
 - `examples.ppo`: proximal policy optimization, once with known and once with random friction.
 - `examples.analytic`: derivatives of the return through the simulator.
-- `examples.evolution`: an evolution strategy.
 """
 
 import argparse
@@ -21,8 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from examples import analytic, evolution, ppo
-from examples.push_box_policy import EPISODE, KNOWN, RANDOM, TESTS, Friction, evaluate
+from examples import analytic, ppo
+from examples.push_box_policy import KNOWN, RANDOM, TESTS, Friction, evaluate
 
 
 class Run(NamedTuple):
@@ -45,9 +44,6 @@ PPO_STEPS = ppo.ENVIRONMENTS * ppo.STEPS
 RUNS = {
     "PPO, random friction": Run(ppo.start, ppo.update, RANDOM, PPO_STEPS),
     "PPO, known friction": Run(ppo.start, ppo.update, KNOWN, PPO_STEPS),
-    "evolution strategy, random friction": Run(
-        evolution.start, evolution.update, RANDOM, 2 * evolution.PAIRS * EPISODE
-    ),
 } | {
     f"analytic gradients over {horizon} steps, random friction": Run(
         analytic.start, partial(analytic.update, horizon=horizon), RANDOM, analytic.ENVIRONMENTS * horizon
@@ -114,7 +110,7 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
     from pushjax.plot.style import SERIES, STYLE
 
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(figsize=(5.6, 3.2), layout="constrained")
+        figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
         for name, (color, dash, _) in zip(RUNS, SERIES, strict=False):
             curves = [np.array(record["curve"]) for record in records if record["run"] == name]
             if not curves:
@@ -125,7 +121,7 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
             mean = np.mean([np.interp(grid, curve[:, 0], curve[:, 2]) for curve in curves], axis=0)
             axes.plot(grid, mean, color=color, ls=dash, label=name)
         axes.set(xlabel="processor time of the training, s", ylabel="episodes with success", ylim=(0, 1))
-        axes.legend(loc="upper left")
+        figure.legend(loc="outside lower center", ncols=2)
         figure.savefig(path)
         plt.close(figure)
 
@@ -133,7 +129,7 @@ def draw(records: list[dict[str, Any]], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--to", type=Path, required=True, help="file of the records; those in it are kept")
-    parser.add_argument("--seconds", type=float, default=75.0, help="processor time of each training")
+    parser.add_argument("--seconds", type=float, default=50.0, help="processor time of each training")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--runs", nargs="*", choices=list(RUNS), default=list(RUNS))
     parser.add_argument("--picture", type=Path)
