@@ -60,8 +60,8 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
-# Three notebooks that compile programs of their own, which takes a minute each.
-LONG_NOTEBOOKS = ("03_several_contacts", "04_stochastic_pushing", "06_planning")
+# Notebooks that compile programs of their own, which takes a minute each.
+LONG_NOTEBOOKS = ("03_several_contacts", "04_stochastic_pushing", "06_planning", "07_tasks", "08_plans")
 
 
 def pytest_collection_modifyitems(items):

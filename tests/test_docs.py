@@ -250,7 +250,7 @@ def test_options_are_all_in_the_command_line_page():
     def names(command) -> set[str]:
         return {field.name for field in fields(command)}
 
-    for command in (commands.Common, commands.Identify, commands.Data):
+    for command in (commands.Common, commands.Identify, commands.Plan, commands.Data):
         for name in names(command) - {"logs", "name"}:
             assert re.search(rf"--(no-)?{name.replace('_', '-')}\b", page), name
     reproduce = (DOCS / "experiments" / "index.md").read_text()
