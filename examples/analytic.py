@@ -12,10 +12,8 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PRNGKeyArray
 
-import pushjax as pj
 from examples.push_box_policy import DISCOUNT, REWARD_SCALE, Policy
 from pushjax.tasks import PushBox, TableParams, TaskState
-from pushjax.tasks.control_step import Pushed
 
 ENVIRONMENTS = 512
 TRACE_DECAY = 0.95
@@ -24,20 +22,7 @@ ACTOR = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2e-3))
 CRITIC = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2e-3))
 
 
-class OneContact(PushBox):
-    """PushBox without the test whether one contact was enough for a step, which it is for a finger on a rectangle.
-
-    The derivative of that test's two branches takes several times as long as the step.
-    """
-
-    def _pushed(self, state: TaskState, path: Array, params: TableParams) -> Pushed:
-        assert state.surface is not None
-        assert state.friction is not None
-        slider = pj.Slider(params.slider.shape, state.surface)
-        return Pushed.of(pj.rollout(slider, self.hand_model, path, pose=state.pose, friction=state.friction))
-
-
-ENV = OneContact()
+ENV = PushBox()
 
 
 class Learner(NamedTuple):

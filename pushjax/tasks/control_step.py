@@ -92,9 +92,12 @@ def control_step(
         at_start = Pushed(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
         return where_needed(jnp.ones((), bool), _with_all_contacts, at_start, *args, rounds=in_rounds)
     once = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
-    valid = jax.lax.stop_gradient(_is_valid(once, polygon, surface, walls, path))
-    deep = ~valid & jax.lax.stop_gradient(_depth_at_start(*args) > DEEP * surface.length)
-    push = where_needed(~valid & ~deep, _with_all_contacts, Pushed.of(once), *args, rounds=in_rounds)
+    push, allowed = Pushed.of(once), _allowed_overlap(surface, path)
+    deep = jax.lax.stop_gradient(_depth_at_start(*args) > jnp.maximum(DEEP * surface.length, allowed))
+    if walls or not polygon.convex:  # else there is no other contact
+        valid = jax.lax.stop_gradient(_is_valid(once, polygon, surface, walls, allowed))
+        push = where_needed(~valid & ~deep, _with_all_contacts, push, *args, rounds=in_rounds)
+        deep &= ~valid
     return where_needed(deep, _separated, push, *args)
 
 
@@ -118,15 +121,19 @@ def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless |
 
 
 def _is_valid(
-    push: Trajectory, polygon: Polygon, surface: LimitSurface, walls: tuple[Wall, ...], path: Array
+    push: Trajectory, polygon: Polygon, surface: LimitSurface, walls: tuple[Wall, ...], allowed: Scalar
 ) -> Bool[Array, ""]:
     """Whether a push with one contact and without walls is what it would be with all of them."""
-    displacement = jnp.sqrt(jnp.max(jnp.sum(jnp.diff(path, axis=0) ** 2, axis=1)))
-    allowed = jnp.maximum(NEGLIGIBLE * surface.length, DEPTH_PER_DISPLACEMENT * displacement)
     valid = jnp.all((push.status == Status.MOVING) | (push.status == Status.FREE)) & jnp.all(push.overlap <= allowed)
     for wall in walls:
         valid &= overlap_of_wall(polygon, wall, Vec3.of(push.pose[-1])).depth <= NEGLIGIBLE * surface.length
     return valid
+
+
+def _allowed_overlap(surface: LimitSurface, path: Float[Array, "steps+1 dof"]) -> Scalar:
+    """Depth of an overlap that a step of the path may leave, m."""
+    displacement = jnp.sqrt(jnp.max(jnp.sum(jnp.diff(path, axis=0) ** 2, axis=1)))
+    return jnp.maximum(NEGLIGIBLE * surface.length, DEPTH_PER_DISPLACEMENT * displacement)
 
 
 @jax.jit  # saves tracing time: loops trace their bodies several times
