@@ -193,6 +193,7 @@ def test_a_corner_that_is_past_the_other_side_touches_no_side(shape, past):
         np.testing.assert_allclose(np.asarray(touches.distance)[near], far, atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_pad_whose_end_lies_flush_with_an_arms_end():
     """Corner on corner, each is past the other's edge or not, by roundoff, and touches it in either case."""
     slider = pj.Slider(survey.shape_of("T"), surface())
@@ -207,6 +208,7 @@ def test_a_pad_whose_end_lies_flush_with_an_arms_end():
     assert float(jnp.max(ends.overlap)) < 1e-5
 
 
+@pytest.mark.long
 def test_a_rake_of_five_fingers_touches_in_ten_places():
     """More contacts than are solved together: those that the answer violates join the set."""
     rake = pj.Hand((0.005,) * 5, lambda q: q[None] + jnp.array([[0.022 * k, 0.0] for k in range(-2, 3)]), 2)
@@ -270,6 +272,7 @@ def test_pushes_of_a_batch_divide_their_own_steps():
     np.testing.assert_allclose(nested.pose.reshape(together.pose.shape), together.pose, atol=1e-9)
 
 
+@pytest.mark.long
 def test_derivatives_of_a_divided_step():
     """Forward and reverse derivatives by friction, start and hand agree with central differences."""
     x, h = jnp.array([0.2, *START, 0.0765]), 1e-6
@@ -286,12 +289,13 @@ def test_derivatives_of_a_divided_step():
     ("shape", "opening", "poses", "friction", "status"),
     [
         # the waist is 64 mm wide between the outer sides of the fingers
-        (
+        pytest.param(
             "peanut",
             0.065,
             [(-8.0375e-4, -5.0178e-4, 0.01843504), (2.2443e-3, 3.7954e-4, 0.0471798)],
             (0.07139, 0.07072),
             pj.Status.GRASPED,
+            marks=pytest.mark.long,
         ),
         ("comb", 0.07, [(-0.01244619, -0.00076171, -0.2869193)], (0.11646,), pj.Status.MOVING),
     ],
@@ -309,6 +313,7 @@ def test_parts_of_a_step_that_come_near_a_jam(shape, opening, poses, friction, s
     np.testing.assert_allclose(found.configuration[:, -1, 3], wanted, atol=2e-5)
 
 
+@pytest.mark.long
 def test_a_step_that_cannot_be_divided_is_the_first_failure():
     """Frictionless fingers on parallel faces: nothing holds the slider where it lies flat, and nothing proves it.
 
