@@ -41,7 +41,7 @@ def test_reward_of_a_block_at_the_goal():
     states = jax.vmap(lambda shift: ENV.state_of([50, 50, 256 + shift, 256, np.pi / 4], position_first=False))(
         jnp.linspace(0.0, 40.0, BATCH)
     )
-    actions = jnp.full((STEPS, BATCH, 2), 50.0)
+    actions = jnp.full((STEPS, BATCH, 2), 50.0, float)
     _, (_, _, reward, terminated, _, info) = pusht.replayed(ENV, states, actions, PARAMS)
     coverage = np.asarray(info["coverage"][0])
     assert coverage[0] == pytest.approx(1, abs=1e-5)
@@ -68,7 +68,7 @@ def test_overlapping_starts_come_apart():
     rows = np.random.default_rng(0).uniform([250, 250, 200, 200, -3], [262, 262, 312, 312, 3], (BATCH, 5))
     rows[::2, 2] = -30
     states = jax.vmap(ENV.state_of)(jnp.asarray(rows))
-    actions = jnp.full((STEPS, BATCH, 2), 256.0)
+    actions = jnp.full((STEPS, BATCH, 2), 256.0, float)
     after, _ = pusht.replayed(ENV, states, actions, PARAMS)
     shapely = pytest.importorskip("shapely")
     last = jax.tree.map(lambda leaf: leaf[-1], after)
