@@ -113,6 +113,7 @@ def test_cases_work():
     np.testing.assert_allclose(*poses, rtol=0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
     poses = grasps.random_poses(jax.random.key(2), 8, "float64")
     square = pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)
@@ -223,6 +224,7 @@ def test_outlines_are_touched_where_the_pushes_begin(which):
     assert distance == pytest.approx(0.01, abs=1e-6)
 
 
+@pytest.mark.long
 def test_rows_of_fits_and_of_monte_carlo():
     """Cases that are not pushes have rows with the same names."""
     names = None
@@ -334,6 +336,7 @@ def test_picture():
     assert "µs" in axes.get_ylabel()
 
 
+@pytest.mark.long
 def test_only_new_shapes_are_compiled():
     """Only new shapes compile; new values of outline, path, friction, or more batches of `monte_carlo` do not."""
     here = tasks.task("quartic", "float64")
