@@ -14,7 +14,7 @@ candidates that `pad_on_curve` finds are selected. The selection is new in each 
 """
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -244,17 +244,17 @@ def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
 
 
 @functools.lru_cache(maxsize=256)  # a trace of a step asks for it dozens of times
-def _num_contacts(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[tuple[int, ...], jnp.dtype], ...]) -> int:
+def _num_contacts(structure: Any, shapes: tuple[tuple[tuple[int, ...], jnp.dtype], ...]) -> int:
     """Number of contacts of a finger on an outline, whose arrays have the given shapes and dtypes."""
 
-    def candidates_of(bodies):
+    def candidates_of(finger: Finger, outline: Outline) -> Candidates:
         zero = jnp.zeros(())
         still = Vec2(zero, zero)
-        return contact_candidates(*bodies, FingerPose(still, still), still, zero)
+        return contact_candidates(finger, outline, FingerPose(still, still), still, zero)
 
-    bodies = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    candidates = jax.eval_shape(candidates_of, bodies)
-    return (3 if is_nonconvex_polygon(bodies[1]) else 2) if isinstance(candidates, Candidate) else len(candidates)
+    finger, outline = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    candidates = jax.eval_shape(candidates_of, finger, outline)
+    return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
 
 
 def is_nonconvex_polygon(outline: Outline) -> bool:

@@ -19,8 +19,8 @@ from pushjax.simulation.candidate import FingerPose, take
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.wall_contact import wall_candidates
 
-# In units of the surface's length: two pixels of PushT, 1.4 mm of the tasks on a table, whose longest steps may leave as
-# much. Deeper overlaps are treated here.
+# In units of the surface's length: two pixels of PushT, or 1.4 mm of the tasks on a table, whose longest steps may
+# leave as much. Deeper overlaps are treated here.
 DEEP = 0.04
 ROUNDS = 10  # in a control step of 0.1 s
 OPENING = 1 - 0.9**0.6  # fraction of the depth that pymunk removes in 0.01 s: a tenth in 1/60 s
