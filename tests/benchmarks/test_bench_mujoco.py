@@ -244,6 +244,7 @@ def test_mjx_ends_where_mujoco_does():
     assert error_mm(same.pose, push(scene, Settings(), FINE, starts, ends).pose).max() < 0.15
 
 
+@pytest.mark.long
 def test_mjx_converges_with_softened_contacts():
     """With softened contacts MJX converges, and another timestep uses the same compiled program."""
     mjx = pytest.importorskip("benchmarks.peers.mjx")

@@ -68,6 +68,7 @@ def grasps():
     return {"one first": final(100, None), "largest": final(100, pj.Exhaustive()), "fine": final(1600, None)}
 
 
+@pytest.mark.long
 def test_a_coarse_grasp_goes_on_as_a_fine_one(grasps):
     """In a coarse grasp, trying one contact first is nearer to fine steps than the motion of largest power.
 

@@ -285,6 +285,7 @@ def test_bad_arguments(pushes, square, expected, hand):
         pj.identify(pushes, slider, pj.Hand.two_fingers(0.002))
 
 
+@pytest.mark.long
 def test_contact_at_end_tells_where_things_are(square, real, expected, hand, tmp_path):
     """The condition that finger and slider touch reveals the offset of the tip and of the frame.
 

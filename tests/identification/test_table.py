@@ -205,6 +205,7 @@ def test_found_again(square, expected, hand):  # noqa: F811
         found.corrected(slider, hand, jnp.asarray(paths[0]))
 
 
+@pytest.mark.long
 def test_overlap_found_again(square, expected, hand):  # noqa: F811
     """For fingers logged to start up to 3 mm inside, the 70 % of that which is measurement error is recovered."""
     rng = np.random.default_rng(6)
