@@ -25,12 +25,10 @@ from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.experiments.pusht_mpc import setting
-from pushjax.experiments.pusht_mpc.player import cache_folder
-from pushjax.planning import CoverageTable, PushController, PushLibrary, PushPlanner
+from pushjax.experiments.pusht_mpc.player import cache_folder, library, planner
+from pushjax.planning import PushController, PushLibrary
 from pushjax.planning.controller import Observation
-from pushjax.planning.cost_to_go import CostToGo
 from pushjax.planning.friction_filter import FrictionFilter
-from pushjax.planning.push_library import digest, fan
 from pushjax.tasks import PushT
 
 Controller = Literal["nominal", "robust", "adapting", "known"]
@@ -103,45 +101,29 @@ def _controller(
 ) -> PushController:
     """Build a controller. Libraries of pushes are kept in the user's cache folder."""
     key, mean = jax.random.key(10**6), float(np.mean(np.asarray(model.friction)))
-    starts, directions = fan(slider, setting.FINGER_RADIUS)
     drawn: dict[str, Any] = {"friction": mean}
     if name in ("robust", "adapting"):
         drawn = {"model": model, "samples": samples, "key": key}
-    wanted = digest(slider, HAND, starts, directions, **drawn)
-    path = cache_folder() / f"pushes-{wanted[:16]}.npz"
-    if path.exists():
-        library = PushLibrary.load(path, wanted)
-    else:
-        library = PushLibrary.simulate(slider, HAND, starts, directions, **drawn)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        library.save(path)
+    pushes, _ = library(slider, cache_folder(), **drawn)
     learning = {}
     if name == "adapting":
         settings = FrictionFilter(slider, HAND, model, samples=samples, error=ERROR, relative_error=RELATIVE_ERROR)
         learning = {"friction_filter": settings, "prior": settings.init(key)}
-    planner = _planner(slider, library)
-    made = PushController(planner, setting.finger_control(), friction=mean, feedback=feedback, **learning)
+    planning = planner(slider, pushes)
+    planning.prepare()
+    made = PushController(planning, setting.finger_control(), friction=mean, feedback=feedback, **learning)
     made.prepare()
     return made
-
-
-def _planner(slider: pj.Slider, library: PushLibrary, value: CostToGo | None = None) -> PushPlanner:
-    """Return a planner whose tables are computed."""
-    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
-    measure = CoverageTable(vertices, library.center, library.length, setting.ENOUGH)
-    given = slider, setting.FINGER_RADIUS, library, setting.goal(), setting.workspace(), setting.pace()
-    planner = PushPlanner(*given, measure=measure, value=value)
-    planner.prepare()
-    return planner
 
 
 def _knowing(nominal: PushController, state: Any) -> PushController:
     """Return a controller that knows the friction of an episode; it keeps the nominal cost to go."""
     slider = pj.Slider(nominal.planner.slider.shape, state.surface)
-    library, friction = nominal.planner.library, float(state.friction)
-    true = PushLibrary.simulate(slider, HAND, library.starts, library.directions, friction=friction)
-    planner = _planner(slider, true, nominal.planner.value)
-    return PushController(planner, setting.finger_control(), friction=friction, feedback=nominal.feedback)
+    pushes, friction = nominal.planner.library, float(state.friction)
+    true = PushLibrary.simulate(slider, HAND, pushes.starts, pushes.directions, friction=friction)
+    planning = planner(slider, true, value=nominal.planner.value)
+    planning.prepare()
+    return PushController(planning, setting.finger_control(), friction=friction, feedback=nominal.feedback)
 
 
 def _play(key: Any, state: Any, step: Any, params: Any, made: PushController) -> Episode:

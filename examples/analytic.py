@@ -12,17 +12,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PRNGKeyArray
 
-from examples.push_box_policy import DISCOUNT, REWARD_SCALE, Policy
-from pushjax.tasks import PushBox, TableParams, TaskState
+from examples.push_box_policy import DISCOUNT, ENV, REWARD_SCALE, Policy, starts, starts_in_midst
+from pushjax.tasks import TableParams, TaskState
 
 ENVIRONMENTS = 512
 TRACE_DECAY = 0.95
 CRITIC_STEPS = 8
 ACTOR = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2e-3))
 CRITIC = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(2e-3))
-
-
-ENV = PushBox()
 
 
 class Learner(NamedTuple):
@@ -37,8 +34,7 @@ class Learner(NamedTuple):
 def start(key: PRNGKeyArray, params: TableParams) -> Learner:
     """Return the state before the first update. Episodes are at different times of their limit."""
     policy_key, reset_key, time_key = jax.random.split(key, 3)
-    observations, states = _starts(reset_key, params)
-    states = states.replace(time=jax.random.randint(time_key, (ENVIRONMENTS,), 0, params.max_steps_in_episode))
+    observations, states = starts_in_midst(reset_key, time_key, params, ENVIRONMENTS)
     policy = Policy(policy_key)
     parameters = eqx.filter(policy, eqx.is_array)
     return Learner(policy, (ACTOR.init(parameters), CRITIC.init(parameters)), states, observations)
@@ -55,7 +51,7 @@ def update(learner: Learner, key: PRNGKeyArray, params: TableParams, horizon: in
     policy, critic = _fit_values(policy, critic, record)
     # Episodes end between updates only, so that no derivative goes through a reset.
     ended = jax.vmap(ENV.is_truncated, in_axes=(0, None))(states, params) | record.success[-1]
-    new_observations, new_states = _starts(reset_key, params)
+    new_observations, new_states = starts(reset_key, params, ENVIRONMENTS)
     states, after = jax.tree.map(
         lambda new, old: jnp.where(ended.reshape(-1, *[1] * (old.ndim - 1)), new, old),
         (new_states, new_observations),
@@ -127,7 +123,3 @@ def _fit_values(policy: Policy, optimizer: Any, record: Record) -> tuple[Policy,
 
     (trainable, optimizer), _ = jax.lax.scan(step, (trainable, optimizer), None, CRITIC_STEPS)
     return eqx.combine(trainable, static), optimizer
-
-
-def _starts(key: PRNGKeyArray, params: TableParams) -> tuple[Array, TaskState]:
-    return jax.vmap(ENV.reset, in_axes=(0, None))(jax.random.split(key, ENVIRONMENTS), params)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, PRNGKeyArray
 
-from examples.push_box_policy import DISCOUNT, ENV, REWARD_SCALE, Policy
+from examples.push_box_policy import DISCOUNT, ENV, REWARD_SCALE, Policy, starts_in_midst
 from pushjax.tasks import TableParams, TaskState
 
 ENVIRONMENTS, STEPS = 1024, 16  # of one update
@@ -39,9 +39,7 @@ class Learner(NamedTuple):
 def start(key: PRNGKeyArray, params: TableParams) -> Learner:
     """Return the state before the first update. Episodes are at different times of their limit."""
     policy_key, reset_key, time_key = jax.random.split(key, 3)
-    keys = jax.random.split(reset_key, ENVIRONMENTS)
-    observations, states = jax.vmap(ENV.reset, in_axes=(0, None))(keys, params)
-    states = states.replace(time=jax.random.randint(time_key, (ENVIRONMENTS,), 0, params.max_steps_in_episode))
+    observations, states = starts_in_midst(reset_key, time_key, params, ENVIRONMENTS)
     policy = Policy(policy_key)
     return Learner(policy, OPTIMIZER.init(eqx.filter(policy, eqx.is_array)), states, observations)
 

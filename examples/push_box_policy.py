@@ -83,6 +83,19 @@ def features(observation: Float[Array, "6"]) -> Float[Array, "8"]:
     return jnp.concatenate([10 * (finger - block), 10 * block, turn, 4 * finger])
 
 
+def starts(key: PRNGKeyArray, params: TableParams, count: int) -> tuple[Array, TaskState]:
+    """Start episodes. Return their observations and states."""
+    return jax.vmap(ENV.reset, in_axes=(0, None))(jax.random.split(key, count), params)
+
+
+def starts_in_midst(
+    key: PRNGKeyArray, time_key: PRNGKeyArray, params: TableParams, count: int
+) -> tuple[Array, TaskState]:
+    """Start episodes at different times of their limit, so that they do not all end together."""
+    observations, states = starts(key, params, count)
+    return observations, states.replace(time=jax.random.randint(time_key, (count,), 0, params.max_steps_in_episode))
+
+
 class Outcome(NamedTuple):
     """How episodes end, each an array over the episodes.
 
@@ -101,7 +114,7 @@ class Outcome(NamedTuple):
 def evaluate(policy: Policy, key: PRNGKeyArray, params: TableParams, episodes: int = 1024) -> Outcome:
     """Let a policy act without noise, for one episode in each of many environments."""
     reset_key, step_key = jax.random.split(key)
-    observations, states = jax.vmap(ENV.reset, in_axes=(0, None))(jax.random.split(reset_key, episodes), params)
+    observations, states = starts(reset_key, params, episodes)
 
     def step(carry: tuple[TaskState, Array, Array], _: None):
         states, observations, done = carry

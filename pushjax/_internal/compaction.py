@@ -22,8 +22,6 @@ TILE = 128  # examples that are computed together on a CPU, so that their data s
 # The same on an accelerator. There a tile costs the start of its kernels, whatever its size: on an H200, 100 000 grasps
 # take 10 s in tiles of 128 and a quarter of a second in tiles of 8192.
 ACCELERATOR_TILE = 1 << 17
-
-
 PLACES = 256  # examples that advance together in `Rounds` on a CPU, where each round takes the start of its kernels
 
 
@@ -48,9 +46,9 @@ class Rounds(NamedTuple):
         return self.finish(state, *args)
 
 
-def tile_size() -> int:
+def tile_size(on_cpu: int = TILE) -> int:
     """Return the number of examples that are computed together on the default backend."""
-    return TILE if jax.default_backend() == "cpu" else ACCELERATOR_TILE
+    return on_cpu if jax.default_backend() == "cpu" else ACCELERATOR_TILE
 
 
 def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
@@ -197,7 +195,7 @@ def _compute_in_rounds(rounds: Rounds, args_batched: Any, needed, otherwise, arg
         args: Arguments of the computation.
     """
     batch = needed.shape[0]
-    places = min(PLACES if jax.default_backend() == "cpu" else ACCELERATOR_TILE, batch)
+    places = min(tile_size(PLACES), batch)
     indices, args_at, axes = _gathering(needed, places, args, args_batched)
     example_shapes = jax.eval_shape(rounds.begin, *jax.tree.map(lambda x, b: x[0] if b else x, args, args_batched))
     blank = jax.tree.map(lambda leaf: jnp.zeros((batch, *leaf.shape), leaf.dtype), example_shapes)

@@ -4,6 +4,7 @@ The results are those of plain JAX. The helpers only decide what is computed onc
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +85,12 @@ def tree_where(condition, yes, no):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
+def structure_and_shapes(tree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
+    """Return the structure of a pytree of arrays, and the shapes and dtypes of its leaves. Both can be hashed."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
+
 def map_items(function: Callable, items: tuple) -> tuple:
     """Return `(of(item), ...)` for all items, in a loop if they have the same structure, shapes and dtypes.
 
@@ -95,11 +102,7 @@ def map_items(function: Callable, items: tuple) -> tuple:
         items: Pytrees of arrays.
     """
 
-    def structure_and_types(item):
-        leaves = jax.tree.leaves(item)
-        return jax.tree.structure(item), tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-
-    if len(items) == 1 or len({structure_and_types(item) for item in items}) > 1:
+    if len(items) == 1 or len({structure_and_shapes(item) for item in items}) > 1:
         return tuple(function(item) for item in items)
     stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
     return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(items)))

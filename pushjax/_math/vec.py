@@ -124,3 +124,15 @@ def linear_combination(vectors: Iterable[Vec3], weights: Iterable[Scalar]) -> Ve
 def cos_sin(angle: Scalar) -> Vec2:
     """Return the unit vector (cos, sin) of an angle in rad."""
     return Vec2(jnp.cos(angle), jnp.sin(angle))
+
+
+def wrap_to_pi(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return an angle, rad, reduced by whole turns to at most half a turn. Its derivative is one everywhere."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Return the Euclidean norm along the last axis. Its derivative at the zero vector is zero."""
+    squared = jnp.sum(vector**2, axis=-1)
+    moves = squared > 0
+    return jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)

@@ -18,11 +18,7 @@ from pushjax.planning.clearance import point_clearance, segment_clearance
 from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
 
-SHARES = (
-    1.0,
-    0.9,
-    0.5,
-)  # of the samples, for which the finger keeps its distance, in the order of attempts
+SHARES = (1.0, 0.9, 0.5)  # of the samples, for which the finger keeps its distance, in the order of attempts
 TIGHT = 0.25  # of the clearance, with which the last attempt is made
 RUN_UPS = (1.0, 2.0, 4.0)  # longest run-ups, in units of the distance that the finger keeps
 TOUCH = 1e-4  # overlap that does not count as touching, in units of the finger's radius

@@ -20,11 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_non_negative, check_positive, check_shape
-from pushjax._math.vec import Vec2
+from pushjax._math.vec import Vec2, norm
 from pushjax.geometry import se2
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.shape import Shape
-from pushjax.planning.goal import Goal, norm
+from pushjax.planning.goal import Goal
 from pushjax.simulation.fixtures import Fixtures, Wall
 from pushjax.simulation.trajectory import Trajectory
 

@@ -37,6 +37,7 @@ from pushjax._internal.checks import (
     concrete,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax._math.vec import wrap_to_pi
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.draws import draw_friction
@@ -223,7 +224,6 @@ def _squared_errors(
 
     It is infinite where the simulation failed.
     """
-
     length = settings.slider.surface.length
     scale = settings.error**2 + settings.relative_error**2 * _distance_squared(before, after, length)
 
@@ -237,8 +237,7 @@ def _squared_errors(
 def _distance_squared(a: Float[Array, "3"], b: Float[Array, "3"], length: Array) -> Float[Array, ""]:
     """Return the squared distance of two poses, m^2; an angle counts with its smaller way round."""
     x, y, theta = a - b
-    turn = theta - 2 * jnp.pi * jnp.round(theta / (2 * jnp.pi))
-    return x**2 + y**2 + (length * turn) ** 2
+    return x**2 + y**2 + (length * wrap_to_pi(theta)) ** 2
 
 
 def _systematic(key: PRNGKeyArray, weight: Float[Array, "samples"], count: int) -> Int[Array, "count"]:

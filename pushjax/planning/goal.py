@@ -16,6 +16,7 @@ from pushjax._internal.checks import (
     check_shape,
     common_dtype,
 )
+from pushjax._math.vec import norm, wrap_to_pi
 
 ANGLE = float(np.radians(5))  # default tolerance of the angle, rad
 
@@ -96,9 +97,7 @@ class Goal(eqx.Module):
         if given.ndim == 0 or given.shape[-1] != 3:
             raise ValueError(f"pose has shape {given.shape}; expected (..., 3)")
         difference = given - jnp.broadcast_to(self.pose, given.shape)
-        # wrapped to half a turn by a whole number of turns, which has no derivative
-        angles = difference[..., 2:] - jnp.broadcast_to(self.turns, (*given.shape[:-1], len(self.turns)))
-        angles = angles - 2 * jnp.pi * jnp.round(angles / (2 * jnp.pi))
+        angles = wrap_to_pi(difference[..., 2:] - jnp.broadcast_to(self.turns, (*given.shape[:-1], len(self.turns))))
         nearest = jnp.argmin(jnp.abs(angles), axis=-1, keepdims=True)
         return jnp.concatenate([difference[..., :2], jnp.take_along_axis(angles, nearest, axis=-1)], axis=-1)
 
@@ -178,10 +177,3 @@ def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array
     if not len(turns):
         raise ValueError("symmetry must have at least one turn, zero for a slider without symmetry; got none")
     return turns
-
-
-def norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Return the Euclidean norm along the last axis. Its derivative at the zero vector is zero."""
-    squared = jnp.sum(vector**2, axis=-1)
-    moves = squared > 0
-    return jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)

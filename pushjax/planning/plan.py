@@ -16,7 +16,7 @@ that has them.
 from collections.abc import Sequence
 from enum import IntEnum
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -184,7 +184,7 @@ def _judged(
     unseen: PushProblem,
     goal: Goal,
     success: float,
-    finger: Any,
+    finger: np.ndarray | None,
 ) -> PushPlan:
     """Predict where a candidate ends under unseen friction, and find the ways of the finger between its pushes."""
     path, poses = lay_out(jnp.asarray(parameters, problem.start.dtype), problem)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._internal.xla import compute_once, decide, structure_and_shapes, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
@@ -239,12 +239,11 @@ def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
     """
     if isinstance(finger, Wall):
         return num_wall_contacts(outline)
-    leaves, structure = jax.tree.flatten((finger, outline))
-    return _num_contacts(structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
+    return _num_contacts(*structure_and_shapes((finger, outline)))
 
 
 @functools.lru_cache(maxsize=256)  # a trace of a step asks for it dozens of times
-def _num_contacts(structure: Any, shapes: tuple[tuple[tuple[int, ...], jnp.dtype], ...]) -> int:
+def _num_contacts(structure: Any, shapes: tuple[jax.ShapeDtypeStruct, ...]) -> int:
     """Number of contacts of a finger on an outline, whose arrays have the given shapes and dtypes."""
 
     def candidates_of(finger: Finger, outline: Outline) -> Candidates:
@@ -252,7 +251,7 @@ def _num_contacts(structure: Any, shapes: tuple[tuple[tuple[int, ...], jnp.dtype
         still = Vec2(zero, zero)
         return contact_candidates(finger, outline, FingerPose(still, still), still, zero)
 
-    finger, outline = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    finger, outline = jax.tree.unflatten(structure, shapes)
     candidates = jax.eval_shape(candidates_of, finger, outline)
     return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
 

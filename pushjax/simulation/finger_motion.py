@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import compute_once, map_items
-from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
+from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, wrap_to_pi
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import FingerPose
 from pushjax.simulation.detection import penetration_depth
@@ -129,7 +129,7 @@ def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> 
     motions = []
     for k, finger in enumerate(hand.fingers):
         start, end = before[k], after[k]
-        angle, turning = (start[2], _wrap_to_pi(end[2] - start[2])) if len(start) == 3 else (None, None)
+        angle, turning = (start[2], wrap_to_pi(end[2] - start[2])) if len(start) == 3 else (None, None)
         center = Vec2(start[0], start[1])
         motions.append(FingerMotion(finger, friction[k], center, Vec2(end[0], end[1]) - center, angle, turning))
     return tuple(motions)
@@ -147,11 +147,6 @@ def fixture_motions(fixtures: Fixtures) -> tuple[FingerMotion, ...]:
             angle, turning = (fixture.pose[2], zero) if isinstance(fixture.body, Pad) else (None, None)
             motions.append(FingerMotion(fixture.body, fixture.friction, fixture.center, still, angle, turning))
     return tuple(motions)
-
-
-def _wrap_to_pi(angle: Scalar) -> Scalar:
-    """Return the angle, rad, reduced to at most half a turn, because recorded angles may jump from pi to -pi."""
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:

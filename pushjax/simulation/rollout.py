@@ -277,18 +277,20 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
 
     Such steps are not divided: their overlap is recorded but not checked. Arguments as in `simulate_in_substeps`.
     """
-    outline, steps, motions_at, solver, friction_at = push[:5]
 
     def body(pose: Vec3, step: Array):
-        form, mu = friction_at(step, pose)
-        motions = motions_at(step, mu)
+        form, mu = push.friction_at(step, pose)
+        motions = push.motions_at(step, mu)
         # also the overlap after the previous step; it costs little, since contact detection starts with the same query
-        depth = max_penetration(outline, motions, pose, 0.0)
-        record, _ = step_in_scalars(form, outline, motions, solver, pose, depth, holding_distance(motions, form.length))
+        depth = max_penetration(push.outline, motions, pose, 0.0)
+        record, _ = step_in_scalars(
+            form, push.outline, motions, push.solver, pose, depth, holding_distance(motions, form.length)
+        )
         return record.pose, record._replace(overlap=depth)
 
     body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
-    last_pose, records = jax.lax.scan(body, start, jnp.arange(steps))
-    motions = motions_at(jnp.asarray(steps - 1), friction_at(jnp.asarray(steps - 1), last_pose)[1])
-    final_depth = max_penetration(outline, motions, last_pose, 1.0)
+    last_pose, records = jax.lax.scan(body, start, jnp.arange(push.steps))
+    last = jnp.asarray(push.steps - 1)
+    motions = push.motions_at(last, push.friction_at(last, last_pose)[1])
+    final_depth = max_penetration(push.outline, motions, last_pose, 1.0)
     return records._replace(overlap=jnp.concatenate([records.overlap[1:], final_depth[None]]))

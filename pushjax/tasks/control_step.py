@@ -2,7 +2,8 @@
 
 A round finger mostly touches a polygon in one place, and mostly there is no wall near. So the step is first computed
 with one contact and without walls, which takes a tenth of the time. Where that leaves the finger inside the slider, or
-the slider inside a wall, it is computed again with all contacts; in a batch, only for the examples that need it.
+the slider inside a wall, it is computed again with all contacts; in a batch, only for the examples that need it. Steps
+of other hands are always computed with all contacts.
 """
 
 from typing import NamedTuple
@@ -84,10 +85,8 @@ def control_step(
         path: Configurations of the hand, world, m.
         pose: Pose of the slider at the start, world, m and rad.
     """
-    args, in_rounds = (
-        (polygon, surface, friction, hand, walls, path, pose),
-        Rounds(_begin, _advance, _is_ongoing, _finish),
-    )
+    args = polygon, surface, friction, hand, walls, path, pose
+    in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
     if not _is_finger(hand):
         at_start = Pushed(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
         return where_needed(jnp.ones((), bool), _with_all_contacts, at_start, *args, rounds=in_rounds)
@@ -162,12 +161,12 @@ class _Progress(NamedTuple):
 
     Attributes:
         push: The push.
-        trials: Number of trials so far.
+        trials_left: Number of trials that may follow.
         status: Status of the steps that are done, (steps,); -1 for the others.
     """
 
     push: PushState
-    trials: Int[Array, ""]
+    trials_left: Int[Array, ""]
     status: Int[Array, "steps"]
 
 
@@ -179,20 +178,20 @@ def _divided(polygon, surface, friction, hand, walls, path, pose) -> DividedPush
 
 @jax.jit
 def _begin(*args) -> _Progress:
-    state = _divided(*args).first_state(Vec3.of(args[-1]))
-    return _Progress(state, jnp.zeros((), jnp.int32), jnp.full(len(args[-2]) - 1, -1, jnp.int8))
+    push = _divided(*args)
+    trials = jnp.full((), push.max_trials, jnp.int32)
+    return _Progress(push.first_state(Vec3.of(args[-1])), trials, jnp.full(push.steps, -1, jnp.int8))
 
 
 @jax.jit
 def _advance(progress: _Progress, *args) -> _Progress:
     state, (record, ended, step) = _divided(*args).trial(progress.push)
     status = progress.status.at[jnp.where(ended, step, len(progress.status))].set(record.status, mode="drop")
-    return _Progress(state, progress.trials + 1, status)
+    return _Progress(state, progress.trials_left - 1, status)
 
 
 def _is_ongoing(progress: _Progress, *args) -> Bool[Array, ""]:
-    push = _divided(*args)
-    return (progress.push.step < push.steps) & (progress.trials < push.max_trials)
+    return (progress.push.step < len(progress.status)) & (progress.trials_left > 0)
 
 
 def _finish(progress: _Progress, *args) -> Pushed:

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type
-from pushjax._math.vec import cos_sin
+from pushjax._math.vec import cos_sin, norm
 from pushjax.friction.random import FrictionModel
 from pushjax.geometry.intersection import intersection_area
 from pushjax.geometry.polygon import Polygon
@@ -171,7 +171,7 @@ class TableTask(Environment):
         """
         offset, half = state.pose - params.goal, np.pi / params.symmetry
         errors = {
-            "position_error": _length(offset[:2]),
+            "position_error": norm(offset[:2]),
             "angle_error": jnp.abs(jnp.mod(offset[2] + half, 2 * half) - half),
         }
         return super().measures(state, params) | errors
@@ -179,7 +179,7 @@ class TableTask(Environment):
     def reward(self, state: TaskState, measures: dict[str, Array], params: TableParams) -> Float[Array, ""]:
         """Return minus the distance of the block from the goal, and of the hand from the block, in units of 0.1 m."""
         from_goal = measures["position_error"] + params.slider.surface.length * measures["angle_error"]
-        from_block = _length(state.hand[:2] - state.pose[:2])
+        from_block = norm(state.hand[:2] - state.pose[:2])
         return -(from_goal + REACHING_WEIGHT * from_block) / REWARD_LENGTH
 
     def observe(self, key: PRNGKeyArray, state: TaskState, action: Array | None, params: TableParams) -> Array:
@@ -204,12 +204,6 @@ class TableTask(Environment):
         dtype = (self.default_params if params is None else params).goal.dtype
         values = checked("row", as_float(row, dtype, "row"), (len(self.MOTION) + 3,), signed=True)
         return TaskState(values[-3:], values[:-3], jnp.zeros_like(values[:-3]), jnp.zeros((), jnp.int32))
-
-
-def _length(offset: Float[Array, "2"]) -> Float[Array, ""]:
-    """Return the length of a vector, with the derivative zero at zero."""
-    squared = jnp.sum(offset**2)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
 
 def draw_beside(key: PRNGKeyArray, nearest: Array, spread: float, angles: tuple[float, float]) -> Array:

@@ -41,7 +41,6 @@ def test_everything_is_finite(degree):
         states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)[1]
         _, (finite, statuses, _) = program(jax.random.key(1), states)
     counts = dict(zip(pj.Status, np.asarray(statuses).sum(0).tolist(), strict=True))
-    print(counts)
     assert np.all(finite)
     assert sum(counts.values()) == BATCH * STEPS * env.substeps
     assert counts[pj.Status.JAMMED] > 10_000

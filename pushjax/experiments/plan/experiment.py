@@ -20,6 +20,7 @@ from pushjax.experiments.identify_logs.setting import expected_surface, shape_of
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
 from pushjax.planning.approach import WayStatus
+from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.poses import to_body
 
@@ -111,7 +112,7 @@ def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) 
     return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_WAY, plan.success))
 
 
-def _figures(plan: PushPlan, goal: Goal, motion: Any) -> dict[str, Any]:
+def _figures(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
     """Return what the record says of a plan."""
     final = np.asarray(plan.outcomes.pose, np.float64)
     errors = np.asarray(goal.offset(final), np.float64)
@@ -134,7 +135,7 @@ def _figures(plan: PushPlan, goal: Goal, motion: Any) -> dict[str, Any]:
     }
 
 
-def _write(path: Path, motion: Any) -> Path:
+def _write(path: Path, motion: FingerMotion) -> Path:
     """Write the motion of the finger, to the micrometer and the millisecond."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:

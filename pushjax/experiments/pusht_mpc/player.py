@@ -68,18 +68,34 @@ def cache_folder() -> Path:
     return platformdirs.user_cache_path("pushjax", appauthor=False) / "planning"
 
 
-def library(friction: float, folder: Path) -> tuple[PushLibrary, bool]:
-    """Return the library of pushes for a friction in the model, and whether it was read from a file."""
-    slider, hand = setting.slider(), pj.Hand.finger(setting.FINGER_RADIUS)
+def library(slider: pj.Slider, folder: Path, **friction: Any) -> tuple[PushLibrary, bool]:
+    """Return the library of the finger's pushes, and whether it was read from a file.
+
+    Args:
+        slider: The slider.
+        folder: Folder of the file. If there is none, it is written.
+        **friction: Friction in the model, as in `PushLibrary.simulate`.
+    """
+    hand = pj.Hand.finger(setting.FINGER_RADIUS)
     starts, directions = fan(slider, setting.FINGER_RADIUS)
-    wanted = digest(slider, hand, starts, directions, friction)
+    wanted = digest(slider, hand, starts, directions, **friction)
     path = folder / f"pushes-{wanted[:16]}.npz"
     if path.exists():
         return PushLibrary.load(path, wanted), True
-    built = PushLibrary.build(slider, setting.FINGER_RADIUS, friction=friction)
+    built = PushLibrary.simulate(slider, hand, starts, directions, **friction)
     folder.mkdir(parents=True, exist_ok=True)
     built.save(path)
     return built, False
+
+
+def planner(
+    slider: pj.Slider, pushes: PushLibrary, *, look_ahead: bool = True, value: CostToGo | bool | None = None
+) -> PushPlanner:
+    """Return a planner of PushT for a library of pushes. The other arguments are those of `PushPlanner`."""
+    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
+    measure = CoverageTable(vertices, pushes.center, pushes.length, setting.ENOUGH)
+    given = slider, setting.FINGER_RADIUS, pushes, setting.goal(), setting.workspace(), setting.pace()
+    return PushPlanner(*given, measure=measure, look_ahead=look_ahead, value=value)
 
 
 def controller(
@@ -105,34 +121,21 @@ def controller(
         The controller, and how long its parts took to set up, s.
     """
     folder, began = folder or cache_folder(), time.perf_counter()
-    slider, goal = setting.slider(), setting.goal()
-    pushes, loaded = library(friction_in_model, folder)
+    slider = setting.slider()
+    pushes, loaded = library(slider, folder, friction=friction_in_model)
     times: dict[str, Any] = {"library": time.perf_counter() - began, "library_from_file": loaded}
     began = time.perf_counter()
-    vertices = np.asarray(slider.shape.vertices, float)  # pyright: ignore[reportAttributeAccessIssue]
-    measure = CoverageTable(vertices, pushes.center, pushes.length, setting.ENOUGH)
-    pace = setting.pace()
-    name = hashlib.sha256(f"{pushes.digest} {pace} {goal}".encode()).hexdigest()[:16]
+    name = hashlib.sha256(f"{pushes.digest} {setting.pace()} {setting.goal()}".encode()).hexdigest()[:16]
     file = folder / f"cost-{name}.npz"
     value: CostToGo | bool | None = (CostToGo.load(file) if file.exists() else None) if cost_to_go else False
-    planner = PushPlanner(
-        slider,
-        setting.FINGER_RADIUS,
-        pushes,
-        goal,
-        setting.workspace(),
-        pace,
-        measure=measure,
-        look_ahead=lookahead,
-        value=value,
-    )
-    if value is None and planner.value is not None:
-        planner.value.save(file)
-    planner.prepare()
+    planning = planner(slider, pushes, look_ahead=lookahead, value=value)
+    if value is None and planning.value is not None:
+        planning.value.save(file)
+    planning.prepare()
     times["tables"] = time.perf_counter() - began
     began = time.perf_counter()
     made = PushController(
-        planner, setting.finger_control(), friction=friction_in_model, feedback=feedback, noise=observation_noise
+        planning, setting.finger_control(), friction=friction_in_model, feedback=feedback, noise=observation_noise
     )
     made.prepare()
     return made, times | {"feedback": time.perf_counter() - began}
