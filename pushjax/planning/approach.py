@@ -1,6 +1,6 @@
-"""Ways of a round finger around a polygon that do not touch it.
+"""Ways of a round finger around a polygon, and among obstacles, that touch neither.
 
-The shortest way around a polygon at a given distance consists of straight segments and of arcs around convex corners.
+The shortest way around polygons at a given distance consists of straight segments and of arcs around convex corners.
 `Roadmap` has a few points just outside of each such arc; the segments between points that see each other are a
 visibility graph. Start and goal are joined to it by the segments that keep the distance too.
 
@@ -9,8 +9,10 @@ So does a finger that overlaps the polygon a little, as positions that are measu
 The goal of an approach is the start of a push, which may be nearer too. The finger gets there along the direction of
 the push, from a point that has the distance: so a push begins with a run-up.
 
-The graph is fixed in the frame of the polygon. Where the limits of the workspace cut a point off, the point is moved to
-the limit and its segments are checked anew.
+The points and segments around the polygon are fixed in its frame. Where the limits of the workspace cut a point off,
+the point is moved to the limit and its segments are checked anew. Obstacles move in this frame, so their points and all
+segments among them are found for each pose. Of the segments to the many goals only those are checked that would be the
+ends of shortest ways.
 """
 
 from enum import IntEnum
@@ -21,11 +23,13 @@ from scipy.sparse.csgraph import dijkstra
 
 from pushjax._internal.checks import check_positive
 from pushjax.planning.clearance import point_clearance, segment_clearance, turns
+from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
 
 ARC_STEP = np.pi / 4  # largest angle between neighboring points around a corner
 OUTSIDE = 1e-3  # points are outside of the arc by this part of its radius, so that segments along it keep the distance
+DISK_POINTS = 16  # around a disk
 RETREATS = 24  # directions in which a retreat is tried
 
 
@@ -37,6 +41,7 @@ class WayStatus(IntEnum):
     NO_RETREAT = 2
     GOAL_BLOCKED = 3
     NO_WAY = 4
+    START_IN_FIXTURE = 5
 
 
 class Way(NamedTuple):
@@ -62,6 +67,7 @@ class Ways(NamedTuple):
         points: The corners that ways may have, the start first, (nodes, 2), body frame.
         previous: For each of these, the one before it on the shortest way from the start.
         last: For each goal, the last of the corners on the way to it.
+        blocked: Whether a goal itself is too near to the polygon or an obstacle, (goals,).
     """
 
     lengths: np.ndarray
@@ -69,6 +75,7 @@ class Ways(NamedTuple):
     points: np.ndarray
     previous: np.ndarray
     last: np.ndarray
+    blocked: np.ndarray
 
 
 class Roadmap:
@@ -80,10 +87,19 @@ class Roadmap:
         clearance: Distance that the finger keeps from the polygon on its way, m, positive.
         goals: Ends of the ways, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
             reached.
+        from_obstacles: Distance that the finger keeps from obstacles, m. None: as from the polygon.
     """
 
-    def __init__(self, vertices: np.ndarray, radius: float, clearance: float, goals: np.ndarray):
+    def __init__(
+        self,
+        vertices: np.ndarray,
+        radius: float,
+        clearance: float,
+        goals: np.ndarray,
+        from_obstacles: float | None = None,
+    ):
         check_positive("clearance", clearance)
+        self.from_obstacles = radius + (clearance if from_obstacles is None else from_obstacles)
         self.vertices, self.radius, self.apart = vertices, radius, radius + clearance
         self.clearance, self.goals = clearance, np.asarray(goals, float)
         points = _corner_points(vertices, self.apart * (1 + OUTSIDE))
@@ -97,21 +113,27 @@ class Roadmap:
         Args:
             start: Center of the finger, (2,), world, m.
             pose: Pose of the polygon, (3,), m and rad.
-            workspace: Where the finger may be.
+            workspace: Where the finger may be, and the obstacles.
         """
-        body_start = to_body(pose, np.asarray(start, float))
-        begin, status = self._retreat(body_start, pose, workspace)
+        body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.seen_from(pose)
+        begin, status = self._retreat(body_start, pose, workspace, obstacles)
         if status != WayStatus.FOUND:
             return self._none(body_start, status)
         nodes, links = self._within(pose, workspace)
+        if obstacles.any:
+            nodes, links = self._among(nodes, links, pose, workspace, obstacles)
         corners = np.concatenate([begin[-1:], nodes])
         graph = self._lengths(corners[:, None], corners)
-        graph[np.isinf(graph)] = 0  # no edge
+        graph[np.isinf(graph) | ~self._clear(obstacles, corners[:, None], corners)] = 0  # no edge
         distance, previous = dijkstra(graph, indices=0, return_predecessors=True)
         direct = self._lengths(begin[-1], self.goals, at_end=self.goal_clearance)
         total = distance[:, None] + np.concatenate([direct[None], links])
         total[:, ~workspace.allows_finger(to_world(pose, self.goals))] = np.inf
-        last = np.argmin(total, axis=0)
+        blocked = self.goal_clearance < self.apart
+        if obstacles.any:
+            blocked |= obstacles.point_clearance(self.goals) < self.from_obstacles
+            total[:, blocked] = np.inf
+        last = self._last(total, corners, obstacles)
         lengths = total[last, np.arange(len(self.goals))]
         if len(begin) > 1:  # the retreat comes first
             corners = np.concatenate([corners, begin[:1]])
@@ -119,7 +141,7 @@ class Roadmap:
             previous[0] = len(corners) - 1
             lengths = lengths + np.linalg.norm(begin[1] - begin[0])
         status = WayStatus.FOUND if np.isfinite(lengths).any() else WayStatus.NO_WAY
-        return Ways(lengths, status, corners, previous, last)
+        return Ways(lengths, status, corners, previous, last, blocked)
 
     def way(self, ways: Ways, goal: int, pose: np.ndarray) -> Way:
         """Return the shortest way to one goal.
@@ -130,9 +152,8 @@ class Roadmap:
             pose: Pose of the polygon that `ways` was given.
         """
         if not np.isfinite(ways.lengths[goal]):
-            blocked = self.goal_clearance[goal] < self.apart
             status = ways.status if ways.status != WayStatus.FOUND else WayStatus.NO_WAY
-            reached = status == WayStatus.NO_WAY and blocked
+            reached = status == WayStatus.NO_WAY and ways.blocked[goal]
             at = ways.points[:1] if ways.previous[0] < 0 else ways.points[-1:]
             return Way(to_world(pose, at), np.inf, WayStatus.GOAL_BLOCKED if reached else status)
         corner, points = int(ways.last[goal]), [self.goals[goal]]
@@ -149,12 +170,13 @@ class Roadmap:
             pose: Pose of the polygon, (3,), m and rad.
             workspace: Where the finger may be.
         """
-        points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace)
+        obstacles = workspace.obstacles.seen_from(pose)
+        points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace, obstacles)
         length = float(np.linalg.norm(points[-1] - points[0])) if status == WayStatus.FOUND else np.inf
         return Way(to_world(pose, points), length, status)
 
     def between(self, starts: np.ndarray) -> np.ndarray:
-        """Return the lengths of the shortest ways from points to all goals, without limits of a workspace.
+        """Return the lengths of the shortest ways from points to all goals, without a workspace and obstacles.
 
         Args:
             starts: Points that have the clearance, (points, 2), body frame, m.
@@ -188,21 +210,78 @@ class Roadmap:
         links[~allowed] = self._lengths(nodes[~allowed][:, None], self.goals, at_end=self.goal_clearance)
         return nodes, links
 
-    def _retreat(self, start: np.ndarray, pose, workspace: Workspace) -> tuple[np.ndarray, WayStatus]:
-        """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2)."""
-        have = float(point_clearance(self.vertices, start))
-        if have >= self.apart:
+    def _clear(self, obstacles: Obstacles, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return whether segments keep the distance from obstacles."""
+        return obstacles.segment_clearance(start, end) >= self.from_obstacles * (1 - 1e-9)
+
+    def _among(self, nodes: np.ndarray, links: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
+        """Return nodes and links with those of obstacles. Links may run through an obstacle, which `_last` excludes."""
+        around = [_corner_points(body, self.from_obstacles * (1 + OUTSIDE)) for body in obstacles.bodies]
+        angle, half = np.arange(DISK_POINTS) * (2 * np.pi / DISK_POINTS), np.pi / DISK_POINTS
+        circle = (1 + OUTSIDE) / np.cos(half) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        around += [
+            center + (radius + self.from_obstacles) * circle
+            for center, radius in zip(obstacles.centers, obstacles.radii, strict=True)
+        ]
+        world = to_world(pose, np.concatenate([np.zeros((0, 2)), *around]))
+        more = to_body(pose, np.clip(world, workspace.finger_low, workspace.finger_high))
+        more = more[point_clearance(self.vertices, more) >= self.apart]
+        nodes = np.concatenate([nodes, more])
+        links = np.concatenate([links, np.linalg.norm(self.goals - more[:, None], axis=-1)])
+        keeps = obstacles.point_clearance(nodes) >= self.from_obstacles
+        return nodes[keeps], links[keeps]
+
+    def _last(self, total: np.ndarray, corners: np.ndarray, obstacles: Obstacles) -> np.ndarray:
+        """Return the last corner before each goal on the shortest way.
+
+        Args:
+            total: Length of the way to each goal by each corner, (corners, goals). It becomes infinite where the last
+                segment of a shortest way does not keep the distances.
+            corners: The corners, (corners, 2).
+            obstacles: The obstacles.
+        """
+        if not obstacles.any:
+            return np.argmin(total, axis=0)
+        last, open_goals = np.argmin(total, axis=0), np.flatnonzero(np.isfinite(total).any(0))
+        while len(open_goals):
+            last[open_goals] = by = np.argmin(total[:, open_goals], axis=0)
+            ends = self.goals[open_goals]
+            keeps = self._clear(obstacles, corners[by], ends)
+            keeps &= np.isfinite(self._lengths(corners[by], ends, at_end=self.goal_clearance[open_goals]))
+            total[by[~keeps], open_goals[~keeps]] = np.inf
+            open_goals = open_goals[~keeps]
+            open_goals = open_goals[np.isfinite(total[:, open_goals]).any(0)]
+        return np.argmin(total, axis=0)
+
+    def _retreat(self, start: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
+        """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2), and the status."""
+        have, have_obstacles = float(point_clearance(self.vertices, start)), float(obstacles.point_clearance(start))
+        if have >= self.apart and have_obstacles >= self.from_obstacles:
             return start[None], WayStatus.FOUND
-        if have <= 0:
-            return start[None], WayStatus.START_IN_SLIDER
+        if have <= 0 or have_obstacles <= 0:
+            return start[None], WayStatus.START_IN_SLIDER if have <= 0 else WayStatus.START_IN_FIXTURE
+        missing = max(self.apart - have, self.from_obstacles - have_obstacles)
         angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
-        reach = (self.apart - have) * np.array([1.0, 1.5, 2.0, 3.0]) + 1e-3 * self.clearance
+        reach = missing * np.array([1.0, 1.5, 2.0, 3.0]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
         apart = point_clearance(self.vertices, ends)
-        # all along the way, at least as far as at its start; the margin excludes sliding along an edge
-        halfway = point_clearance(self.vertices, start + 0.2 * (ends - start)) > have + 0.02 * (self.apart - have)
-        free = segment_clearance(self.vertices, start, ends, at_end=apart) >= have * (1 - 1e-9)
-        good = free & halfway & (apart >= self.apart) & workspace.allows_finger(to_world(pose, ends))
+        halfway = start + 0.2 * (ends - start)
+        good = _recedes(
+            have,
+            self.apart,
+            apart,
+            point_clearance(self.vertices, halfway),
+            segment_clearance(self.vertices, start, ends, at_end=apart),
+        )
+        if obstacles.any:
+            good &= _recedes(
+                have_obstacles,
+                self.from_obstacles,
+                obstacles.point_clearance(ends),
+                obstacles.point_clearance(halfway),
+                obstacles.segment_clearance(start, ends),
+            )
+        good &= workspace.allows_finger(to_world(pose, ends))
         if not good.any():
             return start[None], WayStatus.NO_RETREAT
         best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
@@ -210,7 +289,22 @@ class Roadmap:
 
     def _none(self, start: np.ndarray, status: WayStatus) -> Ways:
         count = len(self.goals)
-        return Ways(np.full(count, np.inf), status, start[None], np.array([-1]), np.zeros(count, int))
+        none = np.full(count, np.inf)
+        return Ways(none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.apart)
+
+
+def _recedes(have: float, wanted: float, at_end: np.ndarray, soon: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return whether segments lead from a distance to the wanted one, and are nowhere nearer than at their start.
+
+    Args:
+        have: Distance at the start.
+        wanted: Distance that is wanted at the end; a start that has it must keep it.
+        at_end: Distance at the ends, (segments,).
+        soon: Distance a little after the start, (segments,). It must have grown, which excludes sliding along an edge.
+        least: Least distance along each segment, (segments,).
+    """
+    grows = True if have >= wanted else soon > have + 0.02 * (wanted - have)
+    return grows & (least >= min(have, wanted) * (1 - 1e-9)) & (at_end >= wanted)
 
 
 def run_ups(

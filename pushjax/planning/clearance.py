@@ -27,11 +27,10 @@ def point_clearance(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
         vertices: Vertices, counterclockwise, (vertices, 2).
         points: Points, (..., 2).
     """
-    start, end = vertices, np.roll(vertices, -1, axis=0)
-    edge = end - start
-    offset = points[..., None, :] - start
-    along = np.clip((offset * edge).sum(-1) / (edge**2).sum(-1), 0, 1)
-    distance = np.sqrt(((offset - along[..., None] * edge) ** 2).sum(-1).min(-1))
+    (xa, ya), (ex, ey) = vertices.T, (np.roll(vertices, -1, axis=0) - vertices).T
+    dx, dy = points[..., :1] - xa, points[..., 1:] - ya
+    along = np.clip((dx * ex + dy * ey) / (ex**2 + ey**2), 0, 1)
+    distance = np.sqrt(((dx - along * ex) ** 2 + (dy - along * ey) ** 2).min(-1))
     return np.where(inside(vertices, points), -distance, distance)
 
 
@@ -63,16 +62,15 @@ def segment_clearance(
     start, end = np.broadcast_arrays(start, end)
     at_start = point_clearance(vertices, start) if at_start is None else at_start
     at_end = point_clearance(vertices, end) if at_end is None else at_end
-    step = (end - start)[..., None, :]
-    offset = vertices - start[..., None, :]
-    length2 = (step**2).sum(-1)
-    along = np.clip((offset * step).sum(-1) / np.where(length2 > 0, length2, 1), 0, 1)
-    from_vertices = np.sqrt(((offset - along[..., None] * step) ** 2).sum(-1).min(-1))
+    (xv, yv), (ex, ey) = vertices.T, (np.roll(vertices, -1, axis=0) - vertices).T
+    (sx, sy), (ox, oy) = np.split(end - start, 2, axis=-1), (xv - start[..., :1], yv - start[..., 1:])
+    length2 = sx**2 + sy**2
+    along = np.clip((ox * sx + oy * sy) / np.where(length2 > 0, length2, 1), 0, 1)
+    from_vertices = np.sqrt(((ox - along * sx) ** 2 + (oy - along * sy) ** 2).min(-1))
     # a segment crosses an edge if each of the two has its ends on both sides of the other
-    side = step[..., 0] * offset[..., 1] - step[..., 1] * offset[..., 0]
-    edge = np.roll(vertices, -1, axis=0) - vertices
-    start_side = edge[:, 1] * offset[..., 0] - edge[:, 0] * offset[..., 1]
-    end_side = start_side + edge[:, 0] * step[..., 1] - edge[:, 1] * step[..., 0]
+    side = sx * oy - sy * ox
+    start_side = ey * ox - ex * oy
+    end_side = start_side + ex * sy - ey * sx
     crosses = (side * np.roll(side, -1, axis=-1) < 0) & (start_side * end_side < 0)
     apart = np.minimum(np.minimum(at_start, at_end), from_vertices)
     return np.where(crosses.any(-1), np.minimum(apart, 0.0), apart)

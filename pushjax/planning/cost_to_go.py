@@ -9,50 +9,24 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
+from pushjax.planning.free_space import FreeSpace
+from pushjax.planning.pose_table import POSITIONS, PoseTable, grid_spacing
 from pushjax.planning.poses import compose, inverse, to_world
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
 
 NEVER = 1e3  # cost of poses from which the goal is not reached
-POSITIONS, ANGLES = 36, 36  # cells of the grid along x and y each, and around
+ANGLES = 36  # cells of the grid around
 SWEEPS = 12
 CHANGE = 0.5  # control steps; smaller changes end the iteration
+LAST_PUSHES = 6  # pushes to the goal that are tried from each cell, if some may run into an obstacle
 NEAR_CENTER = 0.35  # a push stands for a cell if it ends within this part of a cell from the cell's center
 
 
-class CostToGo(NamedTuple):
-    """Cost of the poses on a grid, and of poses between them by interpolation.
-
-    Attributes:
-        origin: Position of the first cell, (2,), m.
-        spacing: Distance of the cells, m.
-        values: Costs, (positions, positions, angles), control steps.
-    """
-
-    origin: np.ndarray
-    spacing: float
-    values: np.ndarray
-
-    def nearest(self, poses: np.ndarray) -> np.ndarray:
-        """Return the cost at the nearest cell of poses (..., 3), (...,)."""
-        i, j, k = np.moveaxis(np.rint(self._cells(poses)).astype(np.int32), -1, 0)
-        rows, columns, angles = self.values.shape
-        return self.values[np.clip(i, 0, rows - 1), np.clip(j, 0, columns - 1), k % angles]
-
-    def __call__(self, poses: np.ndarray) -> np.ndarray:
-        """Return the cost of poses (..., 3) by linear interpolation, (...,)."""
-        cells = self._cells(poses)
-        rows, columns, angles = self.values.shape
-        cells[..., :2] = np.clip(cells[..., :2], 0, np.array([rows - 1.001, columns - 1.001]))
-        low = np.floor(cells).astype(np.int32)
-        part = cells - low
-        total = np.zeros(cells.shape[:-1])
-        for corner in np.ndindex(2, 2, 2):
-            i, j, k = np.moveaxis(low + np.array(corner), -1, 0)
-            weight = np.prod(np.where(corner, part, 1 - part), axis=-1)
-            total = total + weight * self.values[i, j, k % angles]
-        return total
+class CostToGo(PoseTable):
+    """Cost of the poses on a grid, in control steps, and of poses between them by interpolation."""
 
     def save(self, path: str | Path) -> None:
         """Write the table to a file in NumPy's format "npz"."""
@@ -72,13 +46,6 @@ class CostToGo(NamedTuple):
             raise ValueError(f"{path} does not hold a cost to go: {error}") from error
         return CostToGo(origin, float(spacing), values)
 
-    def _cells(self, poses: np.ndarray) -> np.ndarray:
-        """Return positions in the grid, in units of cells, (..., 3)."""
-        angles = self.values.shape[2]
-        return np.concatenate(
-            [(poses[..., :2] - self.origin) / self.spacing, poses[..., 2:] * (angles / (2 * np.pi))], axis=-1
-        )
-
 
 def cost_to_go(
     library: PushLibrary,
@@ -92,6 +59,7 @@ def cost_to_go(
     low: np.ndarray,
     high: np.ndarray,
     vertices: np.ndarray,
+    space: FreeSpace | None = None,
 ) -> CostToGo:
     """Compute the cost to go by value iteration.
 
@@ -106,15 +74,23 @@ def cost_to_go(
         low: Lowest position of the slider's origin on the grid, (2,), m.
         high: Highest position, (2,), m.
         vertices: Vertices of the slider, (vertices, 2), body frame.
+        space: What slider and finger stay out of; its table is in the same place. None: there is nothing.
     """
-    spacing = float(np.max(high - low)) / (POSITIONS - 1)
+    spacing = grid_spacing(low, high)
     axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
     theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
     cells = np.stack(np.meshgrid(*axes, theta, indexing="ij"), axis=-1).astype(np.float32)
     blocked = Extent(vertices).outside(cells, workspace) > 0
-    values = _last_push(library, goal, cells, push_time, usable, tolerance, between)
+    values = _last_push(library, goal, cells, push_time, usable, tolerance, between, space)
     moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
     allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
+    if space is not None:
+        met = space.table.nearest(cells) < 0
+        blocked |= met
+        allowed = [
+            may & space.moves(library, angle, move.entry)
+            for may, angle, move in zip(allowed, theta, moves, strict=True)
+        ]
     for _ in range(SWEEPS):
         change = 0.0
         for k, move in enumerate(moves):
@@ -124,6 +100,8 @@ def cost_to_go(
             values[:, :, k] = new
         if change < CHANGE:
             break
+    if space is not None:  # poses near such a cell's center may be free: they cost what the cells around do
+        values = np.where(met, _least_around(np.where(met, NEVER, values)), values)
     return CostToGo(np.asarray(low, np.float32), spacing, values)
 
 
@@ -141,15 +119,17 @@ class _Moves(NamedTuple):
     entry: np.ndarray
 
 
-def _last_push(library, goal, cells, push_time, usable, tolerance, between) -> np.ndarray:
+def _last_push(library, goal, cells, push_time, usable, tolerance, between, space) -> np.ndarray:
     """Return the cost of the cells from which one push reaches the goal; NEVER for the others."""
     values = np.full(cells.shape[:3], NEVER, np.float32)
     wanted = compose(inverse(cells), np.broadcast_to(np.asarray(goal, np.float32), cells.shape))
-    distance, index = library.nearest(wanted.reshape(-1, 3), 1, tolerance)
-    found = np.isfinite(distance[:, 0])
-    entry = index[found, 0]
+    distance, index = library.nearest(wanted.reshape(-1, 3), 1 if space is None else LAST_PUSHES, tolerance)
+    cell, column = np.nonzero(np.isfinite(distance))
+    entry = index[cell, column]
     cost = np.where(usable[library.entries[entry, 0]], push_time[entry] + between, NEVER)
-    values.reshape(-1)[found] = cost
+    if space is not None:
+        cost = np.where(space.free(library, cells.reshape(-1, 3)[cell], entry), cost, NEVER)
+    np.minimum.at(values.reshape(-1), cell, cost.astype(np.float32))
     return values
 
 
@@ -165,6 +145,13 @@ def _moves(library: PushLibrary, angle: float, spacing: float, cost: np.ndarray,
     _, first = np.unique(_codes(shift[entry]), return_index=True)
     entry = entry[first]
     return _Moves(shift[entry], cost[entry].astype(np.float32), entry)
+
+
+def _least_around(values: np.ndarray) -> np.ndarray:
+    """Return the least of the values of each cell and its neighbors."""
+    for axis, mode in ((0, "nearest"), (1, "nearest"), (2, "wrap")):
+        values = minimum_filter1d(values, 3, axis=axis, mode=mode)
+    return values
 
 
 def _codes(shift: np.ndarray) -> np.ndarray:

@@ -1,5 +1,7 @@
 """How much of the goal a slider covers, from a table of poses near the goal."""
 
+from typing import Protocol
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,24 @@ from pushjax.planning.poses import to_world
 
 POSITIONS, ANGLES = 29, 27  # points of the table along x and y each, and around
 RANGE = 0.26  # of the table to each side: in units of the slider's length, and rad
+
+
+class Measure(Protocol):
+    """How good a final pose is."""
+
+    @property
+    def enough(self) -> float:
+        """Score from which a pose counts as the goal."""
+        ...
+
+    @property
+    def reach(self) -> float:
+        """Largest distance of a pose that counts as the goal, m, in the sense of `pose_features`."""
+        ...
+
+    def __call__(self, errors: np.ndarray) -> np.ndarray:
+        """Return the score of poses relative to the goal, (..., 3), between 0 and 1, (...,)."""
+        ...
 
 
 class CoverageTable:

@@ -11,23 +11,26 @@ Farther away: the push with that least sum.
 from copy import copy
 from enum import IntEnum
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from pushjax.planning.approach import Roadmap, Way, Ways, run_ups
-from pushjax.planning.clearance import outline_vertices
+from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.cost_to_go import CostToGo, cost_to_go
-from pushjax.planning.coverage_table import CoverageTable
+from pushjax.planning.coverage_table import CoverageTable, Measure
+from pushjax.planning.free_space import SPARSE, FreeSpace
 from pushjax.planning.pace import Pace
 from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
+from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.slider import Slider
 
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
+TRIED, TOGETHER = 480, 24  # choices that are looked at for a collision, best first, and how many at a time
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
@@ -37,32 +40,24 @@ RETRY = 10.0  # control steps of another push, if the last one misses the goal
 LOST = 60.0  # control steps of a way that the table of ways does not have
 
 
-class Measure(Protocol):
-    """How good a final pose is."""
-
-    @property
-    def enough(self) -> float:
-        """Score from which a pose counts as the goal."""
-        ...
-
-    @property
-    def reach(self) -> float:
-        """Largest distance of a pose that counts as the goal, m, in the sense of `pose_features`."""
-        ...
-
-    def __call__(self, errors: np.ndarray) -> np.ndarray:
-        """Return the score of poses relative to the goal, (..., 3), between 0 and 1, (...,)."""
-        ...
-
-
 class PlanStatus(IntEnum):
-    """What the next push is for, or why there is none."""
+    """What the next push is for, or why there is none.
+
+    Attributes:
+        ONE_PUSH: It reaches the goal.
+        TWO_PUSHES: It is the first of two that reach the goal.
+        COST_TO_GO: It leads to where the cost to go is least.
+        NO_WAY: The finger gets to no push; the status of the way tells why.
+        NO_PUSH: No push stays within the workspace and out of its fixtures.
+        START_IN_FIXTURE: The slider is deeper in a fixture than a simulation would start from.
+    """
 
     ONE_PUSH = 0
     TWO_PUSHES = 1
     COST_TO_GO = 2
     NO_WAY = 3
     NO_PUSH = 4
+    START_IN_FIXTURE = 5
 
     @property
     def failed(self) -> bool:
@@ -107,7 +102,8 @@ class PushPlanner:
         radius: Radius of the finger, m.
         library: Pushes of that slider and finger.
         goal: The goal, (3,), world, m and rad.
-        workspace: Limits of finger and slider.
+        workspace: Limits of finger and slider, and the fixtures that they stay out of. Pushes in which either comes
+            nearer to a fixture than a clearance are not chosen.
         pace: Speeds of the finger.
         measure: Score of final poses. None: the slider must cover 95 % of the goal.
         look_ahead: Whether to consider plans of two pushes.
@@ -115,6 +111,9 @@ class PushPlanner:
         retry: If the library has several samples of friction: control steps that a last push costs more, times the
             probability that it misses the goal. Other pushes are chosen by their mean outcome, because the next push
             is planned from where they end.
+
+    Raises:
+        ValueError: For a goal at which the slider overlaps a fixture.
     """
 
     def __init__(
@@ -136,6 +135,7 @@ class PushPlanner:
         self.vertices, length = outline_vertices(slider.shape), library.length
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
+        self.space = self._free_space(library) if workspace.obstacles.any else None
         self._weigh(None)
         library = self.library
         starts = library.starts[:, :2]
@@ -160,6 +160,18 @@ class PushPlanner:
         other._weigh(weight)
         return other
 
+    def finger_clearance(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of the finger from slider and fixtures, negative where it overlaps one, (...,), m.
+
+        Args:
+            pose: Pose of the slider, (3,), world.
+            points: Centers of the finger, (..., 2), world.
+        """
+        apart = point_clearance(self.vertices, to_body(pose, points))
+        if self.space is not None:
+            apart = np.minimum(apart, self.workspace.obstacles.point_clearance(points))
+        return apart - self.radius
+
     def _weigh(self, weight: np.ndarray | None) -> None:
         """Set the mean outcomes of pushes by weights of the library's samples."""
         self.weight, self.library = weight, self.sampled.averaged(weight)
@@ -171,10 +183,7 @@ class PushPlanner:
             return self._value
         if self._value is False:
             return None
-        half = np.abs(self.vertices).max() / 2  # the slider's origin is at least about this far from a wall
-        around = self.goal[:2] + AROUND * self.library.length * np.array([[-1.0], [1.0]])
-        low = np.maximum(self.workspace.slider_low + half, around[0])
-        high = np.minimum(self.workspace.slider_high - half, around[1])
+        low, high = self._positions(self.library.length)
         return cost_to_go(
             self.library,
             self.goal,
@@ -186,7 +195,19 @@ class PushPlanner:
             low=low,
             high=high,
             vertices=self.vertices,
+            space=self.space,
         )
+
+    def _positions(self, length: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lowest and the highest position of the slider's origin for which tables are made."""
+        half = np.abs(self.vertices).max() / 2  # the slider's origin is at least about this far from a wall
+        around = self.goal[:2] + AROUND * length * np.array([[-1.0], [1.0]])
+        low = np.maximum(self.workspace.slider_low + half, around[0])
+        return low, np.minimum(self.workspace.slider_high - half, around[1])
+
+    def _free_space(self, library: PushLibrary) -> FreeSpace:
+        given = self.workspace.obstacles, self.vertices, self.radius, library, self.clearance, self.goal
+        return FreeSpace(*given, *self._positions(library.length))
 
     @cached_property
     def after_push(self) -> np.ndarray:
@@ -211,7 +232,7 @@ class PushPlanner:
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self.after_push, self.place, self.library.tree
+        _ = self.value, self.after_push, self.place, self.library.tree, self.space and self.space.table
 
     def choose(self, pose: np.ndarray, finger: np.ndarray, shake: np.ndarray | None = None) -> PlannedPush:
         """Choose the next push.
@@ -226,7 +247,12 @@ class PushPlanner:
         nowhere = Way(np.asarray(finger, float)[None], np.inf, ways.status)
         none = PlannedPush(PlanStatus.NO_WAY, nowhere, finger, finger, pose, np.inf)
         reachable = np.isfinite(ways.lengths) & self.usable
-        reachable &= self.workspace.allows_finger(to_world(pose, self.library.starts[:, :2]))
+        starts = to_world(pose, self.library.starts[:, :2])
+        reachable &= self.workspace.allows_finger(starts)
+        if self.space is not None:
+            if self.space.slider(pose) < -MAX_PENETRATION * self.library.length:
+                return none._replace(status=PlanStatus.START_IN_FIXTURE)
+            reachable &= self.space.finger_free(to_world(pose, self.roadmap.goals), starts)
         if not reachable.any():
             return none
         way_time = self.pace.free_time(np.where(reachable, ways.lengths + np.nan_to_num(self.run_up), np.inf))
@@ -256,8 +282,8 @@ class PushPlanner:
             return None
         risk, good = self._risk(inverse(relative), entries)
         cost = np.where(good, way_time[self.push[entries]] + self.push_time[entries] + risk, np.inf)
-        best = int(np.argmin(cost))
-        if not np.isfinite(cost[best]):
+        best = self._least(cost, (np.broadcast_to(pose, (len(entries), 3)), entries))
+        if best is None:
             return None
         return Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
@@ -287,16 +313,22 @@ class PushPlanner:
         total = spent + self._estimate(reached, quick=True)
         best = np.argpartition(total, min(CANDIDATES, len(total) - 1))[:CANDIDATES]
         entries, reached, spent = entries[best], reached[best], spent[best]
-        two = self._two_pushes(entries, reached, spent) if self.look_ahead else None
+        two = self._two_pushes(pose, entries, reached, spent) if self.look_ahead else None
         if two is not None:
             return [two]
         total = spent + self._estimate(reached, quick=False)
-        k = int(np.argmin(total))
+        k = self._least(total, (np.broadcast_to(pose, reached.shape), entries))
+        if k is None:
+            return []
         return [Candidate(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
 
     def _first_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
-        entries = self.coarse[np.isfinite(way_time[self.push[self.coarse]])]
+        reachable = np.isfinite(way_time)
+        entries = self.coarse[reachable[self.push[self.coarse]]]
+        if self.space is not None:
+            likely = self.space.likely(self.library, pose, np.flatnonzero(reachable))
+            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // SPARSE]]
         here = pose.astype(np.float32)
         entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
         reached = compose(here, self.library.relative[entries])
@@ -316,7 +348,9 @@ class PushPlanner:
         apart = np.sqrt(((self.library.features(poses) - goal) ** 2).sum(-1))
         return 20 * apart / self.library.length
 
-    def _two_pushes(self, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray) -> Candidate | None:
+    def _two_pushes(
+        self, pose: np.ndarray, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray
+    ) -> Candidate | None:
         """Return the best of the first pushes that a second one continues to the goal."""
         goal = self.goal.astype(np.float32)
         wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
@@ -332,8 +366,27 @@ class PushPlanner:
         between = self.after_push[self.place[entries[first]], self.push[second]]
         total = spent[first] + between + self.push_time[second] + risk
         total = np.where(allowed, total, np.inf)
-        k = int(np.argmin(total))
-        if not np.isfinite(total[k]):
+        k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))
+        if k is None:
             return None
         at = first[k]
         return Candidate(PlanStatus.TWO_PUSHES, int(entries[at]), reached[at].astype(float), float(total[k]))
+
+    def _least(self, cost: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]) -> int | None:
+        """Return the index of the least cost, if it is finite and no push runs into a fixture.
+
+        Args:
+            cost: Costs, (choices,).
+            *pushes: Pushes of each choice: poses of the slider before them, (choices, 3), and entries, (choices,).
+        """
+        if self.space is None:
+            best = int(np.argmin(cost))
+            return best if np.isfinite(cost[best]) else None
+        order = np.argsort(cost, kind="stable")[:TRIED]
+        order = order[np.isfinite(cost[order])]
+        for some in np.split(order, range(TOGETHER, len(order), TOGETHER)):
+            free = [self.space.free(self.library, poses[some], entries[some]) for poses, entries in pushes]
+            free = np.all(free, axis=0)
+            if free.any():
+                return int(some[np.argmax(free)])
+        return None

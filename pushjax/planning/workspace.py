@@ -1,37 +1,57 @@
-"""The rectangle in which a finger and a slider may move."""
+"""Where a finger and a slider may move: a rectangle for each, without the walls and fixed bodies in it."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from pushjax.planning.obstacles import Obstacles
+from pushjax.simulation.fixtures import Fixture, Wall
+
 
 class Workspace(NamedTuple):
-    """Limits of the centers of fingers, and walls that the slider must stay within. All are parallel to the axes.
+    """Limits of the centers of fingers, limits that the slider must stay within, and what both must stay out of.
+
+    The limits are parallel to the axes.
 
     Attributes:
         finger_low: Lowest x and y of the finger's center, (2,), world, m.
         finger_high: Highest x and y of the finger's center.
         slider_low: Lowest x and y of any point of the slider.
         slider_high: Highest x and y of any point of the slider.
+        obstacles: Walls at any angle and fixed bodies, which the finger keeps its radius away from.
     """
 
     finger_low: np.ndarray
     finger_high: np.ndarray
     slider_low: np.ndarray
     slider_high: np.ndarray
+    obstacles: Obstacles = Obstacles()
 
     @staticmethod
-    def rectangle(low: tuple[float, float], high: tuple[float, float]) -> "Workspace":
-        """Return a workspace with the same limits for finger and slider, m."""
-        return Workspace(*(np.asarray(corner, float) for corner in (low, high, low, high)))
+    def rectangle(
+        low: tuple[float, float], high: tuple[float, float], fixtures: Sequence[Wall | Fixture] = ()
+    ) -> "Workspace":
+        """Return a workspace with the same limits for finger and slider.
+
+        Args:
+            low: Lowest x and y, m.
+            high: Highest x and y, m.
+            fixtures: Walls and fixed bodies that neither the slider nor the finger may run into.
+
+        Raises:
+            TypeError: If `fixtures` is anything else than a sequence of `Wall` and `Fixture`.
+        """
+        lowest, highest = np.asarray(low, float), np.asarray(high, float)
+        return Workspace(lowest, highest, lowest, highest, Obstacles.of(fixtures))
 
     @staticmethod
-    def unlimited() -> "Workspace":
-        """Return a workspace without limits."""
-        return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf))
+    def unlimited(fixtures: Sequence[Wall | Fixture] = ()) -> "Workspace":
+        """Return a workspace without limits, with walls and fixed bodies as in `rectangle`."""
+        return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf), fixtures)
 
     def allows_finger(self, points: np.ndarray) -> np.ndarray:
-        """Return whether a finger's center may be at points (..., 2)."""
+        """Return whether a finger's center may be at points (..., 2), as far as the limits go."""
         return np.all((points >= self.finger_low) & (points <= self.finger_high), axis=-1)
 
 

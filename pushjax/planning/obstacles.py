@@ -1,0 +1,156 @@
+"""Distances of fingers and sliders from walls and fixed bodies, in NumPy, for planners.
+
+Fixed bodies are convex polygons and disks.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from pushjax.geometry.disk import Disk
+from pushjax.planning.clearance import point_clearance, segment_clearance
+from pushjax.planning.poses import to_body, to_world
+from pushjax.simulation.arguments import checked_fixtures
+from pushjax.simulation.fixtures import Fixture, Wall
+
+TOGETHER = 20_000  # poses whose distances are computed together, so that their data stay in the cache
+
+
+class Obstacles(NamedTuple):
+    """What neither a finger nor the slider may run into.
+
+    Attributes:
+        bodies: Vertices of convex polygons, counterclockwise, each (vertices, 2), m.
+        points: A point on each wall, (walls, 2), m.
+        normals: Unit vector from each wall into the free space, (walls, 2).
+        centers: Centers of disks, (disks, 2), m.
+        radii: Radii of disks, (disks,), m.
+    """
+
+    bodies: tuple[np.ndarray, ...] = ()
+    points: np.ndarray = np.zeros((0, 2))
+    normals: np.ndarray = np.zeros((0, 2))
+    centers: np.ndarray = np.zeros((0, 2))
+    radii: np.ndarray = np.zeros(0)
+
+    @staticmethod
+    def of(fixtures: Sequence[Wall | Fixture]) -> "Obstacles":
+        """Return the obstacles that walls and fixed bodies are, in the world.
+
+        Raises:
+            TypeError: For anything else than a sequence of `Wall` and `Fixture`.
+        """
+        fixed = checked_fixtures(fixtures, jnp.result_type(float))
+        walls = [(each.point, each.normal) for each in fixed if isinstance(each, Wall)]
+        points, normals = np.moveaxis(np.array(walls, float).reshape(-1, 2, 2), 1, 0)
+        bodies, disks = [], []
+        for each in (each for each in fixed if isinstance(each, Fixture)):
+            if isinstance(each.shape, Disk):
+                disks.append((each.center.x, each.center.y, each.shape.radius))
+            else:
+                bodies.append(to_world(np.asarray(each.pose, float), np.asarray(each.shape.vertices, float)))
+        centers, radii = np.split(np.array(disks, float).reshape(-1, 3), [2], axis=1)
+        return Obstacles(tuple(bodies), points, normals, centers, radii[:, 0])
+
+    @property
+    def any(self) -> bool:
+        """Whether there is an obstacle at all."""
+        return bool(self.bodies) or len(self.points) + len(self.radii) > 0
+
+    def seen_from(self, pose: np.ndarray) -> "Obstacles":
+        """Return the same obstacles in the frame of a body at a pose, (3,)."""
+        bodies = tuple(to_body(pose, body) for body in self.bodies)
+        turned = to_body(np.array([0.0, 0.0, pose[2]]), self.normals)
+        return Obstacles(bodies, to_body(pose, self.points), turned, to_body(pose, self.centers), self.radii)
+
+    def point_clearance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of points (..., 2) from the nearest obstacle, negative inside, (...,)."""
+        found = self._behind(points)
+        for center, radius in zip(self.centers, self.radii, strict=True):
+            found = np.minimum(found, np.hypot(*np.moveaxis(points - center, -1, 0)) - radius)
+        for body in self.bodies:
+            found = np.minimum(found, point_clearance(body, points))
+        return found
+
+    def segment_clearance(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return the distance of segments from the nearest obstacle, zero or negative where they touch it, (...,).
+
+        Args:
+            start: First points, (..., 2).
+            end: Last points, (..., 2).
+        """
+        found = np.minimum(self._behind(start), self._behind(end))
+        for center, radius in zip(self.centers, self.radii, strict=True):
+            found = np.minimum(found, _from_point(center, start, end) - radius)
+        for body in self.bodies:
+            ends = point_clearance(body, start), point_clearance(body, end)
+            found = np.minimum(found, segment_clearance(body, start, end, *ends))
+        return found
+
+    def slider_clearance(self, vertices: np.ndarray, poses: np.ndarray, enough: float, tolerance: float) -> np.ndarray:
+        """Return the distance of a slider from the nearest obstacle, for each pose, (...,), m.
+
+        Where they overlap by more than the tolerance it is negative: minus a distance by which the slider would have to
+        be moved to be out of the obstacle, not always the least.
+
+        Args:
+            vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame.
+            poses: Poses, (..., 3), world, m and rad.
+            enough: Distance from which a lower bound of the distance will do, m.
+            tolerance: Overlap that counts as touching, m.
+        """
+        flat = np.asarray(poses, float).reshape(-1, 3)
+        found = np.full(len(flat), np.inf)
+        for point, normal in zip(self.points, self.normals, strict=True):
+            # how far the slider reaches toward the wall depends on its angle only
+            facing = to_body(flat * np.array([0.0, 0.0, 1.0]), normal)
+            found = np.minimum(found, (flat[:, :2] - point) @ normal + (facing @ vertices.T).min(-1))
+        for center, radius in zip(self.centers, self.radii, strict=True):
+            found = np.minimum(found, point_clearance(vertices, to_body(flat, center)) - radius)
+        reach = np.linalg.norm(vertices, axis=1).max()
+        for body in self.bodies:
+            middle = body.mean(0)
+            apart = np.linalg.norm(flat[:, :2] - middle, axis=1) - reach - np.linalg.norm(body - middle, axis=1).max()
+            near = np.flatnonzero(apart < enough)
+            for some in np.array_split(near, len(near) // TOGETHER + 1):
+                apart[some] = _polygons_apart(vertices, flat[some], body, tolerance)
+            found = np.minimum(found, apart)
+        return found.reshape(np.shape(poses)[:-1])
+
+    def _behind(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of points (..., 2) from the nearest wall, negative behind it, (...,)."""
+        found = np.full(points.shape[:-1], np.inf)
+        for point, normal in zip(self.points, self.normals, strict=True):
+            found = np.minimum(found, (points - point) @ normal)
+        return found
+
+
+def _from_point(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Return the distance of segments from a point, (...,)."""
+    (sx, sy), (ox, oy) = np.moveaxis(end - start, -1, 0), np.moveaxis(point - start, -1, 0)
+    length2 = sx**2 + sy**2
+    along = np.clip((ox * sx + oy * sy) / np.where(length2 > 0, length2, 1), 0, 1)
+    return np.hypot(ox - along * sx, oy - along * sy)
+
+
+def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return the distance between a polygon at each pose (poses, 3) and a convex one, as in `slider_clearance`."""
+    corners, placed = to_world(poses[:, None], vertices), to_body(poses[:, None], body)
+    apart = np.minimum(point_clearance(body, corners).min(1), point_clearance(vertices, placed).min(1))
+    edge = np.roll(body, -1, axis=0) - body
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    # distance of each corner from each edge's line, (poses, corners, edges)
+    beyond = corners @ outward.T - (body * outward).sum(1)
+    # Two polygons overlap if an edge of one has a part in the other, or if one is inside of the other. No part of an
+    # edge that merely touches the body is in a body that is smaller by the tolerance.
+    shrunk = beyond + tolerance
+    slope = np.roll(shrunk, -1, axis=1) - shrunk
+    crossing = -shrunk / np.where(slope == 0, 1.0, slope)
+    enters = np.where(slope < 0, crossing, np.where((slope == 0) & (shrunk >= 0), np.inf, 0.0)).max(-1)
+    leaves = np.where(slope > 0, crossing, 1.0).min(-1)
+    overlap = (np.maximum(enters, 0) < np.minimum(leaves, 1)).any(1)
+    overlap |= apart < -tolerance
+    escape = np.minimum(beyond.min(1).max(-1), -tolerance)
+    return np.where(overlap, escape, apart)
