@@ -6,6 +6,8 @@ the predicted slider touches none of the samples. Where there is no such way, sm
 samples that the finger would touch are counted.
 
 A way ends in a run-up: from where the finger has its full distance, straight ahead to where the push starts.
+
+Fixtures are where they are known to be: the finger keeps its clearance from them, and no more.
 """
 
 from typing import NamedTuple
@@ -17,6 +19,7 @@ from pushjax.planning.approach import Roadmap, Way, WayStatus, run_ups
 from pushjax.planning.clearance import point_clearance, segment_clearance
 from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
+from pushjax.simulation.fixtures import Fixtures
 
 SHARES = (1.0, 0.9, 0.5)  # of the samples, for which the finger keeps its distance, in the order of attempts
 TIGHT = 0.25  # of the clearance, with which the last attempt is made
@@ -63,17 +66,19 @@ def ways_between(
     predicted: np.ndarray,
     samples: np.ndarray,
     start: np.ndarray | None = None,
+    fixtures: Fixtures = (),
 ) -> WaysBetween:
     """Find the ways of a finger to the start of each push, and away from the slider after the last one.
 
     Args:
         vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame, m.
         radius: Radius of the finger, m.
-        clearance: Distance that the finger keeps from the slider, m.
+        clearance: Distance that the finger keeps from slider and fixtures, m.
         paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
         predicted: Predicted poses of the slider before the first push and after each, (pushes + 1, 3).
         samples: Samples of these poses, (samples, pushes + 1, 3).
         start: Where the finger is at first, (2,), world, m. None: where the run-up of the first push begins.
+        fixtures: Walls and fixed bodies that the finger stays out of.
 
     Returns:
         The ways. There are none if there is neither a push nor a start.
@@ -81,15 +86,16 @@ def ways_between(
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
         return WaysBetween((), np.zeros(len(samples), bool))
+    around = _Around(vertices, radius, clearance, Workspace.unlimited(fixtures))
     ways, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
         scatter = _displacement(vertices, pose, samples[:, k])
         margins = [*(clearance + np.quantile(scatter, share) for share in SHARES), clearance, TIGHT * clearance]
-        tried = (_way(vertices, radius, margin, paths[k : k + 1], pose, origin) for margin in margins)
+        tried = (_way(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
         way = next((each for each in tried if each.status == WayStatus.FOUND), None)
         if way is None:  # the last attempt is the least demanding, and tells why
-            way = _way(vertices, radius, margins[-1], paths[k : k + 1], pose, origin)
+            way = _way(around, margins[-1], paths[k : k + 1], pose, origin)
         else:
             touched |= _touches(vertices, radius, way.points, samples[:, k])
         ways.append(way)
@@ -126,40 +132,58 @@ def finger_motion(ways: tuple[Way, ...], paths: np.ndarray, *, free: float, push
     return FingerMotion(np.concatenate([[0.0], np.cumsum(duration)]), points, pushes)
 
 
-def _way(
-    vertices: np.ndarray, radius: float, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
-) -> Way:
+class _Around(NamedTuple):
+    """What ways go around: the slider's vertices, radius and clearance of the finger, and the fixtures."""
+
+    vertices: np.ndarray
+    radius: float
+    clearance: float
+    workspace: Workspace
+
+    def roadmap(self, margin: float, goals: np.ndarray) -> Roadmap:
+        return Roadmap(self.vertices, self.radius, margin, goals, min(margin, self.clearance))
+
+
+def _way(around: _Around, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Way:
     """Return the way to the start of the first of `paths`, or the retreat if there are none."""
     if len(paths):
-        return _approach(vertices, radius, margin, paths[0], pose, origin)
+        return _approach(around, margin, paths[0], pose, origin)
     if origin is None:
         raise ValueError("a retreat begins where a push ends")
-    return Roadmap(vertices, radius, margin, np.zeros((0, 2))).retreat(origin, pose, Workspace.unlimited())
+    return around.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose, around.workspace)
 
 
-def _approach(
-    vertices: np.ndarray, radius: float, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
-) -> Way:
+def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Way:
     """Return the way to the start of a push, with a run-up from where the finger has its full distance."""
     first, second = to_body(pose, path[:2])
     ahead = (second - first) / np.linalg.norm(second - first)
-    lengths = [
-        float(run_ups(vertices, radius, margin, first[None], ahead[None], part * (radius + margin))[0])
-        for part in RUN_UPS
-    ]
-    run_up = next((length for length in lengths if np.isfinite(length)), np.nan)
-    overlaps = point_clearance(vertices, first) < (1 - TOUCH) * radius
-    if np.isnan(run_up) or overlaps:
-        return Way(path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, WayStatus.GOAL_BLOCKED)
-    begin = (first - run_up * ahead)[None]
+    blocked = Way(path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, WayStatus.GOAL_BLOCKED)
+    if point_clearance(around.vertices, first) < (1 - TOUCH) * around.radius:
+        return blocked
+    for part in RUN_UPS:
+        longest = part * (around.radius + margin)
+        run_up = float(run_ups(around.vertices, around.radius, margin, first[None], ahead[None], longest)[0])
+        begin = (first - run_up * ahead)[None]
+        if np.isfinite(run_up) and _keeps_out(around, margin, to_world(pose, begin[0]), path[0]):
+            break
+    else:
+        return blocked
     if origin is None:
         way = Way(to_world(pose, begin), 0.0, WayStatus.FOUND)
     else:
-        roadmap = Roadmap(vertices, radius, margin, begin)
-        way = roadmap.way(roadmap.ways(origin, pose, Workspace.unlimited()), 0, pose)
+        roadmap = around.roadmap(margin, begin)
+        way = roadmap.way(roadmap.ways(origin, pose, around.workspace), 0, pose)
     if way.status != WayStatus.FOUND or run_up == 0:
         return way
     return Way(np.concatenate([way.points, path[:1]]), way.length + run_up, WayStatus.FOUND)
+
+
+def _keeps_out(around: _Around, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
+    """Return whether a run-up begins with the clearance from fixtures, and touches none."""
+    obstacles = around.workspace.obstacles
+    if obstacles.point_clearance(begin) < around.radius + min(margin, around.clearance):
+        return False
+    return bool(obstacles.segment_clearance(begin, start) >= around.radius)
 
 
 def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -> np.ndarray:

@@ -25,7 +25,8 @@ from pushjax.geometry import se2
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.shape import Shape
 from pushjax.planning.goal import Goal
-from pushjax.simulation.fixtures import Fixtures, Wall
+from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
+from pushjax.simulation.hand import Hand
 from pushjax.simulation.trajectory import Trajectory
 
 OUTLINE_POINTS = 48  # points on an outline whose distances from fixtures are measured, besides its corners
@@ -182,13 +183,52 @@ class Clearance(Cost):
         """
         points, found = se2.transform(pose, self.points), [jnp.asarray(jnp.inf, pose.dtype)]
         for each in self.fixtures:
+            found.append(_nearest(each, points))
             if isinstance(each, Wall):
-                found.append(jnp.min((points - each.point[None]) @ each.normal))
                 continue
-            found.append(_distance(each.shape, se2.transform(se2.inverse(each.pose), points)))
             corners = se2.transform(each.pose, _outline_points(each.shape))
             found.append(_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
         return jnp.min(jnp.stack(found))
+
+
+class HandClearance(Cost):
+    """How much nearer than a distance a hand of round fingers comes to walls and fixtures: squared, in its units.
+
+    It is that of the nearest finger at the nearest point of the path, so it is above one if the hand runs into one.
+
+    Args:
+        hand: The hand.
+        fixtures: Walls and fixtures to stay away from.
+        distance: The distance, m.
+
+    Raises:
+        ValueError: For a distance that is not positive.
+    """
+
+    hand: Hand
+    fixtures: Fixtures
+    distance: Float[Array, ""]
+
+    def __init__(self, hand: Hand, fixtures: Fixtures, distance: ArrayLike):
+        self.hand, self.fixtures, self.distance = hand, tuple(fixtures), as_float(distance, name="distance")
+        check_shape("distance", self.distance, ())
+        check_finite("distance", self.distance)
+        check_positive("distance", self.distance)
+
+    def __call__(self, push: Trajectory) -> Float[Array, ""]:
+        centers = self.hand.poses(push.configuration)[..., :2].reshape(-1, len(self.hand.fingers), 2)
+        found = [jnp.asarray(jnp.inf, centers.dtype)]
+        for each in self.fixtures:
+            for finger, radius in enumerate(self.hand.radius):
+                found.append(_nearest(each, centers[:, finger]) - radius)
+        return (jnp.maximum(self.distance - jnp.min(jnp.stack(found)), 0) / self.distance) ** 2
+
+
+def _nearest(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float[Array, ""]:
+    """Return the smallest distance of points from a wall or fixture, m, negative inside."""
+    if isinstance(fixture, Wall):
+        return jnp.min((points - fixture.point[None]) @ fixture.normal)
+    return _distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
 
 
 def _outline_points(shape: Shape) -> Float[Array, "points 2"]:

@@ -139,10 +139,7 @@ def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, t
     """Return the distance between a polygon at each pose (poses, 3) and a convex one, as in `slider_clearance`."""
     corners, placed = to_world(poses[:, None], vertices), to_body(poses[:, None], body)
     apart = np.minimum(point_clearance(body, corners).min(1), point_clearance(vertices, placed).min(1))
-    edge = np.roll(body, -1, axis=0) - body
-    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    # distance of each corner from each edge's line, (poses, corners, edges)
-    beyond = corners @ outward.T - (body * outward).sum(1)
+    beyond = _beyond(body, corners)
     # Two polygons overlap if an edge of one has a part in the other, or if one is inside of the other. No part of an
     # edge that merely touches the body is in a body that is smaller by the tolerance.
     shrunk = beyond + tolerance
@@ -152,5 +149,14 @@ def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, t
     leaves = np.where(slope > 0, crossing, 1.0).min(-1)
     overlap = (np.maximum(enters, 0) < np.minimum(leaves, 1)).any(1)
     overlap |= apart < -tolerance
-    escape = np.minimum(beyond.min(1).max(-1), -tolerance)
-    return np.where(overlap, escape, apart)
+    # it is out when it is beyond an edge of the body, or the body beyond an edge that the whole slider is behind
+    hull = _beyond(vertices, vertices).max(0) <= 1e-9 * np.abs(vertices).max()
+    escape = np.maximum(beyond.min(1).max(-1), _beyond(vertices, placed)[..., hull].min(1).max(-1, initial=-np.inf))
+    return np.where(overlap, np.minimum(escape, -tolerance), apart)
+
+
+def _beyond(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the distances of points (..., 2) from the lines of a polygon's edges, positive outside, (..., edges)."""
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
+    return points @ outward.T - (polygon * outward).sum(1)

@@ -27,20 +27,24 @@ from jaxtyping import PRNGKeyArray
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.approach import Way, WayStatus
-from pushjax.planning.between_pushes import ways_between
+from pushjax.planning.between_pushes import TIGHT, ways_between
 from pushjax.planning.clearance import outline_vertices, point_clearance
-from pushjax.planning.costs import Cost, FinalPose, Mean, Missed, Risk
+from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
+from pushjax.planning.free_space import TOLERANCE
 from pushjax.planning.goal import Goal
+from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.poses import to_body
 from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, simulated
 from pushjax.planning.pushes import Pushes
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
-from pushjax.simulation.arguments import check_slider_and_hand
+from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
+from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.slider import Slider
+from pushjax.simulation.slider import Slider, fixture_overlaps
 
 PREDICTED = 256  # samples of the predicted outcomes
+HAND = 10.0  # cost of a hand that runs into a fixture
 MISSED_WIDTH = 0.5  # width of the border of failure in the default cost, in tolerances
 WARM_UP = (Selection(64), CrossEntropy(iterations=6, population=16, elites=4))
 SEARCH = (Selection(16), CrossEntropy(iterations=10, population=32))
@@ -52,12 +56,15 @@ class PushPlanStatus(IntEnum):
     Attributes:
         FOUND: It reaches the goal with at least the probability that was asked for.
         UNLIKELY: The best plan that was found reaches the goal less surely.
-        NO_WAY: For none of the plans that were found does the finger get from push to push without touching the slider.
+        NO_WAY: For none of the plans that were found does the finger get from push to push without touching slider or
+            fixtures.
+        HAND_IN_FIXTURE: In all plans that were found the hand runs into a fixture in a push.
     """
 
     FOUND = 0
     UNLIKELY = 1
     NO_WAY = 2
+    HAND_IN_FIXTURE = 3
 
 
 class PushPlan(NamedTuple):
@@ -126,7 +133,8 @@ def plan_pushes(
         warm_up: Searches under the mean friction.
         search: Searches under sampled friction, which start from the result of `warm_up`.
         success: Probability of success that is asked for.
-        fixtures: Walls and fixed bodies that the slider may run into. The hand passes through them.
+        fixtures: Walls and fixed bodies. The slider may run into them, and then moves as in a simulation; the hand
+            stays out of them, in pushes and, if it is one finger, between them.
         finger: Where the finger is at first, (2,), world, m; for a hand of one finger. By default it is where its
             first push begins.
 
@@ -135,7 +143,8 @@ def plan_pushes(
 
     Raises:
         ValueError: For a count below one, a start that is not finite or of another shape, a success outside [0, 1], a
-            finger in the slider or for another hand, or a hand that does not fit `pushes`.
+            finger in the slider or in a fixture or for another hand, a start or a goal at which the slider overlaps a
+            fixture, or a hand that does not fit `pushes`.
         TypeError: For arguments of other types, and for a hand with pads.
     """
     check_type("goal", goal, Goal)
@@ -147,7 +156,11 @@ def plan_pushes(
     pushes.check_hand(hand)
     cost = Missed(goal, MISSED_WIDTH) + 0.001 * FinalPose(goal) if cost is None else cost
     risk = Mean() if risk is None else risk
+    fixtures = checked_fixtures(fixtures, jnp.result_type(float))
+    if fixtures:
+        cost = cost + HAND * HandClearance(hand, fixtures, TIGHT * pushes.clearance)
     problem = push_problem(key, slider, hand, start, model, samples, fixtures, (pushes, cost, risk))
+    _check_poses(problem, goal)
     at = _finger_at(finger, problem)
     found, history = _search(jax.random.fold_in(key, 1), problem, candidates, warm_up, search)
     unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, PREDICTED, fixtures, None)
@@ -156,7 +169,8 @@ def plan_pushes(
         for parameters, least in zip(found.parameters, found.cost, strict=True)
     )
     first = next(plans)
-    best = next((plan for plan in chain([first], plans) if plan.status != PushPlanStatus.NO_WAY), first)
+    possible = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)
+    best = next((plan for plan in chain([first], plans) if plan.status in possible), first)
     return best._replace(history=history)
 
 
@@ -199,11 +213,14 @@ def _judged(
             poses,
             np.asarray(outcomes.poses),
             finger,
+            problem.fixtures,
         )
         good, ways, found = good & ~between.touched, between.ways, between.status == WayStatus.FOUND
-    probability = float(np.mean(good)) if found else 0.0
+    hits = _hand_in_fixture(problem, path)
+    probability = float(np.mean(good)) if found and not hits else 0.0
     status = PushPlanStatus.FOUND if probability >= success else PushPlanStatus.UNLIKELY
     status = status if found else PushPlanStatus.NO_WAY
+    status = PushPlanStatus.HAND_IN_FIXTURE if hits else status
     return PushPlan(status, path, poses, ways, parameters, outcomes, probability, cost, np.zeros(0))
 
 
@@ -213,6 +230,32 @@ def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tu
     moves = np.any(np.diff(every, axis=1) != 0, axis=(0, 2))
     keep = np.concatenate([[True], moves])
     return path[moves], poses[keep], outcomes._replace(poses=outcomes.poses[:, keep])
+
+
+def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
+    """Return whether a finger runs into a fixture along paths, (pushes, steps + 1, dof)."""
+    if not problem.fixtures:
+        return False
+    centers = np.asarray(problem.hand.poses(jnp.asarray(path)), float)[..., :2]
+    apart = Obstacles.of(problem.fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
+    return bool(np.any(apart < np.asarray(problem.hand.radius)))
+
+
+def _check_poses(problem: PushProblem, goal: Goal) -> None:
+    """Raise an error if the slider overlaps a fixture at the start, or at the goal."""
+    if not problem.fixtures:
+        return
+    length = float(problem.slider.surface.length)
+    for name, poses, allowed in (
+        ("start", problem.start, MAX_PENETRATION * length),  # a rollout pushes out what overlaps less
+        ("goal", goal.pose[None], TOLERANCE * length),
+    ):
+        depth = np.asarray(fixture_overlaps(problem.slider, problem.fixtures, poses.astype(problem.start.dtype)))
+        if depth.max() > allowed:
+            raise ValueError(
+                f"{name} must be a pose at which the slider overlaps no fixture; got an overlap of "
+                f"{1e3 * depth.max():.3g} mm at {np.asarray(poses)[np.argmax(depth)].tolist()}"
+            )
 
 
 def _finger_at(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | None:
@@ -228,6 +271,9 @@ def _finger_at(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | N
     apart = float(point_clearance(outline_vertices(problem.slider.shape), point) - problem.hand.radius[0])
     if apart < 0:
         raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-apart:.3g} m")
+    beyond = float(Obstacles.of(problem.fixtures).point_clearance(np.asarray(at, float)) - problem.hand.radius[0])
+    if beyond < 0:
+        raise ValueError(f"finger must not overlap a fixture at the start; got an overlap of {-beyond:.3g} m")
     return np.asarray(at, float)
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import pushjax as pj
 from pushjax.planning import finger_motion
 from pushjax.planning.approach import WayStatus
 from pushjax.planning.between_pushes import ways_between
@@ -55,6 +56,27 @@ def test_the_finger_touches_no_sample_between_pushes(vertices, scatter):
             assert placed.distance(line) >= begins - 1e-6
             if k == len(paths):  # the retreat ends with the whole clearance, also from the samples
                 assert placed.distance(shapely.Point(way.points[-1])) >= RADIUS + CLEARANCE - 1e-6
+
+
+def test_the_finger_keeps_out_of_fixtures_between_pushes():
+    """Posts between the slider and where the finger goes; a wall leaves no way."""
+    paths, poses, samples = translations(L, 6, 2e-4)
+    free = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
+    start, first = free.ways[0].points[0], free.ways[0].points[1]
+    posts = [pj.Fixture(pj.Disk(0.01), (*(start + share * (first - start)), 0.0)) for share in (0.3, 0.6)]
+    bodies = shapely.union_all([shapely.Point(np.asarray(each.pose[:2])).buffer(0.01, quad_segs=64) for each in posts])
+    assert bodies.distance(shapely.LineString(free.ways[0].points)) == 0
+    found = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=tuple(posts))
+    assert found.status == WayStatus.FOUND
+    for way in found.ways:
+        assert bodies.distance(shapely.LineString(way.points)) >= RADIUS + CLEARANCE - 1e-4
+    assert found.ways[0].length > free.ways[0].length
+    behind = pj.Wall(start + 0.001 * (first - start), first - start)
+    shut = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(behind,))
+    assert shut.status == WayStatus.START_IN_FIXTURE
+    away = pj.Wall(0.5 * (start + first), start - first)
+    shut = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(away,))
+    assert shut.status == WayStatus.GOAL_BLOCKED
 
 
 def test_what_would_be_touched_is_counted():

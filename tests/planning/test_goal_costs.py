@@ -19,6 +19,7 @@ from pushjax.planning import (
     Work,
     Worst,
 )
+from pushjax.planning.costs import HandClearance
 from pushjax.simulation.fixtures import Fixture, Wall
 
 RNG = np.random.default_rng(0)
@@ -128,6 +129,23 @@ def test_clearance_costs_nothing_far_away(push):
     assert Clearance(BLOCK, (wall,), 0.05)(push) == 0
     poses = np.tile([0.0, 0.13, 0.0], (3, 1))  # 40 mm from the wall
     np.testing.assert_allclose(Clearance(BLOCK, (wall,), 0.05)(moved(push, poses)), 0.2**2, rtol=1e-9)
+
+
+def test_clearance_of_a_hand_is_that_of_its_nearest_finger(push):
+    shapely = pytest.importorskip("shapely")
+    hand, triangle = pj.Hand.two_fingers(0.005), np.array([(0, 0), (0.05, 0), (0, 0.04)])
+    body = Fixture(pj.Polygon(triangle), (0.02, 0.03, 0.0))
+    judge = shapely.Polygon(triangle + np.array([0.02, 0.03]))
+    configuration = RNG.uniform(-0.1, 0.1, (3, 4)) + np.array([0.0, -0.1, 0.0, 0.15])
+    at = pj.Trajectory(**{**vars(push), "configuration": jnp.asarray(configuration)})
+    centers = np.asarray(hand.poses(at.configuration))[..., :2].reshape(-1, 2)
+    apart = min(min(judge.distance(shapely.Point(p)), p[1] + 0.3) for p in centers) - 0.005
+    cost = HandClearance(hand, (body, Wall((0.0, -0.3), (0.0, 1.0))), 0.2)(at)
+    np.testing.assert_allclose(cost, max(1 - apart / 0.2, 0) ** 2, rtol=1e-9)
+    inside = HandClearance(hand, (Wall((0.0, 1.0), (0.0, 1.0)),), 0.01)
+    assert inside(at) > 1
+    slope = jax.grad(lambda q: inside(pj.Trajectory(**{**vars(push), "configuration": q})))(at.configuration)
+    assert np.all(np.isfinite(slope))
 
 
 def test_derivatives_of_costs_are_finite(push):

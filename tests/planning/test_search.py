@@ -187,6 +187,49 @@ def test_pushes_that_move_nothing_are_left_out(slider, easy):
     assert plan.outcomes.poses.shape == (256, 1, 3)
 
 
+class One(Pushes):
+    """The same push for every candidate."""
+
+    def sample(self, key, candidates):
+        return np.repeat(np.array([[np.pi, 0.0, 0.5]]), candidates, axis=0)
+
+
+def test_poses_in_fixtures_are_refused(slider, easy):
+    fixture = pj.Fixture(pj.Disk(0.01), (0.0, -0.2, 0.0))
+
+    def plan(start=(0, 0, 0), goal=easy, **settings):
+        return plan_pushes(KEY, slider, HAND, start, goal, **SETTINGS | {"fixtures": (fixture,)} | settings)
+
+    with pytest.raises(ValueError, match="goal must be a pose at which the slider overlaps no fixture; got an overlap"):
+        plan(goal=Goal((0, -0.2, 0)))
+    with pytest.raises(ValueError, match="start must be a pose at which the slider overlaps no fixture; got an over"):
+        plan(start=(0, -0.22, 0))
+    with pytest.raises(ValueError, match=r"finger must not overlap a fixture at the start; got an overlap of 0.013 m"):
+        plan(finger=(0.0, -0.202))
+    with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Fixture"):
+        plan(fixtures=fixture)
+
+
+@pytest.mark.long
+def test_the_hand_stays_out_of_fixtures(slider, easy, plan):
+    shapely = pytest.importorskip("shapely")
+    start, after = plan.path[0, :2]
+    aside = 0.012 * np.array([start[1] - after[1], after[0] - start[0]]) / np.linalg.norm(after - start)
+    fixture = pj.Fixture(pj.Disk(0.01), (*(start + aside), 0.0))  # 3 mm too near to where the push of the plan begins
+    body = shapely.Point(*fixture.pose[:2]).buffer(0.01, quad_segs=64)
+    assert body.distance(shapely.LineString(plan.path[0])) < RADIUS
+    around = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS | {"fixtures": (fixture,)})
+    assert around.status is PushPlanStatus.FOUND
+    for line in (*around.path, *(way.points for way in around.ways if len(way.points) > 1)):
+        assert body.distance(shapely.LineString(line)) >= RADIUS - 1e-6
+    # and if there is no other push, the status says so
+    here = pj.Fixture(fixture.shape, (0.062, 0.0, 0.0))
+    only = {"pushes": One(1, length=0.08, steps=8), "candidates": 1, "warm_up": (), "search": (), "fixtures": (here,)}
+    stuck = plan_pushes(KEY, slider, HAND, np.zeros(3), Goal((-0.04, 0, 0)), **SETTINGS | only)
+    assert stuck.status is PushPlanStatus.HAND_IN_FIXTURE
+    assert stuck.success == 0
+
+
 def test_an_unreachable_goal_has_a_status(slider):
     goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, position=0.008, angle=0.3)
     plan = plan_pushes(KEY, slider, HAND, np.zeros(3), goal, **SETTINGS)
