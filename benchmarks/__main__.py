@@ -49,6 +49,7 @@ MODULES = {
         "contacts",
         "cost_by_batch",
         "derivatives",
+        "environments",
         "first_calls",
         "friction",
         "identification",

@@ -17,15 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from benchmarks.environments import AHEAD, SCATTER, throughput
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.tasks import PushT, TaskState
 
 AT_ONCE = 64  # episodes in one program
-SCATTER = 60.0  # px, standard deviation of where the agent is steered to, around the T's center of gravity
-AHEAD = 20.0  # px, how far ahead of the agent the action is: in the end the agent moves by half of it in a control step
 REACH = 2.5  # px, from the faces of the walls, where pymunk's margin still holds the T
-CONTROL_STEPS = 20  # of a timed program
+ACTIONS = "steered", "uniform"
 LIMITS = {"free": (1.5, 1.0), "walls": (3.0, np.inf)}  # px and degrees
 
 
@@ -71,10 +70,10 @@ def run(
         The record: a row for each number of substeps, and the speeds.
     """
     rows: list[dict[str, Any]] = []
-    speeds: dict[str, float] = {}
+    speeds: dict[str, dict[str, float]] = {}
     settings = {"seeds": seeds, "steps": steps, "substeps": substeps, "batch": batch, "seed": seed}
     record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds)
-    parts = 1 + len(substeps) * (1 + bool(batch))
+    parts = 1 + len(substeps) * (1 + len(ACTIONS) * bool(batch))
     episodes = recorded(seeds, steps, seed)
     progress(1, parts)
     for count in substeps:
@@ -82,12 +81,13 @@ def run(
         rows.append({"substeps": count} | compared(env, episodes))
         keep(record)
         progress(1 + len(rows), parts)
-    if batch:
-        speeds |= {"gym-pusht": _gym_speed(True), "pymunk alone": _gym_speed(False)}
-        for k, count in enumerate(substeps):
-            speeds[f"pushjax, {count} substeps"] = _speed(PushT(substeps=count), batch)
+    for kind in ACTIONS if batch else ():
+        speeds[kind] = {"gym-pusht": _gym_speed(True, kind), "pymunk alone": _gym_speed(False, kind)}
+        for count in substeps:
+            row = throughput(PushT(substeps=count), batch, kind)
+            speeds[kind][f"pushjax, {count} substeps"] = row["steps_per_second"]
             keep(record)
-            progress(2 + len(rows) + k, parts)
+            progress(1 + len(rows) + sum(len(each) - 2 for each in speeds.values()), parts)
     return record
 
 
@@ -104,8 +104,9 @@ def summary(record: dict[str, Any]) -> str:
                 f"{100 * part['within']:.1f} % within {LIMITS[kind][0]} px"
             )
         lines += [f"    farther off: {each}" for each in row["farther_off"]]
-    speeds = record["control_steps_per_second"]
-    return "\n".join(lines + [f"{name:24}{speed:12,.0f} control steps/s" for name, speed in speeds.items()])
+    for kind, speeds in record["control_steps_per_second"].items():
+        lines += [f"{name:24}{speed:12,.0f} control steps/s, {kind} actions" for name, speed in speeds.items()]
+    return "\n".join(lines)
 
 
 def recorded(seeds: int, steps: int, seed: int = 0) -> Recorded:
@@ -232,7 +233,7 @@ def _cause(env: PushT, params: Any, episodes: Recorded, k: int) -> str:
     return f"starts within 0.1 px of it end up to {spread:.1f} px apart"
 
 
-def _gym_speed(whole: bool, seconds: float = 3.0) -> float:
+def _gym_speed(whole: bool, kind: str, seconds: float = 3.0) -> float:
     """Return control steps per second of CPU time of gym-pusht, or of its physics alone."""
     env, rng, done = make_gym(), np.random.default_rng(0), 0
     env.reset(seed=0)
@@ -240,7 +241,7 @@ def _gym_speed(whole: bool, seconds: float = 3.0) -> float:
     while time.process_time() - start < seconds:
         if done % 300 == 299:
             env.reset(seed=done)
-        action = random_action(env, rng)
+        action = random_action(env, rng) if kind == "steered" else rng.uniform(0, 512, 2)
         if whole:
             env.step(action)
         else:
@@ -250,32 +251,3 @@ def _gym_speed(whole: bool, seconds: float = 3.0) -> float:
                 env.space.step(env.dt)
         done += 1
     return done / (time.process_time() - start)
-
-
-def _speed(env: PushT, batch: int) -> float:
-    """Return control steps per second of CPU time of a batch, in the median of several runs."""
-    params = env.default_params
-
-    @jax.jit
-    def program(key: Array, states: TaskState):
-        def one_step(states: TaskState, key: Array):
-            noise_key, step_key = jax.random.split(key)
-            scatter = SCATTER * jax.random.normal(noise_key, (batch, 2))
-            way = states.pose[:, :2] + scatter - states.hand
-            actions = states.hand + AHEAD * way / jnp.linalg.norm(way, axis=1, keepdims=True)
-            actions = jnp.clip(actions, 0, 512)
-            keys = jax.random.split(step_key, batch)
-            out = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
-            observation, states, reward, terminated, truncated, _ = out
-            return states, (jnp.sum(observation), jnp.sum(reward), jnp.sum(terminated | truncated))
-
-        return jax.lax.scan(one_step, states, jax.random.split(key, CONTROL_STEPS))
-
-    keys = jax.random.split(jax.random.key(0), batch)
-    states = jax.vmap(env.reset, in_axes=(0, None))(keys, params)[1]
-    times = []
-    for k in range(8):
-        start = time.process_time()
-        states, _ = jax.block_until_ready(program(jax.random.key(k), states))
-        times.append(time.process_time() - start)
-    return batch * CONTROL_STEPS / float(np.median(times[2:]))

@@ -92,13 +92,17 @@ def train(name: str, seed: int, seconds: float) -> dict[str, Any]:
 
 
 def summary(records: list[dict[str, Any]]) -> str:
-    """Return a table of the tests: mean over the seeds, and the lowest and the highest."""
+    """Return a table of the tests: mean over the seeds with its standard error, and the lowest and the highest."""
     lines = ["| | " + " | ".join(TESTS) + " |", "|---" * (1 + len(TESTS)) + "|"]
     for name in RUNS:
         cells = []
         for test in TESTS:
             values = [record["tests"][test]["success"] for record in records if record["run"] == name]
-            cells.append(f"{np.mean(values):.3f} ({min(values):.3f} to {max(values):.3f})" if values else "")
+            if len(values) > 1:
+                error = np.std(values, ddof=1) / len(values) ** 0.5
+                cells.append(f"{np.mean(values):.2f} ± {error:.2f} ({min(values):.2f} to {max(values):.2f})")
+            else:
+                cells += [f"{value:.2f}" for value in values] or [""]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
