@@ -31,7 +31,7 @@ summary {{ cursor: pointer; font-weight: 600; margin: .6rem 0; }}
 <h1>{title}</h1>
 <pre>{text}</pre>
 {pictures}
-<details open><summary>Figures</summary>{figures}</details>
+{figures}
 <details><summary>Settings, versions, machine</summary>{settings}</details>
 <details><summary>Everything, as JSON</summary><pre id="record">{record}</pre></details>
 </body>
@@ -48,8 +48,8 @@ def write_page(record: dict[str, Any], text: str, path: Path, figures: Sequence[
         record: The record (see `result_record`). Its entry "pictures" lists files, whose content is embedded.
         text: The text that the command printed.
         path: The HTML file. Its folder is created.
-        figures: What the table of figures shows, as pairs of a name and a value in words. None: every entry of the
-            record, by its key.
+        figures: What the table of figures shows, as pairs of a name and a value in words. None: the printed text has
+            the figures in words, and the table, which is closed at first, has every entry of the record by its key.
 
     Returns:
         The path.
@@ -57,11 +57,15 @@ def write_page(record: dict[str, Any], text: str, path: Path, figures: Sequence[
     whole = json.loads(json.dumps(record, default=to_builtin))
     results = {name: value for name, value in whole.items() if name not in (*ABOUT, "pictures", "experiment")}
     pictures = "\n".join(_picture(Path(picture)) for picture in record.get("pictures", ()))
+    if figures is None:
+        table = f"<details><summary>Figures by their keys in the JSON</summary>{_table(_leaves(results))}</details>"
+    else:
+        table = f"<details open><summary>Figures</summary>{_table(figures)}</details>"
     page = TEMPLATE.format(
         title=html.escape(f"pushjax: {record['experiment']}"),
         text=html.escape(text),
         pictures=pictures,
-        figures=_table(_leaves(results) if figures is None else figures),
+        figures=table,
         settings=_table(_leaves({name: whole[name] for name in ABOUT if name in whole})),
         record=html.escape(json.dumps(whole, indent=1)),
     )
