@@ -28,8 +28,8 @@ from pushjax.planning.pace import Pace as Pace
 from pushjax.planning.plan import PushPlan as PushPlan
 from pushjax.planning.plan import PushPlanStatus as PushPlanStatus
 from pushjax.planning.plan import plan_pushes as plan_pushes
+from pushjax.planning.planned_push import PlanStatus as PlanStatus
 from pushjax.planning.push_library import PushLibrary as PushLibrary
-from pushjax.planning.push_planner import PlanStatus as PlanStatus
 from pushjax.planning.push_planner import PushPlanner as PushPlanner
 from pushjax.planning.push_problem import Outcomes as Outcomes
 from pushjax.planning.push_problem import push_outcomes as push_outcomes

@@ -5,7 +5,8 @@ The controller is a state machine. It plans a push, goes around the slider to it
 Going: the finger follows the way as fast as its speed limits allow. Each action is tried on the model of the finger
     first; a step that would come too near to the slider is shortened.
 Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
-    that are seen; the end whose final pose is nearest to the target is taken.
+    that are seen; the end whose final pose is nearest to the target is taken. The push is over once the finger is where
+    the control step before has put its end. So no control step both corrects a push and plans one.
 Learning: with a `FrictionFilter`, each control step of a push updates a belief about friction. Rollouts of the feedback
     use its mean. If its samples are those of the planner's library, pushes are chosen by their weights.
 """
@@ -20,9 +21,10 @@ from pushjax.planning.approach import Way, WayStatus
 from pushjax.planning.clearance import point_clearance
 from pushjax.planning.finger_control import FingerControl, FingerState
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
+from pushjax.planning.planned_push import PlannedPush, PlanStatus
 from pushjax.planning.poses import compose, inverse, to_body
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
-from pushjax.planning.push_planner import PlannedPush, PlanStatus, PushPlanner
+from pushjax.planning.push_planner import PushPlanner
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
@@ -136,7 +138,8 @@ class PushController:
         return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PlanStatus.NO_PUSH, self.prior)
 
     def prepare(self) -> None:
-        """Compile the programs of feedback and filter, which are else compiled when they are first needed."""
+        """Compile the programs of control steps, which are else compiled when they are first needed."""
+        self._shake(jax.random.key(0), 1)
         if self.friction_filter is not None and self.prior is not None:
             self.friction_filter.update(self.prior, np.zeros(3), np.zeros((LEARNING_STEPS + 1, 2)), np.zeros(3))
         if self.feedback:
@@ -194,15 +197,17 @@ class PushController:
 
     def _plan(self, key: PRNGKeyArray, state: FingerState, pose: np.ndarray, memory: Memory) -> Memory:
         """Plan a push. If there is none, `push` stays None."""
-        shake = None
-        if memory.pushes > SHAKE_AFTER:
-            seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, memory.pushes))).ravel().tolist()
-            shake = np.abs(np.random.default_rng(seed).normal(0, memory.pushes, len(self.planner.library.starts)))
+        shake = self._shake(key, memory.pushes) if memory.pushes > SHAKE_AFTER else None
         push = self._planner(memory.belief).choose(pose, state.position, shake)
         planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0, taken=0)
         if push.status.failed:
             return planned._replace(push=None)
         return planned._replace(push=push, end=push.end, pushes=memory.pushes + 1)
+
+    def _shake(self, key: PRNGKeyArray, pushes: int) -> np.ndarray:
+        """Return random costs of all pushes, which grow with the number of pushes so far, control steps."""
+        seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, pushes))).ravel().tolist()
+        return np.abs(np.random.default_rng(seed).normal(0, pushes, len(self.planner.library.starts)))
 
     def _planner(self, belief: FrictionBelief | None) -> PushPlanner:
         """Return the planner, with the weights of the belief if its samples are those of the library."""
@@ -245,16 +250,19 @@ class PushController:
         push, pace = memory.push, self.planner.pace
         assert push is not None
         end = memory.end
-        if correct and np.linalg.norm(end - state.position) < CORRECTED * self.length:
+        left = float(np.linalg.norm(end - state.position))
+        # a finger that does not go where it should would try forever
+        late = memory.taken > LATE * pace.push_time(np.linalg.norm(push.end - push.start)) + 3
+        # no correction at the end: it would go on and on for less than the next push gains in the same time
+        if left < self.arrived or late:
+            return None, memory._replace(push=None, pushing=False, speed=0.0)
+        if correct and left < CORRECTED * self.length:
             end = self._corrected(state.position, pose, end, push, memory.belief)
         way = end - state.position
         left = float(np.linalg.norm(way))
-        # a finger that does not go where it should would try forever
-        late = memory.taken > LATE * pace.push_time(np.linalg.norm(push.end - push.start)) + 3
-        if left < self.arrived or late:
-            return None, memory._replace(push=None, pushing=False, speed=0.0)
         speed = pace.next_speed(memory.speed, left, pace.push)
-        return state.position + way * (speed / left), memory._replace(end=end, speed=speed, taken=memory.taken + 1)
+        target = state.position + way * min(speed / max(left, 1e-9), 1.0)
+        return target, memory._replace(end=end, speed=speed, taken=memory.taken + 1)
 
     def _corrected(
         self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None

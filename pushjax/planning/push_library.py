@@ -196,7 +196,7 @@ class PushLibrary:
     @cached_property
     def relative(self) -> np.ndarray:
         """Relative poses of the entries in the first sample, (entries, 3); `averaged` has the means in its only one."""
-        return np.ascontiguousarray(self.outcomes[0][tuple(self.entries.T)])
+        return self.outcomes[0].reshape(-1, 3)[self.valid.ravel()]
 
     @cached_property
     def tree(self) -> KDTree:

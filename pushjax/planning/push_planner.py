@@ -9,9 +9,7 @@ Farther away: the push with that least sum.
 """
 
 from copy import copy
-from enum import IntEnum
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -22,6 +20,7 @@ from pushjax.planning.cost_to_go import CostToGo, cost_to_go
 from pushjax.planning.coverage_table import CoverageTable, Measure
 from pushjax.planning.free_space import SPARSE, FreeSpace
 from pushjax.planning.pace import Pace
+from pushjax.planning.planned_push import Candidate, PlannedPush, PlanStatus
 from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
@@ -31,6 +30,7 @@ from pushjax.simulation.slider import Slider
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
 TRIED, TOGETHER = 480, 24  # choices that are looked at for a collision, best first, and how many at a time
+JUDGED = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
@@ -38,60 +38,6 @@ AROUND = 8.0  # distance from the goal along x and y up to which the cost to go 
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 RETRY = 10.0  # control steps of another push, if the last one misses the goal
 LOST = 60.0  # control steps of a way that the table of ways does not have
-
-
-class PlanStatus(IntEnum):
-    """What the next push is for, or why there is none.
-
-    Attributes:
-        ONE_PUSH: It reaches the goal.
-        TWO_PUSHES: It is the first of two that reach the goal.
-        COST_TO_GO: It leads to where the cost to go is least.
-        NO_WAY: The finger gets to no push; the status of the way tells why.
-        NO_PUSH: No push stays within the workspace and out of its fixtures.
-        START_IN_FIXTURE: The slider is deeper in a fixture than a simulation would start from.
-    """
-
-    ONE_PUSH = 0
-    TWO_PUSHES = 1
-    COST_TO_GO = 2
-    NO_WAY = 3
-    NO_PUSH = 4
-    START_IN_FIXTURE = 5
-
-    @property
-    def failed(self) -> bool:
-        """Whether there is no push."""
-        return self >= PlanStatus.NO_WAY
-
-
-class PlannedPush(NamedTuple):
-    """The next push.
-
-    Attributes:
-        status: What the push is for, or why there is none.
-        way: Way of the finger to where the run-up begins, world; its status says why there is none.
-        start: Where the finger is about to touch the slider, (2,), world, m.
-        end: Where the push ends, (2,), world, m.
-        target: Pose of the slider that the push is for, (3,), world, m and rad.
-        cost: Predicted number of control steps to the goal.
-    """
-
-    status: PlanStatus
-    way: Way
-    start: np.ndarray
-    end: np.ndarray
-    target: np.ndarray
-    cost: float
-
-
-class Candidate(NamedTuple):
-    """A push that may come next: its kind, its entry in the library, the pose it is for, and its predicted cost."""
-
-    status: PlanStatus
-    entry: int
-    target: np.ndarray
-    cost: float
 
 
 class PushPlanner:
@@ -137,7 +83,7 @@ class PushPlanner:
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
         self.space = self._free_space(library) if workspace.obstacles.any else None
         self._weigh(None)
-        library = self.library
+        self.searched = library = self.library
         starts = library.starts[:, :2]
         self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
         self.usable = np.isfinite(self.run_up)
@@ -153,9 +99,13 @@ class PushPlanner:
     def reweighted(self, weight: np.ndarray) -> "PushPlanner":
         """Return a planner with other weights of the library's samples. It keeps the tables, and the cost to go.
 
+        So pushes are looked up by their mean outcomes under equal weights: building the tree anew takes too long for a
+        control step. Their costs are those of the new weights.
+
         Args:
             weight: Weights of the samples, (samples,), which add up to one.
         """
+        self.prepare()  # so that planners share the tables
         other = copy(self)
         other._weigh(weight)
         return other
@@ -232,7 +182,7 @@ class PushPlanner:
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self.after_push, self.place, self.library.tree, self.space and self.space.table
+        _ = self.value, self.after_push, self.place, self.searched.tree, self.space and self.space.table
 
     def choose(self, pose: np.ndarray, finger: np.ndarray, shake: np.ndarray | None = None) -> PlannedPush:
         """Choose the next push.
@@ -274,24 +224,44 @@ class PushPlanner:
     def _one_push(self, pose: np.ndarray, way_time: np.ndarray) -> Candidate | None:
         """Return the push that reaches the goal in the fewest steps; a better score counts some steps."""
         relative = compose(inverse(pose), self.goal)
-        near = self.library.tree.query_ball_point(self.library.features(relative), self.measure.reach)
+        near = self.searched.tree.query_ball_point(self.library.features(relative), self.measure.reach)
         entries = np.asarray(near, int)
         entries = entries[np.isfinite(way_time[self.push[entries]])]
         entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
         if not len(entries):
             return None
-        risk, good = self._risk(inverse(relative), entries)
-        cost = np.where(good, way_time[self.push[entries]] + self.push_time[entries] + risk, np.inf)
-        best = self._least(cost, (np.broadcast_to(pose, (len(entries), 3)), entries))
+        back = np.broadcast_to(inverse(relative), (len(entries), 3))
+        cost = self._with_risk(way_time[self.push[entries]] + self.push_time[entries], back, entries, reach=True)
+        best = self._least(cost, (np.broadcast_to(pose, back.shape), entries))
         if best is None:
             return None
         return Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
+
+    def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, reach: bool) -> np.ndarray:
+        """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost.
+
+        Args:
+            spent: Control steps without the risk, which is never negative, (pushes,).
+            back: Pose of the slider before each push, relative to the goal, (pushes, 3).
+            entries: The pushes, (pushes,).
+            reach: Whether the cost of pushes that cannot reach the goal is infinite.
+        """
+        cost = np.full(len(entries), np.inf)
+        order = np.argsort(spent, kind="stable")
+        order = order[np.isfinite(spent[order])]
+        for begin in range(0, len(order), JUDGED):
+            some = order[begin : begin + JUDGED]
+            if self.space is None and spent[some[0]] > cost.min():  # a fixture may forbid the best
+                break
+            risk, good = self._risk(back[some], entries[some])
+            cost[some] = np.where(good | (not reach), spent[some] + risk, np.inf)
+        return cost
 
     def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the control steps that stand for the risk of missing the goal, and whether the goal may be reached.
 
         Args:
-            back: Pose of the slider before the push, relative to the goal, (3,) or (pushes, 3).
+            back: Pose of the slider before each push, relative to the goal, (pushes, 3).
             entries: Last pushes, (pushes,).
         """
         enough = self.measure.enough
@@ -354,7 +324,7 @@ class PushPlanner:
         """Return the best of the first pushes that a second one continues to the goal."""
         goal = self.goal.astype(np.float32)
         wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
-        distance, second = self.library.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
+        distance, second = self.searched.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
         first, column = np.nonzero(np.isfinite(distance))
         if not len(first):
             return None
@@ -362,10 +332,9 @@ class PushPlanner:
         starts = self.library.starts[self.push[second], :2].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
-        risk, _ = self._risk(inverse(wanted[first]), second)
         between = self.after_push[self.place[entries[first]], self.push[second]]
-        total = spent[first] + between + self.push_time[second] + risk
-        total = np.where(allowed, total, np.inf)
+        total = np.where(allowed, spent[first] + between + self.push_time[second], np.inf)
+        total = self._with_risk(total, inverse(wanted[first]), second, reach=False)
         k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))
         if k is None:
             return None

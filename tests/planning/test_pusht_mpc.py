@@ -10,16 +10,18 @@ import pytest
 import pushjax as pj
 from pushjax.experiments import pusht_mpc
 from pushjax.experiments.pusht_mpc import experiment, player, setting
+from pushjax.planning import push_planner
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.controller import Observation, PushController
 from pushjax.planning.coverage_table import CoverageTable
 from pushjax.planning.finger_control import FingerState, PositionControl
 from pushjax.planning.friction_filter import FrictionBelief, FrictionFilter
 from pushjax.planning.pace import Pace
+from pushjax.planning.planned_push import PlanStatus
 from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_batch import LEG, simulate_pushes
 from pushjax.planning.push_library import PushLibrary
-from pushjax.planning.push_planner import PlanStatus, PushPlanner
+from pushjax.planning.push_planner import PushPlanner
 from pushjax.planning.workspace import Workspace
 
 RADIUS, ENOUGH = 0.015, 0.95
@@ -113,6 +115,41 @@ def test_weights_choose_among_the_samples_of_a_library(adapting):
     assert one.value is planner.value
     targets = [each.choose(pose, finger).target for each in (one, planner.reweighted(np.eye(12)[4]))]
     assert not np.allclose(*targets)
+
+
+def test_no_control_step_both_corrects_a_push_and_plans_one(rectangle, monkeypatch):
+    """Both take long, and a push whose end is corrected when the finger is there goes on and on."""
+    done, steps = [], []
+    for name in ("_plan", "_corrected"):
+        whole = getattr(rectangle, name)
+        monkeypatch.setattr(rectangle, name, lambda *given, whole=whole, name=name: done.append(name) or whole(*given))
+    whole_step = PushController.__call__
+
+    def step(made, *given):
+        done.clear()
+        found = whole_step(made, *given)
+        steps.append(tuple(done))
+        return found
+
+    monkeypatch.setattr(PushController, "__call__", step)
+    assert play(rectangle, 3).covered > ENOUGH
+    assert set(steps) == {(), ("_plan",), ("_corrected",)}
+
+
+def test_risk_is_left_out_only_where_it_does_not_matter(adapting, monkeypatch):
+    """All risks at once give the same pushes."""
+    planner = adapting.planner.reweighted(np.arange(12) / 66)
+    near = np.flatnonzero((planner.library.entries[:, 1] == 30) & planner.usable[planner.push])[::20]
+    far = GOAL + np.random.default_rng(4).normal(size=(4, 3)) * np.array([0.04, 0.04, 0.5])
+    poses = np.concatenate([planner.library.poses_reaching(GOAL)[near], far])
+    finger = np.array([0.02, 0.02])
+    monkeypatch.setattr(push_planner, "JUDGED", 4)
+    few = [planner.choose(pose, finger) for pose in poses]
+    monkeypatch.setattr(push_planner, "JUDGED", 10**6)
+    every = [planner.choose(pose, finger) for pose in poses]
+    assert {PlanStatus.ONE_PUSH, PlanStatus.TWO_PUSHES} <= {push.status for push in few}
+    assert [push.cost for push in few] == [push.cost for push in every]
+    np.testing.assert_array_equal([push.end for push in few], [push.end for push in every])
 
 
 def test_a_filter_needs_a_prior(adapting):

@@ -1,0 +1,62 @@
+"""The next push of a planner, and why there is none."""
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from pushjax.planning.approach import Way
+
+
+class PlanStatus(IntEnum):
+    """What the next push is for, or why there is none.
+
+    Attributes:
+        ONE_PUSH: It reaches the goal.
+        TWO_PUSHES: It is the first of two that reach the goal.
+        COST_TO_GO: It leads to where the cost to go is least.
+        NO_WAY: The finger gets to no push; the status of the way tells why.
+        NO_PUSH: No push stays within the workspace and out of its fixtures.
+        START_IN_FIXTURE: The slider is deeper in a fixture than a simulation would start from.
+    """
+
+    ONE_PUSH = 0
+    TWO_PUSHES = 1
+    COST_TO_GO = 2
+    NO_WAY = 3
+    NO_PUSH = 4
+    START_IN_FIXTURE = 5
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no push."""
+        return self >= PlanStatus.NO_WAY
+
+
+class PlannedPush(NamedTuple):
+    """The next push.
+
+    Attributes:
+        status: What the push is for, or why there is none.
+        way: Way of the finger to where the run-up begins, world; its status says why there is none.
+        start: Where the finger is about to touch the slider, (2,), world, m.
+        end: Where the push ends, (2,), world, m.
+        target: Pose of the slider that the push is for, (3,), world, m and rad.
+        cost: Predicted number of control steps to the goal.
+    """
+
+    status: PlanStatus
+    way: Way
+    start: np.ndarray
+    end: np.ndarray
+    target: np.ndarray
+    cost: float
+
+
+class Candidate(NamedTuple):
+    """A push that may come next: its kind, its entry in the library, the pose it is for, and its predicted cost."""
+
+    status: PlanStatus
+    entry: int
+    target: np.ndarray
+    cost: float
