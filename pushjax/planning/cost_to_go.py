@@ -85,7 +85,7 @@ def cost_to_go(
     moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
     allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
     if space is not None:
-        met = space.table.nearest(cells) < 0
+        met = space.table.nearest(cells) < space.least
         blocked |= met
         allowed = [
             may & space.moves(library, angle, move.entry)
@@ -100,8 +100,8 @@ def cost_to_go(
             values[:, :, k] = new
         if change < CHANGE:
             break
-    if space is not None:  # poses near such a cell's center may be free: they cost what the cells around do
-        values = np.where(met, _least_around(np.where(met, NEVER, values)), values)
+    if space is not None:  # poses near such a cell's center may be free: a push leads to the cells around
+        values = np.where(met, _least_around(np.where(met, NEVER, values)) + between, values)
     return CostToGo(np.asarray(low, np.float32), spacing, values)
 
 

@@ -90,10 +90,10 @@ class FreeSpace:
     def _grids(self) -> tuple[np.ndarray, np.ndarray]:
         """Where slider (angles, cells, cells) and finger (cells, cells) are free, also some cells beyond the table."""
         side = (self.beyond, self.beyond)
-        slider = np.pad(np.moveaxis(self.table.values, 2, 0) >= 0, ((0, 0), side, side), constant_values=True)
+        slider = np.pad(np.moveaxis(self.table.values, 2, 0) >= self.least, ((0, 0), side, side), constant_values=True)
         axes = [low + self.spacing * np.arange(-self.beyond, self.positions + self.beyond) for low in self.low]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        return np.ascontiguousarray(slider), self.obstacles.point_clearance(points) >= self.radius
+        return np.ascontiguousarray(slider), self.obstacles.point_clearance(points) >= self.radius + self.clearance
 
     def likely(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
         """Return which pushes from one pose seem to be free, (pushes, lengths), each up to every SPARSE-th length.
