@@ -7,7 +7,8 @@ part of a user's program is compiled for a short run time.
 import functools
 import gc
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -37,6 +38,15 @@ NO_TRACE = get_opaque_trace_state()  # this module is imported outside of any tr
 def outside_trace() -> bool:
     """Return whether nothing is being traced: the caller is not inside `jit`, `grad` or `vmap`."""
     return get_opaque_trace_state() == NO_TRACE
+
+
+def eager_context() -> AbstractContextManager[Any]:
+    """Return a context in which arrays are computed at once, also while a program is being traced.
+
+    Outside of a trace they are anyway. There JAX's own context would only compute one by one the constants of each
+    function that is compiled, which took a third of the time of the default parameters of a task.
+    """
+    return nullcontext() if outside_trace() else jax.ensure_compile_time_eval()
 
 
 def jit(function: Callable[P, R]) -> Callable[P, R]:

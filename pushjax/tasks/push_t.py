@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, check_type
+from pushjax._internal.jit import eager_context
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.random import FrictionModel
 from pushjax.geometry.intersection import intersection_area
@@ -286,7 +287,7 @@ class PushT(Environment):
 @cache
 def _default_params(dtype: Any) -> PushTParams:
     """The parameters of gym-pusht, in the given floating dtype, which is the default one at the time of the call."""
-    with jax.ensure_compile_time_eval():
+    with eager_context():
         return PushT().params()
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type
+from pushjax._internal.jit import eager_context
 from pushjax._math.vec import cos_sin, norm
 from pushjax.friction.random import FrictionModel
 from pushjax.geometry.intersection import intersection_area
@@ -222,7 +223,7 @@ def draw_pose(key: PRNGKeyArray, low: tuple[float, float], high: tuple[float, fl
 @cache
 def _default_params(task: type[TableTask], dtype: Any) -> TableParams:
     """The default parameters of a task in a floating dtype, which is the default one at the time of the call."""
-    with jax.ensure_compile_time_eval():
+    with eager_context():
         return task().params()
 
 
