@@ -15,7 +15,7 @@ from pushjax.planning.poses import to_body, to_world
 from pushjax.simulation.arguments import checked_fixtures
 from pushjax.simulation.fixtures import Fixture, Wall
 
-TOGETHER = 20_000  # poses whose distances are computed together, so that their data stay in the cache
+TOGETHER = 4000  # poses whose distances are computed together, so that their data stay in the cache
 
 
 class Obstacles(NamedTuple):
@@ -107,15 +107,17 @@ class Obstacles(NamedTuple):
             # how far the slider reaches toward the wall depends on its angle only
             facing = to_body(flat * np.array([0.0, 0.0, 1.0]), normal)
             found = np.minimum(found, (flat[:, :2] - point) @ normal + (facing @ vertices.T).min(-1))
-        for center, radius in zip(self.centers, self.radii, strict=True):
-            found = np.minimum(found, point_clearance(vertices, to_body(flat, center)) - radius)
         reach = np.linalg.norm(vertices, axis=1).max()
-        for body in self.bodies:
-            middle = body.mean(0)
-            apart = np.linalg.norm(flat[:, :2] - middle, axis=1) - reach - np.linalg.norm(body - middle, axis=1).max()
+        around = [(body.mean(0), np.linalg.norm(body - body.mean(0), axis=1).max(), body) for body in self.bodies]
+        around += [(center, radius, None) for center, radius in zip(self.centers, self.radii, strict=True)]
+        for middle, size, body in around:
+            apart = np.linalg.norm(flat[:, :2] - middle, axis=1) - reach - size
             near = np.flatnonzero(apart < enough)
             for some in np.array_split(near, len(near) // TOGETHER + 1):
-                apart[some] = _polygons_apart(vertices, flat[some], body, tolerance)
+                if body is None:
+                    apart[some] = point_clearance(vertices, to_body(flat[some], middle)) - size
+                else:
+                    apart[some] = _polygons_apart(vertices, flat[some], body, tolerance)
             found = np.minimum(found, apart)
         return found.reshape(np.shape(poses)[:-1])
 

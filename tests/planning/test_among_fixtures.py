@@ -1,0 +1,193 @@
+"""Pushes among fixtures: which ones the planner allows, and whole episodes in this library's simulation.
+
+Shapely judges whether slider and finger stay out of the fixtures.
+
+    python -m pytest -m long -s tests/planning/test_among_fixtures.py
+
+prints the figures of docs/planning.md.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import pushjax as pj
+from pushjax.planning import Observation, Pace, PlanStatus, PositionControl, PushController, PushPlanner, Workspace
+from pushjax.planning.approach import WayStatus
+from pushjax.planning.poses import compose, inverse, to_world
+from pushjax.planning.push_library import PushLibrary
+
+shapely = pytest.importorskip("shapely")
+
+RADIUS, FRICTION, ENOUGH = 0.015, 0.1, 0.95
+GOAL = np.array([0.40, 0.25, 0.8])
+PACE = Pace(0.05, 0.02, 0.02)
+BAR, TRIANGLE = pj.Polygon.rectangle(0.04, 0.20), pj.Polygon([(-0.04, -0.03), (0.04, -0.03), (0.0, 0.04)])
+FIXTURES = (  # a bar in front of the goal, a post in the way around it on one side, and a wedge near the starts
+    pj.Fixture(BAR, (0.27, 0.25, 0.0)),
+    pj.Fixture(pj.Disk(0.03), (0.33, 0.45, 0.0)),
+    pj.Fixture(TRIANGLE, (0.12, 0.08, 0.3)),
+)
+WORLD = shapely.union_all(
+    [shapely.Polygon(to_world(np.asarray(each.pose), np.asarray(each.shape.vertices))) for each in FIXTURES[::2]]
+    + [shapely.Point(0.33, 0.45).buffer(0.03, quad_segs=64)]
+)
+STEPS = 32  # of the simulation of a control step
+
+
+@pytest.fixture(scope="module")
+def slider():
+    return pj.Slider(pj.Polygon.rectangle(0.10, 0.06), pj.Ellipsoid(np.eye(3), 0.05))
+
+
+def placed(slider, pose):
+    return shapely.Polygon(to_world(np.asarray(pose, float), np.asarray(slider.shape.vertices, float)))
+
+
+def starts(slider, count, low=0.06, high=0.20):
+    """Return random poses of slider and finger that touch nothing, before the bar if not told otherwise."""
+    rng, found = np.random.default_rng(0), []
+    while len(found) < count:
+        pose = np.array([rng.uniform(low, high), rng.uniform(0.06, 0.44), rng.uniform(-3, 3)])
+        finger, block = rng.uniform(0.03, 0.47, 2), placed(slider, pose)
+        apart = min(WORLD.distance(shapely.Point(finger)), block.distance(shapely.Point(finger))) - RADIUS
+        if block.distance(WORLD) > 0.005 and apart > 0.001 and block.within(shapely.box(0, 0, 0.5, 0.5)):
+            found.append((pose, finger))
+    return found
+
+
+@pytest.fixture(scope="module")
+def sparse(slider):
+    """A planner with few pushes."""
+    pushes = PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=32, angles=3)
+    table = Workspace.rectangle((0.0, 0.0), (0.5, 0.5), FIXTURES)
+    return PushPlanner(slider, RADIUS, pushes, GOAL, table, PACE)
+
+
+def clearances(planner, pose, entry):
+    """Return the distances of slider and finger from the fixtures along a push, and of the slider before it."""
+    library = planner.library
+    push, index = library.entries[entry]
+    block = [placed(planner.slider, each) for each in compose(pose, library.outcomes[0][push, : index + 1])]
+    way = to_world(pose, library.starts[push] + np.array([[0.0], [library.travel[index]]]) * library.directions[push])
+    return min(map(WORLD.distance, block)), WORLD.distance(shapely.LineString(way)) - RADIUS, WORLD.distance(block[0])
+
+
+def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
+    rng, space, allowed = np.random.default_rng(1), sparse.space, 0
+    assert space.least == pytest.approx(sparse.clearance)  # the goal is farther away
+    for pose, _ in starts(slider, 8, high=0.44):
+        entries = rng.choice(len(sparse.push), 60, replace=False)
+        free = space.free(sparse.library, np.broadcast_to(pose, (60, 3)), entries)
+        for entry, good in zip(entries, free, strict=True):
+            block, finger, before = clearances(sparse, pose, entry)
+            if good:
+                assert block >= min(space.least, before) - 0.003 * slider.surface.length - 1e-4
+                assert finger >= sparse.clearance - 1e-5
+            elif before > space.least:
+                assert min(block - space.least, finger - sparse.clearance) < 1e-4
+            allowed += good
+    assert 80 < allowed < 450
+
+
+def test_the_table_of_distances(slider, sparse):
+    """Where the slider is near, the table is off by less than three quarters of the spacing of its positions."""
+    rng, table = np.random.default_rng(2), sparse.space.table
+    poses = np.column_stack([rng.uniform(0.1, 0.4, (800, 2)), rng.uniform(-9, 9, 800)])
+    apart = np.array([placed(slider, pose).distance(WORLD) for pose in poses])
+    near = (apart > 0) & (apart < sparse.clearance)
+    assert near.sum() > 10
+    assert np.abs(table(poses) - apart)[near].max() < 0.75 * table.spacing
+    assert (table(poses)[apart > 3 * sparse.clearance] > sparse.clearance).all()
+    overlap = np.array([placed(slider, pose).intersection(WORLD).area for pose in poses]) > 3e-4
+    assert (table(poses)[overlap] < 0).all()
+
+
+def test_plans_run_into_no_fixture(slider, sparse):
+    kinds = set()
+    for pose, finger in starts(slider, 16, high=0.44):
+        plan = sparse.choose(pose, finger)
+        kinds.add(plan.status)
+        if plan.status.failed:
+            continue
+        way = shapely.LineString([*plan.way.points, plan.start, plan.end])
+        first = min(RADIUS + sparse.clearance, WORLD.distance(shapely.Point(finger)))
+        assert WORLD.distance(way) >= first - 1e-5
+        if plan.status != PlanStatus.ONE_PUSH:
+            assert placed(slider, plan.target).distance(WORLD) >= 0.9 * sparse.clearance
+    assert {PlanStatus.COST_TO_GO, PlanStatus.TWO_PUSHES} <= kinds
+
+
+def test_cost_to_go_knows_the_fixtures(slider, sparse):
+    """Behind the bar it costs more than without the bar."""
+    free = PushPlanner(slider, RADIUS, sparse.library, GOAL, Workspace.rectangle((0, 0), (0.5, 0.5)), PACE)
+    behind = np.array([[0.17, 0.25, angle] for angle in np.linspace(0, 2 * np.pi, 12)])
+    assert sparse.value is not None
+    assert free.value is not None
+    more = sparse.value(behind) - free.value(behind)
+    assert np.median(more) > 5
+    assert (more > -2).all()
+
+
+def test_poses_in_fixtures(slider, sparse):
+    with pytest.raises(ValueError, match=r"goal must be a pose at which the slider overlaps no fixture; got \[0.27"):
+        PushPlanner(slider, RADIUS, sparse.library, np.array([0.27, 0.3, 0]), sparse.workspace, PACE)
+    inside = sparse.choose(np.array([0.26, 0.25, 0.0]), np.array([0.1, 0.4]))
+    assert inside.status == PlanStatus.START_IN_FIXTURE
+    assert inside.status.failed
+    finger = sparse.choose(np.array([0.12, 0.25, 0.0]), np.array([0.27, 0.3]))
+    assert (finger.status, finger.way.status) == (PlanStatus.NO_WAY, WayStatus.START_IN_FIXTURE)
+    with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Fixture"):
+        Workspace.unlimited(FIXTURES[0])
+
+
+class Episode(NamedTuple):
+    """Whether the goal was reached, in how many control steps, and the smallest distances from the fixtures, m."""
+
+    success: bool
+    steps: int
+    slider: float
+    finger: float
+
+
+def play(made, pose, finger, fixtures, steps=150):
+    """Play one episode in a plant with these fixtures."""
+    hand, memory, slider = pj.Hand.finger(RADIUS), made.initial_memory(), made.planner.slider
+    apart, success = [], False
+    while not success and len(apart) < steps:
+        action, memory = made(jax.random.key(0), Observation(finger, pose), memory)
+        path = finger + np.linspace(0, 1, STEPS + 1)[:, None] * (action - finger)
+        done = pj.rollout(slider, hand, path, pose=pose, friction=FRICTION, fixtures=fixtures)
+        block = min(placed(slider, each).distance(WORLD) for each in np.asarray(done.pose))
+        apart.append((block, WORLD.distance(shapely.LineString(path)) - RADIUS))
+        pose, finger = np.asarray(done.pose[-1], float), action
+        success = float(made.planner.measure(compose(inverse(GOAL), pose))) > ENOUGH
+    return Episode(success, len(apart), *np.min(apart, axis=0))
+
+
+@pytest.mark.long
+def test_a_box_gets_around_fixtures(slider):
+    """The same controller and settings: that knows of the fixtures, that does not, and on a table without them."""
+    pushes = PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=120, angles=7)
+    episodes = {}
+    for name, known, there in (
+        ("fixtures that it knows", FIXTURES, FIXTURES),
+        ("fixtures that it does not know", (), FIXTURES),
+        ("no fixtures", (), ()),
+    ):
+        table = Workspace.rectangle((0.0, 0.0), (0.5, 0.5), known)
+        planner = PushPlanner(slider, RADIUS, pushes, GOAL, table, PACE)
+        made = PushController(planner, PositionControl(), friction=FRICTION)
+        found = episodes[name] = [play(made, *start, there) for start in starts(slider, 20)]
+        reached = [each.steps for each in found if each.success]
+        print(
+            f"{name}: {len(reached)} of {len(found)} in {np.mean(reached):.1f} steps; slider in a fixture "
+            f"{sum(each.slider == 0 for each in found)}, finger {sum(each.finger < 0 for each in found)}; nearest "
+            f"{1e3 * min(each.slider for each in found):.1f} and {1e3 * min(each.finger for each in found):.1f} mm"
+        )
+    knows, ignores, _ = episodes.values()
+    assert sum(each.success for each in knows) >= 19
+    assert all(each.slider > 0 and each.finger >= 0 for each in knows)
+    assert sum(each.success and each.slider > 0 and each.finger >= 0 for each in ignores) < 10
