@@ -61,7 +61,14 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
 
 
 # Notebooks that compile programs of their own, which takes a minute each.
-LONG_NOTEBOOKS = ("03_several_contacts", "04_stochastic_pushing", "06_planning", "07_tasks", "08_plans")
+LONG_NOTEBOOKS = (
+    "03_several_contacts",
+    "04_stochastic_pushing",
+    "05_identifying_friction",
+    "06_planning",
+    "07_tasks",
+    "08_plans",
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import traceback
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SITE = sorted(path for path in DOCS.rglob("*.md"))
+LONG_PAGES = ("docs/concepts/pushing.md", "docs/tasks.md")  # compile for half a minute to a minute
 PAGES = [*SITE, ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CHANGELOG.md"]
 BLOCK = re.compile(r"^(<!-- not run: [^>]+ -->\n)?```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -266,18 +268,31 @@ def test_options_are_all_in_the_command_line_page():
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    """Return for each page "" or the end of a traceback; one process runs all, to share compiled programs."""
-    environment = os.environ | {"JAX_ENABLE_X64": "0", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
-    command = [sys.executable, __file__, *map(str, with_blocks())]
-    folder = tmp_path_factory.mktemp("pages")
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads((folder / "ran.json").read_text())
+    """Return a function that gives for each page "" or the end of a traceback.
+
+    One process runs all long pages, and one all others, to share compiled programs.
+    """
+
+    @cache
+    def run(long: bool) -> dict[str, str]:
+        environment = os.environ | {"JAX_ENABLE_X64": "0", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
+        paths = [str(path) for path in with_blocks() if (label(path) in LONG_PAGES) == long]
+        folder = tmp_path_factory.mktemp("pages")
+        command = [sys.executable, __file__, *paths]
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return json.loads((folder / "ran.json").read_text())
+
+    return run
 
 
-@pytest.mark.parametrize("path", with_blocks(), ids=label)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.long] * (label(path) in LONG_PAGES)) for path in with_blocks()],
+    ids=label,
+)
 def test_examples_run(path, ran):
-    assert ran[str(path)] == ""
+    assert ran(label(path) in LONG_PAGES)[str(path)] == ""
 
 
 def run_pages(paths: list[str]) -> None:

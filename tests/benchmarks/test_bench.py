@@ -94,6 +94,7 @@ def test_traffic_counts_rounds():
     assert product.flops == pytest.approx(2 * 40 * 40 * 30)
 
 
+@pytest.mark.long
 def test_cases_work():
     """Each case runs, and moves what it should."""
     problems = cases.solve("float64", 16, 2)
@@ -203,6 +204,7 @@ def needed_by(which):
     return costs["flops"], work
 
 
+@pytest.mark.long
 def test_smooth_outlines_cost_the_same_whatever_they_were_traced_with():
     """The cost depends on the control points of a curve, or on the vertices of a polygon."""
     coarse, fine = (needed_by(("curve", 12, traced))[0] for traced in outlines.TRACED)
@@ -243,6 +245,7 @@ def test_rows_of_fits_and_of_monte_carlo():
     assert found["modes"][0]["SEPARATED"] == 0  # the finger touches in every step
 
 
+@pytest.mark.long
 def test_tiles_change_nothing(monkeypatch):
     monkeypatch.setattr(cases, "TILE", 16)
     work = cases.push("float64", 40)

@@ -234,6 +234,7 @@ def test_threads_change_nothing():
     np.testing.assert_array_equal(one.pose, two.pose)
 
 
+@pytest.mark.long
 def test_mjx_ends_where_mujoco_does():
     mjx = pytest.importorskip("benchmarks.peers.mjx")
     scene = Scene(THREE, travel=0.02)

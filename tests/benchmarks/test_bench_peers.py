@@ -46,6 +46,7 @@ def test_clipped_pairs_are_counted(rng):
     assert fits.fit(wrench, against, length, 2).clipped >= 40
 
 
+@pytest.mark.long
 def test_the_root_finder_has_the_same_answers():
     surface, problem = cases.solve("float64", 60, 2).args
     motion = jax.jit(jax.vmap(pj.solve_contacts))(surface, problem)

@@ -384,6 +384,7 @@ def test_bootstrap(few, found, block, surface):
     assert np.all(np.abs(z.mean(axis=0) - found.z) < 2 * laplace)
 
 
+@pytest.mark.long
 def test_noise(few, found, block, surface, tmp_path):
     """Identify the noise of simulated pushes: the result predicts better than the initial guess."""
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
@@ -420,6 +421,7 @@ def test_noise(few, found, block, surface, tmp_path):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)
 
 
+@pytest.mark.long
 def test_energy_score_has_a_mean_for_the_longest_tails(few, found, block, surface):
     """The energy score has a mean also for the longest tails.
 

@@ -165,6 +165,7 @@ def test_float32_where_float64_is_enabled(square, expected, hand):
         assert abs(float(found.friction) - MU) < 0.005
 
 
+@pytest.mark.long
 def test_conditions_share_the_calibration(square, hand):
     """Two sliders on two tables share one robot, which goes farther than logged, with a finger thinner than stated."""
     rng = np.random.default_rng(5)

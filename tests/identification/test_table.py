@@ -234,6 +234,7 @@ def test_overlap_found_again(square, expected, hand):  # noqa: F811
         pj.identify(wide, slider, two, pj.Unknowns(overlap=0.5))
 
 
+@pytest.mark.long
 def test_saved_with_a_table(square, expected, hand, tmp_path):  # noqa: F811
     starts, paths = planned(np.random.default_rng(7), 5)
     pushes = pj.Pushes(starts, paths, starts)

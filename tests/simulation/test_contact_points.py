@@ -42,7 +42,9 @@ def pushed(name: str) -> tuple[pj.Shape, pj.Trajectory]:
     return shape, push
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in ("pad, bean", "rake"))) for name in CASES]
+)
 def test_forces_at_the_contact_points_are_the_wrench(name):
     shape, push = pushed(name)
     found = plot.contact_forces(push)

@@ -145,7 +145,7 @@ HAND_DIFFERENCE = 1e-5  # for differences over H, where steps rotate the slider 
     [
         (pj.Hand.two_fingers(0.005), (0.06, 0.04)),
         pytest.param(pj.Hand.three_fingers(0.003), (0.05, 0.015), marks=pytest.mark.long),
-        (pj.Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03)),
+        pytest.param(pj.Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03), marks=pytest.mark.long),
     ],
     ids=["two fingers", "three fingers", "jaw"],
 )

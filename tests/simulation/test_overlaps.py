@@ -111,6 +111,7 @@ def surface(length: float = 0.04) -> pj.Ellipsoid:
     return pj.Ellipsoid(np.eye(3), length)
 
 
+@pytest.mark.long
 def test_an_inner_corner_touches_no_pad():
     """An inner corner was taken for a contact deep in the pad above it, and pushed the slider half a pad away."""
     outline = pj.Polygon(L).outline()
@@ -297,7 +298,14 @@ def test_derivatives_of_a_divided_step():
             pj.Status.GRASPED,
             marks=pytest.mark.long,
         ),
-        ("comb", 0.07, [(-0.01244619, -0.00076171, -0.2869193)], (0.11646,), pj.Status.MOVING),
+        pytest.param(
+            "comb",
+            0.07,
+            [(-0.01244619, -0.00076171, -0.2869193)],
+            (0.11646,),
+            pj.Status.MOVING,
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_parts_of_a_step_that_come_near_a_jam(shape, opening, poses, friction, status):
@@ -378,6 +386,7 @@ def deepest_of(push, friction):
     )
 
 
+@pytest.mark.long
 def test_overlap_is_no_variable():
     x = jnp.array([0.2, *START, 0.0765])
     assert not np.any(jax.jacfwd(lambda x: turned(x).overlap)(x))

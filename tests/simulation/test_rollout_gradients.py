@@ -156,6 +156,7 @@ def derivatives():
     return one, other, jacobian
 
 
+@pytest.mark.long
 def test_forward_equals_reverse(derivatives):
     one, other, _ = derivatives
     # roundoff decides there whether the finger touches, differently in each compiled program and with other derivatives
