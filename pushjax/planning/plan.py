@@ -34,7 +34,7 @@ from pushjax.planning.free_space import TOLERANCE
 from pushjax.planning.goal import Goal
 from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.poses import to_body
-from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, simulated
+from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
 from pushjax.planning.pushes import Pushes
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
 from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
@@ -159,11 +159,12 @@ def plan_pushes(
     fixtures = checked_fixtures(fixtures, jnp.result_type(float))
     if fixtures:
         cost = cost + HAND * HandClearance(hand, fixtures, TIGHT * pushes.clearance)
-    problem = push_problem(key, slider, hand, start, model, samples, fixtures, (pushes, cost, risk))
+    parts = (pushes, cost, risk)
+    problem = push_problem(key, slider, hand, start, model, samples, fixtures, parts)
     _check_poses(problem, goal)
     at = _finger_at(finger, problem)
     found, history = _search(jax.random.fold_in(key, 1), problem, candidates, warm_up, search)
-    unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, PREDICTED, fixtures, None)
+    unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, PREDICTED, fixtures, parts)
     plans = (
         _judged(parameters, float(least), problem, unseen, goal, success, at)
         for parameters, least in zip(found.parameters, found.cost, strict=True)
@@ -201,8 +202,9 @@ def _judged(
     finger: np.ndarray | None,
 ) -> PushPlan:
     """Predict where a candidate ends under unseen friction, and find the ways of the finger between its pushes."""
-    path, poses = lay_out(jnp.asarray(parameters, problem.start.dtype), problem)
-    path, poses, outcomes = _without_idle(np.asarray(path), np.asarray(poses), simulated(path, unseen))
+    paths, poses = lay_out(parameters[None], problem)
+    _, failed, reached = samples_of(paths, unseen)
+    path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
     good, ways, found = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed), (), True
     if _is_one_finger(problem.hand):
         between = ways_between(

@@ -1,5 +1,7 @@
 """Simulation of pushes in a row under sampled friction: the problem that candidates of a search are evaluated on."""
 
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,8 +26,8 @@ from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FAILURE = 1e3  # cost of a rollout that fails, such as a push that would start inside the slider
-BATCH = 256  # candidates that are evaluated in one call; fewer are padded, so that one program does for all
-TOGETHER = 2048  # rollouts that are computed together, so that their data stay in the cache
+BATCH = 256  # candidates that are laid out together
+TOGETHER = 2048  # samples that are simulated together, so that their data stay in the cache
 
 
 class Outcomes(NamedTuple):
@@ -47,6 +49,20 @@ class Outcomes(NamedTuple):
     def success(self, goal: Goal) -> float:
         """Return the fraction of the samples that reach a goal."""
         return float(np.mean(np.asarray(goal.reached(self.pose)) & ~np.asarray(self.failed)))
+
+
+class Sample(NamedTuple):
+    """What a candidate does under one sample of friction.
+
+    Attributes:
+        cost: Its cost.
+        failed: Whether a rollout failed.
+        poses: Poses of the slider before the first push and after each, (pushes + 1, 3), world.
+    """
+
+    cost: Float[Array, ""]
+    failed: Bool[Array, ""]
+    poses: Float[Array, "pushes+1 3"]
 
 
 class PushProblem(eqx.Module):
@@ -100,23 +116,40 @@ class PushProblem(eqx.Module):
 
         return jax.lax.scan(push, pose, paths)[1]
 
-    def judge(self, parameters: Array) -> Float[Array, ""]:
-        """Return the cost of one candidate."""
-        paths, _ = self.lay_out(parameters)
+    def sample(self, paths: Array, draw: Draws, pose: Array) -> Sample:
+        """Push along paths under sampled friction."""
+        done = self.rolls(draw, paths, pose)
+        return Sample(self.cost(done), jnp.any(done.failed), jnp.concatenate([pose[None], done.pose[:, -1]]))
 
-        def sample(draw: Draws, pose: Array) -> tuple[Array, Array]:
-            done = self.rolls(draw, paths, pose)
-            return self.cost(done), jnp.any(done.failed)
-
-        costs, failed = jax.vmap(sample)(self.draws, self.start)
+    def total(self, costs: Array, failed: Array) -> Float[Array, ""]:
+        """Return the cost of one candidate from its samples."""
         total = self.risk(costs) + FAILURE * jnp.mean(failed.astype(costs.dtype))
         return jnp.where(jnp.isfinite(total), total, 2 * FAILURE)
 
+    def judge(self, parameters: Array) -> Float[Array, ""]:
+        """Return the cost of one candidate."""
+        paths, _ = self.lay_out(parameters)
+        found = jax.vmap(partial(self.sample, paths))(self.draws, self.start)
+        return self.total(found.cost, found.failed)
+
+
+# Candidates are evaluated by two programs, with one rollout each: compiling rollouts takes most of the time of a plan.
+# Both have one size, whatever the number of candidates and samples.
+
+
+@quick_jit
+def _lay_outs(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
+    return jax.vmap(problem.lay_out)(parameters)
+
 
 @jit
-def _costs(parameters: Array, problem: PushProblem) -> Array:
-    together = max(1, TOGETHER // len(problem.start))
-    return jax.lax.map(problem.judge, parameters, batch_size=min(together, len(parameters)))
+def _samples(paths: Array, draws: Draws, start: Array, problem: PushProblem) -> Sample:
+    return jax.vmap(problem.sample)(paths, draws, start)
+
+
+@jit
+def _totals(costs: Array, failed: Array, problem: PushProblem) -> Array:
+    return jax.vmap(problem.total)(costs, failed)
 
 
 @jit
@@ -124,10 +157,40 @@ def _costs_and_gradients(parameters: Array, problem: PushProblem) -> tuple[Array
     return jax.lax.map(jax.value_and_grad(problem.judge), parameters)
 
 
-@quick_jit
-def lay_out(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
-    """Return the paths of one candidate, and the poses that they lead to; see `PushProblem.lay_out`."""
-    return problem.lay_out(parameters)
+def lay_out(parameters: np.ndarray, problem: PushProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Return the paths of candidates (candidates, pushes, ...), and the poses that they lead to; see `PushProblem`."""
+    rows, shared = _in_batches(len(parameters), BATCH), _without_samples(problem)
+    given = np.asarray(parameters, problem.start.dtype)
+    return _joined([_lay_outs(jnp.asarray(given[each]), shared) for each in rows], len(parameters))
+
+
+def samples_of(paths: np.ndarray, problem: PushProblem) -> Sample:
+    """Push along the paths of candidates in all samples; the arrays have the leading axes (candidates, samples)."""
+    draws, start = jax.tree.map(np.asarray, (problem.draws, problem.start))
+    candidates, samples, shared = len(paths), len(start), _without_samples(problem)
+    found = []
+    for rows in _in_batches(candidates * samples, TOGETHER):
+        candidate, sample = rows // samples, rows % samples
+        draw = jax.tree.map(lambda leaf, at=sample: leaf[at], draws)
+        found.append(_samples(jnp.asarray(paths[candidate]), draw, jnp.asarray(start[sample]), shared))
+    found = _joined(found, candidates * samples)
+    return jax.tree.map(lambda leaf: leaf.reshape(candidates, samples, *leaf.shape[1:]), found)
+
+
+def _without_samples(problem: PushProblem) -> PushProblem:
+    """Return the problem with what does not depend on the number of samples: the same for all stages of a search."""
+    return replace(problem, draws=None, start=jnp.mean(problem.start, axis=0, keepdims=True))
+
+
+def _in_batches(count: int, size: int) -> list[np.ndarray]:
+    """Return indices below `count` in arrays of one size; the last array begins again at zero."""
+    batches = -(-count // size)
+    return np.split(np.arange(batches * size) % count, batches)
+
+
+def _joined(batches: list[Any], count: int) -> Any:
+    """Return the first rows of the arrays of all batches, in NumPy."""
+    return jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves])[:count], *batches)
 
 
 @quick_jit
@@ -204,14 +267,14 @@ def push_problem(
 
 
 def objective(problem: PushProblem) -> Objective:
-    """Return the cost of many candidates as a function on the host, computed in batches of one size."""
+    """Return the cost of many candidates as a function on the host."""
     dtype = problem.start.dtype
 
     def cost(parameters: np.ndarray) -> np.ndarray:
-        count = len(parameters)
-        padded = np.resize(parameters, (-(-count // BATCH) * BATCH, parameters.shape[1]))
-        parts = [_costs(jnp.asarray(part, dtype), problem) for part in np.split(padded, len(padded) // BATCH)]
-        return np.concatenate([np.asarray(part, np.float64) for part in parts])[:count]
+        found = samples_of(lay_out(parameters, problem)[0], problem)
+        rows, shared = _in_batches(len(parameters), BATCH), _without_samples(problem)
+        totals = [_totals(found.cost[each], found.failed[each], shared) for each in rows]
+        return _joined(totals, len(parameters)).astype(np.float64)
 
     def cost_and_gradient(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         costs, gradients = _costs_and_gradients(jnp.asarray(parameters, dtype), problem)
