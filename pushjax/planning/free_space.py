@@ -10,10 +10,11 @@ from functools import cached_property
 
 import numpy as np
 
-from pushjax.planning.obstacles import Obstacles
+from pushjax.planning.approach import Roadmap
 from pushjax.planning.pose_table import POSITIONS, PoseTable, grid_spacing
 from pushjax.planning.poses import compose, to_world
 from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.workspace import Workspace
 
 TOLERANCE = 0.005  # overlap that counts as touching, in units of the surface's length
 PROGRESS = 0.02  # by which a slider that is too near must get away, in units of the length
@@ -27,9 +28,9 @@ class FreeSpace:
     """Where one slider and one finger may be among obstacles, and which pushes of a library keep them there.
 
     Args:
-        obstacles: The obstacles.
-        vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame, m.
-        radius: Radius of the finger, m.
+        workspace: The obstacles, and limits of the finger.
+        roadmap: Vertices of the slider, radius of the finger, and as goals the points where each push of the library
+            begins with its run-up.
         library: Pushes of the slider. Others may have other outcomes, but the same starts, directions and lengths.
         clearance: Distance that slider and finger keep from obstacles, m.
         goal: The goal, (3,), world. If it is nearer to an obstacle, the slider keeps only the distance it has there.
@@ -42,16 +43,16 @@ class FreeSpace:
 
     def __init__(
         self,
-        obstacles: Obstacles,
-        vertices: np.ndarray,
-        radius: float,
+        workspace: Workspace,
+        roadmap: Roadmap,
         library: PushLibrary,
         clearance: float,
         goal: np.ndarray,
         low: np.ndarray,
         high: np.ndarray,
     ):
-        self.obstacles, self.vertices, self.radius, self.length = obstacles, vertices, radius, library.length
+        self.workspace, self.roadmap, self.length = workspace, roadmap, library.length
+        self.obstacles, self.vertices, self.radius = workspace.obstacles, roadmap.vertices, roadmap.radius
         self.low, self.spacing = low, grid_spacing(low, high) / REFINED
         self.positions = REFINED * (POSITIONS - 1) + 1
         far = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
@@ -87,13 +88,22 @@ class FreeSpace:
         return PoseTable(self.low, self.spacing, np.concatenate(values, axis=-1).astype(np.float32))
 
     @cached_property
-    def _grids(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where slider (angles, cells, cells) and finger (cells, cells) are free, also some cells beyond the table."""
+    def _grids(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where the slider (angles, cells, cells) and the finger in a push (cells, cells) are free, and it before one.
+
+        They have some cells beyond the table.
+        """
         side = (self.beyond, self.beyond)
         slider = np.pad(np.moveaxis(self.table.values, 2, 0) >= self.least, ((0, 0), side, side), constant_values=True)
         axes = [low + self.spacing * np.arange(-self.beyond, self.positions + self.beyond) for low in self.low]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        return np.ascontiguousarray(slider), self.obstacles.point_clearance(points) >= self.radius + self.clearance
+        finger = self.obstacles.point_clearance(points) >= self.radius + self.clearance
+        return np.ascontiguousarray(slider), finger, self._may_begin(points)
+
+    def _may_begin(self, points: np.ndarray) -> np.ndarray:
+        """Return whether a push may begin with the finger at points (..., 2), as far as limits and obstacles go."""
+        apart = self.obstacles.point_clearance(points)
+        return self.workspace.allows_finger(points) & (apart >= self.roadmap.from_obstacles)
 
     def likely(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
         """Return which pushes from one pose seem to be free, (pushes, lengths), each up to every SPARSE-th length.
@@ -125,10 +135,10 @@ class FreeSpace:
         """
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, index.max(initial=0) + DENSE, DENSE), index[:, None])
-        starts = library.starts[push, :2]
-        ends = starts + library.travel[index, None] * library.directions[push]
+        ends = library.starts[push, :2] + library.travel[index, None] * library.directions[push]
         reached = compose(poses[:, None], library.outcomes[0][push[:, None], steps])
-        return self.keeps_out(reached, to_world(poses, starts), to_world(poses, ends))
+        begins = to_world(poses, self.roadmap.goals[push])
+        return self._may_begin(begins) & self.keeps_out(reached, begins, to_world(poses, ends))
 
     def keeps_out(self, poses: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return whether slider and finger keep their distance from obstacles in pushes, (pushes,).
@@ -159,7 +169,7 @@ class FreeSpace:
             angle: Angle of the slider before each push, rad.
             entries: Entries of the library, (entries,).
         """
-        slider, finger = self._grids
+        slider, finger, before = self._grids
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, len(library.travel) + SPARSE, SPARSE), index[:, None])
         here = np.array([0.0, 0.0, angle])
@@ -169,9 +179,12 @@ class FreeSpace:
         places, fingers = (
             np.rint(each / self.spacing).astype(int) + self.beyond for each in (poses[..., :2], to_world(here, ends))
         )
+        begins = np.rint(to_world(here, self.roadmap.goals[push]) / self.spacing).astype(int) + self.beyond
         size = self.positions
         allowed = np.ones((len(entries), POSITIONS, POSITIONS), bool)
         for k, may in enumerate(allowed):
+            i, j = begins[k]
+            may &= before[i : i + size : REFINED, j : j + size : REFINED]
             for step in range(-(-index[k] // SPARSE) + 1):
                 for grid, (i, j) in ((slider[turns[k, step]], places[k, step]), (finger, fingers[k, step])):
                     may &= grid[i : i + size : REFINED, j : j + size : REFINED]

@@ -81,7 +81,6 @@ class PushPlanner:
         self.vertices, length = outline_vertices(slider.shape), library.length
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
-        self.space = self._free_space(library) if workspace.obstacles.any else None
         self._weigh(None)
         self.searched = library = self.library
         starts = library.starts[:, :2]
@@ -91,6 +90,7 @@ class PushPlanner:
         # a control step is straight, so it cuts the corners of a way, at most to within the radius of a fixture
         from_fixtures = max(self.clearance, np.hypot(radius, pace.free / 2) - radius)
         self.roadmap = Roadmap(self.vertices, radius, self.clearance, goals, from_fixtures)
+        self.space = self._free_space() if workspace.obstacles.any else None
         push, index = library.entries.T
         self.push, self.travel = push, library.travel[index]
         self.push_time = pace.push_time(self.travel)
@@ -157,9 +157,9 @@ class PushPlanner:
         low = np.maximum(self.workspace.slider_low + half, around[0])
         return low, np.minimum(self.workspace.slider_high - half, around[1])
 
-    def _free_space(self, library: PushLibrary) -> FreeSpace:
-        given = self.workspace.obstacles, self.vertices, self.radius, library, self.clearance, self.goal
-        return FreeSpace(*given, *self._positions(library.length))
+    def _free_space(self) -> FreeSpace:
+        given = self.workspace, self.roadmap, self.library, self.clearance, self.goal
+        return FreeSpace(*given, *self._positions(self.library.length))
 
     @cached_property
     def after_push(self) -> np.ndarray:

@@ -161,8 +161,9 @@ def play(made, pose, finger, fixtures, steps=150):
         path = finger + np.linspace(0, 1, STEPS + 1)[:, None] * (action - finger)
         done = pj.rollout(slider, hand, path, pose=pose, friction=FRICTION, fixtures=fixtures)
         block = min(placed(slider, each).distance(WORLD) for each in np.asarray(done.pose))
-        apart.append((block, WORLD.distance(shapely.LineString(path)) - RADIUS))
-        pose, finger = np.asarray(done.pose[-1], float), action
+        hand_at = np.asarray(done.configuration, float)  # it stops at a jam
+        apart.append((block, WORLD.distance(shapely.LineString(hand_at)) - RADIUS))
+        pose, finger = np.asarray(done.pose[-1], float), hand_at[-1]
         success = float(made.planner.measure(compose(inverse(GOAL), pose))) > ENOUGH
     return Episode(success, len(apart), *np.min(apart, axis=0))
 
