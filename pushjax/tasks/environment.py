@@ -267,12 +267,13 @@ class Environment(ABC):
 
     def _pushed(self, state: TaskState, path: Array, params: Any) -> Pushed:
         """What the hand's path leaves, m."""
-        slider = params.slider
+        slider, dtype = params.slider, state.pose.dtype
+        hand = jax.tree.map(lambda leaf: leaf.astype(dtype), self.hand_model)
         return control_step(
             slider.shape,
             slider.surface if state.surface is None else state.surface,
             params.friction if state.friction is None else state.friction,
-            self.hand_model,
+            hand,
             self.fixtures(state, params),
             path * self.METERS,
             jnp.concatenate([state.pose[:2] * self.METERS, state.pose[2:]]),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.tasks import PushAlongWall, PushBox, PushTwoFingers, Squeeze
+from pushjax.tasks import PushAlongWall, PushBox, PushT, PushTwoFingers, Squeeze
 
 BATCH, STEPS = 32, 25
 TASKS = (PushBox, PushAlongWall, PushTwoFingers, Squeeze)
@@ -261,3 +261,22 @@ def test_gymnasiums_checks_and_pictures(task):
 def test_bad_input(wrong, error, message):
     with pytest.raises(error, match=message):
         wrong()
+
+
+@pytest.mark.parametrize("task", [PushAlongWall, PushT])
+def test_the_parameters_decide_the_dtype(task):
+    """Parameters in float32 give states, observations and rewards in float32 where float64 is enabled."""
+    env = task()
+    params = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, np.float32) if jnp.issubdtype(jnp.result_type(leaf), np.floating) else leaf,
+        env.params(model=MODEL),
+    )
+
+    def episode(key):
+        _, state = env.reset_env(key, params)
+        return env.step_env(key, state, jnp.zeros(env.num_actions, np.float32), params)
+
+    assert jnp.result_type(float) == np.float64
+    found = {leaf.dtype for leaf in jax.tree.leaves(jax.eval_shape(episode, jax.random.key(0)))}
+    assert np.dtype(np.float64) not in found
+    assert np.dtype(np.float32) in found
