@@ -1,8 +1,9 @@
 """Draw the pictures and animations of the documentation.
 
-    python docs/pictures.py [push grasp stochastic pusht limit_surfaces motion_cone real] [--to FOLDER] [--suffix .gif]
+    python docs/pictures.py [push grasp stochastic pusht limit_surfaces motion_cone real among_fixtures]
+                            [--to FOLDER] [--suffix .gif]
 
-Without a name, all are drawn; this takes three minutes, most of it for compiling. `real` needs PUSHJAX_DATA and `pusht`
+Without a name, all are drawn; this takes four minutes, most of it for compiling. `real` needs PUSHJAX_DATA and `pusht`
 needs gym-pusht; without, they are left out.
 """
 
@@ -125,6 +126,13 @@ def real() -> Figure:
     return plot.real_figure(block, shown, hand)
 
 
+def among_fixtures() -> Figure:
+    """Draw a box that is pushed around fixtures, by a planner that knows them and by one that does not."""
+    import fixtures_picture  # beside this file
+
+    return fixtures_picture.figure()
+
+
 MOVING: dict[str, Callable[[], plot.Animation]] = {
     "push": push,
     "grasp": grasp,
@@ -135,6 +143,7 @@ STILL: dict[str, Callable[[], Figure]] = {
     "limit_surfaces": limit_surfaces,
     "motion_cone": motion_cone,
     "real": real,
+    "among_fixtures": among_fixtures,
 }
 
 

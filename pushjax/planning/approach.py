@@ -212,7 +212,8 @@ class Roadmap:
 
     def _clear(self, obstacles: Obstacles, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return whether segments keep the distance from obstacles."""
-        return obstacles.segment_clearance(start, end) >= self.from_obstacles * (1 - 1e-9)
+        enough = self.from_obstacles
+        return obstacles.segment_clearance(start, end, enough) >= enough * (1 - 1e-9)
 
     def _among(self, nodes: np.ndarray, links: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
         """Return nodes and links with those of obstacles. Links may run through an obstacle, which `_last` excludes."""

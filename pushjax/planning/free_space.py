@@ -157,7 +157,8 @@ class FreeSpace:
 
     def finger_free(self, start: np.ndarray, end: np.ndarray, clearance: float = 0.0) -> np.ndarray:
         """Return whether a finger keeps a clearance from obstacles along segments (..., 2), world."""
-        return self.obstacles.segment_clearance(start, end) >= self.radius + clearance
+        enough = self.radius + clearance
+        return self.obstacles.segment_clearance(start, end, enough) >= enough
 
     def moves(self, library: PushLibrary, angle: float, entries: np.ndarray) -> np.ndarray:
         """Return whether pushes run into no obstacle, from all positions of the cost to go, (entries, rows, columns).

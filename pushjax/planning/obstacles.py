@@ -74,19 +74,24 @@ class Obstacles(NamedTuple):
             found = np.minimum(found, point_clearance(body, points))
         return found
 
-    def segment_clearance(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    def segment_clearance(self, start: np.ndarray, end: np.ndarray, enough: float = np.inf) -> np.ndarray:
         """Return the distance of segments from the nearest obstacle, zero or negative where they touch it, (...,).
 
         Args:
             start: First points, (..., 2).
             end: Last points, (..., 2).
+            enough: Distance from which a lower bound of the distance will do, m.
         """
         found = np.minimum(self._behind(start), self._behind(end))
         for center, radius in zip(self.centers, self.radii, strict=True):
             found = np.minimum(found, _from_point(center, start, end) - radius)
         for body in self.bodies:
-            ends = point_clearance(body, start), point_clearance(body, end)
-            found = np.minimum(found, segment_clearance(body, start, end, *ends))
+            middle = body.mean(0)
+            apart = np.array(_from_point(middle, start, end) - np.linalg.norm(body - middle, axis=1).max())
+            near = apart < enough
+            some = (np.broadcast_to(each, (*apart.shape, 2))[near] for each in (start, end))
+            apart[near] = segment_clearance(body, *some)
+            found = np.minimum(found, apart)
         return found
 
     def slider_clearance(self, vertices: np.ndarray, poses: np.ndarray, enough: float, tolerance: float) -> np.ndarray:

@@ -171,6 +171,8 @@ def play(made, pose, finger, fixtures, steps=150):
         hand_at = np.asarray(done.configuration, float)  # it stops at a jam
         apart.append((block, WORLD.distance(shapely.LineString(hand_at)) - RADIUS))
         pose, finger = np.asarray(done.pose[-1], float), hand_at[-1]
+        if np.any(done.failed):  # the box is wedged between finger and fixture; such an episode is lost
+            break
         success = float(made.planner.measure(compose(inverse(GOAL), pose))) > ENOUGH
     return Episode(success, len(apart), *np.min(apart, axis=0))
 
@@ -191,7 +193,7 @@ def test_a_box_gets_around_fixtures(slider):
         found = episodes[name] = [play(made, *start, there) for start in starts(slider, 20)]
         reached = [each.steps for each in found if each.success]
         print(
-            f"{name}: {len(reached)} of {len(found)} in {np.mean(reached):.1f} steps; slider in a fixture "
+            f"{name}: {len(reached)} of {len(found)} in {np.mean(reached):.1f} steps; slider at places of fixtures "
             f"{sum(each.slider == 0 for each in found)}, finger {sum(each.finger < 0 for each in found)}; nearest "
             f"{1e3 * min(each.slider for each in found):.1f} and {1e3 * min(each.finger for each in found):.1f} mm"
         )
