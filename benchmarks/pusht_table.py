@@ -155,6 +155,7 @@ def _row(name: str, played: list[Episode], nominal: list[Episode] | None, setup:
     row |= {"steps_median": float(np.median(steps)), "steps_95": float(np.percentile(steps, 95))}
     row |= {"pushes_mean": float(np.mean([each.pushes for each in played])), "setup_processor_s": setup}
     row |= {"step_ms": 1e3 * float(times.mean()), "step_95_ms": 1e3 * float(np.percentile(times, 95))}
+    row["step_largest_ms"] = 1e3 * float(times.max())
     row["steps"] = steps.tolist()
     if nominal is not None and name != "nominal":
         less = np.array([each.steps for each in nominal]) - steps
@@ -165,14 +166,14 @@ def _row(name: str, played: list[Episode], nominal: list[Episode] | None, setup:
 def summary(record: dict[str, Any]) -> str:
     """Return the text that the command prints."""
     lines = [
-        f"{'controller':12}{'success':>28}{'steps (median, mean, 95 %)':>28}{'pushes':>8}{'fewer steps':>16}{'ms':>6}"
+        f"{'controller':12}{'success':>28}{'steps (median, mean, 95 %)':>28}{'pushes':>8}{'fewer steps':>16}"
+        f"{'ms (mean, 95 %, largest)':>26}"
     ]
     for row in record["rows"]:
         low, high = row["success_ci95"]
         success = f"{row['successes']} of {row['episodes']} ({low:.3f} to {high:.3f})"
         steps = f"{row['steps_median']:g}, {row['steps_mean']:.1f}, {row['steps_95']:.0f}"
         fewer = f"{row['fewer_steps']:.1f} ± {row['fewer_steps_error']:.1f}" if "fewer_steps" in row else ""
-        lines.append(
-            f"{row['controller']:12}{success:>28}{steps:>28}{row['pushes_mean']:8.1f}{fewer:>16}{row['step_ms']:6.0f}"
-        )
+        times = ", ".join(f"{row[name]:.0f}" for name in ("step_ms", "step_95_ms", "step_largest_ms"))
+        lines.append(f"{row['controller']:12}{success:>28}{steps:>28}{row['pushes_mean']:8.1f}{fewer:>16}{times:>26}")
     return "\n".join(lines)
