@@ -3,7 +3,7 @@
 The controller is a state machine. It plans a push, goes around the slider to its start, pushes, and plans anew.
 
 Going: the finger follows the way as fast as its speed limits allow. Each action is tried on the model of the finger
-    first; a step that would come too near to the slider is shortened.
+    first; a step that would come too near to the slider or to a fixture is shortened.
 Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
     that are seen; the end whose final pose is nearest to the target is taken. The push is over once the finger is where
     the control step before has put its end. So no control step both corrects a push and plans one.
@@ -18,11 +18,10 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from pushjax.planning.approach import Way, WayStatus
-from pushjax.planning.clearance import point_clearance
 from pushjax.planning.finger_control import FingerControl, FingerState
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 from pushjax.planning.planned_push import PlannedPush, PlanStatus
-from pushjax.planning.poses import compose, inverse, to_body
+from pushjax.planning.poses import compose, inverse
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
 from pushjax.planning.push_planner import PushPlanner
 from pushjax.simulation.hand import Hand
@@ -31,7 +30,7 @@ from pushjax.simulation.slider import Slider
 # Lengths in units of the surface's length
 ARRIVED = 0.007  # distance from a point at which the finger has arrived
 MOVED = 0.03  # motion of the slider on the way to a push, from which the push is planned anew
-CLOSE = 0.01  # distance from the slider that each point of a control step must have on the way, besides the radius
+CLOSE = 0.01  # distance of each point of a control step from slider and fixtures on the way, besides the radius
 SLOWER = np.array([1.0, 0.75, 0.5, 0.3, 0.15, 0.05])  # parts of a control step that are tried
 # Ends of a push that are tried around the planned one, along the push and across, in units of the surface's length
 ALONG = np.array([-0.2, -0.11, -0.06, -0.025, 0, 0.025, 0.06, 0.11, 0.2])
@@ -236,8 +235,8 @@ class PushController:
         ahead = np.minimum(memory.along + speed * SLOWER, total)
         targets = np.stack([np.interp(ahead, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
         motions = self.control.motion(state, self.control.action(state, targets))
-        apart = point_clearance(self.planner.vertices, to_body(pose, motions)).min(-1) - self.planner.radius
-        now = float(point_clearance(self.planner.vertices, to_body(pose, state.position))) - self.planner.radius
+        apart = self.planner.finger_clearance(pose, motions).min(-1)
+        now = float(self.planner.finger_clearance(pose, state.position))
         needed = min(CLOSE * self.length, now + 1e-3 * self.length)
         good = np.flatnonzero(apart >= needed)
         best = int(good[0]) if len(good) else int(np.argmax(apart))
