@@ -263,7 +263,8 @@ class Roadmap:
             return start[None], WayStatus.START_IN_SLIDER if have <= 0 else WayStatus.START_IN_FIXTURE
         missing = max(self.apart - have, self.from_obstacles - have_obstacles)
         angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
-        reach = missing * np.array([1.0, 1.5, 2.0, 3.0]) + 1e-3 * self.clearance
+        # out of a wedge between polygon and obstacle it is farther
+        reach = missing * np.array([1.0, 1.5, 2.0, 3.0, 5.0, 8.0][: 6 if obstacles.any else 4]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
         apart = point_clearance(self.vertices, ends)
         halfway = start + 0.2 * (ends - start)
