@@ -17,10 +17,12 @@ from pushjax.planning.poses import to_world
 
 RADIUS, FRICTION = 0.005, 0.25
 BLOCK = 0.03 * np.array([(-1.5, -1), (1.5, -1), (1.5, 1), (-1.5, 1)])
+L = 0.03 * np.array([(-1, -1.5), (2, -1.5), (2, -0.5), (0, -0.5), (0, 2.5), (-1, 2.5)])  # with a reflex corner
 # one push under known friction; and three under random friction
 SIMPLE = ["--no-robust", "--pushes", "1", "--goal", "0.03", "0", "0", "--finger", "0.1", "-0.05", "--dof", "None"]
 SIMPLE += ["--friction", str(FRICTION), str(FRICTION)]
 ROBUST = ["--goal", "0.03", "0.02", "-0.4", "--symmetry", "2", "--finger", "-0.1", "0"]
+NOT_CONVEX = ["--goal", "0.04", "0.03", "0.6", "--finger", "-0.1", "0", "--attempts", "1"]
 
 
 def push_through_the_middle(slider, hand, goal, options, seed):
@@ -36,26 +38,29 @@ def push_through_the_middle(slider, hand, goal, options, seed):
 
 @pytest.fixture(
     scope="module",
-    params=["without search", *(pytest.param(each, marks=pytest.mark.long) for each in (SIMPLE, ROBUST))],
-    ids=["without search", "simple", "robust"],
+    params=[
+        ("without search", BLOCK),
+        *(pytest.param(each, marks=pytest.mark.long) for each in ((SIMPLE, BLOCK), (ROBUST, BLOCK), (NOT_CONVEX, L))),
+    ],
+    ids=["without search", "simple", "robust", "not convex"],
 )
 def planned(request, tmp_path_factory):
-    """Folder, record and way points of a plan."""
+    """Folder, record and way points of a plan, and the vertices of the block."""
     folder = tmp_path_factory.mktemp("plan")
-    np.savetxt(folder / "block.csv", BLOCK, delimiter=",")
+    options, block = request.param
+    np.savetxt(folder / "block.csv", block, delimiter=",")
     with pytest.MonkeyPatch.context() as patch:
-        options = request.param
         if options == "without search":
             options = SIMPLE
             patch.setattr(experiment, "_plans", push_through_the_middle)
         cli.main(["plan", *options, "--shape", str(folder / "block.csv"), "--out", str(folder)])
     rows = list(csv.DictReader((folder / "way_points.csv").open()))
     points = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
-    return folder, json.loads((folder / "plan.json").read_text()), points
+    return folder, json.loads((folder / "plan.json").read_text()), points, block
 
 
 def test_a_plan_is_found(planned):
-    folder, record, _ = planned
+    folder, record, *_ = planned
     assert record["experiment"] == "plan"
     assert record["success"] > 0.7
     assert record["status"] == ("FOUND" if record["success"] >= 0.9 else "UNLIKELY")
@@ -65,14 +70,14 @@ def test_a_plan_is_found(planned):
 
 def test_the_finger_touches_nothing_between_pushes(planned):
     shapely = pytest.importorskip("shapely")
-    _, record, points = planned
+    _, record, points, corners = planned
     position = np.column_stack([points["finger_x"], points["finger_y"]])
     pushes = len(record["path"])
     ends = [0, *(np.flatnonzero(points["push"] == k + 1)[-1] for k in range(pushes))]
     for k, pose in enumerate(record["pose"]):
         stop = np.flatnonzero(points["push"] == k + 1)[0] if k < pushes else len(position)
         way = shapely.LineString(position[ends[k] : stop])
-        block = shapely.Polygon(to_world(np.array(pose), BLOCK))
+        block = shapely.Polygon(to_world(np.array(pose), corners))
         assert block.distance(way) > RADIUS - 2e-6  # way points are written in micrometers
         assert block.distance(shapely.Point(way.coords[-1])) > RADIUS + 1e-3
     np.testing.assert_allclose(position[0], record["settings"]["finger"], atol=1e-6)
@@ -81,9 +86,9 @@ def test_the_finger_touches_nothing_between_pushes(planned):
 @pytest.mark.long
 def test_way_points_do_what_the_plan_says(planned):
     """A rollout along all of them, ways included, ends where the plan does under the mean friction."""
-    _, record, points = planned
+    _, record, points, corners = planned
     steps = 400 * len(record["path"])
-    slider = pj.Slider.uniform(pj.Polygon(BLOCK), degree=2)
+    slider = pj.Slider.uniform(pj.Polygon(corners), degree=2)
     path = pj.resample(np.column_stack([points["finger_x"], points["finger_y"]]), steps)
     done = pj.rollout(slider, pj.Hand.finger(RADIUS), path, pose=np.array(record["pose"][0]), friction=FRICTION)
     assert not np.any(done.failed)
@@ -92,7 +97,7 @@ def test_way_points_do_what_the_plan_says(planned):
 
 
 def test_time_is_that_of_the_speeds(planned):
-    _, record, points = planned
+    _, record, points, _ = planned
     length = np.hypot(np.diff(points["finger_x"]), np.diff(points["finger_y"]))
     speed = np.where(points["push"][1:] > 0, *reversed(record["settings"]["speed"]))
     np.testing.assert_allclose(np.diff(points["time"]), length / speed, atol=2e-3)
