@@ -87,9 +87,7 @@ class PushPlanner:
         self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
         self.usable = np.isfinite(self.run_up)
         goals = starts - np.where(self.usable, self.run_up, 0)[:, None] * library.directions
-        # a control step is straight, so it cuts the corners of a way, at most to within the radius of a fixture
-        from_fixtures = max(self.clearance, np.hypot(radius, pace.free / 2) - radius)
-        self.roadmap = Roadmap(self.vertices, radius, self.clearance, goals, from_fixtures)
+        self.roadmap = Roadmap(self.vertices, radius, self.clearance, goals)
         self.space = self._free_space() if workspace.obstacles.any else None
         push, index = library.entries.T
         self.push, self.travel = push, library.travel[index]
