@@ -8,6 +8,8 @@ one of the same size. Before a part is halved, a contact that the result violate
 problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
 NOT_CONVERGED, and the slider stays where the step began.
 
+A step is also too long if the slider moves far and much faster than the hand (`slider_speed`).
+
 Each push of a batch advances at its own pace: a round of the one loop is the next trial of every push, in whichever
 step that push is. So a push that divides its steps delays the others only at the end, and no trial is made for a push
 that has ended. Trials that are undone do not contribute to derivatives, which are those of the accepted parts.
@@ -34,7 +36,14 @@ from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.detection import num_contacts
-from pushjax.simulation.finger_motion import FingerMotion, allowed_penetration, holding_distance, max_penetration
+from pushjax.simulation.finger_motion import (
+    FingerMotion,
+    allowed_penetration,
+    holding_distance,
+    max_displacement,
+    max_penetration,
+)
+from pushjax.simulation.slider_speed import SliderSpeed, judge_speed
 from pushjax.simulation.step import ScalarStep, step_in_scalars
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
@@ -144,8 +153,9 @@ class DividedPush(NamedTuple):
             self.fixtures,
             state.swaps == 0,
         )
+        speed = judge_speed(state.pose, record.pose, state.part * max_displacement(motions), form.length)
         next_state, end_of_step = _next_state(
-            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, self.steps
+            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.steps
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
@@ -230,7 +240,12 @@ class Decision(NamedTuple):
 
 
 def _decide(
-    state: PushState, record: ScalarStep, urgency_after: Urgency | None, depth: Scalar, tolerance: Scalar
+    state: PushState,
+    record: ScalarStep,
+    urgency_after: Urgency | None,
+    depth: Scalar,
+    tolerance: Scalar,
+    speed: SliderSpeed,
 ) -> Decision:
     """Decide what follows from a trial.
 
@@ -240,13 +255,14 @@ def _decide(
         urgency_after: Urgency of each contact after the trial; None if all are solved together.
         depth: Depth of the deepest finger after the trial, m.
         tolerance: How much deeper a finger may be after a whole step, m.
+        speed: Whether the slider moved no farther than it may.
     """
     fails = state.abandon_status != 0
     is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
     # overlaps do not accumulate, because the next part pushes them out: so the smallest part may leave as much as a
     # whole step
     allowed_share = jnp.where(state.part < 2 * SMALLEST_PART, 1.0, state.part)
-    clear = depth <= jnp.maximum(state.overlap, allowed_share * tolerance)
+    clear = speed.allowed & (depth <= jnp.maximum(state.overlap, allowed_share * tolerance))
     # In a step that is divided for another reason, only the smallest part can confirm a jam, because a slider that
     # squirts out turns far in one step.
     smallest = jnp.where(state.whole_step_jams, JAM_PART, SMALLEST_PART)
@@ -277,6 +293,7 @@ def _next_state(
     outline: Outline,
     part: tuple[FingerMotion, ...],
     tolerance: Scalar,
+    speed: SliderSpeed,
     steps: int,
 ):
     """Return the state after a trial; and of the trial's step the record, whether it ended, and the index.
@@ -288,12 +305,13 @@ def _next_state(
         outline: The slider's outline.
         part: Motion of each finger over the part of the step that was tried, and the fixtures.
         tolerance: How much deeper a finger may be after a whole step, m.
+        speed: Whether the slider moved no farther than it may.
         steps: Number of steps of the path.
     """
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
-    decision = _decide(state, record, urgency_after, depth, tolerance)
+    decision = _decide(state, record, urgency_after, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
     moves = decide(record.status == Status.MOVING, pose.x)
@@ -311,7 +329,7 @@ def _next_state(
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
     smaller = jnp.where(decision.joins, state.part, jnp.where(jams, JAM_PART, state.part / 2))
-    larger = jnp.where(state.halved, state.part, 2 * state.part)
+    larger = jnp.where(state.halved | ~speed.in_double, state.part, 2 * state.part)
     next_state = PushState(
         pose=tree_where(ends, end_record.pose, tree_where(continues, pose, state.pose)),
         origin=tree_where(ends, end_record.pose, state.origin),

@@ -244,7 +244,8 @@ class Environment(ABC):
             Observation, state, reward, whether the episode terminated, and a dictionary. It has the `measures` of the
             state, among them the "coverage" of the goal and "is_success", and "status", the number of steps of the
             simulator with each `Status`, (7,). A step that is JAMMED stops the hand for the rest of the control step;
-            the slider stays.
+            the slider stays. A control step with a step that is NOT_CONVERGED is undone: slider and hand stay where
+            they were.
         """
         key_action, key_observation = jax.random.split(key)
         given = as_float(action, state.hand.dtype, "action")
@@ -253,10 +254,13 @@ class Environment(ABC):
         path, velocity = self.walk(state, command)
         pushed = self._pushed(state, path, params)
         stopped = jnp.any((pushed.status == Status.JAMMED) | (pushed.status == Status.GRASPED))
+        unsolved = jnp.any(pushed.status == Status.NOT_CONVERGED)
+        pose = jnp.concatenate([pushed.pose[:2] / self.METERS, pushed.pose[2:]])
+        hand = jnp.where(stopped, pushed.configuration / self.METERS, path[-1])
         new_state = state.replace(
-            pose=jnp.concatenate([pushed.pose[:2] / self.METERS, pushed.pose[2:]]),
-            hand=jnp.where(stopped, pushed.configuration / self.METERS, path[-1]),
-            velocity=jnp.where(stopped, 0.0, velocity),
+            pose=jnp.where(unsolved, state.pose, pose),
+            hand=jnp.where(unsolved, state.hand, hand),
+            velocity=jnp.where(stopped | unsolved, 0.0, velocity),
             time=state.time + 1,
         )
         measures = self.measures(new_state, params)

@@ -3,8 +3,9 @@
 An episode may start with the finger inside the slider, or with the slider inside a wall, and quasi-static contact says
 nothing about such a state. As pymunk does it, the overlap then decays over time: in 0.01 s a contact is opened by a
 fixed fraction of its depth, in addition to the motion of the finger. The contacts are taken one after another, the
-deepest point of each, without friction. The slider moves as under an elliptic limit surface: a push with the force n at
-the point x moves it by n, and turns it by (x cross n) / length^2.
+deepest point of each, without friction. Walls are last, so that no finger pushes the slider deeper into one. The slider
+moves as under an elliptic limit surface: a push with the force n at the point x moves it by n, and turns it by
+(x cross n) / length^2.
 """
 
 from typing import NamedTuple
@@ -91,10 +92,12 @@ def separate(
 
     def one_round(pose: Vec3, ends: tuple[Array, Array]):
         before, after = (Vec2.of(end) for end in ends)
+        depths = [overlap_of_wall(polygon, wall, pose).depth for wall in walls]
         finger = overlap_of_finger(polygon, radius, after, pose)
         pose = pushed(pose, finger, finger.normal.dot(after - before))
-        for wall in walls:
-            pose = pushed(pose, overlap_of_wall(polygon, wall, pose), jnp.zeros_like(pose.x))
+        for wall, depth in zip(walls, depths, strict=True):
+            at_wall = overlap_of_wall(polygon, wall, pose)
+            pose = pushed(pose, at_wall, at_wall.depth - jnp.maximum(depth, 0))
         return pose, None
 
     last, _ = jax.lax.scan(one_round, Vec3.of(pose), (fine[:-1], fine[1:]))

@@ -187,3 +187,35 @@ def test_one_step_takes_fixtures():
     ends = (TOUCH, 0.001), (TOUCH + 1e-3, 0.0009)
     moved = pj.step(slider, hand, *ends, pose=(0.0, 0.0, 0.0), friction=0.3, fixtures=(FLOOR,))
     np.testing.assert_allclose(moved.pose, [1e-3, 0, 0], atol=1e-9)
+
+
+def test_a_thin_wedge_squirts_out_and_then_rests():
+    """A frictionless finger presses a wedge against a wall, in a single step.
+
+    The wedge moves by the way of the finger over the tangent of its angle, as long as the finger is on its slope.
+    """
+    squirt = jax.jit(
+        lambda shape, wall, path: pj.rollout(
+            pj.Slider(shape, pj.Ellipsoid(np.eye(3), LENGTH)),
+            hand,
+            path,
+            pose=jnp.zeros(3),
+            friction=0.0,
+            fixtures=(wall,),
+        )
+    )
+    for angle in (0.2, 0.05, 0.01, 0.001):
+        half = 0.1 * np.tan(angle)
+        wedge = pj.Polygon(np.array([[-0.1, -half], [0.1, -half], [-0.1, half]]))
+        wall = pj.Wall((0.0, -half), (0.0, 1.0))
+        start = FINGER * np.array([np.sin(angle), np.cos(angle)])  # it touches the middle of the slope
+        for way in (0.5, 1.6):  # in units of `half`: with 1 the finger is at the tip
+            push = squirt(wedge, wall, pj.line(start, start - (0, way * half), 1))
+            assert push.status[0] == pj.Status.MOVING
+            x, turn = np.asarray(push.pose[-1])[[0, 2]]
+            if way < 1:
+                np.testing.assert_allclose(push.pose[-1], [-0.1 * way, 0, 0], atol=1e-12)
+            else:  # the round finger turns the tip away as it passes
+                assert -0.11 < x <= -0.1
+                assert -0.02 < turn <= 0
+            assert push.overlap[0] < 2e-4

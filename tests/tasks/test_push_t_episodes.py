@@ -10,7 +10,7 @@ import pytest
 
 import pushjax as pj
 from benchmarks import pusht
-from pushjax.tasks import PushT
+from pushjax.tasks import PushT, TaskState
 
 BATCH, STEPS = pusht.AT_ONCE, 30
 ENV = PushT()
@@ -61,6 +61,40 @@ def test_a_block_at_a_wall_holds_the_agent_back():
     assert np.allclose(after.pose[-1], states.pose, atol=0.5)
     assert np.allclose(after.hand[-1], [7 + 120 + 15, 256], atol=1.0)
     assert np.asarray(info["status"])[-1, :, pj.Status.JAMMED].min() > 0
+
+
+# Block wedged between agent and walls: x, y and angle of the block, agent, and where it went in a control step.
+WEDGED = (
+    (76.607, 447.912, 0.945, 121.683, 407.964, 116.700, 411.147),
+    (431.460, 453.647, -1.050, 384.270, 415.476, 390.175, 415.156),
+    (62.819, 76.787, 2.522, 102.822, 121.818, 101.611, 116.030),
+    (54.296, 444.466, -1.532, 55.462, 414.489, 49.841, 412.651),
+    (66.390, 456.766, 3.104, 101.240, 455.449, 107.080, 460.878),
+    (444.602, 74.331, -2.450, 391.871, 112.075, 394.067, 106.642),
+    (60.674, 77.943, 2.561, 108.240, 119.549, 107.926, 115.714),
+    (68.278, 438.180, 0.732, 109.323, 394.255, 113.237, 398.688),
+)
+
+
+def test_a_wedged_block_stays_between_agent_and_walls():
+    """It neither flies off nor lets anything in, whatever the agent does; shapely judges."""
+    shapely = pytest.importorskip("shapely")
+    rows = np.repeat(np.array(WEDGED), BATCH // len(WEDGED), axis=0)
+    pose, hand, ahead = rows[:, :3], rows[:, 3:5], rows[:, 5:]
+    states = TaskState(jnp.asarray(pose), jnp.asarray(hand), jnp.zeros((BATCH, 2)), jnp.zeros(BATCH, jnp.int32))
+    rng = np.random.default_rng(0)
+    actions = hand + 3 * (ahead - hand) + rng.normal(0, 8, (STEPS, BATCH, 2))
+    after, (*_, info) = pusht.replayed(ENV, states, jnp.asarray(actions), PARAMS)
+    assert np.asarray(info["status"])[..., pj.Status.OVERLAPPING].sum() == 0
+    moved = np.diff(np.concatenate([pose[None], after.pose]), axis=0)
+    assert np.hypot(moved[..., 0], moved[..., 1]).max() < 30
+    for k in range(0, STEPS, 3):
+        now = jax.tree.map(lambda leaf, k=k: leaf[k], after)
+        corners = np.asarray(jax.vmap(ENV.vertices, in_axes=(0, None))(now, PARAMS))
+        assert corners.min() > 7 - 0.5
+        assert corners.max() < 504 + 0.5
+        for block, agent in zip(corners, np.asarray(now.hand), strict=True):
+            assert shapely.Polygon(block).distance(shapely.Point(agent)) > 15 - 0.5
 
 
 def test_overlapping_starts_come_apart():

@@ -1,0 +1,48 @@
+"""How far a slider may move while the hand moves by a given distance.
+
+Without friction, a slider squirts out of a narrow wedge, between a finger and a wall, say, much faster than the finger
+closes it. On the way out it loses the contacts that drive it, but a step that is computed as a whole does not see that,
+and takes the slider as far as the contacts would if they lasted.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from pushjax._math.vec import Scalar, Vec3
+
+# A slider may move by this multiple of the largest displacement of a finger, and anyway by this fraction of the limit
+# surface's length.
+MAX_RATIO, ALWAYS_ALLOWED = 4.0, 0.1
+
+
+class SliderSpeed(NamedTuple):
+    """Whether a slider moved no farther than it may.
+
+    Attributes:
+        allowed: In the part of a step that was computed.
+        in_double: In a part of twice the size, at the same speed.
+    """
+
+    allowed: Bool[Array, ""]
+    in_double: Bool[Array, ""]
+
+
+def judge_speed(before: Vec3, after: Vec3, displacement: Scalar, length: Scalar) -> SliderSpeed:
+    """Judge how far a slider moved in a part of a step.
+
+    Args:
+        before: Pose of the slider at the start, world.
+        after: Its pose at the end.
+        displacement: Largest displacement of a finger, m.
+        length: Length of the limit surface, m. It makes angles distances.
+    """
+    change = jax.tree.map(jax.lax.stop_gradient, after - before)
+    motion = jnp.sqrt(change.xy.dot(change.xy)) + length * jnp.abs(change.z)
+
+    def is_allowed(multiple: int) -> Bool[Array, ""]:
+        return multiple * motion <= jnp.maximum(multiple * MAX_RATIO * displacement, ALWAYS_ALLOWED * length)
+
+    return SliderSpeed(is_allowed(1), is_allowed(2))
