@@ -1,5 +1,7 @@
 """The public names and their modules. At run time, `__init__.py` imports each of them when it is first used."""
 
+from . import planning as planning
+from . import plot as plot
 from . import tasks as tasks
 from ._internal.compilation_cache import enable_compilation_cache as enable_compilation_cache
 from .contact.cones import friction_cone as friction_cone

@@ -103,12 +103,12 @@ class FrictionModel(eqx.Module):
     Args:
         dof: Degrees of freedom n of the Wishart distribution, at least 3 for an `Ellipsoid` and at least 9 for a
             `Quartic` (the size of the sampled matrix). It need not be an integer. The relative variance of H along a
-            ray is 2 / n. None if the limit surface is known exactly. Not checked if traced; see the header of this
-            module.
+            ray is 2 / n. None if the limit surface is known exactly. Not checked if traced.
         friction: Coefficient of contact friction mu, or the range (lowest, highest), shape (2,), on which it is
             uniformly distributed.
-        sampler: Distribution of a `Quartic`, see the header of this module. "gram" is the paper's and takes every
-            convex quartic. "sum_of_squares" takes a sum of squared quadratic forms, as all fits are.
+        sampler: Distribution of a `Quartic`. "gram" is the paper's: it takes every convex quartic, and repairs draws
+            that are not convex. "sum_of_squares" takes a sum of squared quadratic forms, as fits about the center of
+            pressure are; its draws are always convex.
         resample_every: Number of steps after which a rollout samples again. None to sample once per rollout.
 
     Raises:
