@@ -184,6 +184,11 @@ class PushPlanner:
         """Compute all tables, which are else computed when they are first needed."""
         _ = self.value, self.after_push, self.place, self.searched.tree, self.space and self.space.table
 
+    def is_at_goal(self, pose: np.ndarray) -> bool:
+        """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by the planner's `measure`."""
+        error = compose(inverse(self.goal), np.asarray(pose, float))
+        return bool(self.measure(error) > self.measure.enough)
+
     def choose(self, pose: np.ndarray, finger: np.ndarray, shake: np.ndarray | None = None) -> PlannedPush:
         """Choose the next push.
 

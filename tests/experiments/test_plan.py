@@ -149,6 +149,10 @@ def test_attempts_end_with_the_first_that_is_sure_enough():
         (["--goal", "0", "0", "0", "--success", "2"], "--success must be a probability; got 2"),
         (["--goal", "0", "0", "0", "--shape", "cube:1"], "--shape: expected rectangle:"),
         (["--goal", "0", "0", "0", "--finger", "0", "0"], "--finger overlaps the block at its start, by 35 mm"),
+        (
+            ["--goal", "30", "20", "0"],
+            "--goal is 36.1 m away, and --pushes 3 of at most 0.0777 m (--longest) do not reach",
+        ),
     ],
 )
 def test_bad_options_are_refused_in_one_line(options, message, capsys):

@@ -178,6 +178,13 @@ def test_same_key_same_actions(rectangle):
     assert np.array_equal(first, second)
 
 
+def test_the_goal_is_where_the_slider_covers_it(rectangle):
+    """A rectangle of 0.1 m that is shifted along its length by d covers all but d / 0.1 of the goal."""
+    for shift in (0.0, 0.004, 0.0045, 0.0055, 0.02):
+        pose = compose(GOAL, np.array([shift, 0.0, 0.0]))
+        assert rectangle.planner.is_at_goal(pose) == (1 - shift / 0.1 > ENOUGH)
+
+
 def test_why_there_is_no_push(rectangle):
     planner, pose = rectangle.planner, np.array([0.25, 0.25, 0.0])
     inside = planner.choose(pose, pose[:2])

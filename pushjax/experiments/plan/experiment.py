@@ -6,6 +6,7 @@ one, and zero on its way between pushes.
 """
 
 import csv
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,7 @@ def run(
     position, angle = options.tolerance
     length, at = float(slider.surface.length), np.array(options.goal)
     goal = Goal(at, position=position, angle=angle, length=length, symmetry=options.symmetry)
+    _check_distance(options, length)
     plan = _best(_plans(slider, hand, goal, options, seed), options.attempts, progress)
     motion, files = None, []
     if plan.status != PushPlanStatus.NO_WAY and plan.ways:
@@ -84,7 +86,7 @@ def _check_finger(shape: pj.Shape, options: Options) -> None:
 
 def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed: int) -> Iterator[PushPlan]:
     """Yield the plan of each attempt."""
-    longest = LONGEST * float(slider.surface.length) if options.longest is None else options.longest
+    longest = _longest(options, float(slider.surface.length))
     how: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
     for attempt in range(options.attempts):
         yield plan_pushes(
@@ -98,6 +100,22 @@ def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed:
             success=options.success,
             finger=options.finger,
             **how,
+        )
+
+
+def _longest(options: Options, length: float) -> float:
+    """Return the length of the longest push, m, for a limit surface of this length, m."""
+    return LONGEST * length if options.longest is None else options.longest
+
+
+def _check_distance(options: Options, length: float) -> None:
+    """Raise ValueError if the goal is farther away than all pushes together are long."""
+    assert options.goal is not None
+    away, longest = math.dist(options.start[:2], options.goal[:2]), _longest(options, length)
+    if away > options.pushes * longest + options.tolerance[0]:
+        raise ValueError(
+            f"--goal is {away:.3g} m away, and --pushes {options.pushes} of at most {longest:.3g} m (--longest) do not "
+            "reach it; are its coordinates in millimeters?"
         )
 
 
