@@ -13,9 +13,10 @@ from jaxtyping import Array, Bool
 
 from pushjax._math.vec import Scalar, Vec3
 
-# A slider may move by this multiple of the largest displacement of a finger, and anyway by this fraction of the limit
-# surface's length.
-MAX_RATIO, ALWAYS_ALLOWED = 4.0, 0.1
+# A slider may move by this multiple of the largest displacement of a finger, and anyway by a fraction of the limit
+# surface's length: the first one in general, the second one in the smallest part of a step. Where a wedge closes and is
+# about to hold the slider, it may be fast even then.
+MAX_RATIO, ALWAYS_ALLOWED, ALLOWED_IN_SMALLEST = 4.0, 0.1, 1.0
 
 
 class SliderSpeed(NamedTuple):
@@ -30,7 +31,9 @@ class SliderSpeed(NamedTuple):
     in_double: Bool[Array, ""]
 
 
-def judge_speed(before: Vec3, after: Vec3, displacement: Scalar, length: Scalar) -> SliderSpeed:
+def judge_speed(
+    before: Vec3, after: Vec3, displacement: Scalar, length: Scalar, is_smallest: Bool[Array, ""]
+) -> SliderSpeed:
     """Judge how far a slider moved in a part of a step.
 
     Args:
@@ -38,11 +41,13 @@ def judge_speed(before: Vec3, after: Vec3, displacement: Scalar, length: Scalar)
         after: Its pose at the end.
         displacement: Largest displacement of a finger, m.
         length: Length of the limit surface, m. It makes angles distances.
+        is_smallest: Whether the part cannot be divided any more.
     """
     change = jax.tree.map(jax.lax.stop_gradient, after - before)
     motion = jnp.sqrt(change.xy.dot(change.xy)) + length * jnp.abs(change.z)
 
-    def is_allowed(multiple: int) -> Bool[Array, ""]:
-        return multiple * motion <= jnp.maximum(multiple * MAX_RATIO * displacement, ALWAYS_ALLOWED * length)
+    def is_allowed(multiple: int, fraction: Scalar | float) -> Bool[Array, ""]:
+        return multiple * motion <= jnp.maximum(multiple * MAX_RATIO * displacement, fraction * length)
 
-    return SliderSpeed(is_allowed(1), is_allowed(2))
+    fraction = jnp.where(is_smallest, ALLOWED_IN_SMALLEST, ALWAYS_ALLOWED)
+    return SliderSpeed(is_allowed(1, fraction), is_allowed(2, ALWAYS_ALLOWED))

@@ -153,7 +153,8 @@ class DividedPush(NamedTuple):
             self.fixtures,
             state.swaps == 0,
         )
-        speed = judge_speed(state.pose, record.pose, state.part * max_displacement(motions), form.length)
+        displacement, is_smallest = state.part * max_displacement(motions), state.part < 2 * SMALLEST_PART
+        speed = judge_speed(state.pose, record.pose, displacement, form.length, is_smallest)
         next_state, end_of_step = _next_state(
             state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.steps
         )
