@@ -30,7 +30,8 @@ def slider() -> pj.Slider:
 
 def workspace() -> Workspace:
     """Return the limits: of the finger a little within those of actions, of the T a little within the walls."""
-    return Workspace(*(PIXEL * np.full(2, each) for each in (2.0, 510.0, 8.0, 504.0)))
+    finger_low, finger_high, slider_low, slider_high = (PIXEL * np.full(2, each) for each in (2.0, 510.0, 8.0, 504.0))
+    return Workspace(finger_low, finger_high, slider_low, slider_high)
 
 
 def finger_control() -> SpringDamper:
