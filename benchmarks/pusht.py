@@ -81,13 +81,15 @@ def run(
         rows.append({"substeps": count} | compared(env, episodes))
         keep(record)
         progress(1 + len(rows), parts)
+    done = 1 + len(rows)
     for kind in ACTIONS if batch else ():
         speeds[kind] = {"gym-pusht": _gym_speed(True, kind), "pymunk alone": _gym_speed(False, kind)}
         for count in substeps:
             row = throughput(PushT(substeps=count), batch, kind)
             speeds[kind][f"pushjax, {count} substeps"] = row["steps_per_second"]
             keep(record)
-            progress(1 + len(rows) + sum(len(each) - 2 for each in speeds.values()), parts)
+            done += 1
+            progress(done, parts)
     return record
 
 

@@ -73,9 +73,8 @@ class Record(NamedTuple):
 def _gradient(policy: Policy, learner: Learner, key: PRNGKeyArray, params: TableParams, horizon: int):
     def step(carry: tuple[TaskState, Array], key: PRNGKeyArray):
         states, observations = carry
-        mean = jax.vmap(policy.mean)(observations)
         # Noise explores, and smooths the return; its size is not learned.
-        actions = mean + jnp.exp(policy.log_std) * jax.random.normal(key, mean.shape)
+        _, actions = policy.act(key, observations)
         after, states, reward, success, _ = jax.vmap(ENV.step_env, in_axes=(None, 0, 0, None))(
             key, states, actions, params
         )

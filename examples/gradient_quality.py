@@ -125,8 +125,7 @@ def sums(policy: Policy, key: PRNGKeyArray, params: TableParams) -> dict[str, tu
     def step(carry: tuple[TaskState, Array], key: PRNGKeyArray):
         states, first = carry
         noise_key, step_key = jax.random.split(key)
-        mean = jax.vmap(policy.mean)(first)
-        actions = mean + jnp.exp(policy.log_std) * jax.random.normal(noise_key, mean.shape)
+        _, actions = policy.act(noise_key, first)
         keys = jax.random.split(step_key, TOGETHER)
         first, states, *_ = jax.vmap(ENV.step, in_axes=(0, 0, 0, None))(keys, states, actions, params)
         return (states, first), None

@@ -72,8 +72,7 @@ def _collect(learner: Learner, key: PRNGKeyArray, params: TableParams) -> tuple[
     def step(carry: tuple[TaskState, Array], key: PRNGKeyArray):
         states, observations = carry
         action_key, step_key = jax.random.split(key)
-        mean = jax.vmap(policy.mean)(observations)
-        actions = mean + jnp.exp(policy.log_std) * jax.random.normal(action_key, mean.shape)
+        mean, actions = policy.act(action_key, observations)
         keys = jax.random.split(step_key, ENVIRONMENTS)
         after, states, reward, terminated, truncated, info = jax.vmap(ENV.step, in_axes=(0, 0, 0, None))(
             keys, states, actions, params

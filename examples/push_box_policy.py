@@ -72,6 +72,11 @@ class Policy(eqx.Module):
         """Return the mean of the action."""
         return self.actor(features(observation))
 
+    def act(self, key: PRNGKeyArray, observations: Float[Array, "batch 6"]) -> tuple[Array, Array]:
+        """Return means of the actions of a batch, and actions drawn around them, (batch, actions) each."""
+        mean = jax.vmap(self.mean)(observations)
+        return mean, mean + jnp.exp(self.log_std) * jax.random.normal(key, mean.shape)
+
     def value(self, observation: Float[Array, "6"]) -> Float[Array, ""]:
         """Return the estimated return from a state."""
         return self.critic(features(observation))

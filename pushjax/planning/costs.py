@@ -165,10 +165,7 @@ class Clearance(Cost):
     points: Float[Array, "points 2"]
 
     def __init__(self, shape: Shape, fixtures: Fixtures, distance: ArrayLike):
-        self.shape, self.fixtures, self.distance = shape, tuple(fixtures), as_float(distance, name="distance")
-        check_shape("distance", self.distance, ())
-        check_finite("distance", self.distance)
-        check_positive("distance", self.distance)
+        self.shape, self.fixtures, self.distance = shape, tuple(fixtures), _checked_distance(distance)
         self.points = _outline_points(shape)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
@@ -210,10 +207,7 @@ class HandClearance(Cost):
     distance: Float[Array, ""]
 
     def __init__(self, hand: Hand, fixtures: Fixtures, distance: ArrayLike):
-        self.hand, self.fixtures, self.distance = hand, tuple(fixtures), as_float(distance, name="distance")
-        check_shape("distance", self.distance, ())
-        check_finite("distance", self.distance)
-        check_positive("distance", self.distance)
+        self.hand, self.fixtures, self.distance = hand, tuple(fixtures), _checked_distance(distance)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         centers = self.hand.poses(push.configuration)[..., :2].reshape(-1, len(self.hand.fingers), 2)
@@ -229,6 +223,15 @@ def _nearest(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float
     if isinstance(fixture, Wall):
         return jnp.min((points - fixture.point[None]) @ fixture.normal)
     return _distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
+
+
+def _checked_distance(distance: ArrayLike) -> Float[Array, ""]:
+    """Return a distance to keep, m, as an array, after checks."""
+    array = as_float(distance, name="distance")
+    check_shape("distance", array, ())
+    check_finite("distance", array)
+    check_positive("distance", array)
+    return array
 
 
 def _outline_points(shape: Shape) -> Float[Array, "points 2"]:
