@@ -1,6 +1,7 @@
 """A progress bar that shows the current task, the rate and the remaining time."""
 
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-SILENCE = 10  # s
+SILENCE = 10.0  # s
 
 
 class _Rate(ProgressColumn):
@@ -23,41 +24,49 @@ class Reporter:
     """Reports progress: a bar on a terminal, or lines on standard error without a terminal.
 
     Call it with `(done, total)` to report how far the work has come. Without a terminal that is a line for every tenth
-    of the work, and after `SILENCE` seconds without one.
+    of the work, and a line after every `SILENCE` seconds without one.
     """
 
     def __init__(self, bar: Progress):
         self.bar = bar
         self.task = bar.add_task("", total=None)
-        self.words = ""
-        self.tenth, self.time = 0, time.monotonic()  # of the last line
+        self.words, self.done, self.total = "working", 0, 0
+        self.tenth, self.begin, self.time = 0, time.monotonic(), time.monotonic()  # of the words, and of the last line
 
     def __call__(self, done: int, total: int) -> None:
         self.bar.update(self.task, completed=done, total=total)
-        tenth, now = 10 * done // total if total else 0, time.monotonic()
-        if self.bar.disable and (tenth != self.tenth or (done and now - self.time > SILENCE)):
-            self.tenth, self.time = tenth, now
-            _print_line(f"{self.words}: {100 * done // total}%" if self.words else f"{100 * done // total}%")
+        self.done, self.total = done, total
+        tenth = 10 * done // total if total else 0
+        if self.bar.disable and tenth > self.tenth:
+            self._print_line(f"{self.words}: {100 * done // total}%")
+        self.tenth = tenth
 
     def say(self, words: str) -> None:
-        """Show `words` as the description of the task that begins now."""
-        self.words, self.tenth, self.time = words, 0, time.monotonic()
+        """Show `words` as the description of the work that begins now."""
+        self.words, self.begin = words, time.monotonic()
         if self.bar.disable:
-            _print_line(words)
+            self._print_line(words)
         else:
             self.bar.update(self.task, description=words)
 
     def note(self, words: str) -> None:
         """Print a line that stays, above the bar."""
         if self.bar.disable:
-            _print_line(words)
+            self._print_line(words)
         else:
             self.bar.console.print(words, markup=False, highlight=False)
 
+    def break_silence(self) -> None:
+        """Say what is being done, and for how long, if the last line is `SILENCE` seconds old."""
+        now = time.monotonic()
+        if now - self.time >= SILENCE:
+            parts = f" ({self.done} of {self.total} done)" if self.done < self.total else ""
+            self._print_line(f"{self.words}: {now - self.begin:.0f} s{parts}")
 
-def _print_line(words: str) -> None:
-    """Print a line that a pipe shows at once."""
-    print(f"pushjax: {words}", file=sys.stderr, flush=True)
+    def _print_line(self, words: str) -> None:
+        """Print a line that a pipe shows at once."""
+        self.time = time.monotonic()
+        print(f"pushjax: {words}", file=sys.stderr, flush=True)
 
 
 @contextmanager
@@ -66,4 +75,16 @@ def progress_bar() -> Iterator[Reporter]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
     console = Console()
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield Reporter(bar)
+        reporter, ended = Reporter(bar), threading.Event()
+
+        def watch() -> None:
+            while not ended.wait(SILENCE / 10):
+                reporter.break_silence()
+
+        if bar.disable:
+            # a daemon, so that an interrupted program ends
+            threading.Thread(target=watch, daemon=True).start()
+        try:
+            yield reporter
+        finally:
+            ended.set()

@@ -182,14 +182,7 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
     """
     c1, c2, c3 = contacts
     sticks = jnp.asarray(c1 == c2)
-    approach = dynamic_index(problem.approach, c1)
-    second = jnp.where(sticks, approach.y, dynamic_index(problem.approach, c2).x)
-    rows = (
-        dynamic_index(problem.normal, c1),
-        tree_where(sticks, dynamic_index(problem.tangent, c1), dynamic_index(problem.normal, c2)),
-        dynamic_index(problem.normal, c3),
-    )
-    twist, regular = solve_rows(rows, Vec3(approach.x, second, dynamic_index(problem.approach, c3).x))
+    twist, regular = solve_rows(*_conditions_of_three(problem, contacts, sticks))
     twist = compute_once(twist, problem.runtime_scalar)
     tolerance = kinematic_tolerance(twist)
     m = problem.count
@@ -240,6 +233,27 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
         twist,
         _power_on_limit_surface(problem.form, f.dot(twist), h),
     )
+
+
+def _conditions_of_three(
+    problem: ScaledProblem, contacts: tuple, sticks: Bool[Array, ""]
+) -> tuple[tuple[Vec3, Vec3, Vec3], Vec3]:
+    """The rows and right-hand sides of the three conditions that fix the twist.
+
+    Args:
+        problem: The dimensionless contact problem.
+        contacts: Numbers of the three contacts.
+        sticks: Whether the first two are the same, so that the second condition is the tangential one.
+    """
+    c1, c2, c3 = contacts
+    approach = dynamic_index(problem.approach, c1)
+    second = jnp.where(sticks, approach.y, dynamic_index(problem.approach, c2).x)
+    rows = (
+        dynamic_index(problem.normal, c1),
+        tree_where(sticks, dynamic_index(problem.tangent, c1), dynamic_index(problem.normal, c2)),
+        dynamic_index(problem.normal, c3),
+    )
+    return rows, Vec3(approach.x, second, dynamic_index(problem.approach, c3).x)
 
 
 def _update_incumbent(

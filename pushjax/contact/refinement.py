@@ -130,14 +130,8 @@ def refine_and_check(problem: ScaledProblem, chosen: Incumbent, *, proves_jams: 
     )
     h = problem.form.value(wrench)
     solved = moves & (h > 0)
-    # The components of the twist that the conditions fix are taken from the conditions, not from H. So a sticking
-    # contact has no slip.
     gradient = compute_once(problem.form.gradient(wrench), problem.runtime_scalar)
-    twist = gradient
-    for _ in range(2):  # the second pass is for nearly dependent rows
-        residual = system.b - Vec3(*(row.dot(twist) for row in system.rows))
-        twist = compute_once(twist + _least_norm_correction(system, residual), problem.runtime_scalar)
-
+    twist = _satisfy_conditions(system, gradient, problem.runtime_scalar)
     slips, tolerance = jax.lax.stop_gradient((problem.slips(twist), kinematic_tolerance(twist)))
     admissible = _admissible_edges(problem, chosen, slips, tolerance)
     weights = compute_once(
@@ -238,6 +232,15 @@ def _least_norm_correction(system: _System, residual: Vec3) -> Vec3:
     # `residual` is roundoff, which nearly dependent rows would magnify; below this determinant the result is zero
     relative = float(jnp.finfo(zero.dtype).eps) ** 0.5
     return complete_basis(r1, r2, r3, system.unused.y == 0, system.unused.z == 0, relative).with_products(residual)
+
+
+def _satisfy_conditions(system: _System, gradient: Vec3, runtime_scalar: Scalar) -> Vec3:
+    """The twist nearest to grad H that satisfies the kinematic conditions, so that a sticking contact has no slip."""
+    twist = gradient
+    for _ in range(2):  # the second pass is for nearly dependent rows
+        residual = system.b - Vec3(*(row.dot(twist) for row in system.rows))
+        twist = compute_once(twist + _least_norm_correction(system, residual), runtime_scalar)
+    return twist
 
 
 def _refine_wrench(system: _System, f: Vec3) -> Vec3:

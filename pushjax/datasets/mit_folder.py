@@ -116,21 +116,9 @@ def load_mit_folder(
         raise ValueError(f"speed and fast_speed must differ; got {speed} and {fast_speed}")
     found, misnamed = _find_files(Path(folder), surface, shape)
     constant_speed = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
-    by_speed: dict[float, list[_Push]] = {speed: [], fast_speed: []}
-    problems = list(misnamed)
-    wanted = [
-        (wanted_speed, *each)
-        for each in constant_speed
-        for wanted_speed in by_speed
-        if abs(each[1].speed - wanted_speed) < SAME_SPEED
-    ]
-    for done, (wanted_speed, index, name, path) in enumerate(wanted):
-        try:
-            by_speed[wanted_speed].append(_read_push(index, name, path))
-        except LogError as error:
-            problems.append(error)
-        progress(done + 1, len(wanted))
-    whole, fast = by_speed[speed], by_speed[fast_speed]
+    by_speed, unusable = _read_pushes(constant_speed, (speed, fast_speed), progress)
+    problems = [*misnamed, *unusable]
+    whole, fast = by_speed
     if len(whole) < MIN_PUSHES:
         raise _too_few_error(
             Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), constant_speed, problems
@@ -216,6 +204,36 @@ def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[Push
             _describe_missing(surface, shape, stems_found, [path for path in files if path.suffix.lower() == ".zip"]),
         )
     return sorted(found.values(), key=_sort_key), misnamed
+
+
+def _read_pushes(
+    files: list[tuple[int, PushParameters, Path]], speeds: tuple[float, ...], progress: ProgressCallback
+) -> tuple[list[list[_Push]], list[LogError]]:
+    """Read the files whose push has one of the wanted speeds.
+
+    Args:
+        files: Index, parameters and path of each push.
+        speeds: The wanted speeds, in m/s.
+        progress: Called after each file with the number of files read and the number of files to read.
+
+    Returns:
+        The pushes of each speed, and one error for each file that cannot be used.
+    """
+    pushes: list[list[_Push]] = [[] for _ in speeds]
+    problems = []
+    wanted = [
+        (group, *each)
+        for each in files
+        for group, speed in zip(pushes, speeds, strict=True)
+        if abs(each[1].speed - speed) < SAME_SPEED
+    ]
+    for done, (group, index, name, path) in enumerate(wanted):
+        try:
+            group.append(_read_push(index, name, path))
+        except LogError as error:
+            problems.append(error)
+        progress(done + 1, len(wanted))
+    return pushes, problems
 
 
 def _sort_key(named: tuple[PushParameters, Path]) -> tuple[float, ...]:

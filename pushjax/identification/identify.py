@@ -91,20 +91,10 @@ def identify(
     one_condition, pushes = pushes.weight.ndim == 1, pushes.as_conditions()
     conditions = pushes.weight.shape[0]
     surface = _surface_per_condition(slider.surface, conditions)
-    if pushes.path.shape[-1] != hand.dof:
-        raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
     known_friction = _known_friction(as_float(friction, dtype, "friction"), conditions)
     metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
     pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
-    for name, value in (("length", metric_length), ("sigma", pose_sigma)):
-        check_shape(name, value, ())
-        check_finite(name, value)
-        check_positive(name, value)
-    if robust is not None:
-        check_positive("robust", robust)
-    for name, requested in (("overlap", unknowns.overlap is not None), ("contact_at_end", contact_at_end)):
-        if requested and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
-            raise ValueError(f"{name} is for a single round finger; the hand has {len(hand.fingers)} fingers")
+    _check_settings(pushes, hand, unknowns, metric_length, pose_sigma, robust, contact_at_end)
     total_weight = jnp.maximum(jnp.sum(pushes.weight), 1.0)
     origin = jnp.einsum("cn,cni->i", pushes.weight, pushes.start[..., :2]) / total_weight
     prior = _prior(unknowns, surface, known_friction, origin)
@@ -143,6 +133,29 @@ def identify(
 
 
 _prior = quick_jit(Prior.of)
+
+
+def _check_settings(
+    pushes: Pushes,
+    hand: Hand,
+    unknowns: Unknowns,
+    length: Array,
+    sigma: Array,
+    robust: float | None,
+    contact_at_end: bool,
+) -> None:
+    """Check that the settings fit each other and the hand; the arguments are those of `identify`."""
+    if pushes.path.shape[-1] != hand.dof:
+        raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
+    for name, value in (("length", length), ("sigma", sigma)):
+        check_shape(name, value, ())
+        check_finite(name, value)
+        check_positive(name, value)
+    if robust is not None:
+        check_positive("robust", robust)
+    for name, requested in (("overlap", unknowns.overlap is not None), ("contact_at_end", contact_at_end)):
+        if requested and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
+            raise ValueError(f"{name} is for a single round finger; the hand has {len(hand.fingers)} fingers")
 
 
 def _surface_per_condition(surface: LimitSurface, conditions: int) -> LimitSurface:

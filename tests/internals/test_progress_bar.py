@@ -1,5 +1,7 @@
 """Progress without a terminal: plain lines, at once."""
 
+import time
+
 from pushjax._internal import progress_bar as bars
 
 
@@ -23,10 +25,16 @@ def test_each_tenth_is_a_line(capsys):
 
 
 def test_slow_work_is_not_silent(capsys, monkeypatch):
-    clock = [0.0]
-    monkeypatch.setattr(bars.time, "monotonic", lambda: clock[0])
+    """Work that reports nothing, as a compilation, has a line after each silence, with how far it has come."""
+    monkeypatch.setattr(bars, "SILENCE", 0.05)
     with bars.progress_bar() as progress:
-        for done, now in ((0, 20.0), (1, 20.5), (2, 25.0), (3, 31.0)):
-            clock[0] = now
-            progress(done, 1000)
-    assert lines(capsys) == ["pushjax: 0%", "pushjax: 0%"]  # after 20.5 s, and 10 s later
+        time.sleep(0.3)
+        progress.say("counting")
+        progress(1, 1000)
+        time.sleep(0.3)
+    seen = lines(capsys)
+    words = seen.index("pushjax: counting")
+    assert words >= 2 and set(seen[:words]) == {"pushjax: working: 0 s"}
+    assert len(seen) >= words + 3 and set(seen[words + 1 :]) == {"pushjax: counting: 0 s (1 of 1000 done)"}
+    time.sleep(0.1)
+    assert lines(capsys) == []  # nothing is said after the end
