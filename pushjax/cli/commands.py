@@ -292,6 +292,7 @@ class Data:
     """Where to. Default: pushjax's data folder of this user, where `reproduce table2` and `two-finger` look."""
 
 
+KINDS: dict[str, type[Common]] = {"demo": Demo, "identify": Identify, "plan": Plan}
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]

@@ -9,12 +9,13 @@ import warnings
 from collections.abc import Sequence
 from difflib import get_close_matches
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
-from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, Command, Common, Data, Demo, Reproduce
+from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, KINDS, Command, Common, Data, Demo, Reproduce
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"pushjax {__version__}")
         return
     _check_words(given)
+    _check_counts(given)
     command = parsed(given)
     if isinstance(command, Reproduce):
         command = command.experiment
@@ -79,6 +81,34 @@ def _check_word(kind: str, given: list[str], known: Sequence[str]) -> None:
     raise SystemExit(2)
 
 
+def _check_counts(given: list[str]) -> None:
+    """End with exit status 2 if an option has fewer or more values than it takes.
+
+    tyro names every type that an option may have, of which a reader needs one.
+    """
+    first, second = [*given[:2], "", ""][:2]
+    kind = EXPERIMENTS.get(second) if first == "reproduce" else KINDS.get(first)
+    options = {} if kind is None else get_type_hints(kind, include_extras=True)
+    for name, hint in options.items():
+        flag, count = "--" + name.replace("_", "-"), _fixed_count(hint)
+        if count is None or flag not in given:
+            continue
+        rest = given[given.index(flag) + 1 :]
+        values = list(takewhile(lambda word: not word.startswith("--"), rest))
+        if len(values) < count or (len(values) > count and first != "identify"):  # its logs may follow
+            words = next((each.metavar for each in get_args(hint)[1:] if getattr(each, "metavar", None)), "")
+            takes = f"{count} values{f' ({words})' if words else ''}"
+            print(f"pushjax: {flag} takes {takes}; got {len(values)}: {' '.join(values)}", file=sys.stderr)
+            raise SystemExit(2)
+
+
+def _fixed_count(hint: Any) -> int | None:
+    """Return how many values an option of this type takes, if it is a tuple of fixed length; else None."""
+    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    tuples = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
+    return next((len(get_args(each)) for each in tuples if Ellipsis not in get_args(each)), None)
+
+
 def _compute(command: Common) -> None:
     """Run an experiment, print its summary, and write its record and page."""
     from pushjax._internal.progress_bar import progress_bar
@@ -96,7 +126,7 @@ def _compute(command: Common) -> None:
         experiment: Any = import_module(f"pushjax.experiments.{command.module}")
         callbacks = {"progress": progress, "say": progress.say, "note": progress.note}
         settings |= {name: each for name, each in callbacks.items() if name in experiment.run.__annotations__}
-        progress.say(f"computing {command.title}")
+        progress.say(f"computing {command.title}, and compiling what was not compiled before")
         record = experiment.run(seed=command.seed, out=command.out, **settings)
     text = experiment.summary(record)
     print(text)
@@ -121,6 +151,8 @@ def data_folder(given: Path | None) -> Path:
     Raises:
         ValueError: If there is none.
     """
+    if given is not None and not given.is_dir():
+        raise ValueError(f"--data: there is no folder {given}")
     from pushjax.datasets.data_folder import find_data
 
     folder = given or find_data()

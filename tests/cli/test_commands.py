@@ -218,6 +218,27 @@ def test_table2_wants_data(tmp_path, monkeypatch, capsys):
     assert "hardboard_3pts1.npz, or published logs named hardboard_3pts1….txt" in error
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("plan --goal 0.1 0.2", "--goal takes 3 values (X Y THETA); got 2: 0.1 0.2"),
+        ("plan --goal 0.1 -0.2 0 1", "--goal takes 3 values (X Y THETA); got 4: 0.1 -0.2 0 1"),
+        ("identify log.csv --friction 0.3", "--friction takes 2 values; got 1: 0.3"),
+        ("reproduce stochastic-push --friction 0.2 --n 3", "--friction takes 2 values (LOWEST HIGHEST); got 1: 0.2"),
+        (
+            "identify --friction 0.3 0.4 nowhere.csv",
+            "LOG: give at least one file of recorded pushes; there is no nowhere.csv",
+        ),
+        ("reproduce table1 --data /nowhere", "--data: there is no folder /nowhere"),
+    ],
+)
+def test_a_wrong_number_of_values_and_what_is_not_there_are_one_line(words, message, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(words.split())
+    assert stop.value.code in (1, 2)
+    assert capsys.readouterr().err == f"pushjax: {message}\n"
+
+
 @pytest.mark.parametrize("arguments", [["reproduce"], ["demo", "--sed", "1"], []])
 def test_wrong_words_end_with_a_usage_error(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
