@@ -46,11 +46,11 @@ from pushjax._internal.checks import (
     as_float,
     check_finite,
     check_non_negative,
-    check_shape,
     common_dtype,
     concrete,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax._internal.warn import warn
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax._math.linalg import Cholesky, Lower, add_scaled, entry
 from pushjax._math.wishart import sample_wishart, tril
@@ -64,6 +64,7 @@ Sampler = Literal["gram", "sum_of_squares"]
 LOADING = 0.01  # relative to the least eigenvalue of the mean's Gram matrix
 DECOMPOSITION_TOLERANCE = 1e-3  # largest error of a sum of squares, relative to the largest coefficient
 NUM_RAYS = 200
+MAX_FRICTION = 5.0  # a larger coefficient of friction is probably in percent
 
 
 class SurfaceSample(NamedTuple):
@@ -141,7 +142,8 @@ class FrictionModel(eqx.Module):
         self.dof = None
         if dof is not None:
             self.dof = as_float(dof, dtype, "dof")
-            check_shape("dof", self.dof, ())
+            if self.dof.shape != ():
+                raise ValueError(f"dof has shape {self.dof.shape}; expected a scalar: are dof and friction swapped?")
             check_finite("dof", self.dof)
             _check_dof(self.dof, 3, "an ellipsoid's matrix")
         mu = as_float(friction, dtype, "friction")
@@ -153,6 +155,8 @@ class FrictionModel(eqx.Module):
         known = concrete(self.friction)
         if known is not None and known[0] > known[1]:
             raise ValueError(f"friction must be (lowest, highest); got ({known[0]:g}, {known[1]:g})")
+        if known is not None and known[1] > MAX_FRICTION:
+            warn(f"friction: mu is up to {known[1]:.3g}, and rarely more than 1: is it in percent?")
 
     def around(self, surface: LimitSurface) -> SurfaceDistribution:
         """Prepare the distribution of surfaces around a mean. This is the expensive part, needed once for many samples.

@@ -1,7 +1,5 @@
 """Checks of the arguments of steps and rollouts, and their conversion to one floating dtype."""
 
-import sys
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +19,9 @@ from pushjax._internal.checks import (
     concrete,
     traced,
 )
+from pushjax._internal.warn import warn
 from pushjax.friction.limit_surface import LimitSurface
+from pushjax.friction.random import MAX_FRICTION
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.detection import MAX_PENETRATION
@@ -73,6 +73,8 @@ def checked_arguments(
         raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
     check_finite("friction", mu)
     check_non_negative("friction", mu)
+    if not traced((slider, pose, friction, paths)) and np.max(np.asarray(mu), initial=0) > MAX_FRICTION:
+        warn(f"friction: mu is up to {np.max(np.asarray(mu)):.3g}, and rarely more than 1: is it in percent?")
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
 
@@ -91,20 +93,12 @@ def warn_about_units(slider: Slider, pose: Array, *paths: Array) -> None:
     reach = max((float(np.max(np.abs(np.asarray(path)[..., :2]), initial=0)) for path in paths), default=0.0)
     angle = float(np.max(np.abs(np.asarray(pose)[..., 2]), initial=0))
     if length > MAX_LENGTH:
-        _warn(f"slider: its surface has a length of {length:.3g} m: are its coordinates in millimeters?")
+        warn(f"slider: its surface has a length of {length:.3g} m: are its coordinates in millimeters?")
     elif reach > MAX_REACH * length:
         times = f"{reach / length:.0f} times the length of the slider's surface"
-        _warn(f"path: it goes {reach:.3g} m from the origin, {times}: are its coordinates in millimeters?")
+        warn(f"path: it goes {reach:.3g} m from the origin, {times}: are its coordinates in millimeters?")
     if angle > MAX_TURN:
-        _warn(f"pose: its angle is {angle:.3g} rad: is it in degrees?")
-
-
-def _warn(message: str) -> None:
-    """Show a warning at the line of code outside the package that made the call."""
-    level, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("pushjax."):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(message, UserWarning, stacklevel=level)
+        warn(f"pose: its angle is {angle:.3g} rad: is it in degrees?")
 
 
 def checked_rollout_arguments(
@@ -118,16 +112,28 @@ def checked_rollout_arguments(
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
     if pushes is not None and np.ndim(path) == 3:
         path_array = as_float(path, dtype, "path")
+        _check_columns(path_array, hand)
         check_shape("path", path_array, (pushes, "steps + 1", hand.dof))
         check_finite("path", path_array)
         if path_array.shape[1] < 2:
             raise ValueError(f"path must have at least two configurations; got shape {path_array.shape}")
     else:
-        path_array = checked_path(path, hand.dof, dtype)
+        path_array = as_float(path, dtype, "path")
+        _check_columns(path_array, hand)
+        path_array = checked_path(path_array, hand.dof)
     warn_about_units(slider, start, path_array)
     check_opening(hand, path_array)
     check_start(slider, hand, start, path_array[..., 0, :])
     return slider, hand, path_array, start, mu
+
+
+def _check_columns(path: Array, hand: Hand) -> None:
+    """Raise ValueError for a path whose rows are not as long as a configuration of the hand."""
+    if path.ndim > 1 and path.shape[-1] != hand.dof:
+        raise ValueError(
+            f"path has {path.shape[-1]} columns; a configuration of this hand has {hand.dof}"
+            + (f": {hand.coordinates}" if hand.coordinates else "")
+        )
 
 
 def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:

@@ -92,6 +92,12 @@ class Hand(eqx.Module):
         """Radii of the fingers, m; only for a hand whose fingers are all round."""
         return jnp.stack([finger.radius for finger in self.fingers])  # pyright: ignore[reportAttributeAccessIssue]
 
+    @property
+    def coordinates(self) -> str:
+        """Names of the numbers of a configuration; empty for kinematics of one's own."""
+        names: dict[Any, str] = {_one: "x, y", _two: "x, y, theta, d", _three: "x, y, theta, d"}
+        return names.get(self.kinematics, "")
+
     @staticmethod
     def finger(radius: ArrayLike = 0.0) -> "Hand":
         """One round finger that does not turn.

@@ -1,9 +1,9 @@
 """Monte Carlo simulation: many pushes under random friction, for the distribution of the slider's final pose."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, check_count, check_type, traced
 from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax._internal.warn import warn
 from pushjax.contact.problem import check_solver
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
@@ -40,6 +41,7 @@ ACCELERATOR_TILE = 1 << 18  # the same for an accelerator, whose kernels take lo
 TILE_MULTIPLE = 64  # a tile for fewer pushes is a multiple of this
 # A file of a checkpoint is written after this many pushes, or after this time in s, at the end of the round.
 BLOCK_PUSHES, BLOCK_SECONDS = 16 * TILE, 20.0
+MANY_REPAIRS = 1 / 3  # share of repaired surfaces from which their distribution is no longer that of the model
 
 
 def monte_carlo(
@@ -87,7 +89,8 @@ def monte_carlo(
             all make the same call.
         checkpoint: Folder in which finished pushes are kept; all processes must have access to it. A run that finds its
             beginning there continues from it, and gives the same bits.
-        progress: True for a progress bar on the terminal, or a function of (done, n).
+        progress: True for a progress bar on the terminal (lines on standard error if there is none), or a function of
+            (done, n).
 
     Returns:
         The pushes, in numpy.
@@ -110,43 +113,62 @@ def monte_carlo(
     n = int(n)
     check_solver(solver)
     check_type("model", model, FrictionModel)
-    slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
-    key_data, impl = _key_data(key)
-    used = Devices.of(devices)
-    default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
-    tile = int(batch_size) if batch_size is not None else min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
-    if used.multiprocess:
-        # connect the processes now: after compiling, one may be later than the 30 s that the others wait
-        multihost_utils.sync_global_devices("pushjax monte_carlo")
-    surfaces = model.around(slider.surface)
-    cast_table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
-    check_start_among_fixtures(slider, fixed, start)
-    setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table, fixed)
-    run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
-    saved: Checkpoint | None = None
-    if checkpoint is not None:
-        identity = {"n": n, "batch_size": tile, "trajectories": trajectories, "key": digest(key_data, impl)}
-        identity |= {"slider": digest(slider), "hand": digest(hand, hand.poses(path_array)), "path": digest(path_array)}
-        identity |= {"pose": digest(start), "model": digest(model), "solver": digest(solver) if solver else "default"}
-        identity |= {"table": digest(table) if table else "uniform", "fixtures": digest(fixed)}
-        versions = {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
-        identity |= versions | {"platform": used.local[0].platform}
-        folder = Path(checkpoint)
-        saved = run.in_all_processes(lambda: Checkpoint(folder, identity, writes=used.writes))
-    with _progress_report(progress) as report:
+    with _progress_report(progress, n) as report:
+        slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
+        key_data, impl = _key_data(key)
+        used = Devices.of(devices)
+        default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
+        tile = int(batch_size) if batch_size is not None else min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
+        if used.multiprocess:
+            # connect the processes now: after compiling, one may be later than the 30 s that the others wait
+            multihost_utils.sync_global_devices("pushjax monte_carlo")
+        surfaces = model.around(slider.surface)
+        cast_table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
+        check_start_among_fixtures(slider, fixed, start)
+        setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table, fixed)
+        run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
+        saved = None if checkpoint is None else _checkpoint(Path(checkpoint), run, setup, slider, path_array, start)
         results = run.compute_all(saved, report)
-    starts = np.broadcast_to(run.start, (n, 3))
-    return MonteCarlo(starts, *results, time.perf_counter() - start_time)
+    _warn_about_repairs(results.shrinkage)
+    return MonteCarlo(np.broadcast_to(run.start, (n, 3)), *results, time.perf_counter() - start_time)
 
 
-def _progress_report(progress: bool | ProgressCallback) -> Any:
-    """Return a context manager that yields the progress callback."""
-    if progress is True:
-        # drawing on terminals is not needed by those who only import this
-        from pushjax._internal.progress_bar import progress_bar
+def _checkpoint(folder: Path, run: "_Run", setup: Setup, slider: Slider, path: Array, start: Array) -> Checkpoint:
+    """Return the checkpoint of a run, which knows the run by its arguments, versions and platform."""
+    hand, model, solver = setup.hand, setup.model, setup.solver
+    identity = {"n": run.n, "batch_size": run.tile, "trajectories": run.keep_trajectories}
+    identity |= {"key": digest(setup.key, run.impl), "slider": digest(slider), "path": digest(path)}
+    identity |= {"hand": digest(hand, hand.poses(path)), "pose": digest(start), "model": digest(model)}
+    identity |= {"solver": digest(solver) if solver else "default", "fixtures": digest(setup.fixtures)}
+    identity |= {"table": digest(setup.table) if setup.table else "uniform"}
+    identity |= {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
+    identity |= {"platform": run.devices.local[0].platform}
+    return run.in_all_processes(lambda: Checkpoint(folder, identity, writes=run.devices.writes))
 
-        return progress_bar()
-    return nullcontext(progress or no_progress)
+
+def _warn_about_repairs(shrinkage: np.ndarray) -> None:
+    """Warn if many of the sampled surfaces were not convex and had to be moved toward their mean."""
+    share = float(np.mean(shrinkage > 0))
+    if share > MANY_REPAIRS:
+        warn(
+            f"model: {share:.0%} of the sampled limit surfaces were not convex and were moved toward the mean; put the "
+            "origin of the body frame at the center of the pressure, give a larger dof, or use "
+            'sampler="sum_of_squares"'
+        )
+
+
+@contextmanager
+def _progress_report(progress: bool | ProgressCallback, n: int) -> Iterator[ProgressCallback]:
+    """Yield the progress callback of `n` pushes."""
+    if progress is not True:
+        yield progress or no_progress
+        return
+    # drawing on terminals is not needed by those who only import this
+    from pushjax._internal.progress_bar import progress_bar
+
+    with progress_bar() as reporter:
+        reporter.say(f"compiling and making {n} pushes")
+        yield reporter
 
 
 def _key_data(key: Any) -> tuple[Any, Any]:
