@@ -137,10 +137,10 @@ def _checkpoint(folder: Path, run: "_Run", setup: Setup, slider: Slider, path: A
     """Return the checkpoint of a run, which knows the run by its arguments, versions and platform."""
     hand, model, solver = setup.hand, setup.model, setup.solver
     identity = {"n": run.n, "batch_size": run.tile, "trajectories": run.keep_trajectories}
-    identity |= {"key": digest(setup.key, run.impl), "slider": digest(slider), "path": digest(path)}
-    identity |= {"hand": digest(hand, hand.poses(path)), "pose": digest(start), "model": digest(model)}
-    identity |= {"solver": digest(solver) if solver else "default", "fixtures": digest(setup.fixtures)}
-    identity |= {"table": digest(setup.table) if setup.table else "uniform"}
+    identity |= {"key": digest(setup.key, run.impl), "slider": digest(slider)}
+    identity |= {"hand": digest(hand, hand.poses(path)), "path": digest(path), "pose": digest(start)}
+    identity |= {"model": digest(model), "solver": digest(solver) if solver else "default"}
+    identity |= {"table": digest(setup.table) if setup.table else "uniform", "fixtures": digest(setup.fixtures)}
     identity |= {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
     identity |= {"platform": run.devices.local[0].platform}
     return run.in_all_processes(lambda: Checkpoint(folder, identity, writes=run.devices.writes))

@@ -254,6 +254,20 @@ def test_a_folder_that_cannot_be_one(tmp_path):
         run(checkpoint=tmp_path / "file")
 
 
+def test_progress_in_a_pipe_says_at_once_what_is_done(whole, capsys):
+    assert same(arrays(run(progress=True)), arrays(whole))
+    first, *tenths = capsys.readouterr().err.splitlines()
+    assert first == "pushjax: compiling and making 500 pushes"
+    assert tenths[-1] == f"{first}: 100%"
+
+
+def test_many_repaired_surfaces_give_a_warning(whole, monkeypatch):
+    monkeypatch.setattr("pushjax.simulation.monte_carlo.MANY_REPAIRS", -0.1)  # ellipsoids are never repaired
+    with pytest.warns(UserWarning, match="model: 0% of the sampled .* origin of the body frame") as seen:
+        run()
+    assert [each.filename for each in seen] == [__file__]
+
+
 def test_outcomes_add_up():
     """The outcomes add up, also if a step failed on the way and the hand jammed later."""
     none = np.zeros((4, 1, 4), np.int32)
@@ -280,7 +294,8 @@ def test_bad_input():
         ({"batch_size": 0}, "batch_size must be a whole number, at least 1"),
         ({"pose": np.zeros((3, 3))}, r"pose has shape \(3, 3\); expected \(3,\) or \(500, 3\)"),
         ({"pose": np.full(3, np.nan)}, "pose must be finite"),
-        ({"path": np.zeros((4, 3))}, "path has shape"),
+        ({"path": np.zeros((4, 3))}, "path has 3 columns; a configuration of this hand has 2: x, y"),
+        ({"path": np.zeros(4)}, "path has shape"),
         ({"path": np.zeros((3, 4, 2))}, r"path has shape \(3, 4, 2\); expected \(500, steps \+ 1, 2\)"),
         ({"path": np.full((N, 4, 2), np.nan)}, "path must be finite"),
         ({"path": np.zeros((N, 1, 2))}, "at least two configurations"),
