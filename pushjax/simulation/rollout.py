@@ -7,14 +7,16 @@ If no motion satisfies every contact, the hand has jammed, and it stops there fo
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
-from pushjax._internal.jit import quick_jit
+from pushjax._internal.jit import outside_trace, quick_jit
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
@@ -45,6 +47,8 @@ from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import ScalarStep, step_in_scalars
 from pushjax.simulation.substeps import DividedPush, hand_stops, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
+
+MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 512, ...
 
 
 def step(
@@ -163,14 +167,37 @@ def rollout(
     slider, hand, path_array, start, mu = checked_rollout_arguments(slider, hand, path, pose, friction)
     fixed = checked_fixtures(fixtures, start.dtype)
     check_start_among_fixtures(slider, fixed, start)
-    return _rollout(slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed)
+    checked = slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
+    return _rollout_with_padding(*checked) if outside_trace() else _rollout(*checked)
 
 
 @quick_jit
-def _rollout(slider, hand, path, pose, friction, solver, table, fixtures) -> Trajectory:
+def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
     uniform = to_scalars(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
-    return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures)
+    return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures, num_steps)
+
+
+def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
+    """Roll out a path that is filled up to one of a few lengths, so that paths of many lengths share a program.
+
+    The path ends with copies of its last configuration, which are not simulated. Compiling takes seconds.
+    """
+    steps, size = len(path) - 1, MIN_SIZE
+    while size < steps:
+        size *= SIZE_RATIO
+    padding = np.broadcast_to(path[-1], (size - steps, path.shape[1]))
+    padded = jnp.asarray(np.concatenate([path, padding]))
+    return _first_steps(_rollout(slider, hand, padded, *rest, jnp.asarray(steps)), steps)
+
+
+@partial(jax.jit, static_argnums=1)
+def _first_steps(push: Trajectory, steps: int) -> Trajectory:
+    """The first steps of a push."""
+    extra = {"pose": 1, "configuration": 1}  # before the first step
+    return Trajectory(
+        **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in Trajectory.__dataclass_fields__}
+    )
 
 
 # Called as `friction_at(step, pose)` with the index of a step and the pose of the slider before it. Returns H of the
@@ -206,6 +233,7 @@ def simulate(
     solver: ContactSolver | StickingSolver | None,
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
+    num_steps: Array | None = None,
 ) -> Trajectory:
     """Roll out a path.
 
@@ -218,8 +246,10 @@ def simulate(
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
             All surfaces must have the same length.
         fixtures: Walls and bodies that the slider may touch.
+        num_steps: Number of steps to simulate; None for all. The rest of the result has no meaning.
     """
     push, start, steps = divided_push(shape, hand, path, solver, friction_at, fixtures), Vec3.of(pose), len(path) - 1
+    push = push._replace(num_steps=num_steps)
     if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
         records = _simulate_one_contact(push, start)
         fraction = jnp.zeros_like(start.x)

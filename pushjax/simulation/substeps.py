@@ -99,12 +99,13 @@ class DividedPush(NamedTuple):
 
     Attributes:
         outline: The slider's outline.
-        steps: Number of steps of the path.
+        steps: Number of steps of the path, with those that only fill it up.
         motions_at: Function that gives the motion of the fingers over a step, from its index and the friction of each
             finger.
         solver: Solver of contact problems; None for the default.
         friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
         fixtures: Fixtures as fingers that stay where they are.
+        num_steps: Number of steps to simulate; None for all.
     """
 
     outline: Outline
@@ -113,6 +114,12 @@ class DividedPush(NamedTuple):
     solver: ContactSolver | StickingSolver | None
     friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]]
     fixtures: tuple[FingerMotion, ...] = ()
+    num_steps: Int[Array, ""] | None = None
+
+    @property
+    def end(self) -> Int[Array, ""] | int:
+        """Index of the step at which the push has ended."""
+        return self.steps if self.num_steps is None else self.num_steps
 
     @property
     def max_trials(self) -> int:
@@ -149,14 +156,14 @@ class DividedPush(NamedTuple):
             state.overlap,
             reach,
             state.urgency,
-            state.step < self.steps,
+            state.step < self.end,
             self.fixtures,
             state.swaps == 0,
         )
         displacement, is_smallest = state.part * max_displacement(motions), state.part < 2 * SMALLEST_PART
         speed = judge_speed(state.pose, record.pose, displacement, form.length, is_smallest)
         next_state, end_of_step = _next_state(
-            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.steps
+            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.end
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
@@ -184,14 +191,18 @@ def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Sca
     def skipped(state: PushState):
         return state, (idle_record, jnp.zeros((), bool), state.step)
 
-    def trial_of_batch(state: PushState, _):
-        any_ongoing = eqxi.unvmap_any(state.step < push.steps)
+    def trial_of_batch(state: PushState, trials: Int[Array, ""] | None):
+        is_ongoing = state.step < push.end
+        if push.num_steps is not None:
+            is_ongoing &= trials < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
+        any_ongoing = eqxi.unvmap_any(is_ongoing)
         return jax.lax.cond(any_ongoing, push.trial, skipped, state)
 
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
     trial_of_batch = jax.checkpoint(trial_of_batch, prevent_cse=False, policy=save_search_results)
-    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, length=push.max_trials)
+    trials = None if push.num_steps is None else jnp.arange(push.max_trials)
+    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, trials, length=push.max_trials)
     return _records_of_steps(records, ends, step, push.steps, last, idle_record), last.done
 
 
@@ -295,7 +306,7 @@ def _next_state(
     part: tuple[FingerMotion, ...],
     tolerance: Scalar,
     speed: SliderSpeed,
-    steps: int,
+    steps: Int[Array, ""] | int,
 ):
     """Return the state after a trial; and of the trial's step the record, whether it ended, and the index.
 

@@ -19,6 +19,7 @@ from pushjax import (
     Quartic,
     Slider,
     Status,
+    Trajectory,
     line,
     rollout,
     solve_contacts,
@@ -532,6 +533,20 @@ def test_shapes_and_dtypes_of_a_trajectory():
     assert not push.failed.any()
     assert push.first_failure == -1
     np.testing.assert_array_equal(push.pose[0], 0)
+
+
+def test_paths_of_other_lengths_compile_no_rollout(caplog):
+    """The parts of a path, each with another number of steps, run in the program of the whole path."""
+    whole = rollout(SLIDER, HAND, PATH, **PUSH)
+    with jax.log_compiles(), caplog.at_level("WARNING", logger="jax"):
+        for steps in (1, 13, 19):
+            part = rollout(SLIDER, HAND, PATH[: steps + 1], **PUSH)
+            for name in Trajectory.__dataclass_fields__:
+                entries = steps + (name in ("pose", "configuration"))
+                np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[:entries])
+    compiled = [record.getMessage() for record in caplog.records if record.getMessage().startswith("Compiling")]
+    assert compiled, "what cuts the result to its length"
+    assert not any("_rollout" in message for message in compiled)
 
 
 def test_both_solvers_push_alike():
