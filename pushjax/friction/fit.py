@@ -17,6 +17,7 @@ unconstrained and uses gradients, so fits can be batched; the semidefinite progr
 Reference: Zhou et al. 2016, for the terms of the loss.
 """
 
+import functools
 import warnings
 from typing import Any, Literal, NamedTuple, overload
 
@@ -35,13 +36,16 @@ from pushjax._internal.checks import (
     common_dtype,
     concrete,
     normalized_weights,
+    on_device,
+    traced,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax._math.bfgs import Minimum, minimize, while_loop
 from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface, angle_between
 from pushjax.friction.quartic import MONOMIALS, Quartic
-from pushjax.friction.sum_of_squares import TERMS, initial_factors, quadratic_forms, squared_quadratics
+from pushjax.friction.sum_of_squares import LOWER_ENTRIES, MONOMIAL_SUMS, TERMS, initial_factors, monomial_sums
 
 VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
@@ -50,6 +54,7 @@ MAX_STEPS = 500  # of the optimizer, in each round
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
+QUADRATIC_SUMS = monomial_sums(QUADRATIC_MONOMIALS)
 
 
 class FitReport(eqx.Module):
@@ -80,6 +85,9 @@ class _Quadratic(NamedTuple):
     def value(self, a: Float[Array, "m"]) -> Float[Array, ""]:
         return a @ self.q @ a - 2 * self.b @ a + self.c
 
+    def gradient(self, a: Float[Array, "m"]) -> Float[Array, "m"]:
+        return 2 * (self.q @ a - self.b)
+
 
 class _Pairs(NamedTuple):
     """Pairs in the basis of monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a.
@@ -101,7 +109,7 @@ class _Pairs(NamedTuple):
     @property
     def along(self) -> Float[Array, "pairs m"]:
         """Components of the gradients along the twists: grad H(F_i) . V_i = along[i] . a."""
-        return jnp.sum(self.gradient * self.twist[:, :, None], axis=0)
+        return (self.gradient * self.twist[:, :, None]).sum(axis=0)
 
 
 @overload
@@ -186,9 +194,9 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     if terms < 1:
         raise ValueError(f"terms must be at least 1; got {terms}")
     factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
-    coefficients, fit_report = _fit(
-        wrenches, twists, characteristic_length, share, *factors, degree=degree, terms=terms if degree == 4 else 1
-    )
+    arrays = [wrenches, twists, characteristic_length, share, *factors]
+    fit = _fit_in_jax if traced(arrays) else _fit_in_numpy
+    coefficients, fit_report = fit(*arrays, degree=degree, terms=terms if degree == 4 else 1)
     converged = concrete(fit_report.converged)
     if not report and converged is not None and not converged:
         warnings.warn("fit_limit_surface did not converge; see its report", RuntimeWarning, stacklevel=2)
@@ -250,17 +258,19 @@ def _check_arguments(wrench: Array, twist: Array, length: Array, weights: Array,
         raise ValueError("wrench: all pairs are zero")
 
 
-@quick_jit
-def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, terms: int):
-    """Return the coefficients of H for wrenches in N, 1/N^degree, and the report."""
-    share = weights / jnp.sum(weights)
+def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int, terms: int):
+    """Return the coefficients of H for wrenches in N, 1/N^degree, and the report; with NumPy or with JAX."""
+    dtype = wrench.dtype
+    share = weights / xp.sum(weights)
     has_weight = share > 0  # pairs without weight may be padding with any values: replace them
-    f, v = wrench.at[:, 2].divide(length), twist.at[:, 2].multiply(length)
-    f, v = (jnp.where(has_weight[:, None], each, jnp.array([[1.0, 0.0, 0.0]], each.dtype)) for each in (f, v))
-    v = v / jnp.linalg.norm(v, axis=1, keepdims=True)
-    scale = share @ jnp.linalg.norm(f, axis=1)
-    pairs = _evaluate_monomials(f / scale, v, share, degree)
-    start = initial_factors(degree, terms, pairs.value.dtype)
+    lengths = xp.stack([xp.ones_like(length), xp.ones_like(length), length])[None]
+    f, v = (
+        xp.where(has_weight[:, None], each, xp.asarray([[1, 0, 0]], dtype))
+        for each in (wrench / lengths, twist * lengths)
+    )
+    v = v / xp.linalg.norm(v, axis=1, keepdims=True)
+    scale = share @ xp.linalg.norm(f, axis=1)
+    pairs = _evaluate_monomials(xp, f / scale, v, share, degree)
 
     def is_unfinished(state):
         _, _, _, converged, rounds = state
@@ -268,37 +278,44 @@ def _fit(wrench, twist, length, weights, value_weight, ridge, *, degree: int, te
 
     def solve_round(state):
         parameters, unclipped, steps, _, rounds = state
-        parameters, round_steps, solved = _minimize(_loss(pairs, unclipped, value_weight, ridge), parameters, degree)
-        unclipped_after = (pairs.along @ _coefficients(parameters, degree) > 0) | ~has_weight
-        return (
-            parameters,
-            unclipped_after,
-            steps + round_steps,
-            solved & jnp.all(unclipped_after == unclipped),
-            rounds + 1,
-        )
+        found = _minimize(xp, _loss(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
+        unclipped_after = (pairs.along @ _coefficients(xp, found.x, degree) > 0) | ~has_weight
+        settled = found.converged & xp.all(unclipped_after == unclipped)
+        return found.x, unclipped_after, steps + found.steps, settled, rounds + 1
 
-    zero = jnp.zeros((), jnp.int32)
-    initial_state = (start, jnp.ones(f.shape[0], bool), zero, jnp.zeros((), bool), zero)
-    parameters, unclipped, steps, converged, _ = jax.lax.while_loop(is_unfinished, solve_round, initial_state)
-    a = _coefficients(parameters, degree)
-    angle = angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist))
+    zero = xp.zeros((), xp.int32)
+    start = xp.asarray(initial_factors(degree, terms, dtype).ravel())
+    initial_state = (start, xp.ones(len(f), bool), zero, xp.zeros((), bool), zero)
+    parameters, unclipped, steps, converged, _ = while_loop(xp, is_unfinished, solve_round, initial_state)
+    a = _coefficients(xp, parameters, degree)
+    gradient, given = Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist)
+    across = gradient.cross(given)
     report = FitReport(
-        angle=share @ angle,
-        loss=_loss(pairs, unclipped, value_weight, ridge).value(a),
-        clipped=jnp.sum(~unclipped),
+        angle=share @ xp.arctan2(xp.sqrt(across.dot(across)), gradient.dot(given)),
+        loss=_loss(xp, pairs, unclipped, value_weight, ridge).value(a),
+        clipped=xp.sum(~unclipped),
         converged=converged,
         steps=steps,
     )
     return a / scale**degree, report
 
 
-def _evaluate_monomials(f: Array, v: Array, share: Array, degree: int) -> _Pairs:
+_fit_in_jax = quick_jit(functools.partial(_fit, jnp))
+
+
+def _fit_in_numpy(*arrays: Array, degree: int, terms: int):
+    """Return what `_fit` returns, without compiling anything."""
+    with np.errstate(all="ignore"):
+        coefficients, report = _fit(np, *map(np.asarray, arrays), degree=degree, terms=terms)
+    return jax.tree.map(lambda value: on_device(np.asarray(value)), (coefficients, report))
+
+
+def _evaluate_monomials(xp, f: Array, v: Array, share: Array, degree: int) -> _Pairs:
     """Evaluate the monomials and their gradients at the normalized wrenches `f`."""
     exponents = MONOMIALS if degree == 4 else QUADRATIC_MONOMIALS
     powers = []  # for each component: 1, f, f^2, ...
     for column in f.T:
-        powers.append([jnp.ones_like(column)])
+        powers.append([xp.ones_like(column)])
         for _ in range(degree):
             powers[-1].append(powers[-1][-1] * column)
 
@@ -309,56 +326,59 @@ def _evaluate_monomials(f: Array, v: Array, share: Array, degree: int) -> _Pairs
         lowered = [max(exponent[j] - (j == k), 0) for j in range(3)]
         return exponent[k] * product(lowered)
 
-    value = jnp.stack([product(exponent) for exponent in exponents.tolist()], axis=1)
-    gradient = jnp.stack(
-        [jnp.stack([derivative(exponent, k) for exponent in exponents.tolist()], axis=1) for k in range(3)]
+    value = xp.stack([product(exponent) for exponent in exponents.tolist()], axis=1)
+    gradient = xp.stack(
+        [xp.stack([derivative(exponent, k) for exponent in exponents.tolist()], axis=1) for k in range(3)]
     )
     return _Pairs(value, gradient, v.T, share)
 
 
-def _loss(pairs: _Pairs, unclipped: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> _Quadratic:
+def _loss(xp, pairs: _Pairs, unclipped: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> _Quadratic:
     """Return the loss as a quadratic in the coefficients a, given which pairs are not clipped.
 
     For these |g - s V| is the norm of the component of the gradient g perpendicular to V.
     """
     across = pairs.gradient - (pairs.twist * unclipped[None])[:, :, None] * pairs.along[None]
-    rows = jnp.concatenate([across, jnp.sqrt(value_weight) * pairs.value[None]])
-    rows = (rows * jnp.sqrt(pairs.share)[None, :, None]).reshape(-1, pairs.value.shape[1])
-    q = rows.T @ rows + ridge * jnp.eye(rows.shape[1], dtype=rows.dtype)
+    rows = xp.concatenate([across, xp.sqrt(value_weight) * pairs.value[None]])
+    rows = (rows * xp.sqrt(pairs.share)[None, :, None]).reshape(-1, pairs.value.shape[1])
+    q = rows.T @ rows + ridge * xp.eye(rows.shape[1], dtype=rows.dtype)
     return _Quadratic(q, value_weight * pairs.share @ pairs.value, value_weight)
 
 
-def _coefficients(parameters: Float[Array, "terms 6"], degree: int) -> Float[Array, "m"]:
+def _forms(xp, parameters: Float[Array, "n"]) -> tuple[Float[Array, "terms 3 3"], Float[Array, "terms 9"]]:
+    """Return the L_k and the flattened P_k = L_k L_k', given the lower triangles of the L_k."""
+    lower = (parameters.reshape(-1, 6) @ xp.asarray(LOWER_ENTRIES, parameters.dtype)).reshape(-1, 3, 3)
+    return lower, (lower @ xp.swapaxes(lower, 1, 2)).reshape(-1, 9)
+
+
+def _coefficients(xp, parameters: Float[Array, "n"], degree: int) -> Float[Array, "m"]:
     """Return the coefficients of H, given the lower triangles of its L_k."""
-    p = quadratic_forms(parameters)
-    if degree == 4:
-        return squared_quadratics(p)
-    a = p[0]
-    return jnp.stack([a[0, 0], a[1, 1], a[2, 2], 2 * a[0, 1], 2 * a[0, 2], 2 * a[1, 2]])
+    _, p = _forms(xp, parameters)
+    sums = xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, parameters.dtype)
+    return sums @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
+
+
+def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
+    """Minimize the loss over the factors of the terms, by BFGS.
+
+    The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
+    needs a factorization, and it slows down where the optimum lies on the border of convexity.
+    """
+    sums = xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, parameters.dtype)
+
+    def objective(parameters):
+        lower, p = _forms(xp, parameters)
+        a = sums @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
+        slope = loss.gradient(a) @ sums  # symmetric in the indices of each P_k
+        slope = 2 * p @ slope.reshape(9, 9) if degree == 4 else slope
+        by_factor = 2 * slope.reshape(-1, 3, 3) @ lower
+        return loss.value(a), (by_factor.reshape(-1, 9) @ xp.asarray(LOWER_ENTRIES.T, parameters.dtype)).ravel()
+
+    tolerance = 1e-7 if parameters.dtype == np.float64 else 1e-4
+    return minimize(xp, objective, parameters, tolerance, MAX_STEPS)
 
 
 def _symmetric(a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     """Return the matrix A of an ellipsoid, given the coefficients of its monomials."""
     xy, xz, yz = a[3] / 2, a[4] / 2, a[5] / 2
     return jnp.stack([jnp.stack([a[0], xy, xz]), jnp.stack([xy, a[1], yz]), jnp.stack([xz, yz, a[2]])])
-
-
-def _minimize(loss: _Quadratic, parameters: Array, degree: int) -> tuple[Array, Array, Array]:
-    """Minimize the loss over the factors of the terms, by BFGS.
-
-    The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
-    needs a factorization, and it slows down where the optimum lies on the border of convexity.
-
-    Returns:
-        The parameters, the number of steps, and whether the optimizer converged.
-    """
-
-    def objective(parameters, _):
-        return loss.value(_coefficients(parameters, degree))
-
-    import optimistix as optx  # here, because it takes half as long to import as JAX
-
-    tolerance = 1e-7 if parameters.dtype == jnp.float64 else 1e-4
-    solver = optx.BFGS(rtol=tolerance, atol=tolerance)
-    solution = optx.minimise(objective, solver, parameters, max_steps=MAX_STEPS, throw=False)
-    return solution.value, solution.stats["num_steps"], solution.result == optx.RESULTS.successful

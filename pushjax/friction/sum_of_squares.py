@@ -19,12 +19,35 @@ from pushjax.friction.quartic import MONOMIALS
 TERMS = 5
 MAX_STEPS = 100  # of the Levenberg-Marquardt method
 _LOWER_INDICES = np.tril_indices(3)
+LOWER_ENTRIES = np.eye(9)[np.flatnonzero(np.tril(np.ones((3, 3))))]  # (6, 9), from a lower triangle to a matrix
+
+
+def monomial_sums(monomials: np.ndarray) -> np.ndarray:
+    """Return the matrix that turns a flattened 3 x 3 x ... array into the coefficients of a form.
+
+    The entry (i, j, ...) of the array is a factor of F_i F_j .... For each monomial, its entries are summed.
+
+    Args:
+        monomials: Exponents of each monomial of degree d, (m, 3).
+
+    Returns:
+        The matrix, (m, 3^d).
+    """
+    degree = int(monomials[0].sum())
+    sums = np.zeros((len(monomials), 3**degree))
+    for flat, index in enumerate(np.ndindex(*(3,) * degree)):
+        exponent = np.bincount(index, minlength=3)
+        sums[int(np.argmax((monomials == exponent).all(axis=1))), flat] = 1
+    return sums
+
+
+MONOMIAL_SUMS = monomial_sums(MONOMIALS)
 
 
 def squared_quadratics(p: Float[Array, "terms 3 3"]) -> Float[Array, "15"]:
     """Return the coefficients of sum_k (F' P_k F)^2 in the order of `Quartic`, for symmetric P_k, `p[k]`."""
     products = jnp.einsum("kij,klm->ijlm", p, p)
-    return jnp.asarray(_MONOMIAL_SUMS, p.dtype) @ products.reshape(81)
+    return jnp.asarray(MONOMIAL_SUMS, p.dtype) @ products.reshape(81)
 
 
 def quadratic_forms(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
@@ -38,17 +61,20 @@ def unpack_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
     return jnp.zeros((lower.shape[0], 3, 3), lower.dtype).at[:, *_LOWER_INDICES].set(lower)
 
 
-def initial_factors(degree: int, terms: int, dtype: Any) -> Float[Array, "terms 6"]:
+def initial_factors(degree: int, terms: int, dtype: Any) -> np.ndarray:
     """Return the lower triangles of the L_k at which a search begins.
 
     Each P_k is a multiple of the identity, stretched along a direction of its own. Equal terms would stay equal
     throughout the search. A single term is not stretched.
+
+    Returns:
+        The lower triangles, row by row, (terms, 6).
     """
     directions = fibonacci_hemisphere(terms)
     stretch = 0.5 if terms > 1 else 0.0
     lower = np.linalg.cholesky(np.eye(3) + stretch * (3 * directions[:, :, None] * directions[:, None] - np.eye(3)))
     scale = terms ** (-1 / degree)
-    return jnp.asarray(scale * lower[:, *_LOWER_INDICES], dtype)
+    return (scale * lower[:, *_LOWER_INDICES]).astype(dtype)
 
 
 class SumOfSquares(NamedTuple):
@@ -81,7 +107,8 @@ def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> SumOfSqua
     """
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
     target = coefficients / scale
-    factors = without_derivatives(_search_factors, target, initial_factors(4, terms, coefficients.dtype))
+    start = jnp.asarray(initial_factors(4, terms, coefficients.dtype))
+    factors = without_derivatives(_search_factors, target, start)
     jacobian = jax.lax.stop_gradient(jax.jacobian(_coefficients)(factors).reshape(len(MONOMIALS), -1))
     change = target - jax.lax.stop_gradient(target)
     factors = factors + (jnp.linalg.pinv(jacobian) @ change).reshape(factors.shape)
@@ -104,18 +131,3 @@ def _search_factors(target: Float[Array, "15"], start: Float[Array, "terms 6"]) 
     target, first = target.astype(wide), start.astype(wide)
     found = optx.least_squares(lambda x, _: _coefficients(x) - target, solver, first, max_steps=MAX_STEPS, throw=False)
     return found.value.astype(start.dtype)
-
-
-def _monomial_sums() -> np.ndarray:
-    """Return the matrix (15, 81) that turns a flattened 3 x 3 x 3 x 3 array into the coefficients of a quartic.
-
-    The entry (i, j, l, m) of the array is a factor of F_i F_j F_l F_m. For each monomial, its entries are summed.
-    """
-    sums = np.zeros((len(MONOMIALS), 81))
-    for flat, index in enumerate(np.ndindex(3, 3, 3, 3)):
-        exponent = np.bincount(index, minlength=3)
-        sums[int(np.argmax((MONOMIALS == exponent).all(axis=1))), flat] = 1
-    return sums
-
-
-_MONOMIAL_SUMS = _monomial_sums()

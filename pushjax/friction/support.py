@@ -34,10 +34,14 @@ from pushjax._internal.checks import (
     on_device,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax.friction.coulomb import draw, draw_uniform, in_unit_disk, pairs_of, wrenches
+from pushjax.geometry.disk import Disk
+from pushjax.geometry.ellipse import Ellipse
+from pushjax.geometry.polygon import Polygon, signed_distances
 from pushjax.geometry.shape import Shape
 
-FACET_FRACTION = 0.1  # fraction of the wrench-twist pairs that lie on a facet
 SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
+AT_ONCE = 4096  # points whose distances are computed together, because points times edges may be many
 
 
 class WrenchTwistPairs(NamedTuple):
@@ -175,10 +179,11 @@ class Support(eqx.Module):
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
         grids = [_cells(low, high, spacing) for spacing in spacings]
         max_samples = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
+        tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())  # roundoff would decide
         best: tuple[np.ndarray, np.ndarray] | None = None
         for samples, middles in grids:
             padded = np.concatenate([samples, np.broadcast_to(low, (max_samples - len(samples), 2))])
-            inside = np.asarray(_inside(shape, on_device(padded.astype(dtype))))[: len(samples)]
+            inside = _inside(shape, padded.astype(dtype), tolerance)[: len(samples)]
             found = _covered_parts(samples, middles, inside)
             if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
                 best = found
@@ -240,19 +245,10 @@ class Support(eqx.Module):
         v = as_float(twist, self.point.dtype, "twist")
         check_shape("twist", v, (3,))
         check_finite("twist", v)
-        moved = jnp.any(v != 0)
-        v = v / jnp.where(moved, jnp.max(jnp.abs(v)), 1.0)  # so that squares neither underflow nor overflow
-        velocity = jnp.stack([v[0] - v[2] * self.point[:, 1], v[1] + v[2] * self.point[:, 0]], axis=1)
-        squared_speed = jnp.sum(velocity**2, axis=1)
-        # A point does not slide if its speed is within the roundoff of the products above.
-        speed_scale = jnp.abs(v[2]) * jnp.max(jnp.abs(self.point)) + jnp.max(jnp.abs(v[:2]))
-        is_pivot = squared_speed <= (8 * jnp.finfo(squared_speed.dtype).eps * speed_scale) ** 2
-        force = jnp.where(is_pivot[:, None], 0.0, velocity / jnp.sqrt(jnp.where(is_pivot, 1.0, squared_speed))[:, None])
+        in_disk = jnp.zeros_like(self.point)
         if key is not None:
-            force = jnp.where((is_pivot & moved)[:, None], _in_unit_disk(key, len(self.point), v.dtype), force)
-        f = self.limit[:, None] * force
-        torque = self.point[:, 0] * f[:, 1] - self.point[:, 1] * f[:, 0]
-        return jnp.append(jnp.sum(f, axis=0), jnp.sum(torque))
+            in_disk = in_unit_disk(jnp, draw_uniform(key, len(self.point), v.dtype))
+        return wrenches(jnp, self.point, self.limit, v[None], in_disk[None])[0]
 
     def wrench_twist_pairs(
         self, key: Key[Array, ""], pairs: int = 400, length: ArrayLike | None = None
@@ -284,7 +280,9 @@ class Support(eqx.Module):
         check_shape("length", characteristic_length, ())
         check_finite("length", characteristic_length)
         check_positive("length", characteristic_length)
-        return _pairs(self, key, pairs, characteristic_length)
+        draws = draw(key, self.point, self.limit, pairs)
+        wrench, twist = pairs_of(self.point, self.limit, characteristic_length, *draws)
+        return WrenchTwistPairs(wrench, twist, characteristic_length)
 
 
 def _distribute(xp, total, weights):
@@ -308,27 +306,6 @@ def _characteristic_length(xp, point, limit):
     gyration = _radius_of_gyration(xp, point, limit)
     rounding = 16 * xp.finfo(gyration.dtype).eps * xp.max(xp.abs(point))
     return xp.where(gyration > rounding, gyration, 1.0)
-
-
-@quick_jit
-def _pairs(support: Support, key: Key[Array, ""], pairs: int, length: Float[Array, ""]) -> WrenchTwistPairs:
-    """Draw the pairs of `Support.wrench_twist_pairs`."""
-    dtype = support.point.dtype
-    k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
-    free = jax.random.normal(k_free, (pairs, 3), dtype)
-    pivot_point = jax.random.choice(k_point, support.point, (pairs,), p=support.limit / support.load)
-    # A rotation about r moves the origin with (r_y, -r_x) omega.
-    rotation_sign = jnp.where(jax.random.bernoulli(k_side, 0.5, (pairs,)), 1.0, -1.0).astype(dtype)
-    pivot_twist = rotation_sign[:, None] * jnp.stack(
-        [pivot_point[:, 1], -pivot_point[:, 0], jnp.broadcast_to(length, (pairs,))], axis=1
-    )
-    facet_pairs = round(FACET_FRACTION * pairs)
-    on_facet = jax.random.permutation(k_order, jnp.arange(pairs) < facet_pairs)
-    normalized = jnp.where(on_facet[:, None], pivot_twist, free)
-    normalized = normalized / jnp.linalg.norm(normalized, axis=1, keepdims=True)
-    twist = normalized / jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])[None]
-    wrench = jax.vmap(support.wrench)(twist, jax.random.split(k_facet, pairs))
-    return WrenchTwistPairs(wrench, twist, length)
 
 
 def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
@@ -359,22 +336,26 @@ def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray)
     return mean[fraction > 0], fraction[fraction > 0]
 
 
+def _inside(shape: Shape, points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return 1 for a point inside, 0 outside, and one half where the outline is within the tolerance, m.
+
+    With NumPy, where this is simple. Distances have to be exact near the outline only.
+    """
+    if isinstance(shape, Polygon):
+        vertices, parts = np.asarray(shape.vertices, np.float64), range(0, len(points), AT_ONCE)
+        distance = np.concatenate([signed_distances(vertices, points[k : k + AT_ONCE]) for k in parts])
+    elif isinstance(shape, Disk):
+        distance = np.linalg.norm(points - np.asarray(shape.center), axis=1) - np.asarray(shape.radius)
+    elif isinstance(shape, Ellipse):
+        semi = np.asarray([shape.semi_x, shape.semi_y])
+        scaled = (points - np.asarray(shape.center)) / semi
+        slope = np.maximum(np.linalg.norm(2 * scaled / semi, axis=1), 1e-30)  # zero at the center
+        distance = (np.sum(scaled**2, axis=1) - 1) / slope
+    else:
+        distance = np.asarray(_signed_distances(shape, on_device(points)))
+    return np.where(distance < -tolerance, 1.0, np.where(distance <= tolerance, 0.5, 0.0))
+
+
 @quick_jit
-def _inside(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
-    """Return 1 for a point inside, 0 outside, and one half on the outline, where roundoff would decide."""
-    low, high = shape.bounds
-    tolerance = 64 * jnp.finfo(points.dtype).eps * jnp.max(jnp.maximum(jnp.abs(low), jnp.abs(high)))
-
-    def inside_fraction(point):
-        distance = shape.signed_distance(point)
-        return jnp.where(distance < -tolerance, 1.0, jnp.where(distance <= tolerance, 0.5, 0.0))
-
-    return jax.lax.map(inside_fraction, points, batch_size=4096)  # in parts, because points times edges may be many
-
-
-def _in_unit_disk(key: Key[Array, ""], count: int, dtype) -> Float[Array, "{count} 2"]:
-    """Return `count` points drawn uniformly from the unit disk."""
-    k_r, k_angle = jax.random.split(key)
-    radius = jnp.sqrt(jax.random.uniform(k_r, (count, 1), dtype))
-    angle = jax.random.uniform(k_angle, (count, 1), dtype, maxval=2 * jnp.pi)
-    return radius * jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=1)
+def _signed_distances(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, "points"]:
+    return jax.lax.map(shape.signed_distance, points, batch_size=AT_ONCE)

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete, in_numpy
+from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Vec2
 from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, signed_area
@@ -67,9 +68,9 @@ class Curve(Shape):
             ValueError: As for `Curve`.
         """
         array = _check_points("points", points, least=4)
-        identity = jnp.eye(len(array), dtype=array.dtype)
-        knot_weights = (4 * identity + jnp.roll(identity, 1, axis=0) + jnp.roll(identity, -1, axis=0)) / 6
-        return Curve(jnp.linalg.solve(knot_weights, array), convex=convex)
+        identity = np.eye(len(array))
+        knot_weights = (4 * identity + np.roll(identity, 1, axis=0) + np.roll(identity, -1, axis=0)) / 6
+        return Curve(_solve(jnp.asarray(knot_weights, array.dtype), array), convex=convex)
 
     @staticmethod
     def fit(points: ArrayLike, controls: int = 24, *, convex: bool | None = None) -> "Curve":
@@ -99,11 +100,13 @@ class Curve(Shape):
         return Curve(jnp.asarray(_fit_control_points(known.astype(np.float64), controls), array.dtype), convex=convex)
 
     @property
+    @quick_jit
     def area(self) -> Float[Array, ""]:
         x, y, dx, dy, weight = self._quadrature()
         return jnp.sum(weight * (x * dy - y * dx)) / 2
 
     @property
+    @quick_jit
     def centroid(self) -> Float[Array, "2"]:
         x, y, dx, dy, weight = self._quadrature()
         moment = jnp.stack([jnp.sum(weight * x * x * dy), -jnp.sum(weight * y * y * dx)]) / 2
@@ -124,12 +127,14 @@ class Curve(Shape):
         return *point, *velocity, weights
 
     @property
+    @quick_jit
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         segments = spline_segments(self.control)
         low, high = zip(*(_coordinate_range(*fields) for fields in zip(*segments[:4], strict=True)), strict=True)
         return jnp.stack(low), jnp.stack(high)
 
     @property
+    @quick_jit
     def perimeter(self) -> Float[Array, ""]:
         """Length of the curve, m."""
         nodes, weights = (part / 2 for part in np.polynomial.legendre.leggauss(5))
@@ -254,6 +259,11 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
         near = int(np.argmin(curvature)) // 32
         raise ValueError(f"convex is True, but the curve is not: it turns inward near control point {near}")
     return convex if claimed is None else bool(claimed)
+
+
+@in_numpy
+def _solve(xp, matrix, right):
+    return xp.linalg.solve(matrix, right)
 
 
 def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:

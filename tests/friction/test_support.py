@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pushjax import Disk, Polygon, Support
+from pushjax import Disk, Ellipse, Polygon, Support
+from pushjax.friction.support import _inside
 
 ROUNDINGS = 200  # sums over some hundred points
 DTYPES = [np.float32, np.float64]
@@ -306,3 +307,23 @@ def test_facet_pairs_come_in_random_order():
     on_facet = apart < 1e-9
     assert on_facet.sum() == 40
     assert 5 < on_facet[:200].sum() < 35
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Disk(0.05, (0.01, 0.02)),
+        Ellipse(0.06, 0.03, (0.01, 0.0)),
+        Polygon([[0.0, 0.0], [0.09, 0.0], [0.09, 0.03], [0.03, 0.03], [0.03, 0.09], [0.0, 0.09]]),
+    ],
+    ids=["disk", "ellipse", "L"],
+)
+def test_what_is_inside_agrees_with_the_distance(shape):
+    """Points are classified with NumPy as by the signed distance that contacts use, on the outline too."""
+    outline = np.asarray(shape.boundary(40))
+    points = np.concatenate([np.random.default_rng(0).uniform(-0.08, 0.1, (500, 2)), outline, [shape.centroid]])
+    distance = np.asarray(jax.jit(jax.vmap(shape.signed_distance))(points))
+    seen = _inside(shape, points, 1e-9)
+    np.testing.assert_array_equal(seen, np.where(distance < -1e-9, 1, np.where(distance <= 1e-9, 0.5, 0)))
+    assert (seen[500:540] == 0.5).all()
+    assert 0 < (seen == 1).sum() < 500
