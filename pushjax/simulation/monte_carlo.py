@@ -45,7 +45,7 @@ MANY_REPAIRS = 1 / 3  # share of repaired surfaces from which their distribution
 
 
 def monte_carlo(
-    key: PRNGKeyArray,
+    key: "PRNGKeyArray",  # as text, so that help shows this name and not the types behind it
     n: int,
     slider: Slider,
     hand: Hand,

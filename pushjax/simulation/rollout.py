@@ -125,10 +125,6 @@ def rollout(
     The result is differentiable, in forward and reverse mode, in slider, hand, path, pose, friction and table. Use
     `vmap` for batches.
 
-    A hand that turns while it holds the slider needs kinematics that give the angles of the fingers. If they give only
-    centers, every finger moves in a straight line in each step, along the chord of its arc. Two fingers that hold
-    something between them then close on it by the sagitta of the arc.
-
     Args:
         slider: The slider.
         hand: The hand.
@@ -136,10 +132,8 @@ def rollout(
             the steps sets the accuracy.
         pose: Pose of the slider at the start, (3,), world, m and rad.
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
-        solver: Solver of contact problems. The default first solves the contact that is pressed most, as if there were
-            no other. If another contact does not separate in that solution, several contacts are solved together
-            (`pushjax.contact.single_first`). If several motions satisfy all contacts, `Exhaustive()` gives the one of
-            largest power, which the default need not do.
+        solver: Solver of contact problems. The default suits every hand. Where several motions satisfy all contacts,
+            `Exhaustive()` gives the one of largest power, which the default need not do.
         table: A table whose friction depends on direction or place; None for uniform friction.
         fixtures: Walls (`Wall`) and convex bodies (`Fixture`) that stay where they are, and that the slider may touch.
             Their contacts come after those of the fingers.
