@@ -35,6 +35,7 @@ from pushjax._internal.checks import (
     check_shape,
     common_dtype,
     concrete,
+    in_numpy,
     normalized_weights,
     on_device,
     traced,
@@ -279,7 +280,7 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
     def solve_round(state):
         parameters, unclipped, steps, _, rounds = state
         found = _minimize(xp, _loss(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
-        unclipped_after = (pairs.along @ _coefficients(xp, found.x, degree) > 0) | ~has_weight
+        unclipped_after = (pairs.along @ _coefficients(xp, _forms(xp, found.x)[1], degree) > 0) | ~has_weight
         settled = found.converged & xp.all(unclipped_after == unclipped)
         return found.x, unclipped_after, steps + found.steps, settled, rounds + 1
 
@@ -287,7 +288,7 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
     start = xp.asarray(initial_factors(degree, terms, dtype).ravel())
     initial_state = (start, xp.ones(len(f), bool), zero, xp.zeros((), bool), zero)
     parameters, unclipped, steps, converged, _ = while_loop(xp, is_unfinished, solve_round, initial_state)
-    a = _coefficients(xp, parameters, degree)
+    a = _coefficients(xp, _forms(xp, parameters)[1], degree)
     gradient, given = Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist)
     across = gradient.cross(given)
     report = FitReport(
@@ -351,11 +352,14 @@ def _forms(xp, parameters: Float[Array, "n"]) -> tuple[Float[Array, "terms 3 3"]
     return lower, (lower @ xp.swapaxes(lower, 1, 2)).reshape(-1, 9)
 
 
-def _coefficients(xp, parameters: Float[Array, "n"], degree: int) -> Float[Array, "m"]:
-    """Return the coefficients of H, given the lower triangles of its L_k."""
-    _, p = _forms(xp, parameters)
-    sums = xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, parameters.dtype)
-    return sums @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
+def _sums(xp, degree: int, dtype: Any) -> Float[Array, "m entries"]:
+    """Return the matrix from the sum of all P_k x P_k (degree 4), or from P_0 (degree 2), to the coefficients of H."""
+    return xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, dtype)
+
+
+def _coefficients(xp, p: Float[Array, "terms 9"], degree: int) -> Float[Array, "m"]:
+    """Return the coefficients of H, given the flattened P_k."""
+    return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
 
 
 def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
@@ -364,12 +368,11 @@ def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
     The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
     needs a factorization, and it slows down where the optimum lies on the border of convexity.
     """
-    sums = xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, parameters.dtype)
 
     def objective(parameters):
         lower, p = _forms(xp, parameters)
-        a = sums @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
-        slope = loss.gradient(a) @ sums  # symmetric in the indices of each P_k
+        a = _coefficients(xp, p, degree)
+        slope = loss.gradient(a) @ _sums(xp, degree, p.dtype)  # symmetric in the indices of each P_k
         slope = 2 * p @ slope.reshape(9, 9) if degree == 4 else slope
         by_factor = 2 * slope.reshape(-1, 3, 3) @ lower
         return loss.value(a), (by_factor.reshape(-1, 9) @ xp.asarray(LOWER_ENTRIES.T, parameters.dtype)).ravel()
@@ -378,7 +381,8 @@ def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
     return minimize(xp, objective, parameters, tolerance, MAX_STEPS)
 
 
-def _symmetric(a: Float[Array, "6"]) -> Float[Array, "3 3"]:
+@in_numpy
+def _symmetric(xp, a: Float[Array, "6"]) -> Float[Array, "3 3"]:
     """Return the matrix A of an ellipsoid, given the coefficients of its monomials."""
     xy, xz, yz = a[3] / 2, a[4] / 2, a[5] / 2
-    return jnp.stack([jnp.stack([a[0], xy, xz]), jnp.stack([xy, a[1], yz]), jnp.stack([xz, yz, a[2]])])
+    return xp.stack([xp.stack([a[0], xy, xz]), xp.stack([xy, a[1], yz]), xp.stack([xz, yz, a[2]])])
