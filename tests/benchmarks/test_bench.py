@@ -383,6 +383,7 @@ def test_only_new_shapes_are_compiled():
     assert compiled_by(lambda: many(320), lambda: many(1000)) == 0
 
 
+@pytest.mark.long
 def test_contacts(monkeypatch):
     """Judge two thousand problems of two contacts by the independent solver."""
     monkeypatch.setattr(contacts, "MODELS", {"quartic": 4})

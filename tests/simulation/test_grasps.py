@@ -199,11 +199,12 @@ def test_what_is_held_turns_with_the_hand_and_no_step_turns_it_too_far():
     opposite = turning + np.pi * angle
     jumping = np.where(np.arange(4) == 2, (opposite + np.pi) % (2 * np.pi) - np.pi, opposite)
     closing = np.array(pj.line((0, 0, 0, 0.06), (0, 0, 0, 0.03), 50))
-    paths = jnp.array([turning, opposite, jumping, closing])
     starts = jnp.array([[0, 0, -half], [0, 0, np.pi - half], [0, 0, np.pi - half], [1e-3, 0, 0.1]])
-    push = jax.jit(jax.vmap(lambda p, s, mu: pj.rollout(block, hand, p, pose=s, friction=mu)))
-    run = push(paths, starts, jnp.array([0.3, 0.3, 0.3, 0.0]))
-    status, pose = np.asarray(run.status), np.asarray(run.pose)
+    runs = [
+        pj.rollout(block, hand, path, pose=start, friction=mu)
+        for path, start, mu in zip((turning, opposite, jumping, closing), starts, (0.3, 0.3, 0.3, 0.0), strict=True)
+    ]
+    status, pose = np.stack([run.status for run in runs]), np.stack([run.pose for run in runs])
     assert np.all(status[:3] == pj.Status.MOVING)
     turned = pose[:, -1, 2] - pose[:, 0, 2]
     # once the clearance, as an angle about a corner contact, is used up, the block rotates as far as the hand

@@ -104,6 +104,8 @@ def test_depth_is_shapelys(rng):
 # --- the causes ---
 
 L = np.array([(0, 0), (120, 0), (120, 40), (40, 40), (40, 80), (0, 80)]) * 1e-3 - np.array([0.05, 0.03])
+# two more vertices in the middle of edges: as many as the U has, so that they share programs
+L8 = np.insert(L, [1, 6], [(L[0] + L[1]) / 2, (L[5] + L[0]) / 2], axis=0)
 JAW = pj.Hand.parallel_jaw(width=0.05, thickness=0.01)
 
 
@@ -130,7 +132,11 @@ def test_an_inner_corner_touches_no_pad():
     assert float(jnp.max(jnp.abs(jnp.diff(push.pose[:, 2])))) < 0.1
 
 
-PAD = pj.Hand((pj.Polygon.rectangle(0.03, 0.02),), lambda q: q[None], 3)
+def in_place(q):
+    return q[None]
+
+
+PAD, LONG_PAD = (pj.Hand((pj.Polygon.rectangle(*sides),), in_place, 3) for sides in ((0.03, 0.02), (0.05, 0.01)))
 
 
 @pytest.mark.parametrize("short", [0.0, 1e-9, -1e-9])
@@ -139,7 +145,7 @@ def test_a_pad_in_an_inner_corner_touches_both_edges(way, short):
     """A pad flat on both edges touches in four places, of which three bind: the slider follows without rotation."""
     corner = L[3] + np.array([0.015, 0.01]) + short
     path = pj.line((*corner, 0.0), (*(corner + 0.03 * np.array(way)), 0.0), 30)
-    push = pj.rollout(pj.Slider(pj.Polygon(L), surface()), PAD, path, pose=(0, 0, 0), friction=0.3)
+    push = pj.rollout(pj.Slider(pj.Polygon(L8), surface()), PAD, path, pose=(0, 0, 0), friction=0.3)
     assert set(np.asarray(push.status).tolist()) == {pj.Status.MOVING}
     np.testing.assert_allclose(push.pose[-1], [*(0.03 * np.array(way)), 0], atol=1e-7)
     assert push.force.shape == (30, 3, 2)
@@ -151,8 +157,7 @@ def test_a_pad_across_two_arms_rests_on_its_outermost_places(aside):
     slider = pj.Slider(survey.shape_of("U"), surface())
     top = float(np.max(slider.shape.vertices[:, 1]))
     path = pj.line((aside, top + 0.005, 0.0), (aside, top - 0.025, 0.0), 30)
-    across = pj.Hand((pj.Polygon.rectangle(0.05, 0.01),), lambda q: q[None], 3)
-    push = pj.rollout(slider, across, path, pose=(0, 0, 0), friction=0.3)
+    push = pj.rollout(slider, LONG_PAD, path, pose=(0, 0, 0), friction=0.3)
     np.testing.assert_allclose(push.pose[-1], [0, -0.03, 0], atol=1e-12)
 
 
@@ -241,7 +246,7 @@ def turned(x) -> pj.Trajectory:
 
 def whole_step(push: pj.Trajectory, path, friction: float) -> pj.Trajectory:
     """Divide the last step into many small ones, to find where it should end."""
-    fine = pj.line(path[-2], path[-1], 256)
+    fine = pj.line(path[-2], path[-1], 128)
     return pj.rollout(SLIDER, TWO, fine, pose=push.pose[-2], friction=friction)
 
 
@@ -271,8 +276,14 @@ def test_pushes_of_a_batch_divide_their_own_steps():
         for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(turned(jnp.asarray(row))), strict=True):
             np.testing.assert_allclose(one, other, atol=1e-9)
     assert pj.Status.GRASPED in np.asarray(together.status[2])
-    nested = jax.jit(jax.vmap(jax.vmap(turned)))(jnp.asarray(rows.reshape(2, 2, -1)))
-    np.testing.assert_allclose(nested.pose.reshape(together.pose.shape), together.pose, atol=1e-9)
+
+
+@pytest.mark.long
+def test_pushes_of_nested_batches():
+    rows = jnp.array([[0.2, *START, CLOSED], [0.2, *START, 0.1], [0.5, 0, 0, 0, 0.06], [0.3, 0.5, 0, 0, 0.0772]])
+    nested = jax.jit(jax.vmap(jax.vmap(turned)))(rows.reshape(2, 2, -1))
+    for k, row in enumerate(rows):
+        np.testing.assert_allclose(nested.pose.reshape(4, 5, 3)[k], turned(row).pose, atol=1e-9)
 
 
 @pytest.mark.long
