@@ -1,5 +1,6 @@
 """A first push: fit an ellipsoid and a quartic to a square, push it with both, and draw the results."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +13,23 @@ from pushjax._internal.record import result_record
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
 START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100
+MOTION_CONE = "motion_cone.png"
 
 
-def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
+def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lambda words: None) -> dict[str, Any]:
     """Fit both surfaces to 64 support points under the square, and push it off center over 50 mm with each.
 
     Args:
         seed: Seed of the wrench-twist pairs.
         out: Folder for the pictures. None: no pictures.
+        say: Called with a description of what is done next.
 
     Returns:
         The record. It has one row per surface: the angle error of the fit (degrees), whether the fit converged, the
         final pose (m, rad), the number of steps in each contact mode, and the first failed step or -1. `apart_mm` is
         the deviation between the two final poses.
     """
+    say("demo: 64 support points under a square, and the wrenches and twists of its friction")
     key = jax.random.key(seed)
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=64)
@@ -34,6 +38,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
 
     rows, surfaces, pushes = [], {}, {}
     for degree, name in ((2, "ellipsoid"), (4, "quartic")):
+        say(f"demo: fitting the {name}, then pushing with it (the first time this compiles)")
         surface, fit = pj.fit_limit_surface(*pairs, degree=degree, report=True)
         push = pj.rollout(pj.Slider(block, surface), hand, path, pose=start, friction=FRICTION)
         surfaces[name], pushes[name] = surface, (push, path)
@@ -48,6 +53,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
             }
         )
     apart = pj.deviation(pushes["ellipsoid"][0].pose[-1], pushes["quartic"][0].pose[-1], pairs.length)
+    say("demo: drawing")
     pictures = [] if out is None else _draw(out, key, block, support, pairs, surfaces, pushes)
     settings = {"seed": seed, "side_m": SIDE, "radius_m": RADIUS, "friction": FRICTION, "steps": STEPS, "pairs": 400}
     return result_record("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
@@ -88,7 +94,7 @@ def _draw(out: Path, key, block, support, pairs, surfaces, pushes) -> list[str]:
 
     drawn = {
         "limit_surfaces.png": plot.limit_surfaces(surfaces, pairs, float(support.load)),
-        "motion_cone.png": plot.motion_cone_figure(*motion_cone_setup(key)),
+        MOTION_CONE: plot.motion_cone_figure(*motion_cone_setup(key)),
         "push.png": plot.push_figure(block, pushes, RADIUS),
     }
     return [str(plot.save(figure, out / name)) for name, figure in drawn.items()]
@@ -105,5 +111,6 @@ def summary(record: dict[str, Any]) -> str:
             f"y = {1e3 * y:.2f} mm, theta = {np.degrees(theta):.2f} deg   steps: {modes}"
         )
     lines.append(f"  the two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration)")
-    lines += [f"  drew {path}" for path in record["pictures"]]
+    note = " (the paper's figure 2, with 100 support points)"
+    lines += [f"  drew {path}{note if Path(path).name == MOTION_CONE else ''}" for path in record["pictures"]]
     return "\n".join(lines)

@@ -72,7 +72,7 @@ def _residuals(findings: Findings, out: Path) -> Path:
         share = 100 * np.arange(1, len(order) + 1) / len(order)
         axes[2].step(order, share, dash, color=color, where="post", label=label)
     axes[2].set(xscale="log", ylim=(0, 100), xlabel="deviation of the final pose / mm", ylabel="pushes below / %")
-    axes[2].legend(loc="upper left")
+    axes[2].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)  # above the panel, off the curves
     return plot.save(figure, out / "identify_residuals.png")
 
 

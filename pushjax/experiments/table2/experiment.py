@@ -12,7 +12,8 @@ Second, one set of pairs serves all splits. Third, a surface is fitted to the fo
 percent: with the data at hand, half is the first share that has as many pairs as a quartic has coefficients.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ from pushjax.experiments.table2.conditions import (
     recorded,
     training,
 )
-from pushjax.experiments.table2.methods import FRICTIONS, Predicted, Setup
+from pushjax.experiments.table2.methods import FRICTIONS, Part, Predicted, Setup
 
 Condition = tuple[str, str]  # surface and object
 COLUMN = 20  # width of a column of the printed table
@@ -57,6 +58,7 @@ def run(
     steps: int = 100,
     method: Sequence[str] = tuple(methods.TRAIN_SHARE),
     progress: ProgressCallback = no_progress,
+    say: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Any]:
     """Compute sixteen cells for each method: every condition with both models.
 
@@ -70,6 +72,7 @@ def run(
         steps: Steps of each push.
         method: One or more of "ideal", "wrench_twist" and "identified".
         progress: Called with the number of parts done and their total.
+        say: Called with a description of what is done next.
 
     Returns:
         The record, with the cells, and the means by method and model.
@@ -82,17 +85,21 @@ def run(
     unknown = [name for name in method if name not in methods.TRAIN_SHARE]
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(methods.TRAIN_SHARE)}; got {unknown or 'none'}")
+    say("table2: reading the logs")
     logs, where = load_all(folder / "three_point_push"), GEOMETRIES[geometry]
     pushes = {condition: recorded(log, where, steps) for condition, log in logs.items()}
     done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(logs) for name in method)
 
-    def step() -> None:
+    @contextmanager
+    def part(words: str) -> Iterator[None]:
         nonlocal done
+        say(f"table2: {words} (the first one compiles)" if done == 0 else f"table2: {words}")
+        yield
         done += 1
         progress(done, total)
 
     cells = [
-        cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, where, seed, step)
+        cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, where, seed, part)
     ]
     means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
@@ -108,9 +115,9 @@ def _cells(
     pushes: dict[Condition, pj.Pushes],
     where: Geometry,
     seed: int,
-    step_done: Callable[[], None],
+    part: Part,
 ) -> list[dict[str, Any]]:
-    """Compute the cells of one method and model, and call `step_done` after each part."""
+    """Compute the cells of one method and model, each part of the work within `part`."""
     # each condition has its own keys and generators, so that a cell does not depend on which others there are
     seeds = {condition: seed + k for k, condition in enumerate(CONDITIONS)}
     rngs = {condition: np.random.default_rng(own) for condition, own in seeds.items()}
@@ -121,7 +128,7 @@ def _cells(
         Setup(logs[each], pushes[each], ideal_surface(logs[each], model, jax.random.key(seeds[each])), train[each])
         for each in computed
     ]
-    predicted = dict(zip(computed, _predict(method, model, setups, where, step_done), strict=True))
+    predicted = dict(zip(computed, _predict(method, model, setups, where, part), strict=True))
     cells = []
     for surface, target in CONDITIONS:
         condition = surface, target
@@ -136,17 +143,16 @@ def _cells(
     return cells
 
 
-def _predict(
-    method: str, model: str, setups: list[Setup], where: Geometry, step_done: Callable[[], None]
-) -> list[Predicted]:
-    """Predict conditions with one method, and call `step_done` after each part."""
+def _predict(method: str, model: str, setups: list[Setup], where: Geometry, part: Part) -> list[Predicted]:
+    """Predict conditions with one method, each part of the work within `part`."""
+    words = f"{method.replace('_', '-')}, {model}"
     if method == "identified":
-        return methods.identified(setups, where, step_done) if setups else []
+        return methods.identified(setups, where, lambda split: part(f"{words}, {split}")) if setups else []
     predictions = []
     for setup in setups:
-        ideal = method == "ideal"
-        predictions.append(methods.ideal(setup, where) if ideal else methods.wrench_twist(setup, model, where))
-        step_done()
+        with part(f"{words}, {setup.log.surface} {setup.log.arrangement}"):
+            ideal = method == "ideal"
+            predictions.append(methods.ideal(setup, where) if ideal else methods.wrench_twist(setup, model, where))
     return predictions
 
 

@@ -11,6 +11,7 @@ identified    Friction, surface, and how far the hand really went, identified fr
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ from pushjax.experiments.table2.conditions import MODELS, Geometry, outline, rec
 FRICTIONS = np.linspace(0.0, 0.8, 41)
 # Share of the pushes to learn from. A quartic has fifteen coefficients, and a push gives one pair.
 TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
+Part = Callable[[str], AbstractContextManager[None]]  # from a description of the work to the context of doing it
 IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same answer with more
 # Priors: the supports are known to about a millimeter, the robot's setup less well.
 SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
@@ -90,7 +92,7 @@ def wrench_twist(setup: Setup, model: str, geometry: Geometry) -> Predicted:
     return _choose_friction(np.stack(errors), setup.train, np.asarray(failed))
 
 
-def identified(setups: Sequence[Setup], geometry: Geometry, done: Callable[[], None]) -> list[Predicted]:
+def identified(setups: Sequence[Setup], geometry: Geometry, part: Part) -> list[Predicted]:
     """Predict conditions with what is identified from the final poses of all of them at once.
 
     The conditions share the robot, whose geometry is not taken as given. The surface of each condition is the mean of
@@ -99,7 +101,7 @@ def identified(setups: Sequence[Setup], geometry: Geometry, done: Callable[[], N
     Args:
         setups: The conditions.
         geometry: Where the finger is assumed to have been, as the mean of the prior.
-        done: Called after each split.
+        part: Context in which each split is computed.
 
     Returns:
         One prediction per condition.
@@ -118,12 +120,13 @@ def identified(setups: Sequence[Setup], geometry: Geometry, done: Callable[[], N
         weight = np.zeros(pushes.weight.shape)
         for condition, (setup, count) in enumerate(zip(setups, counts, strict=True)):
             weight[condition, :count] = setup.train[split]
-        found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
-        predicted = found.predict(fine, slider, hand)
-        errors.append(1e3 * np.asarray(pj.deviation(predicted.pose[..., -1, :], fine.end, length), np.float64))
-        failed += np.asarray(predicted.failed).sum(axis=(1, 2))
-        friction.append(np.asarray(found.friction))
-        done()
+        with part(f"split {split + 1} of {len(first.train)}"):
+            found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
+            predicted = found.predict(fine, slider, hand)
+            off = pj.deviation(predicted.pose[..., -1, :], fine.end, length)
+            errors.append(1e3 * np.asarray(off, np.float64))
+            failed += np.asarray(predicted.failed).sum(axis=(1, 2))
+            friction.append(np.asarray(found.friction))
     return [
         Predicted(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
         for k, count in enumerate(counts)
