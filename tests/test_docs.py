@@ -25,7 +25,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SITE = sorted(path for path in DOCS.rglob("*.md"))
-LONG_PAGES = ("docs/concepts/pushing.md", "docs/tasks.md")  # compile for half a minute to a minute
+# pages that compile for half a minute to a minute
+LONG_PAGES = ("docs/concepts/pushing.md", "docs/concepts/random-friction.md", "docs/tasks.md")
 PAGES = [*SITE, ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CHANGELOG.md"]
 BLOCK = re.compile(r"^(<!-- not run: [^>]+ -->\n)?```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)

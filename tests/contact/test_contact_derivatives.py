@@ -76,7 +76,7 @@ pace = jax.jit(jax.vmap(lambda given: jax.jvp(lambda t: moved(given, t), (0.0,),
 
 
 @pytest.mark.parametrize("count", [2, 3])
-@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.long), 4])
 def test_derivatives_are_those_of_the_solution(count, degree):
     surface, contacts = first(problems(count, degree, seed=11, slots=SLOTS, condition=30.0, gaps=0.3), FEW)
     given, active = Given.of(contacts), contacts.active

@@ -160,12 +160,16 @@ ANGLES = np.linspace(0.1, 6.2, 40)
 
 
 def frictionless(leaning: float, count: int, angle: float) -> pj.Contacts:
-    """Return two opposite fingers, or three around a disk of 30 mm, that close; the normal of the first is tilted."""
-    around = angle + 2 * np.pi / count * np.arange(count)
+    """Return two opposite fingers, or three around a disk of 30 mm, that close; the normal of the first is tilted.
+
+    The third of two is inactive, so that both cases share a program.
+    """
+    around = angle + 2 * np.pi / count * np.arange(3)
     point = 0.03 * np.stack([np.cos(around), np.sin(around)], axis=1)
-    lean = around + np.where(np.arange(count) == 0, leaning, 0.0)
+    lean = around + np.where(np.arange(3) == 0, leaning, 0.0)
     normal = -np.stack([np.cos(lean), np.sin(lean)], axis=1)
-    return pj.Contacts(jnp.asarray(point), jnp.asarray(normal), jnp.asarray(1e-3 * normal), 0.0)
+    active = np.arange(3) < count
+    return pj.Contacts(jnp.asarray(point), jnp.asarray(normal), jnp.asarray(1e-3 * normal), 0.0, active=active)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])

@@ -442,6 +442,7 @@ def test_derivatives_match_central_differences(smooth):
     assert np.abs(by_friction[~sticks]).max(axis=1).min() > 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("smooth", [4], indirect=True, ids=["quartic"])
 def test_second_derivatives_while_sticking(smooth):
     """The implicit derivative is itself differentiable: compare `jax.hessian` with differences of the gradient."""

@@ -422,7 +422,7 @@ def test_a_disc_that_starts_touching_does_not_pass(shape, dtype):
     assert np.isinf(sweep(single, start, 0 * normal, dtype(0.00475))).all()
 
 
-@pytest.mark.parametrize("name", ["ellipse", "waisted"])
+@pytest.mark.parametrize("name", ["ellipse", pytest.param("waisted", marks=pytest.mark.long)])
 def test_derivatives_of_the_sweep(name):
     shape, rng = SHAPES[name], np.random.default_rng(10)
     angle = rng.uniform(0, 2 * np.pi, 60)

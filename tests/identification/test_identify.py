@@ -151,6 +151,7 @@ def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     assert abs(share - 0.99) < 4 * np.sqrt(0.99 * 0.01 / 2000)
 
 
+@pytest.mark.long
 def test_float32_where_float64_is_enabled(square, expected, hand):
     """Float32 converges on noisy pushes whose minimum is at a change of mode, or where roundoff hides the descent."""
     slider, single = pj.Slider(square, expected), lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)

@@ -159,6 +159,7 @@ def test_float32_table():
     np.testing.assert_allclose(low.pose, high.pose, atol=2e-6)
 
 
+@pytest.mark.long
 def test_found_again(square, expected, hand):  # noqa: F811
     """An uneven table, the offset of the frame, drift and sides are recovered from pushes simulated with them."""
     rng = np.random.default_rng(5)

@@ -143,7 +143,7 @@ HAND_DIFFERENCE = 1e-5  # for differences over H, where steps rotate the slider 
 @pytest.mark.parametrize(
     ("hand", "opening"),
     [
-        (pj.Hand.two_fingers(0.005), (0.06, 0.04)),
+        pytest.param(pj.Hand.two_fingers(0.005), (0.06, 0.04), marks=pytest.mark.long),
         pytest.param(pj.Hand.three_fingers(0.003), (0.05, 0.015), marks=pytest.mark.long),
         pytest.param(pj.Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03), marks=pytest.mark.long),
     ],

@@ -164,6 +164,7 @@ def many_pushes():
     )
 
 
+@pytest.mark.long
 def test_monte_carlo_takes_fixtures():
     corners = np.asarray(slider.shape.vertices)
     for x, y, angle in np.asarray(many_pushes().pose):
