@@ -1,4 +1,4 @@
-"""How a command's help shows its options."""
+"""Options of the command line. Importing this module does not import JAX."""
 
 from typing import Any
 
@@ -6,7 +6,9 @@ import tyro
 
 
 def cli_option(metavar: str) -> Any:
-    """Return the tyro settings of an option whose help text states the default in words, so that tyro does not add it.
+    """Return the tyro settings of an option whose help text states the default itself.
+
+    tyro then does not add the default to the help text.
 
     Args:
         metavar: Placeholder that the help shows for the option's value.

@@ -1,7 +1,7 @@
 """Read pushes of the aluminum triangle with two fingers from curated arrays.
 
 The origin of the hand's frame is midway between the fingers, which are at (0, +-spacing / 2). Its x axis is the
-direction in which the hand first approaches. World frame, body frame and triangle are those of `pushes`. The hand's
+direction in which the hand first approaches. World frame and body frame are those of `datasets.pushes`. The hand's
 path is the *commanded* one: a rigid rotation about a fixed point of the world, or a straight line.
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pushjax.datasets._archive import Arrays, check_shapes, read_archive, row_count
 from pushjax.datasets.pushes import Floats, LogError, rotation, wrap_angle
 
-# Arrays of the archive. Those of _PER_PUSH have one row of this shape per push, those of _PER_FILE have this shape.
+# Arrays of the archive, with the shape of one push's row (`_PUSH_ARRAYS`) or of the whole array (`_FILE_ARRAYS`).
 _PUSH_ARRAYS = {
     "push_index": (),
     "valid": (),
@@ -118,8 +118,9 @@ class TwoFingerLog:
 def stick_deviation(
     hand_start: ArrayLike, hand_end: ArrayLike, pose_start: ArrayLike, pose_end: ArrayLike, length: float
 ) -> Floats:
-    """Return the motion of the object relative to the hand from start to end, |dx| + length |dtheta|.
+    """Return the motion of the object relative to the hand from start to end.
 
+    It is the length of the translation plus `length` times the angle of the rotation.
     It is zero if both moved as one body. Closing an initial gap between hand and object counts as relative motion too.
 
     Args:

@@ -1,6 +1,6 @@
 """Segments of a closed cubic spline."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,16 +20,16 @@ class SplineSegment(NamedTuple):
         c1: Coefficient of t, m.
         c2: Coefficient of t^2, m.
         c3: Coefficient of t^3, m.
-        left: Jump of c3 from the previous segment to this one, m.
-        right: Jump of c3 from this segment to the next, m.
+        left_jump: Jump of c3 from the previous segment to this one, m.
+        right_jump: Jump of c3 from this segment to the next, m.
     """
 
     c0: Vec2
     c1: Vec2
     c2: Vec2
     c3: Vec2
-    left: Vec2
-    right: Vec2
+    left_jump: Vec2
+    right_jump: Vec2
 
     def evaluate(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
         """Evaluate the point and its first and second derivative with respect to t.
@@ -46,18 +46,18 @@ class SplineSegment(NamedTuple):
         first = self.c1 + (self.c2.scale(2) + self.c3.scale(3 * t)).scale(t)
         second = self.c2.scale(2) + self.c3.scale(6 * t)
         return (
-            point + self.right.scale(over * over * over) + self.left.scale(under * under * under),
-            first + self.right.scale(3 * over * over) - self.left.scale(3 * under * under),
-            second + self.right.scale(6 * over) + self.left.scale(6 * under),
+            point + self.right_jump.scale(over * over * over) + self.left_jump.scale(under * under * under),
+            first + self.right_jump.scale(3 * over * over) - self.left_jump.scale(3 * under * under),
+            second + self.right_jump.scale(6 * over) + self.left_jump.scale(6 * under),
         )
 
     def third_derivative(self, t: Scalar) -> Vec2:
         """Evaluate the third derivative with respect to t, for t from -1 to 2, m."""
         right, left = jnp.where(t > 1, 6.0, 0.0), jnp.where(t < 0, 6.0, 0.0)
-        return self.c3.scale(6) + self.right.scale(right) - self.left.scale(left)
+        return self.c3.scale(6) + self.right_jump.scale(right) - self.left_jump.scale(left)
 
-    def select(self, index) -> "SplineSegment":
-        """Index every field: select one segment, or several, from an array of segments."""
+    def select(self, index: Any) -> "SplineSegment":
+        """Return the segment, or the segments, at an index of the array."""
         return jax.tree.map(lambda field: field[index], self)
 
 
@@ -92,6 +92,7 @@ def outward_normal(velocity: Vec2) -> tuple[Vec2, Scalar]:
     Returns:
         A tuple of the outward unit normal and the norm of `velocity`, m.
     """
+    # Where the speed is zero, the normal is zero, and neither it nor its derivative is NaN.
     squared = velocity.dot(velocity)
     speed = jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))
     return Vec2(velocity.y / speed, -velocity.x / speed), speed

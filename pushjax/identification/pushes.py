@@ -1,7 +1,7 @@
 """Recorded pushes as arrays, the data of identification."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,8 +23,7 @@ from pushjax.datasets.recordings import Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.identification.recordings import push_arrays
 
-STEPS = 50
-ARRAYS = ("start", "path", "end", "weight", "poses_between", "wrench", "twist", "age", "side")
+STEPS = 50  # default number of steps of each path
 
 
 class PushInput(NamedTuple):
@@ -48,8 +47,8 @@ class Pushes(eqx.Module):
         end: (pushes, 3) slider's pose after each push, world, m and rad. The angle is the one that the slider really
             turned to (not wrapped).
         weight: (pushes,) weight of each push; zero leaves it out. Default: ones.
-        poses_between: (pushes, k, 3) slider's poses during the push, after equal parts of it (`observed_steps`).
-            Default: none.
+        poses_between: (pushes, k, 3) slider's poses during the push, at the ends of all but the last of its k + 1 equal
+            parts (`observed_steps`), world, m and rad. Default: none.
         wrench: (pushes, p, 3) wrenches on the slider, in the body frame about its origin, of any scale. Default: none.
         twist: (pushes, p, 3) motion of the slider under each wrench, in the body frame about its origin, of any scale.
             If the wrench or the motion is zero, the pair does not count. Default: none.
@@ -66,7 +65,7 @@ class Pushes(eqx.Module):
     path: Float[Array, "*conditions pushes steps+1 dof"]
     end: Float[Array, "*conditions pushes 3"]
     weight: Float[Array, "*conditions pushes"]
-    poses_between: Float[Array, "*conditions pushes seen 3"]
+    poses_between: Float[Array, "*conditions pushes between 3"]
     wrench: Float[Array, "*conditions pushes pairs 3"]
     twist: Float[Array, "*conditions pushes pairs 3"]
     age: Float[Array, "*conditions pushes"]
@@ -111,10 +110,10 @@ class Pushes(eqx.Module):
             raise ValueError(f"path has shape {self.path.shape}; a push needs at least one step, two rows")
         if between >= steps:
             raise ValueError(
-                f"poses_between has {between} poses on the way; between {steps} steps there are {steps - 1}"
+                f"poses_between has {between} poses for each push; a path of {steps} steps has room for {steps - 1}"
             )
-        for name in ARRAYS:
-            check_finite(name, getattr(self, name))
+        for name, value in vars(self).items():
+            check_finite(name, value)
         check_non_negative("weight", self.weight)
         check_non_negative("side", self.side)
 
@@ -125,8 +124,8 @@ class Pushes(eqx.Module):
         return np.round(np.arange(1, parts + 1) / parts * (self.path.shape[-2] - 1)).astype(int)
 
     @property
-    def poses(self) -> Float[Array, "*conditions pushes seen 3"]:
-        """All poses measured after the start, including the last."""
+    def poses(self) -> Float[Array, "*conditions pushes observed 3"]:
+        """(pushes, k + 1, 3) slider's poses measured after the start: `poses_between`, then `end`."""
         return jnp.concatenate([self.poses_between, self.end[..., None, :]], axis=-2)
 
     @property
@@ -136,7 +135,7 @@ class Pushes(eqx.Module):
 
     @property
     def has_pair(self) -> Bool[Array, "*conditions pushes pairs"]:
-        """True where there is a wrench with a motion."""
+        """(pushes, p) whether neither the wrench nor the motion of a pair is zero."""
         return jnp.any(self.wrench != 0, axis=-1) & jnp.any(self.twist != 0, axis=-1)
 
     def as_conditions(self) -> "Pushes":
@@ -144,11 +143,11 @@ class Pushes(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[None], self) if self.weight.ndim == 1 else self
 
     @staticmethod
-    def of(log: Any, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
+    def of(log: PushLog | Recordings, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
         """Make pushes from the usable pushes of a log.
 
         Args:
-            log: A `pushjax.datasets.PushLog`, or the `Recordings` that `load_recordings` returns.
+            log: A log of one finger, or the recordings that `load_recordings` returns.
             steps: Number of steps of each path.
             parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked
                 during all pushes. Otherwise only the final pose is used.
@@ -182,13 +181,14 @@ class Pushes(eqx.Module):
         if not several:
             raise ValueError("several: expected at least one condition's pushes; got none")
         longest = max(one.weight.shape[0] for one in several)
-        for name in ARRAYS:
+        names = tuple(vars(several[0]))
+        for name in names:
             shapes = {getattr(one, name).shape[1:] for one in several}
             if len(shapes) > 1:
                 raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
 
         def padded(name: str) -> Array:
-            """Return one array of all conditions; the padding repeats a condition's first push."""
+            """Stack one field of all conditions. The padding repeats a condition's first push."""
             rows = []
             for one in several:
                 value = getattr(one, name)
@@ -197,10 +197,14 @@ class Pushes(eqx.Module):
                 rows.append(jnp.concatenate([value, 0 * padding if name == "weight" else padding]))
             return jnp.stack(rows)
 
-        return Pushes(**{name: padded(name) for name in ARRAYS})
+        return Pushes(**{name: padded(name) for name in names})
 
     def weighted(self, weight: ArrayLike) -> "Pushes":
-        """Return the same pushes with other weights (pushes,), for example a training set or a bootstrap sample."""
+        """Return the same pushes with other weights, for example of a training set or a bootstrap sample.
+
+        Args:
+            weight: Weights in the shape of the present ones, (pushes,) or with conditions in front.
+        """
         value = as_float(weight, self.weight.dtype, "weight")
         check_shape("weight", value, self.weight.shape)
         return eqx.tree_at(lambda p: p.weight, self, value)

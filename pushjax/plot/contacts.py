@@ -57,12 +57,15 @@ def motion_cone_figure(
 
 
 def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
-    """Draw two closing contacts, labeled: the centers of rotation that they allow, and what their forces can do.
+    """Draw two fingers that close, to show why they jam or do not.
 
-    Each panel shows the friction cones and the contact normals. It shows the region, between or beyond the normals, in
-    which a counterclockwise (+) or clockwise (-) center of rotation moves both contacts away from their fingers. It
-    shows the line through the contacts, along which the fingers press on each other if it lies in both cones. And it
-    shows the status, with the center of rotation.
+    Each panel shows:
+
+    - the friction cones and the contact normals;
+    - the regions of the centers of rotation that move both contacts away from their fingers, by the sign of the
+      rotation: counterclockwise (+) or clockwise (-);
+    - the line through the contacts; the fingers press on each other along it if it lies in both cones;
+    - the status, and the center of rotation of the solution.
 
     Args:
         shape: Outline of the slider.
@@ -78,15 +81,15 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
             mu = np.asarray(contacts.friction)
             _allowed_centers(axes, point, normal, box)
             outline(axes, shape, np.zeros(3), BLACK, 1.4)
-            for name, p, n, m in zip("AC", point, normal, mu, strict=False):
+            for name, p, n, m in zip("AC", point, normal, mu, strict=True):  # the names of `experiments.jam`
                 _labeled_contact(axes, name, p, n, m, reach)
             axes.plot(*point.T, ":", color="0.2", lw=1.3)
             center_of_rotation(axes, np.asarray(motion.twist))
             axes.plot([], [], color=GREEN, label="friction cone")
             axes.plot([], [], "--", color=BLUE, lw=0.9, label="contact normal")
             axes.plot([], [], ":", color="0.2", label="line through both contacts")
-            verdict = Status(int(motion.status)).name
-            axes.set(title=f"$\\mu$ = {mu[0]:.2f}: {verdict}", xlabel="x / mm", ylabel="y / mm", aspect="equal")
+            status = Status(int(motion.status)).name
+            axes.set(title=f"$\\mu$ = {mu[0]:.2f}: {status}", xlabel="x / mm", ylabel="y / mm", aspect="equal")
             axes.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))
         legend_below(figure, all_axes[0], columns=3)
         return figure
@@ -96,7 +99,7 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
     """Draw where a center of rotation of either sign moves all contacts away from their fingers."""
     grid = np.stack(np.meshgrid(*(np.linspace(a, b, 301) for a, b in zip(*box, strict=True))), axis=-1)
     arm = point[:, None, None] - grid[None]
-    # a counterclockwise turn about c moves p along perp(p - c)
+    # A counterclockwise turn about c moves p along perp(p - c).
     away = -normal[:, None, None, 0] * arm[..., 1] + normal[:, None, None, 1] * arm[..., 0]
     for sign, color in ((1, ORANGE), (-1, PURPLE)):
         region = np.all(sign * away > 0, axis=0)
@@ -107,7 +110,7 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
 
 
 def _labeled_contact(axes: Axes, name: str, point: np.ndarray, normal: np.ndarray, mu: float, reach: float) -> None:
-    """Draw the normal, the friction cone and the closing finger of a contact at p (2,), mm."""
+    """Draw the normal, the friction cone and the closing finger of a contact at `point` (2,), mm."""
     axes.plot(*np.array([point - 2 * reach * normal, point + 2 * reach * normal]).T, "--", color=BLUE, lw=0.9)
     tangent = np.array([-normal[1], normal[0]])
     for side in (1, -1):

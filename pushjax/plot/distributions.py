@@ -1,4 +1,4 @@
-"""Pictures of where many pushes end, drawn into given axes so that an experiment can lay them out."""
+"""Panels of the motions of many pushes, drawn into given axes so that an experiment can lay them out."""
 
 from typing import Any
 
@@ -51,7 +51,7 @@ def histogram_panel(
     *,
     bins: int = 40,
     gaussian: tuple[float, float] | None = None,
-):
+) -> None:
     """Draw a histogram.
 
     Args:
@@ -76,7 +76,9 @@ def histogram_panel(
     axes.set(xlabel=label, ylabel="count", ylim=(0, None))
 
 
-def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside, outside) -> Any:
+def density_panel(
+    axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside: np.ndarray, outside: np.ndarray
+) -> Any:
     """Draw a density over x and y, in mm, with two kinds of points.
 
     Args:
@@ -90,7 +92,7 @@ def density_panel(axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.n
         The color bar.
     """
     drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
-    axes.plot(*(MM * np.asarray(outside)).T, ".", color=BLACK, ms=2.5)
-    axes.plot(*(MM * np.asarray(inside)).T, ".", color=RED, ms=2.5)
+    axes.plot(*(MM * outside).T, ".", color=BLACK, ms=2.5)
+    axes.plot(*(MM * inside).T, ".", color=RED, ms=2.5)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
     return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)
