@@ -1,5 +1,6 @@
-from .animation import animate as animate
-from .animation import animate_cloud as animate_cloud
+from .animated_pushes import animate as animate
+from .animated_pushes import animate_cloud as animate_cloud
+from .animation import Animation as Animation
 from .clouds import capture_figure as capture_figure
 from .clouds import cloud_figure as cloud_figure
 from .contacts import jam_figure as jam_figure
@@ -11,7 +12,6 @@ from .distributions import traces as traces
 from .files import save as save
 from .forces import ContactForces as ContactForces
 from .forces import contact_forces as contact_forces
-from .motion import Animation as Animation
 from .parts import hand_at as hand_at
 from .parts import outline as outline
 from .pushes import RealPush as RealPush

@@ -1,273 +1,163 @@
-"""Animations of pushes and grasps.
+"""The class of all animations, and how it is written: as a GIF, as a page with a player, or as a film."""
 
-The frames of each push are equally spaced over its steps, however many it has. So a recording and its simulation run
-side by side from start to end, even if one has more steps. The animation ends when nothing moves any more in any push,
-for example because the hand jammed, and the last frame stays on the screen for a moment.
-"""
-
-from collections.abc import Mapping, Sequence
-from typing import Any
+import base64
+import html
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from string import Template
 
 import matplotlib.pyplot as plt
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.animation import FFMpegWriter
 from matplotlib.figure import Figure
+from PIL import Image
 
-from pushjax.geometry.shape import Shape
-from pushjax.plot.motion import Animation
-from pushjax.plot.parts import centroids, draw_fixtures, placed_outline, vertices
-from pushjax.plot.squeeze import SQUEEZE_LABEL
-from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
-from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
-from pushjax.simulation.fixtures import Fixture, Wall
-from pushjax.simulation.hand import Hand
+from pushjax.plot.style import STYLE
 
-MAX_ARROW_LENGTH = 0.4  # length of the arrow of the largest force, in units of the slider's size
-SQUEEZE_LENGTH = 0.45  # length of the arrow of a unit of squeeze, in units of the slider's size
-MIN_FORCE = 1e-3  # weaker forces are not drawn, in units of the largest
-PANEL_WIDTH, EXTRA_HEIGHT = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
-LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
-MARGIN = 0.04  # width of the empty margin, in units of what is shown
+DPI = 100
+LAST_FRAME_SECONDS = 1.2  # s, time that the last frame stays
+PALETTE_COLORS = 64  # number of colors of all frames together, small so that the files are small
+PALETTE_ROUNDS = 3  # rounds of refining the palette: without them thin gray lines come out tinted
+PALETTE_FRAMES = 6  # frames that the palette is taken from
+SUFFIXES = (".gif", ".html", ".mp4")
 
 
-def animate(
-    shape: Shape,
-    hand: Hand,
-    pushes: Animatable | Mapping[str, Animatable],
-    *,
-    measured: Mapping[str, np.ndarray] | None = None,
-    forces: bool = True,
-    friction: float | None = None,
-    fixtures: Sequence[Wall | Fixture] = (),
-    frames: int = 60,
-    seconds: float = 4.0,
-) -> Animation:
-    """Animate pushes or grasps side by side.
+@dataclass(frozen=True)
+class Animation:
+    """A figure that is drawn anew for each frame and plays in a loop.
 
-    Each panel shows the slider (its start in gray), the fingers, the trace of the slider's centroid, the contacts
-    with the forces on the slider as arrows, and the status and contact modes of the step in words. From a failed step
-    on, the words are its status and number, in red. Where the hand stops because it holds the slider, the forces of the
-    squeeze are shown if `friction` is given.
+    `save` writes it to a file. A notebook shows it with its player.
 
-    Args:
-        shape: Outline of the slider.
-        hand: The hand.
-        pushes: One push, or several by name, all of that shape and hand: trajectories of `rollout`, or recordings
-            (`RecordedPush`), which are shown without forces.
-        measured: Poses (points, 3) by the name of a push, world, m and rad. They are drawn dashed over that push.
-        forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
-            the largest force.
-        friction: Coefficient of friction at the contacts, to show the forces that hold the slider at the end of a
-            grasp, per unit of squeeze (`pushjax.plot.squeeze`).
-        fixtures: Walls and bodies that do not move, in every panel.
-        frames: Number of frames, equally spaced over the steps.
-        seconds: Time that the animation plays, s.
-
-    Returns:
-        The animation; `save` writes it to a file.
-
-    Raises:
-        ValueError: If there is no push, if there are fewer than two frames, if a name in `measured` is that of no push,
-            or if a trajectory is of a hand with another number of contacts.
+    Attributes:
+        figure: The figure.
+        draw: `draw(k)` makes the figure show frame k.
+        frames: Number of frames.
+        seconds: Time that the frames play, s.
     """
-    by_name = dict(pushes) if isinstance(pushes, Mapping) else {"": pushes}
-    measured_by_name = dict(measured or {})
-    if not by_name:
-        raise ValueError("pushes: there is none to show")
-    unknown = sorted(set(measured_by_name) - set(by_name))
-    if unknown:
-        raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
-    drawn = [
-        drawn_push(shape, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
-    ]
-    fractions = _frame_fractions(drawn, frames)
-    largest_force = max(track.largest_force for track in drawn)
-    with plt.rc_context(STYLE):
-        figure, all_axes = panel_row(len(drawn), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
-        panels = [_Panel(axes, track, largest_force) for axes, track in zip(all_axes, drawn, strict=True)]
-        for axes, name in zip(all_axes, by_name, strict=True):
-            draw_fixtures(axes, fixtures)
-            axes.set_title(name, pad=18)  # leaves room for the words below it
-            axes.set(xlabel="x / mm", aspect="equal")
-        all_axes[0].set_ylabel("y / mm")
-        _share_limits(figure, all_axes, drawn)
-        held = any(track.squeeze is not None for track in drawn)
-        _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force, held)
 
-    def draw(frame: int) -> None:
-        for panel in panels:
-            panel.draw(fractions[frame])
+    figure: Figure
+    draw: Callable[[int], None]
+    frames: int
+    seconds: float
 
-    draw(0)
-    return Animation(figure, draw, frames, seconds)
-
-
-def animate_cloud(
-    shape: Shape,
-    hand: Hand,
-    path: Any,
-    trajectories: np.ndarray,
-    *,
-    title: str = "",
-    frames: int = 60,
-    seconds: float = 4.0,
-) -> Animation:
-    """Animate many pushes along one path at once.
-
-    The picture shows faint outlines of all pushes, the paths of their centroids, the start, and the hand.
-
-    Args:
-        shape: Outline of the slider.
-        hand: The hand.
-        path: (steps + 1, dof), configurations of the hand.
-        trajectories: (pushes, steps + 1, 3), poses as `monte_carlo(..., trajectories=True)` keeps them, world frame, m
-            and rad.
-        title: Title of the picture.
-        frames: Number of frames, equally spaced over the steps.
-        seconds: Time that the animation plays, s.
-
-    Returns:
-        The animation; `save` writes it to a file.
-
-    Raises:
-        ValueError: If there are fewer than two frames, or the path is of another length than the trajectories.
-    """
-    poses, fingers = np.asarray(trajectories, float), fingers_along(hand, path)
-    if poses.ndim != 3 or len(fingers[0]) != poses.shape[1]:
-        raise ValueError(
-            f"trajectories have shape {poses.shape}; expected (pushes, {len(fingers[0])}, 3), as long as path"
+    def pictures(self) -> list[Image.Image]:
+        """Return every frame as an image, all with one palette."""
+        with plt.rc_context(STYLE):
+            self._freeze_layout()
+            drawn = [self._frame_image(k) for k in range(self.frames)]
+        width, height = drawn[0].size
+        sampled = [drawn[round(k * (self.frames - 1) / (PALETTE_FRAMES - 1))] for k in range(PALETTE_FRAMES)]
+        sheet = Image.new("RGB", (width, PALETTE_FRAMES * height))
+        for k, each in enumerate(sampled):
+            sheet.paste(each, (0, k * height))
+        # Maximum coverage, because most pixels are white: the most frequent colors would be shades of white.
+        palette = sheet.quantize(
+            PALETTE_COLORS, Image.Quantize.MAXCOVERAGE, kmeans=PALETTE_ROUNDS, dither=Image.Dither.NONE
         )
-    outline_points, positions = placed_outline(vertices(shape), poses), centroids(shape, poses)
-    steps = _equally_spaced(poses.shape[1] - 1, frames).round().astype(int)
-    opacity = float(np.clip(12 / len(poses), 0.05, 0.6))
-    with plt.rc_context(STYLE):
-        figure, (axes,) = panel_row(1, 5.4, 5.0)
-        outlines, paths = (LineCollection([], colors=BLUE, linewidths=w, alpha=opacity) for w in (0.8, 0.6))
-        axes.add_collection(outlines)
-        axes.add_collection(paths)
-        (points,) = axes.plot([], [], ".", color=RED, ms=3, alpha=0.5, label="centroids")
-        axes.plot(*outline_points[0, 0].T, color=BLACK, lw=1.4, label="start")
-        axes.plot([], [], color=BLUE, lw=0.8, label=f"{len(poses)} pushes")
-        tips = [axes.plot([], [], color=GREEN, lw=1.8)[0] for _ in fingers]
-        axes.set(title=title, xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        _set_limits(axes, [outline_points.reshape(-1, 2), *(finger.reshape(-1, 2) for finger in fingers)])
-        legend_below(figure, axes, columns=3)
+        return [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in drawn]
 
-    def draw(frame: int) -> None:
-        k = steps[frame]
-        outlines.set_segments(list(outline_points[:, k]))
-        paths.set_segments(list(positions[:, : k + 1]))
-        points.set_data(*positions[:, k].T)
-        for tip, finger in zip(tips, fingers, strict=True):
-            tip.set_data(*finger[k].T)
+    def _freeze_layout(self) -> None:
+        """Fix the layout, so that only the contents move."""
+        for _ in range(4):  # each drawing improves the layout of panels of fixed aspect; it settles after a few
+            self.figure.canvas.draw()
+        self.figure.set_layout_engine("none")
 
-    draw(0)
-    return Animation(figure, draw, frames, seconds)
+    def _frame_image(self, k: int) -> Image.Image:
+        """Return frame k as an image."""
+        self.draw(k)
+        buffer = io.BytesIO()
+        self.figure.savefig(buffer, format="png", dpi=DPI, pil_kwargs={"compress_level": 1})
+        return Image.open(buffer).convert("RGB")
 
+    def player(self) -> str:
+        """Return a fragment of an HTML page that plays the animation, with everything in it."""
+        encoded = []
+        for picture in self.pictures():
+            buffer = io.BytesIO()
+            picture.save(buffer, "PNG", optimize=True)
+            encoded.append(f'"{base64.b64encode(buffer.getvalue()).decode()}"')
+        interval = 1e3 * self.seconds / self.frames
+        return PLAYER.substitute(
+            frames=",\n".join(encoded), last=self.frames - 1, interval=interval, last_interval=1e3 * LAST_FRAME_SECONDS
+        )
 
-class _Panel:
-    """The artists of one push.
+    def _repr_html_(self) -> str:
+        """Show the player in a notebook."""
+        return self.player()
 
-    Args:
-        axes: Axes to draw into.
-        track: The push as it is drawn.
-        largest: Largest force of all panels, N, which sets the scale of the arrows.
-    """
+    def write(self, path: Path) -> None:
+        """Write the animation as `save` does, into a folder that exists.
 
-    def __init__(self, axes: Axes, track: DrawnPush, largest_force: float):
-        self.track = track
-        size = float(np.ptp(track.outline[0], axis=0).max())
-        self.scale = MAX_ARROW_LENGTH * size / largest_force if largest_force > 0 else 0.0
-        self.weakest = MIN_FORCE * largest_force
-        axes.plot(*track.outline[0].T, color=GRAY, lw=1.0, label="start")
-        (self.outline,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
-        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centroid")
-        self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
-        (self.measured,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
-        (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
-        zero = np.zeros(track.force.shape[1])
-        arrow_style: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
-        arrow_style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
-        self.arrows = axes.quiver(zero, zero, zero, zero, **arrow_style) if len(zero) else None
-        self.squeeze = None
-        if track.squeeze is not None:
-            tips, force = track.squeeze
-            force = SQUEEZE_LENGTH * size * force
-            squeeze_style: dict[str, Any] = arrow_style | {"color": PURPLE, "pivot": "tip"}
-            self.squeeze = axes.quiver(*tips.T, *force.T, **squeeze_style)
-        above_axes: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
-        self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above_axes)
+        Args:
+            path: Path of the file, with the suffix .gif, .html or .mp4.
 
-    def draw(self, fraction: float) -> None:
-        """Show the push at a share of its steps, from 0 to 1."""
-        track = self.track
-        k = round(fraction * (len(track.outline) - 1))
-        self.outline.set_data(*track.outline[k].T)
-        self.trace.set_data(*track.center[: k + 1].T)
-        for line, finger in zip(self.fingers, track.fingers, strict=True):
-            line.set_data(*finger[k].T)
-        if track.measured is not None:
-            self.measured.set_data(*track.measured[round(fraction * (len(track.measured) - 1))].T)
-        self.words.set_text(track.words[k])
-        self.words.set_color(RED if 0 <= track.failed < k else "0.3")
-        is_acting = np.linalg.norm(track.force[k], axis=1) > self.weakest
-        self.contacts.set_data(*track.contact[k][is_acting].T)
-        if self.arrows is not None:
-            # an arrow of length zero would leave a dot
-            tails, force = (np.where(is_acting[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
-            self.arrows.set_offsets(tails)
-            self.arrows.set_UVC(*(self.scale * force).T)
-        if self.squeeze is not None:
-            self.squeeze.set_visible(k > track.stopped)
+        Raises:
+            ValueError: If the suffix is another one.
+            RuntimeError: If there is no `ffmpeg` for an .mp4.
+        """
+        suffix = path.suffix.lower()
+        if suffix == ".gif":
+            first, *others = self.pictures()
+            interval = 1e3 * self.seconds / self.frames
+            durations = [interval] * len(others) + [1e3 * LAST_FRAME_SECONDS]
+            first.save(path, save_all=True, append_images=others, duration=durations, loop=0, optimize=True)
+        elif suffix == ".html":
+            path.write_text(PAGE.substitute(title=html.escape(path.stem), player=self.player()), encoding="utf-8")
+        elif suffix == ".mp4":
+            self._write_film(path)
+        else:
+            raise ValueError(f"{path.name}: motion is written as {', '.join(SUFFIXES)}; got {path.suffix or 'none'}")
+
+    def _write_film(self, path: Path) -> None:
+        """Write an .mp4 with `ffmpeg`."""
+        if not FFMpegWriter.isAvailable():
+            raise RuntimeError(f"{path.name}: .mp4 needs the program ffmpeg; .gif and .html need nothing")
+        rate = max(1, round(self.frames / self.seconds))
+        writer = FFMpegWriter(fps=rate, extra_args=["-pix_fmt", "yuv420p"])  # a pixel format that every player shows
+        with plt.rc_context(STYLE), writer.saving(self.figure, str(path), dpi=DPI):
+            self._freeze_layout()
+            for k in [*range(self.frames), *[self.frames - 1] * round(LAST_FRAME_SECONDS * rate)]:
+                self.draw(k)
+                writer.grab_frame()
 
 
-def _frame_fractions(drawn: list[DrawnPush], frames: int) -> np.ndarray:
-    """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
-    last_fraction = 0.0
-    for push in drawn:
-        steps = len(push.outline) - 1
-        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (push.outline, *push.fingers)]
-        moving_steps = np.flatnonzero(np.any(moving, axis=0))
-        # includes the step whose status says why nothing moves any more
-        stop_step = steps if moving_steps.size == 0 else min(moving_steps[-1] + 2, steps)
-        last_fraction = max(last_fraction, stop_step / steps)
-    return _equally_spaced(1.0, frames) * last_fraction
+PLAYER = Template("""<figure style="display:inline-block;margin:0;max-width:100%;font:14px sans-serif">
+<img alt="animation" style="display:block;max-width:100%">
+<div style="display:flex;gap:.6em;align-items:center">
+<button type="button" style="min-width:5em">Pause</button>
+<input type="range" min="0" max="$last" value="0" style="flex:1" aria-label="frame">
+<output style="min-width:4em;text-align:right"></output>
+</div>
+<script>
+(function () {
+  const frames = [
+$frames
+  ].map(code => "data:image/png;base64," + code);
+  const figure = document.currentScript.parentElement, last = frames.length - 1;
+  const [image, button, range, count] = ["img", "button", "input", "output"].map(tag => figure.querySelector(tag));
+  let timer = null;
+  function show(k) { range.value = k; image.src = frames[k]; count.value = (k + 1) + " / " + frames.length; }
+  function next() {
+    const k = +range.value === last ? 0 : +range.value + 1;
+    show(k);
+    timer = setTimeout(next, k === last ? $last_interval : $interval);
+  }
+  function pause() { clearTimeout(timer); timer = null; button.textContent = "Play"; }
+  function play() { button.textContent = "Pause"; timer = setTimeout(next, $interval); }
+  button.onclick = () => timer === null ? play() : pause();
+  range.oninput = () => { pause(); show(+range.value); };
+  show(0);
+  play();
+})();
+</script>
+</figure>""")
 
-
-def _equally_spaced(end: float, frames: int) -> np.ndarray:
-    """Return equally spaced numbers from 0 to `end`, one per frame."""
-    if frames < 2:
-        raise ValueError(f"frames must be at least 2; got {frames}")
-    return np.linspace(0, end, frames)
-
-
-def _share_limits(figure: Figure, all_axes: list[Axes], drawn: list[DrawnPush]) -> None:
-    """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
-    parts = [part for push in drawn for part in (push.outline, *push.fingers)]
-    parts += [push.measured for push in drawn if push.measured is not None]
-    _set_limits(all_axes[0], [part.reshape(-1, 2) for part in parts])
-    wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
-    figure.set_layout_engine("compressed", h_pad=0.06)
-    surrounding_height = EXTRA_HEIGHT + (LEGEND_ROW_HEIGHT if len(all_axes) == 1 else 0.0)
-    figure.set_size_inches(
-        PANEL_WIDTH * len(all_axes) + 0.5, float(np.clip(PANEL_WIDTH * high / wide, 1.5, 5.5)) + surrounding_height
-    )
-
-
-def _set_limits(axes: Axes, points: list[np.ndarray]) -> None:
-    """Set the range of the axes to hold all points (..., 2), mm, with an empty margin."""
-    low, high = (find(np.concatenate(points), axis=0) for find in (np.nanmin, np.nanmax))
-    margin = MARGIN * (high - low).max()
-    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
-
-
-def _draw_legend(figure: Figure, axes: Axes, show_measured: bool, largest_force: float, held: bool) -> None:
-    """Draw one legend for all panels, with the measured outlines and the squeeze only if there are any."""
-    if largest_force > 0:
-        axes.plot([], [], color=ORANGE, lw=2.2, label=f"force on the slider, up to {largest_force:.2g} N")
-    if held:
-        axes.plot([], [], color=PURPLE, lw=2.2, label=SQUEEZE_LABEL)
-    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
-    shown = {label: handle for label, handle in handles.items() if show_measured or label != "measured"}
-    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 if len(figure.axes) == 1 else 3)
+PAGE = Template("""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>$title</title>
+$player
+</html>
+""")

@@ -5,7 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from pushjax.plot.motion import Animation
+from pushjax.plot.animation import Animation
 from pushjax.plot.style import STYLE
 
 
