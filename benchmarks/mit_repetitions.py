@@ -27,8 +27,8 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments.table1.conditions import APART, OBJECTS, load, straight
-from pushjax.experiments.table1.methods import TESTED, UNKNOWNS, Setting, fitted, own
+from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, load, straight
+from pushjax.experiments.table1.methods import TEST_SIZE, UNKNOWNS, Setting, fitted, without_padding
 from pushjax.experiments.table1.repeats import relative_motions
 from pushjax.identification.predictive import NoiseParameters, PredictiveModel, predict
 
@@ -74,7 +74,7 @@ def run(
         if len(log.repeats):
             found = _repetitions(jax.random.key(seed + k), log, draws, dof, half_width)
             rows.append({"object": name} | _figures([found], rng))
-            pooled += [] if name in APART else [found]
+            pooled += [] if name in NOT_IN_PAPER else [found]
         progress(k + 1, len(object))
     if not rows:
         raise ValueError(f"object: none of {', '.join(object)} has repetitions on {SURFACE}")
@@ -92,15 +92,15 @@ def _repetitions(key: Any, log: MitPushes, draws: int, dof: float, half_width: f
     measured = np.linalg.norm((fast - slow) * scale, axis=1) / np.sqrt(2)
     setting = Setting.of(log, "quartic", STEPS)
     found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-    pushes = straight(log, log.whole, pairs[:, 1], STEPS, TESTED)
+    pushes = straight(log, log.whole, pairs[:, 1], STEPS, TEST_SIZE)
     dtype = pushes.path.dtype
     mu = jnp.maximum(found.friction + half_width * jnp.array([[-1.0, 1.0]], dtype), 0)
     none, many = jnp.zeros((), dtype), jnp.asarray(1e3, dtype)
     friction_only = NoiseParameters(jnp.asarray(dof, dtype), mu, none, none, jnp.zeros(2, dtype), many)
     model = PredictiveModel.of(found, pushes, setting.slider, setting.hand, "sum_of_squares")
-    ends = own(predict(key, model, friction_only, draws)[0], pushes) * scale
+    ends = without_padding(predict(key, model, friction_only, draws)[0], pushes) * scale
     spread = np.sqrt(np.sum(np.var(ends, axis=1, ddof=1), axis=-1))
-    motion = np.linalg.norm(ends.mean(axis=1) - own(pushes.start, pushes) * scale, axis=1)
+    motion = np.linalg.norm(ends.mean(axis=1) - without_padding(pushes.start, pushes) * scale, axis=1)
     one, other = ends[:, :PAIRS], ends[:, PAIRS : 2 * PAIRS]
     simulated = np.linalg.norm(one - other, axis=-1) / np.sqrt(2)
     return np.concatenate([np.stack([measured, spread, motion], axis=1), simulated], axis=1)

@@ -22,7 +22,7 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments.table1.conditions import APART, OBJECTS, SIDES, chosen, load
+from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, SIDES, checked_surfaces, load
 from pushjax.experiments.table1.experiment import deviation_mm
 from pushjax.experiments.table1.methods import (
     FRAME_OFFSET,
@@ -33,7 +33,7 @@ from pushjax.experiments.table1.methods import (
     SURFACE_DOF,
     Setting,
     fitted,
-    own,
+    without_padding,
 )
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
@@ -93,7 +93,7 @@ def run(
         ValueError: As table 1 does.
     """
     folder = data_folder(data)
-    surface = chosen(folder, surface, object)
+    surface = checked_surfaces(folder, surface, object)
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
     todo = []
     for log in (load(folder, on, target, seed) for on in surface for target in object):
@@ -113,8 +113,8 @@ def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) 
     """Identify with these causes and predict the test pushes of one object on one surface."""
     setting = made()
     found = identified(setting, causes)
-    predicted = found.predict(setting.tested, setting.slider, setting.hand)
-    off = deviation_mm(log, own(predicted.pose[:, -1], setting.tested))
+    predicted = found.predict(setting.test, setting.slider, setting.hand)
+    off = deviation_mm(log, without_padding(predicted.pose[:, -1], setting.test))
     parameters = found.parameters._asdict()
     return {
         "mean_mm": float(off.mean()),
@@ -122,7 +122,7 @@ def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) 
         "friction": float(found.friction),
         "sigma_mm": 1e3 * float(found.sigma),
         "found": {name: np.asarray(parameters[name], float) for cause in causes for name in CAUSES[cause]},
-        "failed_steps": int(own(predicted.failed, setting.tested).sum()),
+        "failed_steps": int(without_padding(predicted.failed, setting.test).sum()),
         "noise_floor_mm": noise_floor_mm(log),
     }
 
@@ -150,7 +150,7 @@ def _share(cells: list[dict], name: str) -> dict[str, float]:
     """Return a run's mean over the paper's objects, its change, and the change in percent of the error without it."""
 
     def each(run: str) -> dict[tuple[str, str], np.ndarray]:
-        mine = (cell for cell in cells if cell["run"] == run and cell["object"] not in APART)
+        mine = (cell for cell in cells if cell["run"] == run and cell["object"] not in NOT_IN_PAPER)
         return {(cell["surface"], cell["object"]): np.asarray(cell["each_mm"]) for cell in mine}
 
     mine, without = each(name), each(_without(name))
@@ -168,7 +168,7 @@ def _deviations(cells: list[dict]) -> dict[str, float | None]:
 
     For objects whose pushes were repeated, also those with the calibration (`twice`) and the noise floor (`noise`).
     """
-    mine = [cell for cell in cells if cell["object"] not in APART]
+    mine = [cell for cell in cells if cell["object"] not in NOT_IN_PAPER]
     floors = [cell["noise_floor_mm"] for cell in mine if cell["run"] == NOTHING and cell["noise_floor_mm"] is not None]
     found: dict[str, float | None] = {
         name: float(np.mean([cell["mean_mm"] for cell in mine if cell["run"] == name])) if mine else None

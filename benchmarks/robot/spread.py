@@ -41,8 +41,8 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments.table1.conditions import APART, OBJECTS, chosen, load, straight
-from pushjax.experiments.table1.methods import LEARNED, TESTED, UNKNOWNS, Setting, fitted, own
+from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, checked_surfaces, load, straight
+from pushjax.experiments.table1.methods import TEST_SIZE, TRAINING_SIZE, UNKNOWNS, Setting, fitted, without_padding
 
 STEPS = 25
 FOLDS, FOLD = 3, 48  # number of parts, and largest number of pushes in each
@@ -88,7 +88,7 @@ def run(
         ValueError: As table 1 does, and if scikit-learn is not installed.
     """
     folder = data_folder(data)
-    surface = chosen(folder, surface, object)
+    surface = checked_surfaces(folder, surface, object)
     settings = {"seed": seed, "steps": steps, "version": pj.__version__, "format": FORMAT}
     kept = CellCache("table1-spread", out, settings)
 
@@ -100,7 +100,7 @@ def run(
     logs = [load(folder, on, target, seed) for on in surface for target in object]
     todo = [({"surface": log.surface, "object": log.shape}, partial(cell_of, log)) for log in logs]
     cells = kept.find_or_compute(todo, progress)
-    paper = [cell for cell in cells if cell["object"] not in APART]
+    paper = [cell for cell in cells if cell["object"] not in NOT_IN_PAPER]
     pooled = {
         group: _pooled([cell[group] for cell in paper], [cell["levels_of"][group] for cell in paper])
         for group in ("middle", "whole")
@@ -122,12 +122,12 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
     every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
     found = fitted(setting.coarse, setting, every)
-    off = own(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
+    off = without_padding(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
     predicted = noise.transferred_to(found)
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
     levels, far = _held(first, log, setting, noise, rows, steps)
-    groups = {"middle": setting.tested, "whole": straight(log, log.whole, log.middle_of, steps, TESTED)}
+    groups = {"middle": setting.test, "whole": straight(log, log.whole, log.middle_of, steps, TEST_SIZE)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     scalars = ("surface_dof", "hand_offset", "sigma", "student_dof")
     numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in scalars}
@@ -135,14 +135,14 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     cell["noise"] = numbers | {"relative_error": np.asarray(noise.relative_error), "spread": spread}
     cell |= {"held_level": levels, "levels_of": {}}
     for k, (group, pushes) in enumerate(groups.items()):
-        ends, start = own(pushes.end, pushes), own(pushes.start, pushes)
-        draws = own(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
-        density = own(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
+        ends, start = without_padding(pushes.end, pushes), without_padding(pushes.start, pushes)
+        draws = without_padding(predicted.predict(keys[k], pushes, slider, hand, DRAWS), pushes)
+        density = without_padding(predicted.log_density(keys[2 + k], pushes, slider, hand, DRAWS), pushes)
         methods = {"noise": scored(draws, ends, length)._replace(density=density)}
         weights = density_ratio(far, reach(draws, start, length))
         methods["calibrated"] = methods["noise"].calibrated(levels, weights)
         cell["levels_of"][group] = effective(weights[0])
-        point = own(_ends(found, pushes, setting), pushes)
+        point = without_padding(_ends(found, pushes, setting), pushes)
         seen = errors(point, ends, start)
         scale = np.array([1, 1, length])
         normal: Any = multivariate_normal  # its type annotations want a number
@@ -165,9 +165,9 @@ def _held(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict each training push from nearly all others; return the levels and the predicted `reach`."""
     of_rest, held = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
-    draws = own(noise.transferred_to(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
-    there = scored(draws, own(held.end, held), setting.length)
-    return there.level, reach(draws, own(held.start, held), setting.length)
+    draws = without_padding(noise.transferred_to(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
+    there = scored(draws, without_padding(held.end, held), setting.length)
+    return there.level, reach(draws, without_padding(held.start, held), setting.length)
 
 
 def _crossed(
@@ -179,7 +179,7 @@ def _crossed(
         The identifications, and the parts, each of at most `most` pushes.
     """
     parts = np.array_split(rows, count)
-    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, LEARNED) for part in parts]
+    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, TRAINING_SIZE) for part in parts]
     held = pj.Pushes.conditions([straight(log, log.whole, part, steps, most) for part in parts])
     # nothing is shared: each part has its own unknowns, as if the parts were different objects
     apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
@@ -205,14 +205,14 @@ def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generato
     Both use the same whole pushes, in random order.
     """
     rows = rng.permutation(np.flatnonzero(log.whole.valid))
-    tests = np.sort(rows[: min(round(CURVE_TESTS * len(rows)), TESTED)])
+    tests = np.sort(rows[: min(round(CURVE_TESTS * len(rows)), TEST_SIZE)])
     rest, length, found = rows[len(tests) :], setting.length, []
-    tested = straight(log, log.whole, tests, steps, TESTED)
+    tested = straight(log, log.whole, tests, steps, TEST_SIZE)
     ends = log.whole.end[tests]
     for count in (count for count in COUNTS if count <= len(rest)):
-        learned = straight(log, log.whole, rest[:count], steps, LEARNED)
+        learned = straight(log, log.whole, rest[:count], steps, TRAINING_SIZE)
         physics = fitted(learned, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-        point = own(_ends(physics, tested, setting), tested)
+        point = without_padding(_ends(physics, tested, setting), tested)
         sigma = float(physics.sigma) / np.array([1, 1, length])
         about = point[:, None] + rng.normal(size=(len(tests), DRAWS, 3)) * sigma
         process = gaussian_process.predict(gaussian_process.learn(log.whole, rest[:count], length), log.whole, tests)

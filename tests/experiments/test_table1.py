@@ -105,7 +105,7 @@ def test_real_archives(logs):
         means = [
             experiment.deviation_mm(logs[surface, name], logs[surface, name].middle.toolbox["quartic"]).mean()
             for name in conditions.OBJECTS
-            if name not in conditions.APART
+            if name not in conditions.NOT_IN_PAPER
         ]
         assert np.mean(means) == pytest.approx(expected, abs=0.3)
 

@@ -25,9 +25,9 @@ from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.poses import to_body
 
-FILE = "way_points.csv"
-LONGEST = 2.5  # longest push, in units of the limit surface's length
-STEPS = 12  # of a push
+WAY_POINTS_FILE = "way_points.csv"
+MAX_PUSH_LENGTH = 2.5  # in units of the limit surface's length
+STEPS = 12  # number of steps of each push
 
 
 def run(
@@ -46,7 +46,7 @@ def run(
         spread, and the files that were written.
 
     Raises:
-        ValueError: For options that cannot be.
+        ValueError: If an option is invalid.
     """
     options.check()
     shape, hand = shape_of(options.shape, []), pj.Hand.finger(options.radius)
@@ -55,28 +55,28 @@ def run(
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
     slider = pj.Slider(shape, expected_surface(support, degree, seed))
     position, angle = options.tolerance
-    length, at = float(slider.surface.length), np.array(options.goal)
-    goal = Goal(at, position=position, angle=angle, length=length, symmetry=options.symmetry)
+    length = float(slider.surface.length)
+    goal = Goal(np.array(options.goal), position=position, angle=angle, length=length, symmetry=options.symmetry)
     _check_distance(options, length)
     plan = _best(_plans(slider, hand, goal, options, seed), options.attempts, progress)
-    motion, files = None, []
+    motion = None
     if plan.status != PushPlanStatus.NO_WAY and plan.ways:
         motion = finger_motion(plan.ways, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
-    if out is not None and motion is not None:
-        files.append(str(_write(out / FILE, motion)))
-    elif out is not None:
-        (out / FILE).unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
-    pictures = []
+    files, pictures = [], []
     if out is not None:
         from pushjax.experiments.plan.picture import draw
 
+        if motion is None:
+            (out / WAY_POINTS_FILE).unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
+        else:
+            files.append(str(_write_way_points(out / WAY_POINTS_FILE, motion)))
         pictures.append(str(draw(slider, goal, plan, options, out / "plan.png")))
     settings = {"seed": seed} | vars(options)
-    return result_record("plan", settings, **_figures(plan, goal, motion), files=files, pictures=pictures)
+    return result_record("plan", settings, **_plan_entries(plan, goal, motion), files=files, pictures=pictures)
 
 
 def _check_finger(shape: pj.Shape, options: Options) -> None:
-    """Raise an error if the finger overlaps the block; nothing is compiled."""
+    """Raise ValueError if the finger overlaps the block, before anything is compiled."""
     if options.finger is None:
         return
     apart = point_clearance(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
@@ -86,8 +86,9 @@ def _check_finger(shape: pj.Shape, options: Options) -> None:
 
 def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed: int) -> Iterator[PushPlan]:
     """Yield the plan of each attempt."""
-    longest = _longest(options, float(slider.surface.length))
-    how: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
+    longest = _max_push_length(options, float(slider.surface.length))
+    # Without a search under sampled friction, the plan is the best one under the mean friction.
+    planner: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
     for attempt in range(options.attempts):
         yield plan_pushes(
             jax.random.fold_in(jax.random.key(seed), attempt),
@@ -99,19 +100,19 @@ def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed:
             pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
             success=options.success,
             finger=options.finger,
-            **how,
+            **planner,
         )
 
 
-def _longest(options: Options, length: float) -> float:
-    """Return the length of the longest push, m, for a limit surface of this length, m."""
-    return LONGEST * length if options.longest is None else options.longest
+def _max_push_length(options: Options, length: float) -> float:
+    """Return the greatest allowed length of a push, m, for a limit surface of characteristic length `length`, m."""
+    return MAX_PUSH_LENGTH * length if options.longest is None else options.longest
 
 
 def _check_distance(options: Options, length: float) -> None:
     """Raise ValueError if the goal is farther away than all pushes together are long."""
     assert options.goal is not None
-    away, longest = math.dist(options.start[:2], options.goal[:2]), _longest(options, length)
+    away, longest = math.dist(options.start[:2], options.goal[:2]), _max_push_length(options, length)
     if away > options.pushes * longest + options.tolerance[0]:
         raise ValueError(
             f"--goal is {away:.3g} m away, and --pushes {options.pushes} of at most {longest:.3g} m (--longest) do not "
@@ -130,8 +131,8 @@ def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) 
     return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_WAY, plan.success))
 
 
-def _figures(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
-    """Return what the record says of a plan."""
+def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
+    """Return the entries of the record that describe a plan."""
     final = np.asarray(plan.outcomes.pose, np.float64)
     errors = np.asarray(goal.offset(final), np.float64)
     spread = errors.std(axis=0)
@@ -153,8 +154,8 @@ def _figures(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[st
     }
 
 
-def _write(path: Path, motion: FingerMotion) -> Path:
-    """Write the motion of the finger, to the micrometer and the millisecond."""
+def _write_way_points(path: Path, motion: FingerMotion) -> Path:
+    """Write the motion of the finger, rounded to micrometers and milliseconds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
@@ -166,20 +167,20 @@ def _write(path: Path, motion: FingerMotion) -> Path:
 
 def summary(record: dict[str, Any]) -> str:
     """Return the text that the command prints for a record of `run`."""
-    spread, status = record["spread"], record["status"]
-    if status == PushPlanStatus.NO_WAY.name:
+    spread, status = record["spread"], PushPlanStatus[record["status"]]
+    if status == PushPlanStatus.NO_WAY:
         blocked = next(k for k, way in enumerate(record["ways"]) if way["status"] != WayStatus.FOUND.name)
-        words = f"no plan: the finger does not get to push {blocked + 1} ({record['ways'][blocked]['status']})"
-        return "\n".join([words, *(f"drew {path}" for path in record["pictures"])])
-    if not len(record["path"]):
-        words = "no push is needed" if status == PushPlanStatus.FOUND.name else "no push that helps was found"
+        lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['ways'][blocked]['status']})"]
+    elif not len(record["path"]):
+        words = "no push is needed" if status == PushPlanStatus.FOUND else "no push that helps was found"
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
-        return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])
-    lines = [
-        f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
-        f"{record['samples']} samples of friction" + ("" if status == "FOUND" else ", less than asked for"),
-        f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
-        f"{spread['theta_deg']:.1f} deg",
-    ]
-    lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]
+    else:
+        lines = [
+            f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
+            f"{record['samples']} samples of friction"
+            + ("" if status == PushPlanStatus.FOUND else ", less than asked for"),
+            f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
+            f"{spread['theta_deg']:.1f} deg",
+        ]
+        lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]
     return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])

@@ -20,7 +20,7 @@ ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")
 OBJECTS = ("rect1", "rect2", "rect3", "tri1", "tri3", "ellip1", "ellip2", "ellip3", "hex", "butter", "tri2")
 ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the archives
-APART = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
+NOT_IN_PAPER = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
 MODELS = {"quartic": 4, "ellipsoid": 2}
 # Polygons with fewer vertices get this many, by splitting edges, so that one compiled program serves all polygons.
 MIN_VERTICES = 6
@@ -49,7 +49,7 @@ PAPER_NO_MOTION_MM = {
 PAPER_PERCENT = {"quartic": 20.05, "ellipsoid": 21.39}
 
 
-def chosen(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
+def checked_surfaces(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
     """Check the names of surfaces and objects, and return the surfaces.
 
     Args:
@@ -94,7 +94,7 @@ def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
 
 def paper_mm(surface: str, name: str, model: str) -> float | None:
     """Return the paper's mean deviation in mm, or None for an object that is not in the paper."""
-    return None if name in APART else PAPER_MM[surface, model][OBJECTS.index(name)]
+    return None if name in NOT_IN_PAPER else PAPER_MM[surface, model][OBJECTS.index(name)]
 
 
 def outline(log: MitPushes) -> pj.Shape:

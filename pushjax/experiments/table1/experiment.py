@@ -2,6 +2,7 @@
 
 Surface and friction are learned from about eighty whole pushes of each object. The other pushes are predicted, from 10
 to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al. 2017, section VI.B, table 1).
+The curated archives also hold what the authors' toolbox predicts for the same pushes.
 
 Deviations from the paper: there is one split, where the paper has ten. Pushes that the tracker lost are tested too, as
 in the paper. The curated archives have no pushes on delrin, the paper's third surface; the published folders do.
@@ -20,7 +21,15 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments._tables import bootstrapped_ci95
-from pushjax.experiments.table1.conditions import APART, MODELS, OBJECTS, PAPER_PERCENT, chosen, load, paper_mm
+from pushjax.experiments.table1.conditions import (
+    MODELS,
+    NOT_IN_PAPER,
+    OBJECTS,
+    PAPER_PERCENT,
+    checked_surfaces,
+    load,
+    paper_mm,
+)
 from pushjax.experiments.table1.methods import METHODS, Predicted, Setting
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
@@ -35,7 +44,7 @@ def run(
     object: Sequence[str] = OBJECTS,
     progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """Compute one cell for each surface, object, method and model.
+    """Compute one cell of the table for each surface, object, method and model.
 
     With `out`, every cell is saved there as soon as it is known. An interrupted run continues with the saved cells.
 
@@ -56,11 +65,11 @@ def run(
         LogError: If data are missing or damaged.
         ValueError: If a method, surface or object is unknown.
     """
-    surface = chosen(folder, surface, object)
+    surface = checked_surfaces(folder, surface, object)
     unknown = [one for one in method if one not in METHODS]
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(METHODS)}; got {unknown or 'none'}")
-    logs = [load(folder, on, target, seed) for on in surface for target in object]
+    logs = [load(folder, surface_name, object_name, seed) for surface_name in surface for object_name in object]
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
     todo = []
     for log in logs:
@@ -70,7 +79,7 @@ def run(
                 labels = {"surface": log.surface, "object": log.shape, "model": model, "method": name}
                 todo.append((labels, partial(_cell, log, model, METHODS[name], setting, seed)))
     cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
-    means = {name: {model: _means(cells, name, model) for model in MODELS} for name in method}
+    means = {name: {model: _means_by_surface(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
     settings |= {"method": list(method), "surfaces": list(surface), "objects": list(object)}
     return result_record("table1", settings, cells=cells, means=means, pictures=pictures)
@@ -102,7 +111,7 @@ def _cell(
 
 
 def _calibration(predicted: Predicted) -> dict[str, Any]:
-    """Return what else was identified: lengths in mm, the angle of the object's frame in degrees."""
+    """Return the other identified unknowns and the noise: lengths in mm, angles in degrees; {} if there are none."""
     if predicted.found is None:
         return {}
     parameters = predicted.found.parameters
@@ -126,19 +135,19 @@ def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:
     return 1e3 * np.asarray(pj.deviation(final, log.middle.end, log.length), np.float64)
 
 
-def _means(cells: list[dict], method: str, model: str) -> dict[str, Any]:
+def _means_by_surface(cells: list[dict], method: str, model: str) -> dict[str, Any]:
     """Return the means over the paper's ten objects, over all surfaces and for each surface alone."""
-    selected = [c for c in cells if (c["method"], c["model"]) == (method, model) and c["object"] not in APART]
+    selected = [c for c in cells if (c["method"], c["model"]) == (method, model) and c["object"] not in NOT_IN_PAPER]
     if not selected:
         return {}
     surfaces = dict.fromkeys(cell["surface"] for cell in selected)
-    return _mean(selected, model) | {
-        name: _mean([c for c in selected if c["surface"] == name], model) for name in surfaces
+    return _mean_cell(selected, model) | {
+        name: _mean_cell([c for c in selected if c["surface"] == name], model) for name in surfaces
     }
 
 
-def _mean(cells: list[dict], model: str) -> dict[str, float | None]:
-    """Average cells of one method and model."""
+def _mean_cell(cells: list[dict], model: str) -> dict[str, float | None]:
+    """Return the means over cells of one method and model."""
     toolbox = [cell["toolbox_mm"] for cell in cells]
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in cells])),
@@ -155,8 +164,8 @@ def _draw(cells: list[dict], out: Path) -> list[str]:
 
     title, drawn = "Straight pushes: final pose, predicted against measured", []
     for name in dict.fromkeys(cell["method"] for cell in cells):
-        mine = [cell for cell in cells if cell["method"] == name]
-        figure = plot.table_figure(mine, f"{title} ({name.replace('_', '-')})", width=13.0)
+        of_method = [cell for cell in cells if cell["method"] == name]
+        figure = plot.table_figure(of_method, f"{title} ({name.replace('_', '-')})", width=13.0)
         drawn.append(str(plot.save(figure, out / f"table1_{name}.png")))
     return drawn
 
@@ -167,7 +176,7 @@ def summary(record: dict[str, Any]) -> str:
     lines = ["Mean deviation in mm, test pushes; the paper's in brackets."]
     for name, means in record["means"].items():
         cells = [cell for cell in record["cells"] if cell["method"] == name]
-        lines += ["", f"{name:20}" + "".join(f"{target:>13}" for target in objects)]
+        lines += ["", f"{name:20}" + "".join(f"{object_name:>13}" for object_name in objects)]
         for surface in surfaces:
             for model in MODELS:
                 row = [c for c in cells if (c["surface"], c["model"]) == (surface, model)]
@@ -178,12 +187,12 @@ def summary(record: dict[str, Any]) -> str:
             lines.append(f"{surface:9} {'noise':10}" + "".join(f"{floor:>13}" for floor in floors))
         for model, mean in means.items():
             for surface in surfaces if mean else ():
-                own = mean[surface]
-                toolbox = own["toolbox_mm"]
-                theirs = "" if toolbox is None else f", its program on these pushes {toolbox:.2f}"
+                there = mean[surface]
+                toolbox = there["toolbox_mm"]
+                by_toolbox = "" if toolbox is None else f", its program on these pushes {toolbox:.2f}"
                 lines.append(
-                    f"{model:10}{surface:9} mean {own['mean_mm']:.2f} mm (paper {own['paper_mm']:.2f}{theirs}), "
-                    f"{own['percent']:.2f} % of the motion"
+                    f"{model:10}{surface:9} mean {there['mean_mm']:.2f} mm (paper {there['paper_mm']:.2f}"
+                    f"{by_toolbox}), {there['percent']:.2f} % of the motion"
                 )
             if mean:
                 lines.append(

@@ -25,7 +25,7 @@ FRICTIONS = np.linspace(0.0, 0.6, 31)
 # Largest number of steps per push in the identification, which takes derivatives. More steps give the same answer.
 IDENTIFY_STEPS = 25
 # Largest numbers of pushes to learn from and to test with; arrays are padded to them.
-LEARNED, TESTED = 128, 304
+TRAINING_SIZE, TEST_SIZE = 128, 304
 # Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. All values were chosen
 # on the surface abs.
 SURFACE_DOF, PRESSURE_CENTER, INSET, HAND_OFFSET, FRAME_OFFSET = 10.0, 0.015, 0.001, 0.002, 0.001
@@ -60,18 +60,18 @@ class Setting(NamedTuple):
     """What both methods need of one object, with pushes as padded arrays.
 
     Attributes:
-        learned: Pushes to learn from.
+        training: Pushes to learn from.
         coarse: The same pushes in at most `IDENTIFY_STEPS` steps.
-        tested: Pushes to predict.
+        test: Pushes to predict.
         shape: Outline of the object.
         hand: The round finger.
         surface: Limit surface fitted to measured forces and motions.
         length: Length that weighs rotation against translation, m.
     """
 
-    learned: pj.Pushes
+    training: pj.Pushes
     coarse: pj.Pushes
-    tested: pj.Pushes
+    test: pj.Pushes
     shape: pj.Shape
     hand: pj.Hand
     surface: pj.LimitSurface
@@ -90,9 +90,9 @@ class Setting(NamedTuple):
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
         return Setting(
-            straight(log, log.whole, rows, steps, LEARNED),
-            straight(log, log.whole, rows, min(steps, IDENTIFY_STEPS), LEARNED),
-            straight(log, log.middle, np.arange(len(log.middle)), steps, TESTED),
+            straight(log, log.whole, rows, steps, TRAINING_SIZE),
+            straight(log, log.whole, rows, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
+            straight(log, log.middle, np.arange(len(log.middle)), steps, TEST_SIZE),
             outline(log),
             pj.Hand.finger(log.tip_radius),
             pj.fit_limit_surface(*pairs, log.length, degree=MODELS[model]),
@@ -107,20 +107,21 @@ class Setting(NamedTuple):
 
 def wrench_twist(setting: Setting) -> Predicted:
     """Predict with the fitted surface and the friction that is best for the training pushes, on a grid."""
-    learned, tested = setting.learned, setting.tested
-    on_grid, _ = final_poses(setting.slider, setting.hand, learned, jnp.asarray(FRICTIONS, learned.path.dtype))
-    errors = pj.deviation(on_grid, learned.end[None], setting.length)
-    best = FRICTIONS[int(np.argmin(np.asarray(errors @ learned.weight)))]
-    final, failed = final_poses(setting.slider, setting.hand, tested, jnp.asarray([best], learned.path.dtype))
-    return Predicted(own(final[0], tested), float(best), int(own(failed[0], tested).sum()), None)
+    training, test = setting.training, setting.test
+    on_grid, _ = final_poses(setting.slider, setting.hand, training, jnp.asarray(FRICTIONS, training.path.dtype))
+    errors = pj.deviation(on_grid, training.end[None], setting.length)
+    best = FRICTIONS[int(np.argmin(np.asarray(errors @ training.weight)))]
+    final, failed = final_poses(setting.slider, setting.hand, test, jnp.asarray([best], training.path.dtype))
+    final, failed = (without_padding(values[0], test) for values in (final, failed))
+    return Predicted(final, float(best), int(failed.sum()), None)
 
 
 def identified(setting: Setting) -> Predicted:
     """Predict with everything that is identified from the final poses of the training pushes."""
     found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-    predicted = found.predict(setting.tested, setting.slider, setting.hand)
-    failed = own(predicted.failed, setting.tested)
-    return Predicted(own(predicted.pose[:, -1], setting.tested), float(found.friction), int(failed.sum()), found)
+    predicted = found.predict(setting.test, setting.slider, setting.hand)
+    final, failed = (without_padding(values, setting.test) for values in (predicted.pose[:, -1], predicted.failed))
+    return Predicted(final, float(found.friction), int(failed.sum()), found)
 
 
 def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: float = 0.0) -> pj.Identified:
@@ -148,6 +149,6 @@ def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}
 
 
-def own(values, pushes: pj.Pushes) -> np.ndarray:
-    """Return the values of a push's own rows, without those of the padding, as float64."""
+def without_padding(values, pushes: pj.Pushes) -> np.ndarray:
+    """Return the rows of `values` that belong to pushes, without those of the padding, as float64."""
     return np.asarray(values, np.float64)[np.asarray(pushes.weight) > 0]
