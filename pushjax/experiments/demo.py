@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax._internal.jit import quick_jit
 from pushjax._internal.record import result_record
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
@@ -79,7 +80,7 @@ def motion_cone_setup(key: jax.Array):
     support = pj.Support.uniform(block, points=100)
     surface = pj.fit_limit_surface(*support.wrench_twist_pairs(key, 200), degree=4)
     point, normal = jnp.array([[-0.02, -SIDE / 2]]), jnp.array([[0.0, 1.0]])
-    right = pj.motion_cone(surface, point[0], normal[0], FRICTION)[1]
+    right = quick_jit(pj.motion_cone)(surface, point[0], normal[0], FRICTION)[1]
     turn = -np.radians(15)  # the push lies clockwise of the cone's right edge
     push = jnp.stack(
         [np.cos(turn) * right[0] - np.sin(turn) * right[1], np.sin(turn) * right[0] + np.cos(turn) * right[1]]

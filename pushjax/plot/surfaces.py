@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pushjax._math.vec import Vec3
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.support import WrenchTwistPairs
 from pushjax.plot.style import STYLE, curve_styles
@@ -105,7 +106,6 @@ def _spread_out(wrench: np.ndarray, count: int) -> np.ndarray:
 
 def _on_level_set(surface: LimitSurface, normalized: np.ndarray) -> np.ndarray:
     """Scale wrenches `(fx, fy, tau / length)` along their rays to H = 1; the result has the same form, in N."""
-    flat = normalized.reshape(-1, 3) * np.array([1, 1, float(surface.length)])
-    level = np.array(jax.vmap(surface.on_level_set)(flat.astype(surface.length.dtype)))
-    level[:, 2] /= float(surface.length)
-    return level.reshape(normalized.shape)
+    form = jax.tree.map(np.asarray, surface.form())  # with NumPy, so that nothing is compiled for a picture
+    value = np.asarray(form.value(Vec3(*np.moveaxis(normalized, -1, 0))))
+    return normalized * value[..., None] ** (-1 / form.degree)
