@@ -1,7 +1,7 @@
-"""Solves sets of one, two or three cone edges, and checks each solution against every condition of the problem.
+"""Solve sets of one, two or three cone edges, and check each solution against every condition of the problem.
 
-Each solution is checked against the whole problem, so a wrong answer cannot pass. The equations of each set are in the
-header of `exhaustive`, which tries all sets. `projected` tries those that its iteration points to.
+The checks do not depend on how a set was found or solved, so a wrong answer cannot pass. The equations of each set
+are in the header of `exhaustive`, which tries all sets. `projected` tries those that its iteration points to.
 """
 
 from typing import NamedTuple
@@ -35,16 +35,16 @@ class Incumbent(NamedTuple):
 
     Attributes:
         edges: Numbers of the set's generators (see `scaled_problem`), the used ones first, then `NO_EDGE`.
-        contacts: Number of the contact whose condition each slot has. If the first two are the same, the second
-            condition is that this contact sticks. These are the contacts of the edges, but for the last one in the
-            case that `solve_three_edges` describes.
+        contacts: Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the
+            same, the second condition is that this contact sticks. They are the contacts of the edges. An exception
+            is the third one in the case that `solve_three_edges` describes.
         weight: Weight of each generator in the wrench, up to one common factor.
         twist: Dimensionless twist.
         power: Power F . V with the wrench F scaled to H = 1. Of several solutions, the one with the largest is kept.
         found: Whether any set passed every check.
         second_found: Whether a set with a different twist passed too.
-        too_fast: Whether a twist passed that is too fast to be an answer (`max_twist_ratio`), by a factor of at most
-            `TOO_FAST`. Then the problem is no jam either.
+        too_fast: Whether a set passed whose twist exceeds `max_twist_ratio` by a factor of at most `TOO_FAST`. Such a
+            twist is not accepted as an answer. But it shows that the problem is not a jam.
     """
 
     edges: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
@@ -88,7 +88,7 @@ def solve_one_edge(problem: ScaledProblem, incumbent: Incumbent, edge: Index) ->
     tolerance = kinematic_tolerance(twist)
     passes = (normal_motion != 0) & (scale > 0) & touching & none_violated & (side * slip <= tolerance)
     one = jnp.ones_like(approach)
-    # by Euler's identity, H is the power of the unscaled motion divided by the degree
+    # By Euler's identity, H is the power of the unscaled motion divided by the degree.
     raw_power = scale * motion.dot(generator)
     power = _power_on_limit_surface(
         problem.form, raw_power, raw_power / (problem.form.degree * jnp.where(scale > 0, scale, 1.0))
@@ -122,7 +122,7 @@ def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, 
     row1 = dynamic_index(problem.normal, c1)
     row2 = tree_where(sticks, dynamic_index(problem.tangent, c1), dynamic_index(problem.normal, c2))
     b1, b2 = approach1.x, jnp.where(sticks, approach1.y, approach2.x)
-    # orthogonal to the twists that satisfy both conditions up to a common factor
+    # Orthogonal to the twists that satisfy both conditions up to a common factor.
     across = row1.scale(b2) - row2.scale(b1)
     constant, linear, quadratic, leading = (across.dot(motion) for motion in segment.motions)
     cubic = compute_once((constant, linear, quadratic, leading), runtime_scalar)
@@ -135,6 +135,7 @@ def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, 
         pending, incumbent = state
         first, second, third = pending
         interval = tree_where(first, intervals[0], tree_where(second, intervals[1], intervals[2]))
+        # Drop the first one that is pending.
         pending = first & False, first & second, (first | second) & third
         u = cubic_root(cubic, interval)
         motion = segment.motion(u)
@@ -155,7 +156,7 @@ def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, 
         edges, contacts = (edge1, edge2, NO_EDGE), (c1, c2, NO_EDGE)
         return pending, _update_incumbent(incumbent, passes, edges, contacts, Vec3(1 - s, s, 0 * s), twist, power)
 
-    # few examples of a batch have more than one root: all take their next root in the same iteration
+    # Few examples of a batch have more than one root, so all take their next root in the same iteration.
     return jax.lax.while_loop(
         lambda state: state[0][0] | state[0][1] | state[0][2], try_next_root, (pending, incumbent)
     )[1]
@@ -188,7 +189,7 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
     m = problem.count
     states, none_violated = _contact_states(problem, twist, tuple(range(m)))
     feasible = regular & none_violated
-    # left edge, right edge; both where the contact sticks
+    # Whether the left edge and the right edge may carry force; both may where the contact sticks.
     may_carry = tuple((touching & (slip <= tolerance), touching & (slip >= -tolerance)) for touching, slip in states)
     touches = tuple(left | right for left, right in may_carry)
     for contact in contacts:
@@ -352,8 +353,8 @@ def _cone_coordinates(
     Args:
         f: The wrench.
         generators: The three generators.
-        violation_per_weight: `ScaledProblem.violation_per_weight` of each generator's contact; the larger it is, the
-            less may a weight be below zero.
+        violation_per_weight: `ScaledProblem.violation_per_weight` of each generator's contact. A weight may be below
+            zero by an amount that is inversely proportional to it.
 
     Returns:
         The weights, whether f lies between the generators, and the least weight as a fraction of their sum.

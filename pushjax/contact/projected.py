@@ -1,8 +1,8 @@
 """Iterative solver of several contacts: a sequence of projected problems, then an exact finish.
 
-Each iteration linearizes grad H at the last wrench F_t, with the constant term kept (Josephy and Newton's method). Zhou
-et al. drop the constant and damp, which converges linearly. Then the iteration sweeps over the contacts: projected
-Gauss-Seidel on normal and tangential force in turn. The result of the sweeps only has to show which cone edges carry
+Each iteration linearizes grad H at the last wrench: grad H(F) = A F + c (Josephy and Newton's method). Zhou et al. drop
+the constant c and damp, which converges linearly. Then the iteration sweeps over the contacts: projected Gauss-Seidel
+on normal and tangential force in turn. The result of the sweeps only has to show which cone edges carry
 the force. The systems of the edges with the largest forces are then solved exactly, as in `exhaustive`, and checked
 against every condition.
 
@@ -55,15 +55,16 @@ class Projected(ContactSolver):
 
 
 class _Linearization(NamedTuple):
-    """grad H(F) = A F + c near the last wrench, A being the Hessian of H there.
+    """grad H(F) = A F + c near the last wrench, where A is the Hessian of H.
 
-    The compliances are the diagonal of the Delassus matrix: how far a unit force moves its own contact point.
+    The unit forces of a contact along its normal and its tangent have the wrenches a_n and a_t. The compliances are the
+    diagonal of the Delassus matrix: how far a unit force moves its own contact point.
 
     Attributes:
         along_n: A a_n for each contact.
         along_t: A a_t for each contact.
-        stiff_n: a_n . A a_n for each contact.
-        stiff_t: a_t . A a_t for each contact.
+        compliance_n: a_n . A a_n for each contact.
+        compliance_t: a_t . A a_t for each contact.
         constant: c.
     """
 

@@ -13,12 +13,7 @@ from pushjax._math.vec import Scalar, Vec3
 from pushjax.friction.limit_surface import InverseMap, LimitSurface, angle_between, angle_tolerance, checked_length
 
 
-class _EllipsoidFields(NamedTuple):
-    a: Symmetric3
-    length: Scalar
-
-
-class EllipsoidForm(_EllipsoidFields):
+class EllipsoidForm(NamedTuple):
     """The `Form` of an ellipsoid: H(F) = F' A F.
 
     Attributes:
@@ -26,7 +21,10 @@ class EllipsoidForm(_EllipsoidFields):
         length: Characteristic length, m.
     """
 
-    degree: ClassVar[int] = 2
+    a: Symmetric3
+    length: Scalar
+
+    degree = 2
 
     def scaled(self, factor: Scalar) -> "EllipsoidForm":
         return EllipsoidForm(Symmetric3(*(factor * entry for entry in self.a)), self.length)

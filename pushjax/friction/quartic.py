@@ -30,12 +30,7 @@ CONVEXITY_TOLERANCE = 1e-6
 MAX_NEWTON_ROUNDS = 100
 
 
-class _QuarticFields(NamedTuple):
-    c: tuple[Scalar, ...]
-    length: Scalar
-
-
-class QuarticForm(_QuarticFields):
+class QuarticForm(NamedTuple):
     """The `Form` of a quartic H.
 
     Attributes:
@@ -43,7 +38,10 @@ class QuarticForm(_QuarticFields):
         length: Characteristic length, m.
     """
 
-    degree: ClassVar[int] = 4
+    c: tuple[Scalar, ...]
+    length: Scalar
+
+    degree = 4
 
     def scaled(self, factor: Scalar) -> "QuarticForm":
         return QuarticForm(tuple(factor * c for c in self.c), self.length)

@@ -1,4 +1,4 @@
-"""A table whose friction depends on position or direction.
+"""The table that the slider lies on, with friction that depends on position or direction.
 
 Such a table transforms the wrenches of a limit surface: H(F) becomes H(T F). T stretches the force and takes the torque
 about another point. The twist becomes T' grad H(T F), which preserves power.
@@ -17,7 +17,7 @@ from pushjax.friction.limit_surface import Form
 
 # Number of entries of each attribute of `Table`.
 SIZES = {"anisotropy": 2, "log_gradient": 2, "log_hessian": 3, "origin": 2}
-NEAR_ZERO = 1e-3  # value of r^2 below which cosh(r) and sinh(r) / r are computed by their series
+NEAR_ZERO = 1e-3  # squared norm r^2 of the anisotropy below which series give cosh(r) and sinh(r) / r, without 0 / 0
 
 
 class WrenchTransform(NamedTuple):
@@ -54,18 +54,16 @@ class WrenchTransform(NamedTuple):
         )
 
 
-class _TransformedFields(NamedTuple):
-    base: Form
-    transform: WrenchTransform
-
-
-class TransformedForm(_TransformedFields):
+class TransformedForm(NamedTuple):
     """The `Form` H(T F) of a limit surface on a table.
 
     Attributes:
         base: The form H.
         transform: The map T.
     """
+
+    base: Form
+    transform: WrenchTransform
 
     @property
     def degree(self) -> int:
