@@ -44,11 +44,10 @@ class Curve(Shape):
     convex: bool = eqx.field(static=True)
 
     def __init__(self, control: ArrayLike, *, convex: bool | None = None):
-        array = _check_points("control", control, least=4)
+        array = _checked_points("control", control)
         known = concrete(array)
-        if known is not None:
-            if _check_curve(known.astype(np.float64)) < 0:
-                array = jnp.roll(array[::-1], 1, axis=0)
+        if known is not None and _checked_signed_area(known.astype(np.float64)) < 0:
+            array = jnp.roll(array[::-1], 1, axis=0)
         self.control = array
         self.convex = _is_convex(array, convex)
 
@@ -67,7 +66,7 @@ class Curve(Shape):
         Raises:
             ValueError: As for `Curve`.
         """
-        array = _check_points("points", points, least=4)
+        array = _checked_points("points", points)
         identity = np.eye(len(array))
         knot_weights = (4 * identity + np.roll(identity, 1, axis=0) + np.roll(identity, -1, axis=0)) / 6
         return Curve(_solve(jnp.asarray(knot_weights, array.dtype), array), convex=convex)
@@ -91,7 +90,7 @@ class Curve(Shape):
         Raises:
             ValueError: If the points are traced, `controls` is out of range, or as for `Curve`.
         """
-        array = _check_points("points", points, least=4)
+        array = _checked_points("points", points)
         known = concrete(array)
         if known is None:
             raise ValueError("points are traced; a curve is fitted only to known points, outside jit, grad and vmap")
@@ -182,12 +181,12 @@ def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array
     return jnp.min(values), jnp.max(values)
 
 
-def _check_points(name: str, points: ArrayLike, least: int) -> Array:
-    """Return the argument `name` as an array; raise unless it holds at least `least` finite, distinct points."""
-    array = as_float(points, name="points")
+def _checked_points(name: str, points: ArrayLike) -> Array:
+    """Return the argument `name` as an array; raise unless it holds at least four finite, distinct points."""
+    array = as_float(points, name=name)
     check_shape(name, array, (name, 2))
-    if len(array) < least:
-        raise ValueError(f"{name}: a curve needs at least {least}; got {len(array)}")
+    if len(array) < 4:
+        raise ValueError(f"{name}: a curve needs at least 4; got {len(array)}")
     check_finite(name, array)
     known = concrete(array)
     if known is not None:
@@ -208,8 +207,8 @@ _BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) 
 def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return points and first and second derivatives of a known curve, each of shape (parameters, 2).
 
-    This repeats `spline_segments` and `SplineSegment.at` in NumPy, to compute in float64 whatever precision JAX runs
-    in.
+    This repeats `spline_segments` and `SplineSegment.evaluate` in NumPy, to compute in float64 whatever precision JAX
+    runs in.
     """
     index = np.floor(parameter).astype(int)
     t = (parameter - index)[:, None]
@@ -218,7 +217,7 @@ def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.n
     return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3), 2 * c2 + 6 * t * c3
 
 
-def _check_curve(control: np.ndarray) -> float:
+def _checked_signed_area(control: np.ndarray) -> float:
     """Return the approximate signed area, m^2; raise if the curve encloses no area, has a cusp or crosses itself."""
     samples = max(4, min(16, 1200 // len(control)))  # per segment; all pairs of samples are compared
     points, velocity, _ = _evaluate_in_numpy(control, np.arange(len(control) * samples) / samples)
@@ -263,6 +262,7 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
 
 @in_numpy
 def _solve(xp, matrix, right):
+    """Solve a linear system."""
     return xp.linalg.solve(matrix, right)
 
 
