@@ -24,7 +24,7 @@ from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.planning import SqueezeOutcomes, SqueezePlan, Squeezes, plan_squeezes, squeeze_outcomes
-from pushjax.planning.goal import ANGLE, symmetric_turns
+from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
 from pushjax.planning.pose_spread import distances, entropy, most_likely
 from pushjax.planning.squeezes import WIDTH
 from pushjax.plot.files import save
@@ -120,7 +120,7 @@ def _row(outcomes: list[SqueezeOutcomes], slider: pj.Slider, symmetry: int) -> d
     poses, known, failed = [], [], 0
     for each in outcomes:
         poses.append(np.exp(entropy(np.moveaxis(each.poses, 1, 0), turns, length, WIDTH * length)))
-        _, near = most_likely(each.poses[:, -1], turns, POSITION, ANGLE)
+        _, near = most_likely(each.poses[:, -1], turns, POSITION, ANGLE_TOLERANCE)
         known.append(np.mean(near & each.held[:, -1]))
         failed += int(each.failed.sum())
     held = float(np.mean([each.held[:, -1].mean() for each in outcomes]))
@@ -134,7 +134,7 @@ def _agreement(plan: SqueezePlan, real: SqueezeOutcomes, slider: pj.Slider, symm
     apart, turned = distances(np.concatenate([real.poses[:, -1], predicted]), turns, length)
     among = np.hypot(apart, turned)[: len(real.poses), len(real.poses) :].min(axis=1) <= 2 * WIDTH * length
     apart, turned = distances(np.concatenate([plan.pose[None], real.poses[:, -1]]), turns, 1.0)
-    near = (apart[0, 1:] <= POSITION) & (turned[0, 1:] <= ANGLE)
+    near = (apart[0, 1:] <= POSITION) & (turned[0, 1:] <= ANGLE_TOLERANCE)
     came_true = float(np.mean(near & real.held[:, -1]))
     return {"predicted": plan.success, "came_true": came_true, "among_predicted": float(np.mean(among))}
 

@@ -109,7 +109,7 @@ class Missed(Cost):
         check_non_negative("width", self.width)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        beyond = self.goal.excess(_poses(push)[-1]) - 1
+        beyond = self.goal.max_error(_poses(push)[-1]) - 1
         smooth = self.width > 0
         slope = jax.nn.sigmoid(beyond / jnp.where(smooth, self.width, 1.0).astype(beyond.dtype))
         return jnp.where(smooth, slope, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))

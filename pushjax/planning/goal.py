@@ -18,7 +18,7 @@ from pushjax._internal.checks import (
 )
 from pushjax._math.vec import norm, wrap_to_pi
 
-ANGLE = float(np.radians(5))  # default tolerance of the angle, rad
+ANGLE_TOLERANCE = float(np.radians(5))  # rad
 
 
 class Goal(eqx.Module):
@@ -62,7 +62,7 @@ class Goal(eqx.Module):
         pose: ArrayLike,
         *,
         position: ArrayLike = 0.005,
-        angle: ArrayLike = ANGLE,
+        angle: ArrayLike = ANGLE_TOLERANCE,
         length: ArrayLike = 0.05,
         symmetry: int | ArrayLike = 1,
     ):
@@ -81,14 +81,14 @@ class Goal(eqx.Module):
         self.turns = symmetric_turns(symmetry, dtype)
 
     def offset(self, pose: ArrayLike) -> Float[Array, "*batch 3"]:
-        """Return what is missing from the goal: the difference of the poses, with the smallest of the angles.
+        """Return the offset of poses from the goal, in the orientation of the nearest of the equivalent goals.
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
 
         Returns:
-            Pose minus goal, (..., 3), m and rad. The angle is that of the turn that is nearest, within half a turn.
-            Its derivative is one everywhere; where two turns are equally near, that of either.
+            Pose minus goal, (..., 3), m and rad. The angle is at most half a turn, and its derivative is one
+            everywhere. Where two of the equivalent goals are equally near, it is that of either.
 
         Raises:
             ValueError: For poses of another shape.
@@ -130,10 +130,12 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
-        return norm(offset[..., :2]) + self.length * offset[..., 2] * jnp.sign(offset[..., 2])
+        return norm(offset[..., :2]) + self.length * jnp.abs(offset[..., 2])
 
-    def excess(self, pose: ArrayLike) -> Float[Array, "*batch"]:
-        """Return the larger of the errors of position and angle in units of their tolerances; at most one if reached.
+    def max_error(self, pose: ArrayLike) -> Float[Array, "*batch"]:
+        """Return the larger of the errors of position and angle, each in units of its tolerance.
+
+        The goal is reached if it is at most one.
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
@@ -142,8 +144,7 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
-        turn = offset[..., 2] * jnp.sign(offset[..., 2])
-        return jnp.maximum(norm(offset[..., :2]) / self.position, turn / self.angle)
+        return jnp.maximum(norm(offset[..., :2]) / self.position, jnp.abs(offset[..., 2]) / self.angle)
 
     def reached(self, pose: ArrayLike) -> Bool[Array, "*batch"]:
         """Return whether poses are within both tolerances.
@@ -154,7 +155,7 @@ class Goal(eqx.Module):
         Raises:
             ValueError: For poses of another shape.
         """
-        return self.excess(pose) <= 1
+        return self.max_error(pose) <= 1
 
 
 def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array, "turns"]:

@@ -1,4 +1,4 @@
-"""How well a pose is known, of which there are samples: entropy, and the most likely pose.
+"""The spread of samples of a pose: their entropy, and the most likely pose.
 
 A slider that looks the same after some turns has equivalent poses, which count as one.
 
@@ -14,12 +14,12 @@ import numpy as np
 
 
 def distances(poses: np.ndarray, turns: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far samples are from each other.
+    """Return the distances between samples, of their positions and of their angles.
 
     Args:
         poses: Samples of poses, (..., samples, 3), m and rad.
         turns: Turns after which the slider looks the same, (turns,), rad.
-        length: What an angle of one radian counts, m. It is applied to the second result.
+        length: Distance that counts as much as an angle of one radian, m.
 
     Returns:
         The distances of the positions, and of the angles times `length`, both (..., samples, samples), m.
@@ -37,7 +37,7 @@ def entropy(poses: np.ndarray, turns: np.ndarray, length: float, width: float) -
     Args:
         poses: Samples of poses, (..., samples, 3), m and rad.
         turns: Turns after which the slider looks the same, (turns,), rad.
-        length: What an angle of one radian counts, m.
+        length: Distance that counts as much as an angle of one radian, m.
         width: Width of the kernel, m: poses that are nearer than about this are the same.
     """
     apart, turned = distances(poses, turns, length)

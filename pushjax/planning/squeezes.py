@@ -36,7 +36,7 @@ from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
 from pushjax.friction.random import FrictionModel
 from pushjax.planning.draws import draw_friction
-from pushjax.planning.goal import ANGLE, symmetric_turns
+from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
 from pushjax.planning.pose_spread import entropy, most_likely
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand
@@ -163,7 +163,7 @@ def plan_squeezes(
     count: int = 3,
     symmetry: int | ArrayLike = 1,
     position: float = 0.005,
-    angle: float = ANGLE,
+    angle: float = ANGLE_TOLERANCE,
     width: float | None = None,
     samples: int = 64,
     beam: int = 2,

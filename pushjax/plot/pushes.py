@@ -15,7 +15,7 @@ from pushjax.contact.status import Status
 from pushjax.geometry.shape import Shape
 from pushjax.plot.parts import arrow, centroids, draw_fixtures, hand_at, outline, placed_outline, vertices
 from pushjax.plot.squeeze import SQUEEZE_LABEL, SqueezeForces, squeeze_forces
-from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, legend_of_moments, panel_row
+from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, panel_row, start_to_end_legend
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.trajectory import Trajectory
@@ -59,7 +59,7 @@ def push_figure(
             axes.plot(*centroids(shape, pose).T, color=BLUE, lw=1.2, label="centroid of the slider")
             draw_fixtures(axes, fixtures)
             axes.set(title=_title_with_failure(name, push), xlabel="x / mm", ylabel="y / mm", aspect="equal")
-        legend_of_moments(figure, all_axes[0])
+        start_to_end_legend(figure, all_axes[0])
         return figure
 
 
@@ -108,7 +108,7 @@ def grasp_figure(
         all_axes[0].set_ylabel("y / mm")
         if held:
             all_axes[0].plot([], [], color=ORANGE, lw=2.2, label=SQUEEZE_LABEL)
-        legend_of_moments(figure, all_axes[0])
+        start_to_end_legend(figure, all_axes[0])
         return figure
 
 

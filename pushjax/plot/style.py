@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 MM, DEGREES = 1e3, 180 / np.pi  # lengths are drawn in mm, angles in degrees
-# The colors of Okabe & Ito, which color-blind readers can tell apart
+# The colors of Okabe & Ito, which color-blind readers can tell apart.
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 # Where a picture shows the start, the middle and the end of a push, they are black, gray and red. These colors differ
 # in lightness, so that a grayscale print keeps them apart.
@@ -25,7 +25,7 @@ SERIES = (
     ("#56B4E9", (0, (5, 1, 1, 1, 1, 1)), "v"),
     ("black", (0, (1, 3)), "x"),
 )
-MODELS = {"quartic": 0, "ellipsoid": 1}  # row of `SERIES`, the same in every picture
+MODEL_ROWS = {"quartic": 0, "ellipsoid": 1}  # index into `SERIES`, the same in every picture
 STYLE_KEYS = ("color", "linestyle", "marker")
 HATCH = "////"  # hatch of the second of two kinds of bars
 
@@ -71,7 +71,7 @@ def curve_styles(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, An
     """
     if len(curves) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
-    order = [MODELS[name] for name in curves] if MODELS.keys() >= curves.keys() else range(len(curves))
+    order = [MODEL_ROWS[name] for name in curves] if MODEL_ROWS.keys() >= curves.keys() else range(len(curves))
     rows = zip(curves.items(), order, strict=True)
     return [(name, curve, dict(zip(STYLE_KEYS, SERIES[k], strict=True))) for (name, curve), k in rows]
 
@@ -88,7 +88,7 @@ def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
-def legend_of_moments(figure: Figure, axes: Axes) -> None:
+def start_to_end_legend(figure: Figure, axes: Axes) -> None:
     """Draw the legend of pictures that show a push at its start, between, and at its end."""
     for color, label in ((BLACK, "start"), (GRAY, "between"), (RED, "end")):
         axes.plot([], [], color=color, label=label)

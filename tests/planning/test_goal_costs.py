@@ -58,7 +58,7 @@ def test_errors_from_the_nearest_equivalent_goal(symmetry):
 def test_derivatives_at_the_goal(dtype):
     """Zero where the goal is met, one where only the angle's tie is; never NaN."""
     goal = Goal(np.array([0.1, -0.2, 3.0], dtype), symmetry=2)
-    for function in (goal.distance, goal.squared_error, goal.excess):
+    for function in (goal.distance, goal.squared_error, goal.max_error):
         value, slope = jax.value_and_grad(function)(goal.pose)
         assert value == 0
         assert value.dtype == dtype
