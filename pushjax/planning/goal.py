@@ -130,7 +130,7 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
-        return norm(offset[..., :2]) + self.length * jnp.abs(offset[..., 2])
+        return norm(offset[..., :2]) + self.length * _absolute(offset[..., 2])
 
     def max_error(self, pose: ArrayLike) -> Float[Array, "*batch"]:
         """Return the larger of the errors of position and angle, each in units of its tolerance.
@@ -144,7 +144,7 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
-        return jnp.maximum(norm(offset[..., :2]) / self.position, jnp.abs(offset[..., 2]) / self.angle)
+        return jnp.maximum(norm(offset[..., :2]) / self.position, _absolute(offset[..., 2]) / self.angle)
 
     def reached(self, pose: ArrayLike) -> Bool[Array, "*batch"]:
         """Return whether poses are within both tolerances.
@@ -156,6 +156,11 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         return self.max_error(pose) <= 1
+
+
+def _absolute(angle: Array) -> Array:
+    """Return |angle| with derivative zero at zero, where that of `jnp.abs` is one."""
+    return angle * jnp.sign(angle)
 
 
 def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array, "turns"]:
