@@ -85,10 +85,10 @@ def cost_to_go(
     moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
     allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
     if space is not None:
-        met = space.table.nearest(cells) < space.least
+        met = space.table.nearest(cells) < space.slider_clearance
         blocked |= met
         allowed = [
-            may & space.moves(library, angle, move.entry)
+            may & space.free_from_grid(library, angle, move.entry)
             for may, angle, move in zip(allowed, theta, moves, strict=True)
         ]
     for _ in range(SWEEPS):

@@ -1,9 +1,10 @@
 """Which pushes of a library keep slider and finger out of walls and fixed bodies.
 
 As long as nothing else touches the slider, a push has the outcome that the library has. So a push is free if slider and
-finger keep a distance from all obstacles at every pose on the way; others are not considered at all.
+finger keep a distance from all obstacles at every pose on the way. Other pushes are not considered at all.
 
-Many pushes from one pose are judged by a table of the slider's distance from obstacles, the few best of them exactly.
+The many pushes from one pose are first judged by a table of the slider's distance from obstacles. The best few of them
+are then checked exactly.
 """
 
 from functools import cached_property
@@ -16,12 +17,14 @@ from pushjax.planning.poses import compose, to_world
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import Workspace
 
-TOLERANCE = 0.005  # overlap that counts as touching, in units of the surface's length
-PROGRESS = 0.02  # by which a slider that is too near must get away, in units of the length
-ANGLES = 72  # of the table
-REFINED = 4  # cells of the table in one of the cost to go, along x and y each
-SPARSE, DENSE = 4, 2  # of the lengths of a push, one in so many is looked at: by the table, and exactly
-OUTLINE = 24  # vertices of the slider for the table, at most
+# Lengths in units of the surface's length.
+OVERLAP_TOLERANCE = 0.005  # overlap that counts as touching
+MIN_RETREAT = 0.02  # by how much a push must increase the slider's distance from an obstacle that is too near
+# Of the lengths of a push, every so many is checked: by the table, and exactly.
+TABLE_STRIDE, EXACT_STRIDE = 4, 2
+ANGLES = 72  # number of angles in the table
+SUBDIVISIONS = 4  # spacings of the table in one spacing of the grid of the cost to go
+MAX_VERTICES = 24  # number of vertices of the slider for the table
 
 
 class FreeSpace:
@@ -34,8 +37,12 @@ class FreeSpace:
         library: Pushes of the slider. Others may have other outcomes, but the same starts, directions and lengths.
         clearance: Distance that slider and finger keep from obstacles, m.
         goal: The goal, (3,), world. If it is nearer to an obstacle, the slider keeps only the distance it has there.
-        low: Lowest position of the slider in the table of the cost to go, (2,), m.
-        high: Highest position, (2,), m.
+        low: Lowest position of the slider on the grid of the cost to go, (2,), world, m. The table has the same range.
+        high: Highest position, (2,), world, m.
+
+    Attributes:
+        clearance: Distance that the finger keeps from obstacles, m.
+        slider_clearance: Distance that the slider keeps from obstacles, m: the same, or less if the goal is nearer.
 
     Raises:
         ValueError: For a goal at which the slider overlaps an obstacle.
@@ -53,80 +60,87 @@ class FreeSpace:
     ):
         self.workspace, self.roadmap, self.length = workspace, roadmap, library.length
         self.obstacles, self.vertices, self.radius = workspace.obstacles, roadmap.vertices, roadmap.radius
-        self.low, self.spacing = low, grid_spacing(low, high) / REFINED
-        self.positions = REFINED * (POSITIONS - 1) + 1
-        far = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
-        self.beyond = int(np.ceil(far / self.spacing)) + 1  # cells that a push may lead to, beyond the table
-        self.clearance = self.least = clearance
-        at_goal = float(self.slider(goal))
-        if at_goal < -TOLERANCE * self.length:
+        self.low, self.spacing = low, grid_spacing(low, high) / SUBDIVISIONS
+        self.positions = SUBDIVISIONS * (POSITIONS - 1) + 1
+        reach = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
+        self.padding = int(np.ceil(reach / self.spacing)) + 1  # cells beyond the table that a push may lead to
+        self.clearance = clearance
+        at_goal = float(self.slider_distance(goal))
+        if at_goal < -OVERLAP_TOLERANCE * self.length:
             raise ValueError(
                 f"goal must be a pose at which the slider overlaps no fixture; got {np.asarray(goal).tolist()}, where "
                 "it does"
             )
-        self.least = min(clearance, max(at_goal, 0.0))
+        self.slider_clearance = min(clearance, max(at_goal, 0.0))
 
-    def slider(self, poses: np.ndarray) -> np.ndarray:
+    def slider_distance(self, poses: np.ndarray) -> np.ndarray:
         """Return the distance of the slider from obstacles at poses (..., 3), as `Obstacles.slider_clearance` does."""
-        return self.obstacles.slider_clearance(self.vertices, poses, 2 * self.clearance, TOLERANCE * self.length)
+        return self._distance_of(self.vertices, poses)
+
+    def _distance_of(self, vertices: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Return the distance of a polygon, (vertices, 2), from obstacles at poses (..., 3), m."""
+        tolerance = OVERLAP_TOLERANCE * self.length
+        return self.obstacles.slider_clearance(vertices, poses, 2 * self.clearance, tolerance)
 
     @cached_property
     def table(self) -> PoseTable:
-        """The same distance on a grid of poses."""
+        """`slider_distance` on a grid of poses, for an outline of at most `MAX_VERTICES` vertices."""
         axes = [low + self.spacing * np.arange(self.positions) for low in self.low]
         theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-        outline = self.vertices[:: -(-len(self.vertices) // OUTLINE)]
+        outline = self.vertices[:: -(-len(self.vertices) // MAX_VERTICES)]
         values = [
-            self.obstacles.slider_clearance(
-                outline,
-                np.stack(np.meshgrid(*axes, [each], indexing="ij"), axis=-1),
-                2 * self.clearance,
-                TOLERANCE * self.length,
-            )
-            for each in theta
+            self._distance_of(outline, np.stack(np.meshgrid(*axes, [each], indexing="ij"), axis=-1)) for each in theta
         ]
         return PoseTable(self.low, self.spacing, np.concatenate(values, axis=-1).astype(np.float32))
 
     @cached_property
-    def _grids(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the slider (angles, cells, cells) and the finger in a push (cells, cells) are free, and it before one.
+    def _free_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cells that are free, on the grid of the table with `padding` more cells on each side.
 
-        They have some cells beyond the table.
+        A tuple of three: those of the slider, (angles, cells, cells), those of the finger during a push, (cells,
+        cells), and those of the finger at the start of a run-up, (cells, cells).
         """
-        side = (self.beyond, self.beyond)
-        slider = np.pad(np.moveaxis(self.table.values, 2, 0) >= self.least, ((0, 0), side, side), constant_values=True)
-        axes = [low + self.spacing * np.arange(-self.beyond, self.positions + self.beyond) for low in self.low]
+        side = (self.padding, self.padding)
+        slider = np.pad(
+            np.moveaxis(self.table.values, 2, 0) >= self.slider_clearance, ((0, 0), side, side), constant_values=True
+        )
+        axes = [low + self.spacing * np.arange(-self.padding, self.positions + self.padding) for low in self.low]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         finger = self.obstacles.point_clearance(points) >= self.radius + self.clearance
-        return np.ascontiguousarray(slider), finger, self._may_begin(points)
+        return np.ascontiguousarray(slider), finger, self._run_up_may_start(points)
 
-    def _may_begin(self, points: np.ndarray) -> np.ndarray:
-        """Return whether a push may begin with the finger at points (..., 2), as far as limits and obstacles go."""
-        apart = self.obstacles.point_clearance(points)
-        return self.workspace.allows_finger(points) & (apart >= self.roadmap.from_obstacles)
+    def _run_up_may_start(self, points: np.ndarray) -> np.ndarray:
+        """Return whether the finger may start a run-up at points (..., 2), world, m."""
+        distance = self.obstacles.point_clearance(points)
+        return self.workspace.allows_finger(points) & (distance >= self.roadmap.from_obstacles)
 
-    def likely(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
-        """Return which pushes from one pose seem to be free, (pushes, lengths), each up to every SPARSE-th length.
+    def probably_free(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
+        """Return which pushes from one pose are free by the table, each up to every `TABLE_STRIDE`-th length.
 
         Args:
             library: The pushes.
             pose: Pose of the slider, (3,), world.
-            pushes: Indices of the pushes that are looked at; the others are not free.
+            pushes: Indices of the pushes that are checked; the others are not free.
+
+        Returns:
+            Whether they are free, (pushes, checked lengths).
         """
-        found = np.zeros((len(library.starts), len(range(0, len(library.travel), SPARSE))), bool)
-        poses = compose(pose, library.outcomes[0][pushes, ::SPARSE])
-        apart = self.table(poses)
+        found = np.zeros((len(library.starts), len(range(0, len(library.travel), TABLE_STRIDE))), bool)
+        poses = compose(pose, library.outcomes[0][pushes, ::TABLE_STRIDE])
+        distance = self.table(poses)
         last = self.low + self.spacing * (self.positions - 1)
-        apart = np.where(np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1), apart, np.inf)
-        ends = library.starts[pushes, None, :2] + library.travel[::SPARSE, None] * library.directions[pushes, None]
+        in_table = np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1)
+        ends = (
+            library.starts[pushes, None, :2] + library.travel[::TABLE_STRIDE, None] * library.directions[pushes, None]
+        )
         finger = self.obstacles.point_clearance(to_world(pose, ends)) >= self.radius + self.clearance
-        # a slider that is nearer already, by a table that is not exact
-        least = min(self.least, float(self.slider(pose)) - self.spacing)
-        found[pushes] = np.logical_and.accumulate((apart >= least) & finger, axis=1)
+        # A slider that is nearer already may stay so. Its distance in the table can be off by about the spacing.
+        required = min(self.slider_clearance, float(self.slider_distance(pose)) - self.spacing)
+        found[pushes] = np.logical_and.accumulate((~in_table | (distance >= required)) & finger, axis=1)
         return found
 
     def free(self, library: PushLibrary, poses: np.ndarray, entries: np.ndarray) -> np.ndarray:
-        """Return whether pushes are free, (entries,).
+        """Return whether pushes are free, by exact distances at every `EXACT_STRIDE`-th length, (entries,).
 
         Args:
             library: The pushes.
@@ -134,59 +148,66 @@ class FreeSpace:
             entries: Entries of the library, (entries,).
         """
         push, index = library.entries[entries].T
-        steps = np.minimum(np.arange(0, index.max(initial=0) + DENSE, DENSE), index[:, None])
+        steps = np.minimum(np.arange(0, index.max(initial=0) + EXACT_STRIDE, EXACT_STRIDE), index[:, None])
         ends = library.starts[push, :2] + library.travel[index, None] * library.directions[push]
         reached = compose(poses[:, None], library.outcomes[0][push[:, None], steps])
-        begins = to_world(poses, self.roadmap.goals[push])
-        return self._may_begin(begins) & self.keeps_out(reached, begins, to_world(poses, ends))
+        starts = to_world(poses, self.roadmap.goals[push])
+        return self._run_up_may_start(starts) & self._keeps_distance(reached, starts, to_world(poses, ends))
 
-    def keeps_out(self, poses: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    def _keeps_distance(self, poses: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return whether slider and finger keep their distance from obstacles in pushes, (pushes,).
 
-        A slider that is too near to an obstacle at first must come no nearer, and get away.
+        A slider that is too near to an obstacle at first must come no nearer, and must be farther away at the end.
 
         Args:
             poses: Poses of the slider along each push, (pushes, poses, 3), world.
-            start: Where the finger starts, (pushes, 2), world.
-            end: Where it ends, (pushes, 2), world.
+            start: Where the finger starts, (pushes, 2), world, m.
+            end: Where it ends, (pushes, 2), world, m.
         """
-        apart = self.slider(poses)
-        good = apart.min(1) >= np.minimum(self.least, apart[:, 0] - TOLERANCE * self.length)
-        good &= apart[:, -1] >= np.minimum(self.least, apart[:, 0] + PROGRESS * self.length)
-        return good & self.finger_free(start, end, self.clearance)
+        distance = self.slider_distance(poses)
+        before, required = distance[:, 0], self.slider_clearance
+        kept = distance.min(1) >= np.minimum(required, before - OVERLAP_TOLERANCE * self.length)
+        kept &= distance[:, -1] >= np.minimum(required, before + MIN_RETREAT * self.length)
+        return kept & self.finger_free(start, end, self.clearance)
 
     def finger_free(self, start: np.ndarray, end: np.ndarray, clearance: float = 0.0) -> np.ndarray:
-        """Return whether a finger keeps a clearance from obstacles along segments (..., 2), world."""
+        """Return whether the finger keeps a clearance from obstacles along segments (..., 2), world, m."""
         enough = self.radius + clearance
         return self.obstacles.segment_clearance(start, end, enough) >= enough
 
-    def moves(self, library: PushLibrary, angle: float, entries: np.ndarray) -> np.ndarray:
-        """Return whether pushes run into no obstacle, from all positions of the cost to go, (entries, rows, columns).
+    def free_from_grid(self, library: PushLibrary, angle: float, entries: np.ndarray) -> np.ndarray:
+        """Return whether pushes are free by the table, from every position on the grid of the cost to go.
 
-        Poses on the way are rounded to the table, and the finger's positions to its spacing.
+        Poses on the way and positions of the finger are rounded to the nearest cell of the table.
 
         Args:
             library: The pushes.
             angle: Angle of the slider before each push, rad.
             entries: Entries of the library, (entries,).
+
+        Returns:
+            Whether they are free, (entries, rows, columns).
         """
-        slider, finger, before = self._grids
+        slider, finger, run_up = self._free_cells
         push, index = library.entries[entries].T
-        steps = np.minimum(np.arange(0, len(library.travel) + SPARSE, SPARSE), index[:, None])
+        steps = np.minimum(np.arange(0, len(library.travel) + TABLE_STRIDE, TABLE_STRIDE), index[:, None])
         here = np.array([0.0, 0.0, angle])
         poses = compose(here, library.outcomes[0][push[:, None], steps].astype(float))
         ends = library.starts[push, None, :2] + library.travel[steps, None] * library.directions[push, None]
         turns = np.rint(poses[..., 2] * (ANGLES / (2 * np.pi))).astype(int) % ANGLES
-        places, fingers = (
-            np.rint(each / self.spacing).astype(int) + self.beyond for each in (poses[..., :2], to_world(here, ends))
+        slider_cells, finger_cells, run_up_cells = (
+            np.rint(each / self.spacing).astype(int) + self.padding
+            for each in (poses[..., :2], to_world(here, ends), to_world(here, self.roadmap.goals[push]))
         )
-        begins = np.rint(to_world(here, self.roadmap.goals[push]) / self.spacing).astype(int) + self.beyond
-        size = self.positions
-        allowed = np.ones((len(entries), POSITIONS, POSITIONS), bool)
-        for k, may in enumerate(allowed):
-            i, j = begins[k]
-            may &= before[i : i + size : REFINED, j : j + size : REFINED]
-            for step in range(-(-index[k] // SPARSE) + 1):
-                for grid, (i, j) in ((slider[turns[k, step]], places[k, step]), (finger, fingers[k, step])):
-                    may &= grid[i : i + size : REFINED, j : j + size : REFINED]
-        return allowed
+        free = np.ones((len(entries), POSITIONS, POSITIONS), bool)
+        for k, free_from in enumerate(free):
+            free_from &= self._shifted(run_up, run_up_cells[k])
+            for step in range(-(-index[k] // TABLE_STRIDE) + 1):
+                free_from &= self._shifted(slider[turns[k, step]], slider_cells[k, step])
+                free_from &= self._shifted(finger, finger_cells[k, step])
+        return free
+
+    def _shifted(self, cells: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """Return the values of cells at each position of the cost to go plus a shift, in cells from the first one."""
+        i, j = shift
+        return cells[i : i + self.positions : SUBDIVISIONS, j : j + self.positions : SUBDIVISIONS]

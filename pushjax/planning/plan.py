@@ -30,7 +30,7 @@ from pushjax.planning.approach import Way, WayStatus
 from pushjax.planning.between_pushes import TIGHT, ways_between
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
-from pushjax.planning.free_space import TOLERANCE
+from pushjax.planning.free_space import OVERLAP_TOLERANCE
 from pushjax.planning.goal import Goal
 from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.poses import to_body
@@ -250,7 +250,7 @@ def _check_poses(problem: PushProblem, goal: Goal) -> None:
     length = float(problem.slider.surface.length)
     for name, poses, allowed in (
         ("start", problem.start, MAX_PENETRATION * length),  # a rollout pushes out what overlaps less
-        ("goal", goal.pose[None], TOLERANCE * length),
+        ("goal", goal.pose[None], OVERLAP_TOLERANCE * length),
     ):
         depth = np.asarray(fixture_overlaps(problem.slider, problem.fixtures, poses.astype(problem.start.dtype)))
         if depth.max() > allowed:

@@ -18,7 +18,7 @@ from pushjax.planning.approach import Roadmap, Way, Ways, run_ups
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.cost_to_go import CostToGo, cost_to_go
 from pushjax.planning.coverage_table import CoverageTable, Measure
-from pushjax.planning.free_space import SPARSE, FreeSpace
+from pushjax.planning.free_space import TABLE_STRIDE, FreeSpace
 from pushjax.planning.pace import Pace
 from pushjax.planning.planned_push import Candidate, PlannedPush, PlanStatus
 from pushjax.planning.poses import compose, inverse, to_body, to_world
@@ -205,7 +205,7 @@ class PushPlanner:
         starts = to_world(pose, self.library.starts[:, :2])
         reachable &= self.workspace.allows_finger(starts)
         if self.space is not None:
-            if self.space.slider(pose) < -MAX_PENETRATION * self.library.length:
+            if self.space.slider_distance(pose) < -MAX_PENETRATION * self.library.length:
                 return none._replace(status=PlanStatus.START_IN_FIXTURE)
             reachable &= self.space.finger_free(to_world(pose, self.roadmap.goals), starts)
         if not reachable.any():
@@ -302,8 +302,8 @@ class PushPlanner:
         reachable = np.isfinite(way_time)
         entries = self.coarse[reachable[self.push[self.coarse]]]
         if self.space is not None:
-            likely = self.space.likely(self.library, pose, np.flatnonzero(reachable))
-            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // SPARSE]]
+            likely = self.space.probably_free(self.library, pose, np.flatnonzero(reachable))
+            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // TABLE_STRIDE]]
         here = pose.astype(np.float32)
         entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
         reached = compose(here, self.library.relative[entries])

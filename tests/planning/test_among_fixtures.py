@@ -83,7 +83,7 @@ def clearances(planner, pose, entry):
 def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
     rng, space, allowed = np.random.default_rng(1), sparse.space, 0
     wanted = np.array([sparse.clearance, sparse.clearance, sparse.roadmap.from_obstacles - RADIUS])
-    assert space.least == pytest.approx(sparse.clearance)  # the goal is farther away
+    assert space.slider_clearance == pytest.approx(sparse.clearance)  # the goal is farther away
     for pose, _ in starts(slider, 8, high=0.44):
         before = placed(slider, pose).distance(WORLD)
         entries = rng.choice(len(sparse.push), 60, replace=False)
@@ -91,9 +91,10 @@ def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
         for entry, good in zip(entries, free, strict=True):
             beyond = clearances(sparse, pose, entry) - wanted
             if good:
-                assert beyond[0] >= min(before - space.least, 0) - 4e-4  # between the poses that are looked at
+                # between the poses that are checked
+                assert beyond[0] >= min(before - space.slider_clearance, 0) - 4e-4
                 assert beyond[1:].min() >= -1e-5
-            elif before > space.least:
+            elif before > space.slider_clearance:
                 assert beyond.min() < 1e-4
             allowed += good
     assert 80 < allowed < 400
