@@ -1,4 +1,4 @@
-"""Grasping under uncertainty: where a parallel jaw leaves a rectangle or a butterfly that lay anywhere in it.
+"""Grasping under uncertainty: final poses of a rectangle or a butterfly that a parallel jaw closes on.
 
 The pads of the jaw are 27 x 10 mm. The jaw closes from 85 mm until it is stopped or shut. The limit surface is an
 ellipsoid, sampled with 250 degrees of freedom around the one that the pressure gives. The pressure acts along the rim;
@@ -23,9 +23,13 @@ from pushjax._internal.record import result_record
 from pushjax.experiments.grasps.outcomes import classify, spikes, start_poses
 from pushjax.experiments.grasps.sliders import SLIDERS
 
-PAD, THICKNESS = 0.027, 0.010  # m
-STEPS, DOF, FRICTION, PAIRS, HOLD = 840, 250.0, (0.015, 0.02), 400, 5
-BINS = 45
+PAD_WIDTH, PAD_THICKNESS = 0.027, 0.010  # m
+STEPS = 840  # steps in which the jaw closes
+HOLD = 5  # steps for which the closed jaw waits, so that a slider that has slipped out is free at the end
+DOF = 250.0
+FRICTION = (0.015, 0.02)
+PAIRS = 400  # wrench-twist pairs that the mean ellipsoid is fitted to
+BINS = 45  # of each histogram
 OUTCOMES = ("grasped", "jammed", "free", "failed")
 
 
@@ -39,7 +43,7 @@ def run(
     friction: tuple[float, float] = FRICTION,
     progress: ProgressCallback = no_progress,
 ) -> dict[str, Any]:
-    """Simulate the grasps of one slider and compute one cell for each pressure.
+    """Simulate the grasps of one slider, once for each pressure distribution under it.
 
     Args:
         slider: "rectangle" or "butterfly".
@@ -52,7 +56,8 @@ def run(
         progress: Called with the number of grasps done and their total.
 
     Returns:
-        The record, with the cells, the start poses, and how many of them were sampled again.
+        The record: `cells` has the results for each pressure distribution, `starts` the start poses, and `redrawn` the
+        number of start poses that were sampled again because they overlapped the open jaw.
 
     Raises:
         ValueError: If the slider is unknown.
@@ -61,7 +66,7 @@ def run(
         raise ValueError(f"slider must be one of {', '.join(SLIDERS)}; got {slider!r}")
     setting = SLIDERS[slider]()
     count = setting.n if n is None else n
-    hand = pj.Hand.parallel_jaw(PAD, THICKNESS)
+    hand = pj.Hand.parallel_jaw(PAD_WIDTH, PAD_THICKNESS)
     open_configuration, shut_configuration = ((0.0, 0.0, 0.0, d) for d in setting.opening)
     path = jnp.concatenate(
         [pj.line(open_configuration, shut_configuration, steps), jnp.asarray([shut_configuration] * HOLD)]
@@ -82,15 +87,15 @@ def run(
         grasps = pj.monte_carlo(
             key, count, grasped_slider, hand, path, pose=starts, model=model, progress=report_progress
         )
-        outcomes = classify(grasps, setting.shape, PAD)
-        cells.append({"pressure": name} | _figures(grasps, outcomes, setting.symmetry))
+        outcomes = classify(grasps, setting.shape, PAD_WIDTH)
+        cells.append({"pressure": name} | _results(grasps, outcomes, setting.symmetry))
         shown[name] = grasps, outcomes
     pictures = []
     if out is not None:
         from pushjax.experiments.grasps.picture import draw
 
         pictures = draw(out, f"grasp_{slider}", setting, hand, path, starts, shown)
-    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "pad_m": (PAD, THICKNESS)}
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "pad_m": (PAD_WIDTH, PAD_THICKNESS)}
     settings |= {"opening_m": setting.opening, "circle_m": setting.circle, "pairs": PAIRS}
     first = cells[0]
     return result_record(
@@ -105,8 +110,8 @@ def run(
     )
 
 
-def _figures(grasps: pj.MonteCarlo, outcomes: np.ndarray, symmetry: float) -> dict[str, Any]:
-    """Compute the outcomes, the spikes of the angle, and the histograms of the grasps that hold."""
+def _results(grasps: pj.MonteCarlo, outcomes: np.ndarray, symmetry: float) -> dict[str, Any]:
+    """Return the results for one pressure distribution: outcomes, and the spikes and histograms of the held poses."""
     held = grasps.stopped >= 0
     pose = np.asarray(grasps.pose, np.float64)
     histograms = {
@@ -127,7 +132,9 @@ def _figures(grasps: pj.MonteCarlo, outcomes: np.ndarray, symmetry: float) -> di
 def summary(record: dict[str, Any]) -> str:
     """Return the text that the command prints for a record of `run`."""
     name = record["experiment"].removeprefix("grasp-")
-    lines = [f"A jaw closes on a {name} from {record['n']} poses ({record['redrawn']} drawn again, being in its way):"]
+    lines = [
+        f"A jaw closes on a {name} from {record['n']} poses ({record['redrawn']} sampled again, which overlapped it):"
+    ]
     for cell in record["cells"]:
         counts = ", ".join(f"{count} {word}" for word, count in cell["outcomes"].items())
         found = ", ".join(f"{spike['degrees']:.0f}° {spike['share']:.0%}" for spike in cell["spikes"][:8])

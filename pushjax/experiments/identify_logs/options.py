@@ -22,7 +22,7 @@ class Options:
     hand: str = "finger"
     """finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (m, a pad's width and thickness)."""
     radius: Meters = None
-    """Of the fingers, m. Default: what the logs tell."""
+    """Radius of the fingers, m. Default: what the logs tell."""
     support: Annotated[str | None, cli_option("SUPPORT")] = None
     """Pressure distribution under the object, which gives the prior of the limit surface: uniform, rim, or
     points:x,y;x,y;x,y (m). Default: what the logs tell, else uniform."""
@@ -63,7 +63,7 @@ class Options:
         """Check the options as far as no log is needed.
 
         Raises:
-            ValueError: For the first option that cannot be.
+            ValueError: For the first option that is invalid.
         """
         low, high = self.friction
         if not 0 <= low <= high < math.inf:

@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 from pushjax._internal.options import cli_option
 
 Pose = tuple[float, float, float]
-MOST_TURN = 8 * math.pi  # rad; a larger angle is probably in degrees
+MAX_ANGLE = 8 * math.pi  # rad; a larger angle is probably in degrees
 
 
 @dataclass
 class Options:
-    """The block, where it is, where it shall go, and what is known of friction."""
+    """The block, its start and goal, the finger, and what is known of friction."""
 
     shape: Annotated[str, cli_option("SHAPE")] = "rectangle:0.09x0.06"
     """The block: rectangle:0.09x0.06, disk:0.05 (radius), ellipse:0.06x0.04 (semi-axes), regular:6x0.05 (corners,
@@ -25,13 +25,13 @@ class Options:
     goal: Annotated[Pose | None, cli_option("X Y THETA")] = None
     """Pose of the block that is wanted, m and rad. It must be given."""
     tolerance: Annotated[tuple[float, float], cli_option("M RAD")] = (0.005, 0.0873)
-    """Of position, m, and angle, rad, within which the goal is reached. Default: 0.005 0.0873 (5 degrees)."""
+    """Tolerances of the goal: of the position, m, and of the angle, rad. Default: 0.005 0.0873 (5 degrees)."""
     symmetry: int = 1
     """Number of angles in a full turn at which the block looks the same: 2 for a rectangle, 4 for a square."""
     finger: Annotated[tuple[float, float] | None, cli_option("X Y")] = None
     """Where the center of the finger is now, m. Default: where its first push begins."""
     radius: float = 0.005
-    """Of the finger, m."""
+    """Radius of the finger, m."""
     pushes: int = 3
     """Largest number of pushes."""
     longest: Annotated[float | None, cli_option("M")] = None
@@ -39,17 +39,18 @@ class Options:
     clearance: float = 0.01
     """Distance that the finger keeps from the block between pushes, m."""
     speed: Annotated[tuple[float, float], cli_option("FREE PUSH")] = (0.1, 0.02)
-    """Speed of the finger between pushes and in pushes, m/s. Default: 0.1 0.02."""
+    """Speeds of the finger, m/s: between pushes, and in pushes. Default: 0.1 0.02."""
     friction: Annotated[tuple[float, float], cli_option("LOWEST HIGHEST")] = (0.2, 0.3)
     """Range of the friction coefficient of the finger; twice the same number if it is known. Default: 0.2 0.3."""
     dof: Annotated[float | None, cli_option("DOF")] = 100.0
-    """Degrees of freedom of the limit surface's noise; fewer, more noise; None if it is known. Default: 100."""
+    """Degrees of freedom of the limit surface's noise: the fewer, the more noise. None: no noise. Default: 100."""
     surface: Literal["ellipsoid", "quartic"] = "ellipsoid"
     """Kind of limit surface."""
     support: str = "uniform"
     """Pressure distribution under the block: uniform, rim, or points:x,y;x,y;x,y (m)."""
     robust: bool = True
-    """Plan for all of this friction. Without, for its mean: in a fifth of the time, but such plans fail more often."""
+    """Plan for all of this friction. With --no-robust the plan is for the mean friction only. That takes a fifth of the
+    time, but such plans fail more often."""
     success: float = 0.9
     """Probability of success that is asked for."""
     attempts: int = 3
@@ -59,21 +60,21 @@ class Options:
         """Check the options as far as that needs no JAX.
 
         Raises:
-            ValueError: For the first option that cannot be.
+            ValueError: For the first option that is invalid.
         """
         if self.goal is None:
             raise ValueError("--goal: give the pose that is wanted, X Y THETA (m and rad)")
         for name in ("start", "goal", "finger"):
             value = getattr(self, name)
             if value is not None and not all(map(math.isfinite, value)):
-                raise ValueError(f"--{name} must be finite; got {_words(value)}")
+                raise ValueError(f"--{name} must be finite; got {_joined(value)}")
         for name, pose in (("start", self.start), ("goal", self.goal)):
-            if abs(pose[2]) > MOST_TURN:
-                raise ValueError(f"--{name}: the angle is in rad, at most {MOST_TURN:.1f}; got {pose[2]:g}")
+            if abs(pose[2]) > MAX_ANGLE:
+                raise ValueError(f"--{name}: the angle is in rad, at most {MAX_ANGLE:.1f}; got {pose[2]:g}")
         if any(not 0 < each < math.inf for each in self.tolerance):
-            raise ValueError(f"--tolerance must be positive; got {_words(self.tolerance)}")
+            raise ValueError(f"--tolerance must be positive; got {_joined(self.tolerance)}")
         if any(not 0 < each < math.inf for each in self.speed):
-            raise ValueError(f"--speed must be positive; got {_words(self.speed)}")
+            raise ValueError(f"--speed must be positive; got {_joined(self.speed)}")
         for name in ("radius", "clearance", "longest"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -91,5 +92,6 @@ class Options:
             raise ValueError(f"--success must be a probability; got {self.success:g}")
 
 
-def _words(numbers: tuple[float, ...]) -> str:
+def _joined(numbers: tuple[float, ...]) -> str:
+    """Return numbers as they are typed on the command line."""
     return " ".join(f"{number:g}" for number in numbers)
