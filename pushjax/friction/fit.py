@@ -41,7 +41,6 @@ from pushjax._internal.checks import (
     traced,
 )
 from pushjax._internal.jit import quick_jit
-from pushjax._math.bfgs import Minimum, minimize, while_loop
 from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface, angle_between
@@ -52,6 +51,7 @@ VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
 CLIP_ROUNDS = 4  # rounds of minimization, to find which s_i are clipped
 MAX_STEPS = 500  # of the optimizer, in each round
+GRADIENT_TOLERANCE = 1e-9  # of the optimizer in NumPy
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
@@ -74,6 +74,20 @@ class FitReport(eqx.Module):
     clipped: Int[Array, ""]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
+
+
+class Minimum(NamedTuple):
+    """Result of a minimization.
+
+    Attributes:
+        x: The parameters, (n,).
+        steps: Number of steps.
+        converged: Whether the optimizer converged.
+    """
+
+    x: Any
+    steps: Any
+    converged: Any
 
 
 class _Quadratic(NamedTuple):
@@ -286,8 +300,13 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
 
     zero = xp.zeros((), xp.int32)
     start = xp.asarray(initial_factors(degree, terms, dtype).ravel())
-    initial_state = (start, xp.ones(len(f), bool), zero, xp.zeros((), bool), zero)
-    parameters, unclipped, steps, converged, _ = while_loop(xp, is_unfinished, solve_round, initial_state)
+    state = start, xp.ones(len(f), bool), zero, xp.zeros((), bool), zero
+    if xp is np:
+        while is_unfinished(state):
+            state = solve_round(state)
+    else:
+        state = jax.lax.while_loop(is_unfinished, solve_round, state)
+    parameters, unclipped, steps, converged, _ = state
     a = _coefficients(xp, _forms(xp, parameters)[1], degree)
     gradient, given = Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist)
     across = gradient.cross(given)
@@ -305,10 +324,17 @@ _fit_in_jax = quick_jit(functools.partial(_fit, jnp))
 
 
 def _fit_in_numpy(*arrays: Array, degree: int, terms: int):
-    """Return what `_fit` returns, without compiling anything."""
+    """Return what `_fit` returns, computed in float64 and without compiling anything."""
+    dtype = arrays[0].dtype
     with np.errstate(all="ignore"):
-        coefficients, report = _fit(np, *map(np.asarray, arrays), degree=degree, terms=terms)
-    return jax.tree.map(lambda value: on_device(np.asarray(value)), (coefficients, report))
+        found = _fit(np, *(np.asarray(array, np.float64) for array in arrays), degree=degree, terms=terms)
+
+    return jax.tree.map(lambda value: on_device(_as_given(np.asarray(value), dtype)), found)
+
+
+def _as_given(value: np.ndarray, dtype: Any) -> np.ndarray:
+    """Return floats in the dtype of the pairs."""
+    return value.astype(dtype) if np.issubdtype(value.dtype, np.floating) else value
 
 
 def _evaluate_monomials(xp, f: Array, v: Array, share: Array, degree: int) -> _Pairs:
@@ -366,7 +392,8 @@ def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
     """Minimize the loss over the factors of the terms, by BFGS.
 
     The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
-    needs a factorization, and it slows down where the optimum lies on the border of convexity.
+    needs a factorization, and it slows down where the optimum lies on the border of convexity. With NumPy nothing is
+    compiled, which takes longer than the minimization.
     """
 
     def objective(parameters):
@@ -377,8 +404,19 @@ def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
         by_factor = 2 * slope.reshape(-1, 3, 3) @ lower
         return loss.value(a), (by_factor.reshape(-1, 9) @ xp.asarray(LOWER_ENTRIES.T, parameters.dtype)).ravel()
 
-    tolerance = 1e-7 if parameters.dtype == np.float64 else 1e-4
-    return minimize(xp, objective, parameters, tolerance, MAX_STEPS)
+    # imported here, because both take as long to import as NumPy or longer
+    if xp is np:
+        from scipy.optimize import minimize
+
+        options = {"gtol": GRADIENT_TOLERANCE, "maxiter": MAX_STEPS}
+        found = minimize(objective, parameters, jac=True, method="BFGS", options=options)
+        return Minimum(found.x, np.int32(found.nit), found.status in (0, 2))  # 2: the line search is down to roundoff
+    import optimistix as optx
+
+    tolerance = 1e-7 if parameters.dtype == jnp.float64 else 1e-4
+    solver = optx.BFGS(rtol=tolerance, atol=tolerance)
+    solution = optx.minimise(lambda x, _: objective(x)[0], solver, parameters, max_steps=MAX_STEPS, throw=False)
+    return Minimum(solution.value, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
 
 
 @in_numpy
