@@ -27,7 +27,7 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, load, straight
+from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, load, padded_pushes
 from pushjax.experiments.table1.methods import TEST_SIZE, UNKNOWNS, Setting, fitted, without_padding
 from pushjax.experiments.table1.repeats import relative_motions
 from pushjax.identification.predictive import NoiseParameters, PredictiveModel, predict
@@ -92,7 +92,7 @@ def _repetitions(key: Any, log: MitPushes, draws: int, dof: float, half_width: f
     measured = np.linalg.norm((fast - slow) * scale, axis=1) / np.sqrt(2)
     setting = Setting.of(log, "quartic", STEPS)
     found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-    pushes = straight(log, log.whole, pairs[:, 1], STEPS, TEST_SIZE)
+    pushes = padded_pushes(log, log.whole, pairs[:, 1], STEPS, TEST_SIZE)
     dtype = pushes.path.dtype
     mu = jnp.maximum(found.friction + half_width * jnp.array([[-1.0, 1.0]], dtype), 0)
     none, many = jnp.zeros((), dtype), jnp.asarray(1e3, dtype)

@@ -41,7 +41,7 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, checked_surfaces, load, straight
+from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, checked_surfaces, load, padded_pushes
 from pushjax.experiments.table1.methods import TEST_SIZE, TRAINING_SIZE, UNKNOWNS, Setting, fitted, without_padding
 
 STEPS = 25
@@ -127,7 +127,7 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
     levels, far = _held(first, log, setting, noise, rows, steps)
-    groups = {"middle": setting.test, "whole": straight(log, log.whole, log.middle_of, steps, TEST_SIZE)}
+    groups = {"middle": setting.test, "whole": padded_pushes(log, log.whole, log.middle_of, steps, TEST_SIZE)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     scalars = ("surface_dof", "hand_offset", "sigma", "student_dof")
     numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in scalars}
@@ -179,8 +179,8 @@ def _crossed(
         The identifications, and the parts, each of at most `most` pushes.
     """
     parts = np.array_split(rows, count)
-    rest = [straight(log, log.whole, np.setdiff1d(rows, part), steps, TRAINING_SIZE) for part in parts]
-    held = pj.Pushes.conditions([straight(log, log.whole, part, steps, most) for part in parts])
+    rest = [padded_pushes(log, log.whole, np.setdiff1d(rows, part), steps, TRAINING_SIZE) for part in parts]
+    held = pj.Pushes.conditions([padded_pushes(log, log.whole, part, steps, most) for part in parts])
     # nothing is shared: each part has its own unknowns, as if the parts were different objects
     apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
     return fitted(pj.Pushes.conditions(rest), setting, apart), held
@@ -207,10 +207,10 @@ def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generato
     rows = rng.permutation(np.flatnonzero(log.whole.valid))
     tests = np.sort(rows[: min(round(CURVE_TESTS * len(rows)), TEST_SIZE)])
     rest, length, found = rows[len(tests) :], setting.length, []
-    tested = straight(log, log.whole, tests, steps, TEST_SIZE)
+    tested = padded_pushes(log, log.whole, tests, steps, TEST_SIZE)
     ends = log.whole.end[tests]
     for count in (count for count in COUNTS if count <= len(rest)):
-        learned = straight(log, log.whole, rest[:count], steps, TRAINING_SIZE)
+        learned = padded_pushes(log, log.whole, rest[:count], steps, TRAINING_SIZE)
         physics = fitted(learned, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
         point = without_padding(_ends(physics, tested, setting), tested)
         sigma = float(physics.sigma) / np.array([1, 1, length])

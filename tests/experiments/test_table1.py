@@ -137,12 +137,12 @@ def test_sides(logs):
     """Pushes are about equally frequent on the sides of an object, or its quadrants; the tip is nearest to its side."""
     for name, many in (("rect1", 4), ("tri1", 3), ("hex", 6), ("ellip2", 4), ("butter", 4)):
         log = logs["abs", name]
-        side = conditions.sides(log, log.whole)
+        side = conditions.pushed_sides(log, log.whole)
         counts = np.bincount(side, minlength=many)
         assert len(counts) == many
         assert counts.min() > len(side) / many / 3
     rect = logs["abs", "rect1"]
-    side = conditions.sides(rect, rect.whole)
+    side = conditions.pushed_sides(rect, rect.whole)
     start = rect.whole.start
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
     away = rect.whole.tip_start - start[:, :2]
@@ -168,13 +168,13 @@ def test_noise_floor(logs):
 def test_filled_up(logs):
     log = logs["abs", "tri1"]
     rows = np.flatnonzero(log.is_training)
-    pushes = conditions.straight(log, log.whole, rows, 10, 128)
+    pushes = conditions.padded_pushes(log, log.whole, rows, 10, 128)
     assert pushes.path.shape == (128, 11, 2)
     assert float(pushes.weight.sum()) == len(rows)
     assert 0 <= float(pushes.age.min()) < 0.2 < 0.8 < float(pushes.age.max()) <= 1
-    np.testing.assert_array_equal(pushes.side[: len(rows)], conditions.sides(log, log.whole)[rows])
+    np.testing.assert_array_equal(pushes.side[: len(rows)], conditions.pushed_sides(log, log.whole)[rows])
     with pytest.raises(ValueError, match=f"batch must be at least {len(rows)}; got 3"):
-        conditions.straight(log, log.whole, rows, 10, 3)
+        conditions.padded_pushes(log, log.whole, rows, 10, 3)
     np.testing.assert_allclose(pushes.path[: len(rows), -1], log.whole.tip_end[rows])
     np.testing.assert_allclose(pushes.path[3, 5], (log.whole.tip_start[rows[3]] + log.whole.tip_end[rows[3]]) / 2)
 

@@ -120,7 +120,7 @@ def _with_split_edges(vertices: Floats) -> Floats:
     return vertices
 
 
-def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
+def pushed_sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
     """Find the side of the object that the tip is nearest to at the start of each push.
 
     Args:
@@ -142,11 +142,11 @@ def sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
     return np.argmin([np.abs(nearest_on_outline(edge, tip)[0]) for edge in edges], axis=0)
 
 
-def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
+def padded_pushes(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
     """Convert some of the pushes to `Pushes`, padded to a fixed number.
 
     The padding has no weight. With it, one compiled program serves all objects of a kind. Each push carries the side
-    that it pushes (`sides`), and as its age how late it comes in the file.
+    that it pushes (`pushed_sides`), and as its age how late it comes in the file.
 
     Args:
         log: The object and all its pushes.
@@ -158,9 +158,9 @@ def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: in
     Raises:
         ValueError: If `batch` is smaller than the number of chosen pushes.
     """
-    path = lines(pushes, rows, steps)
+    path = straight_paths(pushes, rows, steps)
     age = pushes.index / max(int(log.whole.index.max()), 1)
-    parts = pushes.start[rows], path, pushes.end[rows], age[rows], sides(log, pushes)[rows]
+    parts = pushes.start[rows], path, pushes.end[rows], age[rows], pushed_sides(log, pushes)[rows]
     padding = batch - len(rows)
     if padding < 0:
         raise ValueError(f"batch must be at least {len(rows)}; got {batch}")
@@ -171,7 +171,7 @@ def straight(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: in
     return pj.Pushes(start, path, end, (np.arange(batch) < len(rows)).astype(float), age=age, side=side)
 
 
-def lines(pushes: StraightPushes, rows: np.ndarray, steps: int) -> Floats:
+def straight_paths(pushes: StraightPushes, rows: np.ndarray, steps: int) -> Floats:
     """Return the straight paths of the tip in the chosen pushes, (rows, steps + 1, 2), m, world."""
     begin, stop = pushes.tip_start[rows], pushes.tip_end[rows]
     return begin[:, None] + np.linspace(0, 1, steps + 1)[None, :, None] * (stop - begin)[:, None]

@@ -19,7 +19,7 @@ import numpy as np
 import pushjax as pj
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments._tables import final_poses
-from pushjax.experiments.table1.conditions import MODELS, outline, straight
+from pushjax.experiments.table1.conditions import MODELS, outline, padded_pushes
 
 FRICTIONS = np.linspace(0.0, 0.6, 31)
 # Largest number of steps per push in the identification, which takes derivatives. More steps give the same answer.
@@ -90,9 +90,9 @@ class Setting(NamedTuple):
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
         return Setting(
-            straight(log, log.whole, rows, steps, TRAINING_SIZE),
-            straight(log, log.whole, rows, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
-            straight(log, log.middle, np.arange(len(log.middle)), steps, TEST_SIZE),
+            padded_pushes(log, log.whole, rows, steps, TRAINING_SIZE),
+            padded_pushes(log, log.whole, rows, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
+            padded_pushes(log, log.middle, np.arange(len(log.middle)), steps, TEST_SIZE),
             outline(log),
             pj.Hand.finger(log.tip_radius),
             pj.fit_limit_surface(*pairs, log.length, degree=MODELS[model]),
