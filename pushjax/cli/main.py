@@ -4,6 +4,7 @@ JAX is imported only once a command runs, so that `--help` and wrong options are
 """
 
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -26,7 +27,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: The command's arguments. Default: those of the process.
     """
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        _run(list(sys.argv[1:] if arguments is None else arguments))
+        sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads the output any more, as after `pushjax --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+    except (ValueError, OSError) as error:
+        print(f"pushjax: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def _run(given: list[str]) -> None:
+    """Run the command that the arguments say."""
     if given == ["--version"]:
         from pushjax import __version__
 
@@ -37,14 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     command = parsed(given)
     if isinstance(command, Reproduce):
         command = command.experiment
-    try:
-        if isinstance(command, Data):
-            _fetch(command)
-        else:
-            _compute(command)
-    except (ValueError, OSError) as error:
-        print(f"pushjax: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
+    if isinstance(command, Data):
+        _fetch(command)
+    else:
+        _compute(command)
 
 
 def parsed(arguments: Sequence[str]) -> Any:

@@ -3,6 +3,7 @@
 import html
 import inspect
 import json
+import os
 import re
 import subprocess
 import sys
@@ -252,6 +253,16 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"pushjax {pj.__version__}\n"
 
 
+def test_help_into_a_pipe_that_is_closed():
+    """`pushjax --help | head` ends without a traceback."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "pushjax", "reproduce", "--help"]
+    with os.fdopen(writer, "w") as closed:
+        done = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 @pytest.mark.parametrize("command", ["reproduce", "identify", "plan"])
 def test_help_reads_well(command, capsys):
     with pytest.raises(SystemExit) as end:
@@ -344,7 +355,8 @@ def test_capture(random_record):
     assert not caught[np.abs(starts[:, 0]) > 0.07].any()
 
 
-@pytest.mark.parametrize("slider", ["rectangle", pytest.param("butterfly", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("slider", ["rectangle", "butterfly"])
 def test_grasps_under_uncertainty(random_record, slider):
     _, record = random_record(f"grasp-{slider}")
     cells = record["cells"]
@@ -364,7 +376,7 @@ def test_grasps_under_uncertainty(random_record, slider):
     [
         "stochastic-push",
         pytest.param("capture", marks=pytest.mark.long),
-        "grasp-rectangle",
+        pytest.param("grasp-rectangle", marks=pytest.mark.long),
         pytest.param("grasp-butterfly", marks=pytest.mark.long),
     ],
 )
