@@ -18,6 +18,7 @@ import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
+from pushjax.experiments._slider_options import expected_surface
 from pushjax.experiments.identify_logs import setting, words
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
 from pushjax.experiments.identify_logs.options import Options
@@ -213,7 +214,7 @@ def conditions(recordings: list[Recordings], shape, options: Options, seed: int)
     supports = [setting.support_of(options.support, shape, one) for one in recordings]
 
     def expected(support: pj.Support) -> pj.LimitSurface:
-        return setting.expected_surface(support, degree, seed)
+        return expected_surface(support, degree, seed)
 
     if options.separate and len(each) > 1:
         several = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(expected, supports))

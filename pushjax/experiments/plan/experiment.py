@@ -17,7 +17,7 @@ import numpy as np
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
-from pushjax.experiments.identify_logs.setting import expected_surface, shape_of, support_of
+from pushjax.experiments._slider_options import expected_surface, parse_shape, parse_support
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
 from pushjax.planning.approach import WayStatus
@@ -49,9 +49,9 @@ def run(
         ValueError: If an option is invalid.
     """
     options.check()
-    shape, hand = shape_of(options.shape, []), pj.Hand.finger(options.radius)
+    shape, hand = parse_shape(options.shape), pj.Hand.finger(options.radius)
     _check_finger(shape, options)
-    support = support_of(options.support, shape, [])  # pyright: ignore[reportArgumentType]
+    support = parse_support(options.support, shape)
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
     slider = pj.Slider(shape, expected_surface(support, degree, seed))
     position, angle = options.tolerance

@@ -1,0 +1,109 @@
+"""Sliders as values of command-line options: outlines and supports from text."""
+
+import csv
+from pathlib import Path
+
+import jax
+import numpy as np
+
+import pushjax as pj
+
+SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
+SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
+NUM_PAIRS = 400
+NUM_POINTS = 100  # support points under a slider whose pressure is known everywhere
+
+
+def parse_shape(text: str) -> pj.Polygon | pj.Disk | pj.Ellipse:
+    """Return the outline that the option `--shape` describes, m.
+
+    Raises:
+        ValueError: If the text is no outline.
+    """
+    kind, colon, rest = text.partition(":")
+    if kind not in ("rectangle", "disk", "ellipse", "regular"):
+        if colon and not Path(text).exists():
+            raise ValueError(f"--shape: expected {SHAPES}; got {text!r}")
+        return pj.Polygon(_vertices(Path(text)))
+    sizes = parse_numbers("--shape", text, rest, "x", 1 if kind == "disk" else 2, SHAPES)
+    if kind == "disk":
+        return pj.Disk(sizes[0])
+    if kind == "ellipse":
+        return pj.Ellipse(*sizes)
+    if kind == "regular":
+        return pj.Polygon.regular(int(sizes[0]), sizes[1])
+    return pj.Polygon.rectangle(*sizes)
+
+
+def parse_support(text: str, shape: pj.Shape) -> pj.Support:
+    """Return the support, with unit load, that the option `--support` describes.
+
+    Args:
+        text: The value of the option.
+        shape: Outline of the slider.
+
+    Raises:
+        ValueError: If the text is no support.
+    """
+    if text == "uniform":
+        return pj.Support.uniform(shape, NUM_POINTS)
+    if text == "rim":
+        return pj.Support.rim(shape, NUM_POINTS)
+    kind, _, rest = text.partition(":")
+    if kind != "points":
+        raise ValueError(f"--support: expected {SUPPORTS}; got {text!r}")
+    points = [parse_numbers("--support", text, point, ",", 2, SUPPORTS) for point in rest.split(";")]
+    return pj.Support.tripod(points) if len(points) == 3 else pj.Support.points(points)
+
+
+def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSurface:
+    """Fit a limit surface to the wrench-twist pairs of a support.
+
+    Args:
+        support: The support.
+        degree: 4 for a quartic, else an ellipsoid.
+        seed: Seed of the wrench-twist pairs.
+    """
+    pairs = support.wrench_twist_pairs(jax.random.key(seed), NUM_PAIRS)
+    return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
+
+
+def _vertices(path: Path) -> np.ndarray:
+    """Read a file with one vertex x, y (m) per line; a heading is allowed."""
+    try:
+        rows = [row for row in csv.reader(path.read_text().splitlines()) if row]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"--shape: {path}: expected {SHAPES}; {error}") from error
+    numbers = []
+    for k, row in enumerate(rows):
+        try:
+            numbers.append([float(cell) for cell in row])
+        except ValueError as error:
+            if k > 0:
+                raise ValueError(f"--shape: {path}, line {k + 1}: expected two numbers, x and y; got {row}") from error
+    if any(len(row) != 2 for row in numbers) or len(numbers) < 3:
+        raise ValueError(f"--shape: {path}: expected at least three vertices, two numbers each; got {len(numbers)}")
+    return np.array(numbers)
+
+
+def parse_numbers(option: str, value: str, text: str, separator: str, count: int, allowed: str) -> list[float]:
+    """Return the numbers in a part of an option's value.
+
+    Args:
+        option: Name of the option, for the message.
+        value: Its whole value, for the message.
+        text: The part with the numbers.
+        separator: What stands between two numbers.
+        count: How many numbers there must be.
+        allowed: Description of what is allowed, for the message.
+
+    Raises:
+        ValueError: If the text is anything else.
+    """
+    try:
+        found = [float(part) for part in text.split(separator)]
+    except ValueError:
+        found = []
+    if len(found) != count:
+        raise ValueError(f"{option}: expected {allowed}; got {value!r}")
+    return found
