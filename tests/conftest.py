@@ -62,6 +62,7 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
 
 # Notebooks that compile programs of their own, which takes a minute each.
 LONG_NOTEBOOKS = (
+    "02_one_push",
     "03_several_contacts",
     "04_stochastic_pushing",
     "05_identifying_friction",

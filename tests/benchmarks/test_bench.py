@@ -27,6 +27,7 @@ def test_errors_fall_with_the_square_of_the_step():
         tasks.fewest_steps(by_steps, 1e-9)
 
 
+@pytest.mark.long
 def test_no_slip_where_it_sticks():
     """A sticking tip rolls as the side turns; the slip that is left is the discretization error, nanometers."""
     coarse, fine = (max(rows.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))

@@ -205,6 +205,7 @@ def test_slip_and_errors_are_of_the_steps_of_the_row(monkeypatch, tmp_path):
     assert drawn["MJX, four supports"] == [(1e-3, 0.3), (1e-3, 0.05)]
 
 
+@pytest.mark.long
 def test_fewer_steps_slip_more():
     """With 8 steps, which still stick, the slip is larger, so it has to be measured at the row's number of steps."""
     with both_dtypes():
@@ -299,7 +300,7 @@ AMONG_FIXTURES = {
 }
 
 
-@pytest.mark.parametrize("name", AMONG_FIXTURES)
+@pytest.mark.parametrize("name", ["along a wall", pytest.param("around a peg", marks=pytest.mark.long)])
 def test_pushes_among_fixtures_agree(name):
     """The poses agree to what a quartic and soft contacts allow; without the fixture they are far apart."""
     (geom, fixture), start, travel = AMONG_FIXTURES[name]
