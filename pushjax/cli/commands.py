@@ -57,14 +57,20 @@ class Common:
 
 @dataclass
 class Demo(Common):
-    """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result."""
+    """Fit an ellipsoid and a quartic to a square, push it with both, and draw the result.
+
+    Takes about 20 s of processor time, and 10 s once its programs are compiled.
+    """
 
     module = "demo"
 
 
 @dataclass
 class Table1(Common):
-    """Eleven objects on two surfaces, pushed by a robot: predicted against measured final poses (table I)."""
+    """Eleven objects on two surfaces, pushed by a robot: predicted against measured final poses (table I).
+
+    Takes about eleven minutes on two cores. If it is interrupted, the next call goes on.
+    """
 
     module = "table1"
 
@@ -87,7 +93,10 @@ class Table1(Common):
 
 @dataclass
 class Table2(Common):
-    """A triangle on three support points, pushed by a robot: predicted against measured final poses (table II)."""
+    """A triangle on three support points, pushed by a robot: predicted against measured final poses (table II).
+
+    Takes about ten minutes of processor time, and less than two without the method `identified`.
+    """
 
     module = "table2"
 
@@ -105,7 +114,10 @@ class Table2(Common):
 
 @dataclass
 class TwoFinger(Common):
-    """The triangle pushed by two fingers: predicted against measured poses (section V-B)."""
+    """The triangle pushed by two fingers: predicted against measured poses (section V-B).
+
+    Takes about 90 s of processor time, most of it to compile.
+    """
 
     module = "two_finger"
 
@@ -117,7 +129,10 @@ class TwoFinger(Common):
 
 @dataclass
 class Squeeze(Common):
-    """A parallel jaw closes on a rectangle from four start poses."""
+    """A parallel jaw closes on a rectangle from four start poses.
+
+    Takes about 70 s of processor time, most of it to compile.
+    """
 
     module = "squeeze"
 
@@ -127,14 +142,20 @@ class Squeeze(Common):
 
 @dataclass
 class Jam(Common):
-    """Two fingers that jam, and the friction from which they jam."""
+    """Two fingers that jam, and the friction from which they jam.
+
+    Takes about 50 s of processor time, most of it to compile.
+    """
 
     module = "jam"
 
 
 @dataclass
 class StochasticPush(Common):
-    """A square pushed many times under random friction: the distribution of its motion."""
+    """A square pushed many times under random friction: the distribution of its motion.
+
+    Takes about 80 s of processor time, most of it to compile.
+    """
 
     module = "stochastic_push"
 
@@ -150,7 +171,10 @@ class StochasticPush(Common):
 
 @dataclass
 class Capture(Common):
-    """Two fingers push a disk from anywhere: from where they catch it."""
+    """Two fingers push a disk from anywhere: from where they catch it.
+
+    Takes about 70 s of processor time, most of it to compile.
+    """
 
     module = "capture"
 
@@ -191,21 +215,30 @@ class Grasp(Common):
 
 @dataclass
 class GraspRectangle(Grasp):
-    """A parallel jaw closes on a rectangle from random poses under random friction."""
+    """A parallel jaw closes on a rectangle from random poses under random friction.
+
+    Takes about 100 s of processor time, most of it to compile.
+    """
 
     slider = "rectangle"
 
 
 @dataclass
 class GraspButterfly(Grasp):
-    """A parallel jaw closes on a butterfly-shaped block from random poses under random friction."""
+    """A parallel jaw closes on a butterfly-shaped block from random poses under random friction.
+
+    Takes about 200 s of processor time.
+    """
 
     slider = "butterfly"
 
 
 @dataclass
 class PushtMpc(Common):
-    """PushT in the package gym-pusht, solved by a planner whose model is pushjax."""
+    """PushT in the package gym-pusht, solved by a planner whose model is pushjax.
+
+    The first call compiles for about a minute.
+    """
 
     module = "pusht_mpc"
 
@@ -250,7 +283,10 @@ class Reproduce:
 
 @dataclass
 class Identify(Options, Common):
-    """Identify friction, limit surface and calibration from logs of pushes, with intervals, and write a report."""
+    """Identify friction, limit surface and calibration from logs of pushes, with intervals, and write a report.
+
+    Takes about a minute of processor time for some dozens of pushes, most of it to compile.
+    """
 
     module = "identify_logs"
 
@@ -273,7 +309,10 @@ class Identify(Options, Common):
 
 @dataclass
 class Plan(PlanOptions, Common):
-    """Plan pushes of a finger that bring a block from pose to pose, and write them as way points for a robot."""
+    """Plan pushes of a finger that bring a block from pose to pose, and write them as way points for a robot.
+
+    Takes about two minutes of processor time, most of it to compile, and 20 s for each further attempt.
+    """
 
     module = "plan"
 
