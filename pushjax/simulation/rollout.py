@@ -182,7 +182,7 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
         size *= SIZE_RATIO
     padding = np.broadcast_to(path[-1], (size - steps, path.shape[1]))
     padded = jnp.asarray(np.concatenate([path, padding]))
-    return _first_steps(_rollout(slider, hand, padded, *rest, jnp.asarray(steps)), steps)
+    return _first_steps(_rollout(slider, hand, padded, *rest, num_steps=jnp.asarray(steps)), steps)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -193,7 +193,7 @@ def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Sca
 
     def trial_of_batch(state: PushState, trials: Int[Array, ""] | None):
         is_ongoing = state.step < push.end
-        if push.num_steps is not None:
+        if trials is not None and push.num_steps is not None:
             is_ongoing &= trials < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
         any_ongoing = eqxi.unvmap_any(is_ongoing)
         return jax.lax.cond(any_ongoing, push.trial, skipped, state)
