@@ -177,6 +177,7 @@ def main(arguments: list[str]) -> None:
 
     try:
         with progress_bar() as progress:
+            progress.say(f"running {program}")
             callbacks = {"progress": progress, "keep": keep}
             takes = inspect.signature(run).parameters
             record = case(**{name: each for name, each in callbacks.items() if name in takes})

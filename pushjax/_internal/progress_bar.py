@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-SILENCE = 10.0  # s
+SILENCE, LONGEST_SILENCE = 10.0, 60.0  # s without a line in a pipe: at first, and after minutes of the same work
 
 
 class _Rate(ProgressColumn):
@@ -24,7 +24,7 @@ class Reporter:
     """Reports progress: a bar on a terminal, or lines on standard error without a terminal.
 
     Call it with `(done, total)` to report how far the work has come. Without a terminal that is a line for every tenth
-    of the work, and a line after every `SILENCE` seconds without one.
+    of the work, and a line after every ten seconds without one, later every minute.
     """
 
     def __init__(self, bar: Progress):
@@ -57,9 +57,9 @@ class Reporter:
             self.bar.console.print(words, markup=False, highlight=False)
 
     def break_silence(self) -> None:
-        """Say what is being done, and for how long, if the last line is `SILENCE` seconds old."""
+        """Say what is being done, and for how long, if the last line is old: 10 s, later up to a minute."""
         now = time.monotonic()
-        if now - self.time >= SILENCE:
+        if now - self.time >= max(SILENCE, min(LONGEST_SILENCE, (now - self.begin) / 6)):
             parts = f" ({self.done} of {self.total} done)" if self.done < self.total else ""
             self._print_line(f"{self.words}: {now - self.begin:.0f} s{parts}")
 
