@@ -1,6 +1,8 @@
-"""Ways of a round finger around a polygon, and among obstacles, that touch neither.
+"""Transits of a round finger around a polygon, and among obstacles, that touch neither.
 
-The shortest way around polygons at a given distance consists of straight segments and of arcs around convex corners.
+A transit is a path of the finger from one push to the next, on which it moves alone.
+
+The shortest transit around polygons at a given distance has straight segments, and arcs around convex corners.
 `Roadmap` has a few points just outside of each such arc; the segments between points that see each other are a
 visibility graph. Start and goal are joined to it by the segments that keep the distance too.
 
@@ -12,7 +14,7 @@ the push, from a point that has the distance: so a push begins with a run-up.
 The points and segments around the polygon are fixed in its frame. Where the limits of the workspace cut a point off,
 the point is moved to the limit and its segments are checked anew. Obstacles move in this frame, so their points and all
 segments among them are found for each pose. Of the segments to the many goals only those are checked that would be the
-ends of shortest ways.
+ends of shortest transits.
 """
 
 from enum import IntEnum
@@ -33,45 +35,45 @@ DISK_POINTS = 16  # around a disk
 RETREATS = 24  # directions in which a retreat is tried
 
 
-class WayStatus(IntEnum):
-    """Why there is a way, or none."""
+class TransitStatus(IntEnum):
+    """Why there is a transit, or none."""
 
     FOUND = 0
     START_IN_SLIDER = 1
     NO_RETREAT = 2
     GOAL_BLOCKED = 3
-    NO_WAY = 4
+    NO_TRANSIT = 4
     START_IN_FIXTURE = 5
 
 
-class Way(NamedTuple):
-    """A way of the finger's center.
+class Transit(NamedTuple):
+    """A transit of the finger's center.
 
     Attributes:
-        points: Its corners, (points, 2), world, m; only the start if there is no way.
-        length: Its length, m; infinite if there is no way.
-        status: Whether there is a way, and why not.
+        points: Its corners, (points, 2), world, m; only the start if there is no transit.
+        length: Its length, m; infinite if there is no transit.
+        status: Whether there is a transit, and why not.
     """
 
     points: np.ndarray
     length: float
-    status: WayStatus
+    status: TransitStatus
 
 
-class Ways(NamedTuple):
-    """Shortest ways from one start to many goals; `Roadmap.way` traces one of them.
+class ShortestTransits(NamedTuple):
+    """Shortest transits from one start to many goals; `Roadmap.transit` traces one of them.
 
     Attributes:
-        lengths: Length of the way to each goal, (goals,), m, infinite where there is none.
+        lengths: Length of the transit to each goal, (goals,), m, infinite where there is none.
         status: FOUND, or why no goal can be reached at all.
-        points: The corners that ways may have, the start first, (nodes, 2), body frame.
-        previous: For each of these, the one before it on the shortest way from the start.
+        points: The corners that transits may have, the start first, (nodes, 2), body frame.
+        previous: For each of these, the one before it on the shortest transit from the start.
         last: For each goal, the last of the corners on the way to it.
         blocked: Whether a goal itself is too near to the polygon or an obstacle, (goals,).
     """
 
     lengths: np.ndarray
-    status: WayStatus
+    status: TransitStatus
     points: np.ndarray
     previous: np.ndarray
     last: np.ndarray
@@ -85,7 +87,7 @@ class Roadmap:
         vertices: Vertices of the polygon, counterclockwise, (vertices, 2), m.
         radius: Radius of the finger, m.
         clearance: Distance that the finger keeps from the polygon on its way, m, positive.
-        goals: Ends of the ways, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
+        goals: Ends of the transits, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
             reached.
         from_obstacles: Distance that the finger keeps from obstacles, m. None: as from the polygon.
     """
@@ -107,8 +109,8 @@ class Roadmap:
         self.goal_clearance = point_clearance(vertices, self.goals)
         self.links = self._lengths(self.nodes[:, None], self.goals, at_end=self.goal_clearance)
 
-    def ways(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Ways:
-        """Find the shortest ways from one point to all goals.
+    def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> ShortestTransits:
+        """Find the shortest transits from one point to all goals.
 
         Args:
             start: Center of the finger, (2,), world, m.
@@ -117,7 +119,7 @@ class Roadmap:
         """
         body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.seen_from(pose)
         begin, status = self._retreat(body_start, pose, workspace, obstacles)
-        if status != WayStatus.FOUND:
+        if status != TransitStatus.FOUND:
             return self._none(body_start, status)
         nodes, links = self._within(pose, workspace)
         if obstacles.any:
@@ -140,30 +142,30 @@ class Roadmap:
             previous = np.append(previous, -1)
             previous[0] = len(corners) - 1
             lengths = lengths + np.linalg.norm(begin[1] - begin[0])
-        status = WayStatus.FOUND if np.isfinite(lengths).any() else WayStatus.NO_WAY
-        return Ways(lengths, status, corners, previous, last, blocked)
+        status = TransitStatus.FOUND if np.isfinite(lengths).any() else TransitStatus.NO_TRANSIT
+        return ShortestTransits(lengths, status, corners, previous, last, blocked)
 
-    def way(self, ways: Ways, goal: int, pose: np.ndarray) -> Way:
-        """Return the shortest way to one goal.
+    def transit(self, transits: ShortestTransits, goal: int, pose: np.ndarray) -> Transit:
+        """Return the shortest transit to one goal.
 
         Args:
-            ways: Result of `ways`.
+            transits: Result of `transits`.
             goal: Index of the goal.
-            pose: Pose of the polygon that `ways` was given.
+            pose: Pose of the polygon that `transits` was given.
         """
-        if not np.isfinite(ways.lengths[goal]):
-            status = ways.status if ways.status != WayStatus.FOUND else WayStatus.NO_WAY
-            reached = status == WayStatus.NO_WAY and ways.blocked[goal]
-            at = ways.points[:1] if ways.previous[0] < 0 else ways.points[-1:]
-            return Way(to_world(pose, at), np.inf, WayStatus.GOAL_BLOCKED if reached else status)
-        corner, points = int(ways.last[goal]), [self.goals[goal]]
+        if not np.isfinite(transits.lengths[goal]):
+            status = transits.status if transits.status != TransitStatus.FOUND else TransitStatus.NO_TRANSIT
+            reached = status == TransitStatus.NO_TRANSIT and transits.blocked[goal]
+            at = transits.points[:1] if transits.previous[0] < 0 else transits.points[-1:]
+            return Transit(to_world(pose, at), np.inf, TransitStatus.GOAL_BLOCKED if reached else status)
+        corner, points = int(transits.last[goal]), [self.goals[goal]]
         while corner >= 0:
-            points.append(ways.points[corner])
-            corner = int(ways.previous[corner])
-        return Way(to_world(pose, np.array(points[::-1])), float(ways.lengths[goal]), WayStatus.FOUND)
+            points.append(transits.points[corner])
+            corner = int(transits.previous[corner])
+        return Transit(to_world(pose, np.array(points[::-1])), float(transits.lengths[goal]), TransitStatus.FOUND)
 
-    def retreat(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Way:
-        """Return the shortest straight way to where the finger has its clearance; only the start if it has it already.
+    def retreat(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Transit:
+        """Return the shortest straight transit to where the finger has its clearance; only the start if it has it.
 
         Args:
             start: Center of the finger, (2,), world, m.
@@ -172,17 +174,17 @@ class Roadmap:
         """
         obstacles = workspace.obstacles.seen_from(pose)
         points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace, obstacles)
-        length = float(np.linalg.norm(points[-1] - points[0])) if status == WayStatus.FOUND else np.inf
-        return Way(to_world(pose, points), length, status)
+        length = float(np.linalg.norm(points[-1] - points[0])) if status == TransitStatus.FOUND else np.inf
+        return Transit(to_world(pose, points), length, status)
 
     def between(self, starts: np.ndarray) -> np.ndarray:
-        """Return the lengths of the shortest ways from points to all goals, without a workspace and obstacles.
+        """Return the lengths of the shortest transits from points to all goals, without a workspace and obstacles.
 
         Args:
             starts: Points that have the clearance, (points, 2), body frame, m.
 
         Returns:
-            The lengths, (points, goals), m, infinite where there is no way.
+            The lengths, (points, goals), m, infinite where there is no transit.
         """
         at = point_clearance(self.vertices, starts)
         direct = self._lengths(starts[:, None], self.goals, at[:, None], self.goal_clearance)
@@ -233,11 +235,11 @@ class Roadmap:
         return nodes[keeps], links[keeps]
 
     def _last(self, total: np.ndarray, corners: np.ndarray, obstacles: Obstacles) -> np.ndarray:
-        """Return the last corner before each goal on the shortest way.
+        """Return the last corner before each goal on the shortest transit.
 
         Args:
-            total: Length of the way to each goal by each corner, (corners, goals). It becomes infinite where the last
-                segment of a shortest way does not keep the distances.
+            total: Length of the transit to each goal by each corner, (corners, goals). It becomes infinite where the
+                last segment of a shortest transit does not keep the distances.
             corners: The corners, (corners, 2).
             obstacles: The obstacles.
         """
@@ -258,9 +260,9 @@ class Roadmap:
         """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2), and the status."""
         have, have_obstacles = float(point_clearance(self.vertices, start)), float(obstacles.point_clearance(start))
         if have >= self.apart and have_obstacles >= self.from_obstacles:
-            return start[None], WayStatus.FOUND
+            return start[None], TransitStatus.FOUND
         if have <= 0 or have_obstacles <= 0:
-            return start[None], WayStatus.START_IN_SLIDER if have <= 0 else WayStatus.START_IN_FIXTURE
+            return start[None], TransitStatus.START_IN_SLIDER if have <= 0 else TransitStatus.START_IN_FIXTURE
         missing = max(self.apart - have, self.from_obstacles - have_obstacles)
         angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
         # out of a wedge between polygon and obstacle it is farther
@@ -285,14 +287,16 @@ class Roadmap:
             )
         good &= workspace.allows_finger(to_world(pose, ends))
         if not good.any():
-            return start[None], WayStatus.NO_RETREAT
+            return start[None], TransitStatus.NO_RETREAT
         best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
-        return np.stack([start, ends[best]]), WayStatus.FOUND
+        return np.stack([start, ends[best]]), TransitStatus.FOUND
 
-    def _none(self, start: np.ndarray, status: WayStatus) -> Ways:
+    def _none(self, start: np.ndarray, status: TransitStatus) -> ShortestTransits:
         count = len(self.goals)
         none = np.full(count, np.inf)
-        return Ways(none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.apart)
+        return ShortestTransits(
+            none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.apart
+        )
 
 
 def _recedes(have: float, wanted: float, at_end: np.ndarray, soon: np.ndarray, least: np.ndarray) -> np.ndarray:

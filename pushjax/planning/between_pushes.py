@@ -1,11 +1,11 @@
-"""Ways of a round finger from one planned push to the next, and its whole motion as points in time.
+"""Transits of a round finger from one planned push to the next, and its whole motion as points in time.
 
 After a push the slider is not exactly where it was predicted to be. The samples of the prediction tell how far any
 point of it may be displaced; that is largest at a vertex. A finger that keeps this distance beside its clearance from
-the predicted slider touches none of the samples. Where there is no such way, smaller distances are tried, and the
+the predicted slider touches none of the samples. Where there is no such transit, smaller distances are tried, and the
 samples that the finger would touch are counted.
 
-A way ends in a run-up: from where the finger has its full distance, straight ahead to where the push starts.
+A transit ends in a run-up: from where the finger has its full distance, straight ahead to where the push starts.
 
 Fixtures are where they are known to be: the finger keeps its clearance from them, and no more.
 """
@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax._internal.checks import check_positive
-from pushjax.planning.approach import Roadmap, Way, WayStatus, run_ups
+from pushjax.planning.approach import Roadmap, Transit, TransitStatus, run_ups
 from pushjax.planning.clearance import point_clearance, segment_clearance
 from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
@@ -27,21 +27,23 @@ RUN_UPS = (1.0, 2.0, 4.0)  # longest run-ups, in units of the distance that the 
 TOUCH = 1e-4  # overlap that does not count as touching, in units of the finger's radius
 
 
-class WaysBetween(NamedTuple):
-    """Ways of a finger before, between and after pushes.
+class Transits(NamedTuple):
+    """Transits of a finger before, between and after pushes.
 
     Attributes:
-        ways: A way to the start of each push, and the retreat after the last one, (pushes + 1).
+        transits: A transit to the start of each push, and the retreat after the last one, (pushes + 1).
         touched: Whether the finger touches the slider on any way, for each sample of the prediction, (samples,).
     """
 
-    ways: tuple[Way, ...]
+    transits: tuple[Transit, ...]
     touched: np.ndarray
 
     @property
-    def status(self) -> WayStatus:
-        """FOUND, or why the first missing way is missing."""
-        return next((way.status for way in self.ways if way.status != WayStatus.FOUND), WayStatus.FOUND)
+    def status(self) -> TransitStatus:
+        """FOUND, or why the first missing transit is missing."""
+        return next(
+            (transit.status for transit in self.transits if transit.status != TransitStatus.FOUND), TransitStatus.FOUND
+        )
 
 
 class FingerMotion(NamedTuple):
@@ -58,7 +60,7 @@ class FingerMotion(NamedTuple):
     push: np.ndarray
 
 
-def ways_between(
+def transits_between(
     vertices: np.ndarray,
     radius: float,
     clearance: float,
@@ -67,8 +69,8 @@ def ways_between(
     samples: np.ndarray,
     start: np.ndarray | None = None,
     fixtures: Fixtures = (),
-) -> WaysBetween:
-    """Find the ways of a finger to the start of each push, and away from the slider after the last one.
+) -> Transits:
+    """Find the transits of a finger to the start of each push, and away from the slider after the last one.
 
     Args:
         vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame, m.
@@ -81,49 +83,49 @@ def ways_between(
         fixtures: Walls and fixed bodies that the finger stays out of.
 
     Returns:
-        The ways. There are none if there is neither a push nor a start.
+        The transits. There are none if there is neither a push nor a start.
     """
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
-        return WaysBetween((), np.zeros(len(samples), bool))
+        return Transits((), np.zeros(len(samples), bool))
     around = _Around(vertices, radius, clearance, Workspace.unlimited(fixtures))
-    ways, touched = [], np.zeros(len(samples), bool)
+    transits, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
         scatter = _displacement(vertices, pose, samples[:, k])
         margins = [*(clearance + np.quantile(scatter, share) for share in SHARES), clearance, TIGHT * clearance]
-        tried = (_way(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
-        way = next((each for each in tried if each.status == WayStatus.FOUND), None)
-        if way is None:  # the last attempt is the least demanding, and tells why
-            way = _way(around, margins[-1], paths[k : k + 1], pose, origin)
+        tried = (_transit(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
+        transit = next((each for each in tried if each.status == TransitStatus.FOUND), None)
+        if transit is None:  # the last attempt is the least demanding, and tells why
+            transit = _transit(around, margins[-1], paths[k : k + 1], pose, origin)
         else:
-            touched |= _touches(vertices, radius, way.points, samples[:, k])
-        ways.append(way)
-    return WaysBetween(tuple(ways), touched)
+            touched |= _touches(vertices, radius, transit.points, samples[:, k])
+        transits.append(transit)
+    return Transits(tuple(transits), touched)
 
 
-def finger_motion(ways: tuple[Way, ...], paths: np.ndarray, *, free: float, push: float) -> FingerMotion:
+def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: float, push: float) -> FingerMotion:
     """Return the motion of a finger through all ways and pushes, at one speed in pushes and another between them.
 
     Args:
-        ways: The ways: one to the start of each push, and the last retreat.
+        transits: The transits: one to the start of each push, and the last retreat.
         paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
         free: Speed between pushes, m/s.
         push: Speed in pushes, m/s.
 
     Raises:
-        ValueError: For a speed that is not positive, if a way was not found, and if there is none.
+        ValueError: For a speed that is not positive, if a transit was not found, and if there is none.
     """
     check_positive("free", free)
     check_positive("push", push)
-    if not ways:
-        raise ValueError("ways must have one way to each push, and the last retreat; got none")
-    for k, way in enumerate(ways):
-        if way.status != WayStatus.FOUND:
-            raise ValueError(f"ways[{k}] must be a way that was found; its status is {way.status.name}")
-    position, number = [ways[0].points], [np.zeros(len(ways[0].points), int)]
+    if not transits:
+        raise ValueError("transits must have one transit to each push, and the last retreat; got none")
+    for k, transit in enumerate(transits):
+        if transit.status != TransitStatus.FOUND:
+            raise ValueError(f"transits[{k}] must be a transit that was found; its status is {transit.status.name}")
+    position, number = [transits[0].points], [np.zeros(len(transits[0].points), int)]
     for k, path in enumerate(np.asarray(paths, float)):
-        after = ways[k + 1].points[1:]
+        after = transits[k + 1].points[1:]
         position += [path[1:], after]
         number += [np.full(len(path) - 1, k + 1), np.zeros(len(after), int)]
     points, pushes = np.concatenate(position), np.concatenate(number)
@@ -133,7 +135,7 @@ def finger_motion(ways: tuple[Way, ...], paths: np.ndarray, *, free: float, push
 
 
 class _Around(NamedTuple):
-    """What ways go around: the slider's vertices, radius and clearance of the finger, and the fixtures."""
+    """What transits go around: the slider's vertices, radius and clearance of the finger, and the fixtures."""
 
     vertices: np.ndarray
     radius: float
@@ -144,8 +146,8 @@ class _Around(NamedTuple):
         return Roadmap(self.vertices, self.radius, margin, goals, min(margin, self.clearance))
 
 
-def _way(around: _Around, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Way:
-    """Return the way to the start of the first of `paths`, or the retreat if there are none."""
+def _transit(around: _Around, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+    """Return the transit to the start of the first of `paths`, or the retreat if there are none."""
     if len(paths):
         return _approach(around, margin, paths[0], pose, origin)
     if origin is None:
@@ -153,11 +155,13 @@ def _way(around: _Around, margin: float, paths: np.ndarray, pose: np.ndarray, or
     return around.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose, around.workspace)
 
 
-def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Way:
-    """Return the way to the start of a push, with a run-up from where the finger has its full distance."""
+def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+    """Return the transit to the start of a push, with a run-up from where the finger has its full distance."""
     first, second = to_body(pose, path[:2])
     ahead = (second - first) / np.linalg.norm(second - first)
-    blocked = Way(path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, WayStatus.GOAL_BLOCKED)
+    blocked = Transit(
+        path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, TransitStatus.GOAL_BLOCKED
+    )
     if point_clearance(around.vertices, first) < (1 - TOUCH) * around.radius:
         return blocked
     for part in RUN_UPS:
@@ -169,13 +173,13 @@ def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray
     else:
         return blocked
     if origin is None:
-        way = Way(to_world(pose, begin), 0.0, WayStatus.FOUND)
+        transit = Transit(to_world(pose, begin), 0.0, TransitStatus.FOUND)
     else:
         roadmap = around.roadmap(margin, begin)
-        way = roadmap.way(roadmap.ways(origin, pose, around.workspace), 0, pose)
-    if way.status != WayStatus.FOUND or run_up == 0:
-        return way
-    return Way(np.concatenate([way.points, path[:1]]), way.length + run_up, WayStatus.FOUND)
+        transit = roadmap.transit(roadmap.transits(origin, pose, around.workspace), 0, pose)
+    if transit.status != TransitStatus.FOUND or run_up == 0:
+        return transit
+    return Transit(np.concatenate([transit.points, path[:1]]), transit.length + run_up, TransitStatus.FOUND)
 
 
 def _keeps_out(around: _Around, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
@@ -193,7 +197,7 @@ def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -
 
 
 def _touches(vertices: np.ndarray, radius: float, points: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Return whether a finger touches the slider along a way, for each sample of its pose, (samples,).
+    """Return whether a finger touches the slider along a transit, for each sample of its pose, (samples,).
 
     A finger that has just pushed touches the slider, so there only what comes nearer counts.
     """

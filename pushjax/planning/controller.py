@@ -2,7 +2,7 @@
 
 The controller is a state machine. It plans a push, goes around the slider to its start, pushes, and plans anew.
 
-Going: the finger follows the way as fast as its speed limits allow. Each action is tried on the model of the finger
+Going: the finger follows the transit as fast as its speed limits allow. Each action is tried on the model of the finger
     first; a step that would come too near to the slider or to a fixture is shortened.
 Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
     that are seen; the end whose final pose is nearest to the target is taken. The push is over once the finger is where
@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from pushjax.planning.approach import Way, WayStatus
+from pushjax.planning.approach import Transit, TransitStatus
 from pushjax.planning.finger_control import FingerControl, FingerState
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 from pushjax.planning.planned_push import PlannedPush, PlanStatus
@@ -62,7 +62,7 @@ class Memory(NamedTuple):
         pushing: Whether the finger is in the push, not on the way to it.
         pose: Pose of the slider when the push was planned.
         end: Where the push ends, as corrected, (2,), world, m.
-        along: How far along the way the finger is, m.
+        along: How far along the transit the finger is, m.
         speed: Length of the last control step, m.
         velocity: Velocity of the finger by its own model, (2,), m/s.
         taken: Number of control steps of the push that is going on.
@@ -145,7 +145,7 @@ class PushController:
             far = self.planner.goal[:2] + 10 * self.length
             aim = np.zeros(2)
             push = PlannedPush(
-                PlanStatus.ONE_PUSH, Way(aim[None], 0.0, WayStatus.FOUND), aim, aim, self.planner.goal, 0.0
+                PlanStatus.ONE_PUSH, Transit(aim[None], 0.0, TransitStatus.FOUND), aim, aim, self.planner.goal, 0.0
             )
             self._corrected(far, self.planner.goal, far + 0.1 * self.length, push, self.prior)
 
@@ -223,7 +223,7 @@ class PushController:
             return None, memory._replace(push=None)
         push = memory.push
         assert push is not None
-        points = np.concatenate([push.way.points, push.start[None]])
+        points = np.concatenate([push.transit.points, push.start[None]])
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         total, run_up = lengths[-1], lengths[-1] - lengths[-2]
         pace, left = self.planner.pace, total - memory.along
@@ -257,19 +257,19 @@ class PushController:
             return None, memory._replace(push=None, pushing=False, speed=0.0)
         if correct and left < CORRECTED * self.length:
             end = self._corrected(state.position, pose, end, push, memory.belief)
-        way = end - state.position
-        left = float(np.linalg.norm(way))
+        ahead = end - state.position
+        left = float(np.linalg.norm(ahead))
         speed = pace.next_speed(memory.speed, left, pace.push)
-        target = state.position + way * min(speed / max(left, 1e-9), 1.0)
+        target = state.position + ahead * min(speed / max(left, 1e-9), 1.0)
         return target, memory._replace(end=end, speed=speed, taken=memory.taken + 1)
 
     def _corrected(
         self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
     ) -> np.ndarray:
         """Return the end, of those around `end`, from which the slider comes nearest to the push's target."""
-        way = end - finger
-        left = float(np.linalg.norm(way))
-        along = way / left if left > 1e-9 else np.array([1.0, 0.0])
+        ahead = end - finger
+        left = float(np.linalg.norm(ahead))
+        along = ahead / left if left > 1e-9 else np.array([1.0, 0.0])
         across = np.array([-along[1], along[0]])
         scale = min(1.0, FINE + left / (FULL * self.length) * (1 - FINE))
         ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)

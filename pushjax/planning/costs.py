@@ -131,7 +131,7 @@ class WayPoints(Cost):
 
 
 class Travel(Cost):
-    """Length of the hand's path, m, from its first two numbers. The way between pushes is not counted."""
+    """Length of the hand's path, m, from its first two numbers. The transit between pushes is not counted."""
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         return jnp.sum(norm(jnp.diff(push.configuration[..., :2], axis=-2)))

@@ -19,7 +19,7 @@ class Pace(NamedTuple):
     acceleration: float
 
     def free_time(self, distance):
-        """Return the number of control steps of a way of a length in m, from rest to rest."""
+        """Return the number of control steps of a transit of a length in m, from rest to rest."""
         ramp = self.free**2 / self.acceleration
         short = 2 * np.sqrt(np.minimum(distance, ramp) / self.acceleration)
         return short + np.maximum(distance - ramp, 0) / self.free

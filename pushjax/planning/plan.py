@@ -4,12 +4,12 @@ A plan is open loop: the hand's paths are fixed before the first push. Each push
 (`Pushes`), at the pose that the pushes before it lead to under the mean friction. The search runs in two stages:
 
 1. under the mean friction, from many random plans: which ways there are to reach the goal at all;
-2. under sampled friction, the same samples for all candidates: which of these ways does so most surely, and how to
+2. under sampled friction, the same samples for all candidates: which of these plans does so most surely, and how to
    change it so that it does more surely still.
 
 The search has seen its samples, so the plan's own distribution and its probability of success are computed with others.
 Between two pushes a finger goes around the slider (`between_pushes`). A sample in which it would touch the slider there
-does not count as a success. The ways are looked for only when the search has ended: the plan is the best candidate
+does not count as a success. The transits are looked for only when the search has ended: the plan is the best candidate
 that has them.
 """
 
@@ -26,8 +26,8 @@ from jaxtyping import PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
 from pushjax.friction.random import FrictionModel
-from pushjax.planning.approach import Way, WayStatus
-from pushjax.planning.between_pushes import TIGHT, ways_between
+from pushjax.planning.approach import Transit, TransitStatus
+from pushjax.planning.between_pushes import TIGHT, transits_between
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
 from pushjax.planning.free_space import OVERLAP_TOLERANCE
@@ -56,14 +56,14 @@ class PushPlanStatus(IntEnum):
     Attributes:
         FOUND: It reaches the goal with at least the probability that was asked for.
         UNLIKELY: The best plan that was found reaches the goal less surely.
-        NO_WAY: For none of the plans that were found does the finger get from push to push without touching slider or
-            fixtures.
+        NO_TRANSIT: For none of the plans that were found does the finger get from push to push without touching slider
+            or fixtures.
         HAND_IN_FIXTURE: In all plans that were found the hand runs into a fixture in a push.
     """
 
     FOUND = 0
     UNLIKELY = 1
-    NO_WAY = 2
+    NO_TRANSIT = 2
     HAND_IN_FIXTURE = 3
 
 
@@ -74,7 +74,8 @@ class PushPlan(NamedTuple):
         status: Whether it is sure enough.
         path: Paths of the hand, (pushes, steps + 1, dof), world. Pushes that move the slider in no sample are left out.
         pose: Poses of the slider under the mean friction, before the first push and after each, (pushes + 1, 3), world.
-        ways: Ways of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other hands.
+        transits: Transits of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other
+            hands.
         parameters: Its parameters, as in `Pushes`, (size,), also of pushes that are left out.
         outcomes: Predicted poses under friction that the search has not seen.
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
@@ -86,7 +87,7 @@ class PushPlan(NamedTuple):
     status: PushPlanStatus
     path: np.ndarray
     pose: np.ndarray
-    ways: tuple[Way, ...]
+    transits: tuple[Transit, ...]
     parameters: np.ndarray
     outcomes: Outcomes
     success: float
@@ -201,13 +202,13 @@ def _judged(
     success: float,
     finger: np.ndarray | None,
 ) -> PushPlan:
-    """Predict where a candidate ends under unseen friction, and find the ways of the finger between its pushes."""
+    """Predict where a candidate ends under unseen friction, and find the transits of the finger between its pushes."""
     paths, poses = lay_out(parameters[None], problem)
     _, failed, reached = samples_of(paths, unseen)
     path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
-    good, ways, found = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed), (), True
+    good, transits, found = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed), (), True
     if _is_one_finger(problem.hand):
-        between = ways_between(
+        between = transits_between(
             outline_vertices(problem.slider.shape),
             float(problem.hand.radius[0]),
             float(problem.pushes.clearance),
@@ -217,13 +218,13 @@ def _judged(
             finger,
             problem.fixtures,
         )
-        good, ways, found = good & ~between.touched, between.ways, between.status == WayStatus.FOUND
+        good, transits, found = good & ~between.touched, between.transits, between.status == TransitStatus.FOUND
     hits = _hand_in_fixture(problem, path)
     probability = float(np.mean(good)) if found and not hits else 0.0
     status = PushPlanStatus.FOUND if probability >= success else PushPlanStatus.UNLIKELY
-    status = status if found else PushPlanStatus.NO_WAY
+    status = status if found else PushPlanStatus.NO_TRANSIT
     status = PushPlanStatus.HAND_IN_FIXTURE if hits else status
-    return PushPlan(status, path, poses, ways, parameters, outcomes, probability, cost, np.zeros(0))
+    return PushPlan(status, path, poses, transits, parameters, outcomes, probability, cost, np.zeros(0))
 
 
 def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tuple[np.ndarray, np.ndarray, Outcomes]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.planning.approach import Way
+from pushjax.planning.approach import Transit
 
 
 class PlanStatus(IntEnum):
@@ -15,7 +15,7 @@ class PlanStatus(IntEnum):
         ONE_PUSH: It reaches the goal.
         TWO_PUSHES: It is the first of two that reach the goal.
         COST_TO_GO: It leads to where the cost to go is least.
-        NO_WAY: The finger gets to no push; the status of the way tells why.
+        NO_TRANSIT: The finger gets to no push; the status of the transit tells why.
         NO_PUSH: No push stays within the workspace and out of its fixtures.
         START_IN_FIXTURE: The slider is deeper in a fixture than a simulation would start from.
     """
@@ -23,14 +23,14 @@ class PlanStatus(IntEnum):
     ONE_PUSH = 0
     TWO_PUSHES = 1
     COST_TO_GO = 2
-    NO_WAY = 3
+    NO_TRANSIT = 3
     NO_PUSH = 4
     START_IN_FIXTURE = 5
 
     @property
     def failed(self) -> bool:
         """Whether there is no push."""
-        return self >= PlanStatus.NO_WAY
+        return self >= PlanStatus.NO_TRANSIT
 
 
 class PlannedPush(NamedTuple):
@@ -38,7 +38,7 @@ class PlannedPush(NamedTuple):
 
     Attributes:
         status: What the push is for, or why there is none.
-        way: Way of the finger to where the run-up begins, world; its status says why there is none.
+        transit: Transit of the finger to where the run-up begins, world; its status says why there is none.
         start: Where the finger is about to touch the slider, (2,), world, m.
         end: Where the push ends, (2,), world, m.
         target: Pose of the slider that the push is for, (3,), world, m and rad.
@@ -46,7 +46,7 @@ class PlannedPush(NamedTuple):
     """
 
     status: PlanStatus
-    way: Way
+    transit: Transit
     start: np.ndarray
     end: np.ndarray
     target: np.ndarray

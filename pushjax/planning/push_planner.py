@@ -1,10 +1,10 @@
 """Choice of the next push: one that reaches the goal, else the first of two, else by cost to go.
 
-Costs are control steps: the way around the slider to the start of the push, the push, and what comes after it.
+Costs are control steps: the transit around the slider to the start of the push, the push, and what comes after it.
 
 One push: the outcomes near the relative pose of the goal, by the library's k-d tree.
 Two pushes: the poses that promising first pushes lead to are looked up in the same tree. Promising are those for which
-    the way, the push and the cost to go make the least sum.
+    the transit, the push and the cost to go make the least sum.
 Farther away: the push with that least sum.
 """
 
@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import KDTree
 
-from pushjax.planning.approach import Roadmap, Way, Ways, run_ups
+from pushjax.planning.approach import Roadmap, ShortestTransits, Transit, run_ups
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.cost_to_go import CostToGo, cost_to_go
 from pushjax.planning.coverage_table import CoverageTable, Measure
@@ -37,7 +37,7 @@ OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the 
 AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 RETRY = 10.0  # control steps of another push, if the last one misses the goal
-LOST = 60.0  # control steps of a way that the table of ways does not have
+LOST = 60.0  # control steps of a transit that the table of transits does not have
 
 
 class PushPlanner:
@@ -161,7 +161,7 @@ class PushPlanner:
 
     @cached_property
     def after_push(self) -> np.ndarray:
-        """Control steps of the way from where a push along each row ends to the start of each push, (places, pushes).
+        """Control steps of the transit from the end of a push in each row to the start of each push, (places, pushes).
 
         A row is a place of the finger around the slider; `place` is that of each entry.
         """
@@ -198,10 +198,10 @@ class PushPlanner:
             shake: Control steps that are added to the cost of each push, (pushes,), for another choice than before.
         """
         pose = np.asarray(pose, float)
-        ways = self.roadmap.ways(finger, pose, self.workspace)
-        nowhere = Way(np.asarray(finger, float)[None], np.inf, ways.status)
-        none = PlannedPush(PlanStatus.NO_WAY, nowhere, finger, finger, pose, np.inf)
-        reachable = np.isfinite(ways.lengths) & self.usable
+        transits = self.roadmap.transits(finger, pose, self.workspace)
+        nowhere = Transit(np.asarray(finger, float)[None], np.inf, transits.status)
+        none = PlannedPush(PlanStatus.NO_TRANSIT, nowhere, finger, finger, pose, np.inf)
+        reachable = np.isfinite(transits.lengths) & self.usable
         starts = to_world(pose, self.library.starts[:, :2])
         reachable &= self.workspace.allows_finger(starts)
         if self.space is not None:
@@ -210,33 +210,33 @@ class PushPlanner:
             reachable &= self.space.finger_free(to_world(pose, self.roadmap.goals), starts)
         if not reachable.any():
             return none
-        way_time = self.pace.free_time(np.where(reachable, ways.lengths + np.nan_to_num(self.run_up), np.inf))
+        transit_time = self.pace.free_time(np.where(reachable, transits.lengths + np.nan_to_num(self.run_up), np.inf))
         if shake is not None:
-            way_time = way_time + shake
-        found = [self._one_push(pose, way_time), *self._more_pushes(pose, way_time)]
+            transit_time = transit_time + shake
+        found = [self._one_push(pose, transit_time), *self._more_pushes(pose, transit_time)]
         best = min((each for each in found if each is not None), key=lambda each: each.cost, default=None)
         if best is None:
             return none._replace(status=PlanStatus.NO_PUSH)
-        return self._planned(best, ways, pose)
+        return self._planned(best, transits, pose)
 
-    def _planned(self, best: Candidate, ways: Ways, pose: np.ndarray) -> PlannedPush:
+    def _planned(self, best: Candidate, transits: ShortestTransits, pose: np.ndarray) -> PlannedPush:
         push = int(self.push[best.entry])
-        way = self.roadmap.way(ways, push, pose)
+        transit = self.roadmap.transit(transits, push, pose)
         start = to_world(pose, self.library.starts[push, :2])
         end = to_world(pose, self.ends[best.entry].astype(float))
-        return PlannedPush(best.status, way, start, end, best.target, best.cost)
+        return PlannedPush(best.status, transit, start, end, best.target, best.cost)
 
-    def _one_push(self, pose: np.ndarray, way_time: np.ndarray) -> Candidate | None:
+    def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> Candidate | None:
         """Return the push that reaches the goal in the fewest steps; a better score counts some steps."""
         relative = compose(inverse(pose), self.goal)
         near = self.searched.tree.query_ball_point(self.library.features(relative), self.measure.reach)
         entries = np.asarray(near, int)
-        entries = entries[np.isfinite(way_time[self.push[entries]])]
+        entries = entries[np.isfinite(transit_time[self.push[entries]])]
         entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
         if not len(entries):
             return None
         back = np.broadcast_to(inverse(relative), (len(entries), 3))
-        cost = self._with_risk(way_time[self.push[entries]] + self.push_time[entries], back, entries, reach=True)
+        cost = self._with_risk(transit_time[self.push[entries]] + self.push_time[entries], back, entries, reach=True)
         best = self._least(cost, (np.broadcast_to(pose, back.shape), entries))
         if best is None:
             return None
@@ -279,12 +279,12 @@ class PushPlanner:
         chance = np.average(reached, axis=0, weights=self.weight)
         return self.retry * (1 - chance), (chance > 0) | (score > enough)
 
-    def _more_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> list[Candidate]:
+    def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> list[Candidate]:
         """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
-        entries, reached = self._first_pushes(pose, way_time)
+        entries, reached = self._first_pushes(pose, transit_time)
         if not len(entries):
             return []
-        spent = way_time[self.push[entries]] + self.push_time[entries]
+        spent = transit_time[self.push[entries]] + self.push_time[entries]
         total = spent + self._estimate(reached, quick=True)
         best = np.argpartition(total, min(CANDIDATES, len(total) - 1))[:CANDIDATES]
         entries, reached, spent = entries[best], reached[best], spent[best]
@@ -297,9 +297,9 @@ class PushPlanner:
             return []
         return [Candidate(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
 
-    def _first_pushes(self, pose: np.ndarray, way_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _first_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
-        reachable = np.isfinite(way_time)
+        reachable = np.isfinite(transit_time)
         entries = self.coarse[reachable[self.push[self.coarse]]]
         if self.space is not None:
             likely = self.space.probably_free(self.library, pose, np.flatnonzero(reachable))

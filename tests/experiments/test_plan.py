@@ -12,7 +12,7 @@ import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.experiments.plan import experiment
 from pushjax.planning import Outcomes, PushPlan, PushPlanStatus
-from pushjax.planning.between_pushes import ways_between
+from pushjax.planning.between_pushes import transits_between
 from pushjax.planning.poses import to_world
 
 RADIUS, FRICTION = 0.005, 0.25
@@ -30,10 +30,10 @@ def push_through_the_middle(slider, hand, goal, options, seed):
     path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
     poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
     samples = poses + np.array([0.0, 1.0])[:, None] * np.linspace(-1e-3, 1e-3, 20)[:, None, None]
-    between = ways_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
+    between = transits_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
     outcomes = Outcomes(samples, np.zeros(20, bool))
     nothing = np.zeros(0)
-    yield PushPlan(PushPlanStatus.FOUND, path, poses, between.ways, nothing, outcomes, 1.0, 0.0, nothing)
+    yield PushPlan(PushPlanStatus.FOUND, path, poses, between.transits, nothing, outcomes, 1.0, 0.0, nothing)
 
 
 @pytest.fixture(
@@ -76,16 +76,16 @@ def test_the_finger_touches_nothing_between_pushes(planned):
     ends = [0, *(np.flatnonzero(points["push"] == k + 1)[-1] for k in range(pushes))]
     for k, pose in enumerate(record["pose"]):
         stop = np.flatnonzero(points["push"] == k + 1)[0] if k < pushes else len(position)
-        way = shapely.LineString(position[ends[k] : stop])
+        transit = shapely.LineString(position[ends[k] : stop])
         block = shapely.Polygon(to_world(np.array(pose), corners))
-        assert block.distance(way) > RADIUS - 2e-6  # way points are written in micrometers
-        assert block.distance(shapely.Point(way.coords[-1])) > RADIUS + 1e-3
+        assert block.distance(transit) > RADIUS - 2e-6  # way points are written in micrometers
+        assert block.distance(shapely.Point(transit.coords[-1])) > RADIUS + 1e-3
     np.testing.assert_allclose(position[0], record["settings"]["finger"], atol=1e-6)
 
 
 @pytest.mark.long
 def test_way_points_do_what_the_plan_says(planned):
-    """A rollout along all of them, ways included, ends where the plan does under the mean friction."""
+    """A rollout along all of them, transits included, ends where the plan does under the mean friction."""
     _, record, points, corners = planned
     steps = 400 * len(record["path"])
     slider = pj.Slider.uniform(pj.Polygon(corners), degree=2)
@@ -103,22 +103,22 @@ def test_time_is_that_of_the_speeds(planned):
     np.testing.assert_allclose(np.diff(points["time"]), length / speed, atol=2e-3)
 
 
-def test_without_a_way_there_are_no_way_points(tmp_path, monkeypatch, capsys):
+def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys):
     """Those of an earlier plan are deleted."""
     (tmp_path / "way_points.csv").write_text("old")
     notched = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (0.1, 1), (0.1, 0), (-0.1, 0), (-0.1, 1), (-1, 1)])
 
     def into_the_notch(slider, hand, goal, options, seed):
         path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
-        between = ways_between(notched, RADIUS, options.clearance, path, still, still[None])
+        between = transits_between(notched, RADIUS, options.clearance, path, still, still[None])
         outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
-        yield PushPlan(PushPlanStatus.NO_WAY, path, still, between.ways, nothing, outcomes, 0.0, 0.0, nothing)
+        yield PushPlan(PushPlanStatus.NO_TRANSIT, path, still, between.transits, nothing, outcomes, 0.0, 0.0, nothing)
 
     monkeypatch.setattr(experiment, "_plans", into_the_notch)
     cli.main(["plan", *SIMPLE, "--out", str(tmp_path)])
     assert "no plan: the finger does not get to push 1 (GOAL_BLOCKED)" in capsys.readouterr().out
     assert not (tmp_path / "way_points.csv").exists()
-    assert json.loads((tmp_path / "plan.json").read_text())["status"] == "NO_WAY"
+    assert json.loads((tmp_path / "plan.json").read_text())["status"] == "NO_TRANSIT"
 
 
 def test_attempts_end_with_the_first_that_is_sure_enough():

@@ -15,7 +15,7 @@ import pytest
 
 import pushjax as pj
 from pushjax.planning import Observation, Pace, PlanStatus, PositionControl, PushController, PushPlanner, Workspace
-from pushjax.planning.approach import WayStatus
+from pushjax.planning.approach import TransitStatus
 from pushjax.planning.poses import compose, inverse, to_world
 from pushjax.planning.push_library import PushLibrary
 
@@ -120,9 +120,9 @@ def test_plans_run_into_no_fixture(slider, sparse):
         kinds.add(plan.status)
         if plan.status.failed:
             continue
-        way = shapely.LineString([*plan.way.points, plan.start, plan.end])
+        transit = shapely.LineString([*plan.transit.points, plan.start, plan.end])
         first = min(RADIUS + sparse.clearance, WORLD.distance(shapely.Point(finger)))
-        assert WORLD.distance(way) >= first - 1e-5
+        assert WORLD.distance(transit) >= first - 1e-5
         if plan.status != PlanStatus.ONE_PUSH:
             assert placed(slider, plan.target).distance(WORLD) >= 0.9 * sparse.clearance
     assert {PlanStatus.COST_TO_GO, PlanStatus.TWO_PUSHES} <= kinds
@@ -146,7 +146,7 @@ def test_poses_in_fixtures(slider, sparse):
     assert inside.status == PlanStatus.START_IN_FIXTURE
     assert inside.status.failed
     finger = sparse.choose(np.array([0.12, 0.25, 0.0]), np.array([0.27, 0.3]))
-    assert (finger.status, finger.way.status) == (PlanStatus.NO_WAY, WayStatus.START_IN_FIXTURE)
+    assert (finger.status, finger.transit.status) == (PlanStatus.NO_TRANSIT, TransitStatus.START_IN_FIXTURE)
     with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Fixture"):
         Workspace.unlimited(FIXTURES[0])
 

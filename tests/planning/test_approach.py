@@ -1,9 +1,9 @@
-"""Ways of a round finger around polygons, judged by shapely."""
+"""Transits of a round finger around polygons, judged by shapely."""
 
 import numpy as np
 import pytest
 
-from pushjax.planning.approach import Roadmap, WayStatus, run_ups
+from pushjax.planning.approach import Roadmap, TransitStatus, run_ups
 from pushjax.planning.clearance import inside, offset_curve, point_clearance, segment_clearance
 from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
@@ -62,8 +62,8 @@ def test_offset_curve_is_at_its_distance():
 
 
 @pytest.fixture(scope="module")
-def found_ways():
-    """Ways around many polygons from anywhere, also from where the finger has just pushed."""
+def found_transits():
+    """Transits around many polygons from anywhere, also from where the finger has just pushed."""
     rng = np.random.default_rng(2)
     found = []
     for vertices in map(counterclockwise, polygons(40)):
@@ -73,36 +73,38 @@ def found_ways():
         roadmap = Roadmap(vertices, RADIUS, CLEARANCE, np.concatenate([anywhere, touching]))
         pose = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-4, 4)])
         for start in to_world(pose, starts):
-            ways = roadmap.ways(start, pose, Workspace.unlimited())
+            transits = roadmap.transits(start, pose, Workspace.unlimited())
             for goal in rng.choice(len(roadmap.goals), 8, replace=False):
-                found.append((vertices, pose, start, roadmap.goals[goal], roadmap.way(ways, int(goal), pose), ways))
+                found.append(
+                    (vertices, pose, start, roadmap.goals[goal], roadmap.transit(transits, int(goal), pose), transits)
+                )
     return found
 
 
-def test_no_way_touches_the_slider(found_ways):
+def test_no_transit_touches_the_slider(found_transits):
     count = 0
-    for vertices, pose, start, goal, way, _ in found_ways:
-        if way.status != WayStatus.FOUND:
+    for vertices, pose, start, goal, transit, _ in found_transits:
+        if transit.status != TransitStatus.FOUND:
             continue
         polygon = shapely.Polygon(to_world(pose, vertices))
-        assert polygon.distance(shapely.LineString(way.points)) >= RADIUS - 1e-9
-        np.testing.assert_allclose(way.points[0], start, atol=1e-12)
-        np.testing.assert_allclose(way.points[-1], to_world(pose, goal), atol=1e-12)
-        pieces = np.linalg.norm(np.diff(way.points, axis=0), axis=1)
-        assert way.length == pytest.approx(pieces.sum())
+        assert polygon.distance(shapely.LineString(transit.points)) >= RADIUS - 1e-9
+        np.testing.assert_allclose(transit.points[0], start, atol=1e-12)
+        np.testing.assert_allclose(transit.points[-1], to_world(pose, goal), atol=1e-12)
+        pieces = np.linalg.norm(np.diff(transit.points, axis=0), axis=1)
+        assert transit.length == pytest.approx(pieces.sum())
         count += 1
     assert count > 1000
 
 
-def test_a_way_is_found_where_there_is_one(found_ways):
+def test_a_transit_is_found_where_there_is_one(found_transits):
     """If start and goal are in one part of the plane that is a little farther away than the clearance."""
     missing = 0
-    for vertices, pose, start, goal, way, _ in found_ways:
-        if way.status == WayStatus.FOUND:
-            assert np.isfinite(way.length)
+    for vertices, pose, start, goal, transit, _ in found_transits:
+        if transit.status == TransitStatus.FOUND:
+            assert np.isfinite(transit.length)
             continue
-        assert np.isinf(way.length)
-        assert len(way.points) == 1
+        assert np.isinf(transit.length)
+        assert len(transit.points) == 1
         fat = shapely.Polygon(vertices).buffer(1.02 * (RADIUS + CLEARANCE), quad_segs=64)
         free = shapely.box(-9, -9, 9, 9).difference(fat)
         parts = getattr(free, "geoms", [free])
@@ -112,17 +114,17 @@ def test_a_way_is_found_where_there_is_one(found_ways):
     assert missing > 100
 
 
-def test_ways_are_shortest():
+def test_transits_are_shortest():
     """Around a square, from the middle of one side to that of the other: two straight pieces and two quarter arcs."""
     square = 0.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
     apart = RADIUS + CLEARANCE
     roadmap = Roadmap(square, RADIUS, CLEARANCE, np.array([[0.0, 0.05 + 1.01 * apart]]))
-    ways = roadmap.ways(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3), Workspace.unlimited())
+    transits = roadmap.transits(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3), Workspace.unlimited())
     best = 2 * 0.05 + 0.1 + np.pi * apart
-    assert best < ways.lengths[0] < 1.06 * best
+    assert best < transits.lengths[0] < 1.06 * best
 
 
-def test_ways_stay_in_the_workspace():
+def test_transits_stay_in_the_workspace():
     rng = np.random.default_rng(3)
     limits = Workspace.rectangle((-0.1, -0.1), (0.1, 0.1))
     goals = offset_curve(L, RADIUS + 1.1 * CLEARANCE, 60).points
@@ -133,13 +135,13 @@ def test_ways_stay_in_the_workspace():
         start = rng.uniform(-0.1, 0.1, 2)
         if point_clearance(L, to_body(pose, start)) < RADIUS:
             continue
-        ways = roadmap.ways(start, pose, limits)
+        transits = roadmap.transits(start, pose, limits)
         for goal in range(0, len(goals), 7):
-            way = roadmap.way(ways, goal, pose)
-            if way.status == WayStatus.FOUND:
-                assert limits.allows_finger(way.points[1:]).all()
-                assert shapely.Polygon(to_world(pose, L)).distance(shapely.LineString(way.points)) >= RADIUS - 1e-9
-            found, blocked = found + np.isfinite(way.length), blocked + np.isinf(way.length)
+            transit = roadmap.transit(transits, goal, pose)
+            if transit.status == TransitStatus.FOUND:
+                assert limits.allows_finger(transit.points[1:]).all()
+                assert shapely.Polygon(to_world(pose, L)).distance(shapely.LineString(transit.points)) >= RADIUS - 1e-9
+            found, blocked = found + np.isfinite(transit.length), blocked + np.isinf(transit.length)
     assert found > 50
     assert blocked > 50
 
@@ -148,16 +150,19 @@ def test_why_there_is_no_way():
     pose = np.zeros(3)
     near = offset_curve(L, RADIUS + 0.2 * CLEARANCE, 20).points
     roadmap = Roadmap(L, RADIUS, CLEARANCE, np.concatenate([[[0.3, 0.3]], near]))
-    in_slider = roadmap.ways(np.array([0.01, 0.01]), pose, Workspace.unlimited())
-    assert roadmap.way(in_slider, 0, pose).status == WayStatus.START_IN_SLIDER
-    free = roadmap.ways(np.array([-0.2, 0.0]), pose, Workspace.unlimited())
-    assert roadmap.way(free, 0, pose).status == WayStatus.FOUND
-    assert roadmap.way(free, 3, pose).status == WayStatus.GOAL_BLOCKED
+    in_slider = roadmap.transits(np.array([0.01, 0.01]), pose, Workspace.unlimited())
+    assert roadmap.transit(in_slider, 0, pose).status == TransitStatus.START_IN_SLIDER
+    free = roadmap.transits(np.array([-0.2, 0.0]), pose, Workspace.unlimited())
+    assert roadmap.transit(free, 0, pose).status == TransitStatus.FOUND
+    assert roadmap.transit(free, 3, pose).status == TransitStatus.GOAL_BLOCKED
     walls = Workspace.rectangle((-0.3, -0.3), (0.2, 0.2))
-    assert roadmap.way(roadmap.ways(np.array([-0.2, 0.0]), pose, walls), 0, pose).status == WayStatus.NO_WAY
+    assert (
+        roadmap.transit(roadmap.transits(np.array([-0.2, 0.0]), pose, walls), 0, pose).status
+        == TransitStatus.NO_TRANSIT
+    )
     narrow = Workspace.rectangle((-RADIUS - 1e-3, -0.3), (-RADIUS, 0.3))
-    stuck = roadmap.ways(np.array([-RADIUS - 1e-4, 0.05]), pose, narrow)
-    assert roadmap.way(stuck, 0, pose).status == WayStatus.NO_RETREAT
+    stuck = roadmap.transits(np.array([-RADIUS - 1e-4, 0.05]), pose, narrow)
+    assert roadmap.transit(stuck, 0, pose).status == TransitStatus.NO_RETREAT
     with pytest.raises(ValueError, match="clearance must be positive"):
         Roadmap(L, RADIUS, 0.0, near)
 

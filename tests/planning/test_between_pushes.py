@@ -1,12 +1,12 @@
-"""Ways of a finger between pushes, and its motion in time, judged by shapely."""
+"""Transits of a finger between pushes, and its motion in time, judged by shapely."""
 
 import numpy as np
 import pytest
 
 import pushjax as pj
 from pushjax.planning import finger_motion
-from pushjax.planning.approach import WayStatus
-from pushjax.planning.between_pushes import ways_between
+from pushjax.planning.approach import TransitStatus
+from pushjax.planning.between_pushes import transits_between
 from pushjax.planning.poses import compose, inverse, to_world
 
 shapely = pytest.importorskip("shapely")
@@ -40,43 +40,43 @@ def translations(vertices, pushes, scatter):
 @pytest.mark.parametrize("scatter", [0.0, 5e-4])
 def test_the_finger_touches_no_sample_between_pushes(vertices, scatter):
     paths, poses, samples = translations(vertices, 12, scatter)
-    found = ways_between(vertices, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
-    assert found.status == WayStatus.FOUND
+    found = transits_between(vertices, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
+    assert found.status == TransitStatus.FOUND
     assert not found.touched.any()
-    for k, way in enumerate(found.ways):
+    for k, transit in enumerate(found.transits):
         if k:
-            np.testing.assert_allclose(way.points[0], paths[k - 1, -1], atol=1e-12)
+            np.testing.assert_allclose(transit.points[0], paths[k - 1, -1], atol=1e-12)
         if k < len(paths):
-            np.testing.assert_allclose(way.points[-1], paths[k, 0], atol=1e-12)
-        line = shapely.LineString(way.points)
+            np.testing.assert_allclose(transit.points[-1], paths[k, 0], atol=1e-12)
+        line = shapely.LineString(transit.points)
         for pose in [poses[k], *samples[:, k]]:
             placed = shapely.Polygon(to_world(pose, vertices))
             # a finger that has just pushed is in contact, and may overlap a sample by the scatter
-            begins = min(RADIUS, placed.distance(shapely.Point(way.points[0])))
+            begins = min(RADIUS, placed.distance(shapely.Point(transit.points[0])))
             assert placed.distance(line) >= begins - 1e-6
             if k == len(paths):  # the retreat ends with the whole clearance, also from the samples
-                assert placed.distance(shapely.Point(way.points[-1])) >= RADIUS + CLEARANCE - 1e-6
+                assert placed.distance(shapely.Point(transit.points[-1])) >= RADIUS + CLEARANCE - 1e-6
 
 
 def test_the_finger_keeps_out_of_fixtures_between_pushes():
-    """Posts between the slider and where the finger goes; a wall leaves no way."""
+    """Posts between the slider and where the finger goes; a wall leaves no transit."""
     paths, poses, samples = translations(L, 6, 2e-4)
-    free = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
-    start, first = free.ways[0].points[0], free.ways[0].points[1]
+    free = transits_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=np.array([0.0, 0.2]))
+    start, first = free.transits[0].points[0], free.transits[0].points[1]
     posts = [pj.Fixture(pj.Disk(0.01), (*(start + share * (first - start)), 0.0)) for share in (0.3, 0.6)]
     bodies = shapely.union_all([shapely.Point(np.asarray(each.pose[:2])).buffer(0.01, quad_segs=64) for each in posts])
-    assert bodies.distance(shapely.LineString(free.ways[0].points)) == 0
-    found = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=tuple(posts))
-    assert found.status == WayStatus.FOUND
-    for way in found.ways:
-        assert bodies.distance(shapely.LineString(way.points)) >= RADIUS + CLEARANCE - 1e-4
-    assert found.ways[0].length > free.ways[0].length
+    assert bodies.distance(shapely.LineString(free.transits[0].points)) == 0
+    found = transits_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=tuple(posts))
+    assert found.status == TransitStatus.FOUND
+    for transit in found.transits:
+        assert bodies.distance(shapely.LineString(transit.points)) >= RADIUS + CLEARANCE - 1e-4
+    assert found.transits[0].length > free.transits[0].length
     behind = pj.Wall(start + 0.001 * (first - start), first - start)
-    shut = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(behind,))
-    assert shut.status == WayStatus.START_IN_FIXTURE
+    shut = transits_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(behind,))
+    assert shut.status == TransitStatus.START_IN_FIXTURE
     away = pj.Wall(0.5 * (start + first), start - first)
-    shut = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(away,))
-    assert shut.status == WayStatus.GOAL_BLOCKED
+    shut = transits_between(L, RADIUS, CLEARANCE, paths, poses, samples, start=start, fixtures=(away,))
+    assert shut.status == TransitStatus.GOAL_BLOCKED
 
 
 def test_what_would_be_touched_is_counted():
@@ -84,8 +84,8 @@ def test_what_would_be_touched_is_counted():
     paths, poses, _ = translations(SQUARE, 1, 0.0)
     samples = np.repeat(poses[None], 40, axis=0)
     samples[20:, 0, :2] += np.random.default_rng(1).uniform(-0.2, 0.2, (20, 2))
-    found = ways_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples, start=poses[0, :2] + [0.3, 0.3])
-    line = shapely.LineString(found.ways[0].points)
+    found = transits_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples, start=poses[0, :2] + [0.3, 0.3])
+    line = shapely.LineString(found.transits[0].points)
     placed = [shapely.Polygon(to_world(pose, SQUARE)) for pose in samples[:, 0]]
     np.testing.assert_array_equal(found.touched, [each.distance(line) < RADIUS for each in placed])
     assert 0 < found.touched.sum() < 20
@@ -94,34 +94,34 @@ def test_what_would_be_touched_is_counted():
 def test_a_push_in_a_notch_that_the_finger_does_not_fit_into_has_no_way():
     path = np.array([[(0.0, 0.02), (0.0, 0.0)]])
     still = np.zeros((2, 3))
-    found = ways_between(NOTCHED, RADIUS, CLEARANCE, path, still, still[None], start=np.array([0.2, 0.2]))
-    assert found.status == WayStatus.GOAL_BLOCKED
-    with pytest.raises(ValueError, match=r"ways\[0\] must be a way that was found; its status is GOAL_BLOCKED"):
-        finger_motion(found.ways, path, free=0.1, push=0.02)
+    found = transits_between(NOTCHED, RADIUS, CLEARANCE, path, still, still[None], start=np.array([0.2, 0.2]))
+    assert found.status == TransitStatus.GOAL_BLOCKED
+    with pytest.raises(ValueError, match=r"transits\[0\] must be a transit that was found; its status is GOAL_BLOCKED"):
+        finger_motion(found.transits, path, free=0.1, push=0.02)
 
 
 def test_motion_has_the_speeds():
     paths, poses, samples = translations(SQUARE, 4, 0.0)
-    ways = ways_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples).ways
-    motion = finger_motion(ways, paths, free=0.1, push=0.02)
+    transits = transits_between(SQUARE, RADIUS, CLEARANCE, paths, poses, samples).transits
+    motion = finger_motion(transits, paths, free=0.1, push=0.02)
     speed = np.linalg.norm(np.diff(motion.position, axis=0), axis=1) / np.diff(motion.time)
     np.testing.assert_allclose(speed, np.where(motion.push[1:] > 0, 0.02, 0.1))
     assert motion.time[0] == 0
     for k, path in enumerate(paths):
         np.testing.assert_allclose(motion.position[motion.push == k + 1], path[1:], atol=1e-12)
     assert np.sum(np.diff(motion.push) != 0) == 2 * len(paths)
-    whole = sum(way.length for way in ways) / 0.1 + len(paths) * (CLEARANCE + TRAVEL) / 0.02
+    whole = sum(transit.length for transit in transits) / 0.1 + len(paths) * (CLEARANCE + TRAVEL) / 0.02
     assert motion.time[-1] == pytest.approx(whole)
     with pytest.raises(ValueError, match="push must be positive; got 0"):
-        finger_motion(ways, paths, free=0.1, push=0.0)
+        finger_motion(transits, paths, free=0.1, push=0.0)
 
 
-def test_ways_do_not_depend_on_the_frame():
+def test_transits_do_not_depend_on_the_frame():
     paths, poses, samples = translations(L, 3, 3e-4)
     moved = np.array([0.4, -0.3, 2.0])
     there = [to_world(moved, paths), compose(moved, poses), compose(moved, samples)]
-    ways = ways_between(L, RADIUS, CLEARANCE, paths, poses, samples).ways
-    again = ways_between(L, RADIUS, CLEARANCE, *there).ways
-    for here, other in zip(ways, again, strict=True):
+    transits = transits_between(L, RADIUS, CLEARANCE, paths, poses, samples).transits
+    again = transits_between(L, RADIUS, CLEARANCE, *there).transits
+    for here, other in zip(transits, again, strict=True):
         assert other.length == pytest.approx(here.length, rel=1e-6)
         np.testing.assert_allclose(to_world(inverse(moved), other.points), here.points, atol=1e-6)

@@ -1,11 +1,11 @@
-"""Distances from walls and fixed bodies, and ways of a finger among them, judged by shapely."""
+"""Distances from walls and fixed bodies, and transits of a finger among them, judged by shapely."""
 
 import numpy as np
 import pytest
 
 import pushjax as pj
 from pushjax.planning import Workspace
-from pushjax.planning.approach import Roadmap, WayStatus
+from pushjax.planning.approach import Roadmap, TransitStatus
 from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.poses import to_body, to_world
 
@@ -82,8 +82,8 @@ def test_a_frame_changes_no_distance():
     np.testing.assert_allclose(there, obstacles.point_clearance(points), atol=1e-12)
 
 
-def random_ways(count, seed):
-    """Yield ways in random worlds: slider and fixtures of shapely, start, goal, the way, and whether it must exist.
+def random_transits(count, seed):
+    """Yield transits in random worlds: slider, fixtures (shapely), start, goal, transit, and whether it must exist.
 
     It must if start and goal are in one part of the plane that is a little farther away than the clearance.
     """
@@ -101,46 +101,48 @@ def random_ways(count, seed):
         free = shapely.box(-0.4, -0.4, 0.4, 0.4).difference(slider.union(bodies).buffer(1.09 * APART, quad_segs=32))
         parts = getattr(free, "geoms", [free])
         for start in rng.uniform(-0.3, 0.3, (3, 2)):
-            ways = roadmap.ways(start, pose, limits)
+            transits = roadmap.transits(start, pose, limits)
             for k, goal in enumerate(goals):
                 ends = [shapely.Point(start), shapely.Point(goal)]
                 joined = any(all(part.contains(end) for end in ends) for part in parts)
-                yield slider, bodies, start, goal, roadmap.way(ways, k, pose), joined
+                yield slider, bodies, start, goal, roadmap.transit(transits, k, pose), joined
 
 
-def check_ways(count, seed):
-    """Check random ways, and return how many there are, and of how many that must exist."""
+def check_transits(count, seed):
+    """Check random transits, and return how many there are, and of how many that must exist."""
     found = must = 0
-    for slider, bodies, start, goal, way, joined in random_ways(count, seed):
+    for slider, bodies, start, goal, transit, joined in random_transits(count, seed):
         must += joined
-        if way.status != WayStatus.FOUND:
+        if transit.status != TransitStatus.FOUND:
             assert not joined
-            assert np.isinf(way.length)
-            assert len(way.points) == 1
+            assert np.isinf(transit.length)
+            assert len(transit.points) == 1
             continue
         found += 1
-        np.testing.assert_allclose(way.points[[0, -1]], [start, goal], atol=1e-9)
-        assert way.length == pytest.approx(np.linalg.norm(np.diff(way.points, axis=0), axis=1).sum())
-        line, first = shapely.LineString(way.points), shapely.Point(start)
+        np.testing.assert_allclose(transit.points[[0, -1]], [start, goal], atol=1e-9)
+        assert transit.length == pytest.approx(np.linalg.norm(np.diff(transit.points, axis=0), axis=1).sum())
+        line, first = shapely.LineString(transit.points), shapely.Point(start)
         for each in (
             slider,
             bodies,
-        ):  # a start that is nearer than the clearance is left by the way that comes no nearer
+        ):  # a start that is nearer than the clearance is left by the transit that comes no nearer
             assert each.distance(line) >= min(APART, each.distance(first)) - ROUNDED
         if min(slider.distance(first), bodies.distance(first)) < APART - ROUNDED:
-            after = shapely.LineString(way.points[1:]) if len(way.points) > 2 else shapely.Point(way.points[1])
+            after = (
+                shapely.LineString(transit.points[1:]) if len(transit.points) > 2 else shapely.Point(transit.points[1])
+            )
             assert slider.union(bodies).distance(after) >= APART - ROUNDED
     return found, must
 
 
-def test_ways_among_fixtures():
-    found, must = check_ways(60, 2)
+def test_transits_among_fixtures():
+    found, must = check_transits(60, 2)
     assert found > 400
     assert must > 400
 
 
 @pytest.mark.long
-def test_ways_in_thousands_of_worlds():
-    found, must = check_ways(2000, 3)
-    print(f"{found} ways; {must} must exist")
+def test_transits_in_thousands_of_worlds():
+    found, must = check_transits(2000, 3)
+    print(f"{found} transits; {must} must exist")
     assert found >= must > 10_000

@@ -188,13 +188,13 @@ def test_the_goal_is_where_the_slider_covers_it(rectangle):
 def test_why_there_is_no_push(rectangle):
     planner, pose = rectangle.planner, np.array([0.25, 0.25, 0.0])
     inside = planner.choose(pose, pose[:2])
-    assert inside.status == PlanStatus.NO_WAY
+    assert inside.status == PlanStatus.NO_TRANSIT
     assert inside.status.failed
     outside = planner.choose(np.array([2.0, 2.0, 0.0]), np.array([0.1, 0.1]))
     assert outside.status.failed
     action, memory = rectangle(jax.random.key(0), Observation(pose[:2], pose), rectangle.initial_memory())
     np.testing.assert_array_equal(action, pose[:2])  # the finger waits
-    assert memory.status == PlanStatus.NO_WAY
+    assert memory.status == PlanStatus.NO_TRANSIT
     assert memory.waited == 1
 
 

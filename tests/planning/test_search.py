@@ -137,7 +137,7 @@ def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
     assert not np.any(done.failed)
     error = np.sqrt(0.25 / 256)  # largest standard error of a frequency
     np.testing.assert_allclose(done.success(easy), plan.success, atol=4 * np.sqrt(2) * error)
-    approach, retreat = plan.ways
+    approach, retreat = plan.transits
     np.testing.assert_allclose(approach.points[-1], plan.path[0, 0], atol=1e-9)
     np.testing.assert_allclose(retreat.points[0], plan.path[0, -1], atol=1e-9)
     np.testing.assert_allclose(plan.pose[-1], np.mean(plan.outcomes.pose, axis=0), atol=0.01)
@@ -182,7 +182,7 @@ def test_pushes_that_move_nothing_are_left_out(slider, easy):
     plan = plan_pushes(KEY, slider, HAND, np.zeros(3), here, **SETTINGS)
     assert plan.status is PushPlanStatus.FOUND
     assert plan.success == 1
-    assert plan.path.shape[0] == len(plan.ways) == 0
+    assert plan.path.shape[0] == len(plan.transits) == 0
     np.testing.assert_array_equal(plan.pose, np.zeros((1, 3)))
     assert plan.outcomes.poses.shape == (256, 1, 3)
 
@@ -220,7 +220,7 @@ def test_the_hand_stays_out_of_fixtures(slider, easy, plan):
     assert body.distance(shapely.LineString(plan.path[0])) < RADIUS
     around = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS | {"fixtures": (fixture,)})
     assert around.status is PushPlanStatus.FOUND
-    for line in (*around.path, *(way.points for way in around.ways if len(way.points) > 1)):
+    for line in (*around.path, *(transit.points for transit in around.transits if len(transit.points) > 1)):
         assert body.distance(shapely.LineString(line)) >= RADIUS - 1e-6
     # and if there is no other push, the status says so
     here = pj.Fixture(fixture.shape, (0.062, 0.0, 0.0))

@@ -20,7 +20,7 @@ from pushjax._internal.record import result_record
 from pushjax.experiments._slider_options import expected_surface, parse_shape, parse_support
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
-from pushjax.planning.approach import WayStatus
+from pushjax.planning.approach import TransitStatus
 from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.poses import to_body
@@ -42,8 +42,8 @@ def run(
         progress: Called with the number of attempts done and their total.
 
     Returns:
-        The record: status and probability of success of the plan, its paths and ways, predicted final poses and their
-        spread, and the files that were written.
+        The record: status and probability of success of the plan, its paths and transits, predicted final poses and
+        their spread, and the files that were written.
 
     Raises:
         ValueError: If an option is invalid.
@@ -60,8 +60,8 @@ def run(
     _check_distance(options, length)
     plan = _best(_plans(slider, hand, goal, options, seed), options.attempts, progress)
     motion = None
-    if plan.status != PushPlanStatus.NO_WAY and plan.ways:
-        motion = finger_motion(plan.ways, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
+    if plan.status != PushPlanStatus.NO_TRANSIT and plan.transits:
+        motion = finger_motion(plan.transits, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
     files, pictures = [], []
     if out is not None:
         from pushjax.experiments.plan.picture import draw
@@ -128,7 +128,7 @@ def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) 
         progress(len(made), attempts)
         if plan.status == PushPlanStatus.FOUND:
             break
-    return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_WAY, plan.success))
+    return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_TRANSIT, plan.success))
 
 
 def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
@@ -143,10 +143,10 @@ def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> di
         "spread": {"x_mm": 1e3 * spread[0], "y_mm": 1e3 * spread[1], "theta_deg": np.degrees(spread[2])},
         "path": plan.path,
         "pose": plan.pose,
-        "ways": [
-            {"status": way.status.name, "points": way.points}
-            | ({"length": way.length} if way.status == WayStatus.FOUND else {})
-            for way in plan.ways
+        "transits": [
+            {"status": transit.status.name, "points": transit.points}
+            | ({"length": transit.length} if transit.status == TransitStatus.FOUND else {})
+            for transit in plan.transits
         ],
         "final_poses": final,
         "duration_s": None if motion is None else float(motion.time[-1]),
@@ -168,9 +168,11 @@ def _write_way_points(path: Path, motion: FingerMotion) -> Path:
 def summary(record: dict[str, Any]) -> str:
     """Return the text that the command prints for a record of `run`."""
     spread, status = record["spread"], PushPlanStatus[record["status"]]
-    if status == PushPlanStatus.NO_WAY:
-        blocked = next(k for k, way in enumerate(record["ways"]) if way["status"] != WayStatus.FOUND.name)
-        lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['ways'][blocked]['status']})"]
+    if status == PushPlanStatus.NO_TRANSIT:
+        blocked = next(
+            k for k, transit in enumerate(record["transits"]) if transit["status"] != TransitStatus.FOUND.name
+        )
+        lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['transits'][blocked]['status']})"]
     elif not len(record["path"]):
         words = "no push is needed" if status == PushPlanStatus.FOUND else "no push that helps was found"
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]

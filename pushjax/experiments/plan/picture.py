@@ -1,4 +1,4 @@
-"""The picture of a plan: the finger's pushes and ways, where the block is on the way, and where it may end."""
+"""The picture of a plan: the finger's pushes and transits, where the block is on the way, and where it may end."""
 
 from pathlib import Path
 
@@ -48,9 +48,9 @@ def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, option
         color, label = (plot.BLACK, "start") if number == 0 else (plot.GRAY, "after each push" if number == 1 else None)
         plot.outline(axes, slider.shape, pose, color, 1.2, label=label)
     plot.outline(axes, slider.shape, np.asarray(goal.pose), plot.GREEN, 1.6, linestyle="--", label="goal")
-    for number, way in enumerate(plan.ways):
+    for number, transit in enumerate(plan.transits):
         label = "between pushes" if number == 0 else None
-        axes.plot(*(plot.MM * way.points.T), color=plot.ORANGE, lw=0.9, ls="--", label=label)
+        axes.plot(*(plot.MM * transit.points.T), color=plot.ORANGE, lw=0.9, ls="--", label=label)
     for number, path in enumerate(np.asarray(plan.path)):
         points = plot.MM * path
         axes.plot(*points.T, color=plot.BLUE, lw=1.8, label="pushes of the finger" if number == 0 else None)
