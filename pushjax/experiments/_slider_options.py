@@ -14,8 +14,12 @@ NUM_PAIRS = 400
 NUM_POINTS = 100  # support points under a slider whose pressure is known everywhere
 
 
-def parse_shape(text: str) -> pj.Polygon | pj.Disk | pj.Ellipse:
-    """Return the outline that the option `--shape` describes, m.
+def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj.Ellipse:
+    """Return the outline that a text describes, m.
+
+    Args:
+        text: The text.
+        option: Name of the option, for the message.
 
     Raises:
         ValueError: If the text is no outline.
@@ -23,9 +27,9 @@ def parse_shape(text: str) -> pj.Polygon | pj.Disk | pj.Ellipse:
     kind, colon, rest = text.partition(":")
     if kind not in ("rectangle", "disk", "ellipse", "regular"):
         if colon and not Path(text).exists():
-            raise ValueError(f"--shape: expected {SHAPES}; got {text!r}")
-        return pj.Polygon(_vertices(Path(text)))
-    sizes = parse_numbers("--shape", text, rest, "x", 1 if kind == "disk" else 2, SHAPES)
+            raise ValueError(f"{option}: expected {SHAPES}; got {text!r}")
+        return pj.Polygon(_vertices(Path(text), option))
+    sizes = parse_numbers(option, text, rest, "x", 1 if kind == "disk" else 2, SHAPES)
     if kind == "disk":
         return pj.Disk(sizes[0])
     if kind == "ellipse":
@@ -68,21 +72,21 @@ def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSur
     return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
 
 
-def _vertices(path: Path) -> np.ndarray:
+def _vertices(path: Path, option: str) -> np.ndarray:
     """Read a file with one vertex x, y (m) per line; a heading is allowed."""
     try:
         rows = [row for row in csv.reader(path.read_text().splitlines()) if row]
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"--shape: {path}: expected {SHAPES}; {error}") from error
+        raise ValueError(f"{option}: {path}: expected {SHAPES}; {error}") from error
     numbers = []
     for k, row in enumerate(rows):
         try:
             numbers.append([float(cell) for cell in row])
         except ValueError as error:
             if k > 0:
-                raise ValueError(f"--shape: {path}, line {k + 1}: expected two numbers, x and y; got {row}") from error
+                raise ValueError(f"{option}: {path}, line {k + 1}: expected two numbers, x and y; got {row}") from error
     if any(len(row) != 2 for row in numbers) or len(numbers) < 3:
-        raise ValueError(f"--shape: {path}: expected at least three vertices, two numbers each; got {len(numbers)}")
+        raise ValueError(f"{option}: {path}: expected at least three vertices, two numbers each; got {len(numbers)}")
     return np.array(numbers)
 
 

@@ -25,7 +25,7 @@ ROBUST = ["--goal", "0.03", "0.02", "-0.4", "--symmetry", "2", "--finger", "-0.1
 NOT_CONVEX = ["--goal", "0.04", "0.03", "0.6", "--finger", "-0.1", "0", "--attempts", "1"]
 
 
-def push_through_the_middle(slider, hand, goal, options, seed):
+def push_through_the_middle(slider, hand, goal, fixtures, options, seed):
     """A plan that needs no search: a push through the center of a symmetric block, which then only translates."""
     path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
     poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
@@ -108,7 +108,7 @@ def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys
     (tmp_path / "way_points.csv").write_text("old")
     notched = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (0.1, 1), (0.1, 0), (-0.1, 0), (-0.1, 1), (-1, 1)])
 
-    def into_the_notch(slider, hand, goal, options, seed):
+    def into_the_notch(slider, hand, goal, fixtures, options, seed):
         path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
         between = transits_between(notched, RADIUS, options.clearance, path, still, still[None])
         outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
@@ -119,6 +119,46 @@ def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys
     assert "no plan: the finger does not get to push 1 (GOAL_BLOCKED)" in capsys.readouterr().out
     assert not (tmp_path / "way_points.csv").exists()
     assert json.loads((tmp_path / "plan.json").read_text())["status"] == "NO_TRANSIT"
+
+
+def test_fixtures_of_a_plan(tmp_path, monkeypatch, capsys):
+    """Walls and bodies get to the planner; a finger that would run into one makes no way points."""
+    given = []
+
+    def into_the_disk(slider, hand, goal, fixtures, options, seed):
+        given.extend(fixtures)
+        path, still = np.array([[(-0.06, 0.0), (0.0, 0.0)]]), np.zeros((2, 3))
+        outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
+        yield PushPlan(PushPlanStatus.HAND_IN_FIXTURE, path, still, (), nothing, outcomes, 0.0, 0.0, nothing)
+
+    monkeypatch.setattr(experiment, "_plans", into_the_disk)
+    fixtures = ["wall@0,-0.1,1.5707963267948966", "disk:0.02@0.1,0.05,0", "rectangle:0.1x0.02@0,0.2,0.5"]
+    options = ["--fixtures", *fixtures, "--fixture-friction", "0.3"]
+    cli.main(["plan", *SIMPLE, *options, "--out", str(tmp_path)])
+    wall, disk, bar = given
+    np.testing.assert_allclose(np.concatenate([wall.point, wall.normal]), (0, -0.1, 0, 1), atol=1e-7)
+    assert (float(disk.shape.radius), disk.pose.tolist()) == (pytest.approx(0.02), pytest.approx([0.1, 0.05, 0]))
+    assert (float(bar.shape.area), bar.pose.tolist()) == (pytest.approx(0.002), pytest.approx([0, 0.2, 0.5]))
+    assert [float(each.friction) for each in given] == pytest.approx([0.3] * 3)
+    assert "runs into a fixture" in capsys.readouterr().out
+    assert not (tmp_path / "way_points.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("fixture", "message"),
+    [
+        ("wall", "--fixtures: expected wall@X,Y,ANGLE"),
+        ("wall@0,1", "--fixtures: expected wall@X,Y,ANGLE"),
+        ("disc:0.02@0,1,0", "--fixtures: expected rectangle:"),
+        ("ellipse:0.02x0.01@0,1,0", "a body is a disk or a convex polygon; got 'ellipse:0.02x0.01@0,1,0'"),
+        ("disk:0.02@0,0,0", "start must be a pose at which the slider overlaps no fixture"),
+    ],
+)
+def test_fixtures_that_cannot_be(fixture, message, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["plan", *SIMPLE, "--fixtures", fixture, "--out", str(tmp_path)])
+    assert stop.value.code == 1
+    assert message in capsys.readouterr().err
 
 
 def test_attempts_end_with_the_first_that_is_sure_enough():

@@ -18,16 +18,19 @@ import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.experiments._slider_options import expected_surface, parse_shape, parse_support
+from pushjax.experiments.plan.fixtures import parse_fixtures
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
 from pushjax.planning.approach import TransitStatus
 from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.clearance import outline_vertices, point_clearance
 from pushjax.planning.poses import to_body
+from pushjax.simulation.fixtures import Fixtures
 
 WAY_POINTS_FILE = "way_points.csv"
 MAX_PUSH_LENGTH = 2.5  # in units of the limit surface's length
 STEPS = 12  # number of steps of each push
+POSSIBLE = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)  # the finger can do what the plan says
 
 
 def run(
@@ -49,7 +52,7 @@ def run(
         ValueError: If an option is invalid.
     """
     options.check()
-    shape, hand = parse_shape(options.shape), pj.Hand.finger(options.radius)
+    shape, hand, fixtures = parse_shape(options.shape), pj.Hand.finger(options.radius), parse_fixtures(options)
     _check_finger(shape, options)
     support = parse_support(options.support, shape)
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
@@ -58,9 +61,9 @@ def run(
     length = float(slider.surface.length)
     goal = Goal(np.array(options.goal), position=position, angle=angle, length=length, symmetry=options.symmetry)
     _check_distance(options, length)
-    plan = _best(_plans(slider, hand, goal, options, seed), options.attempts, progress)
+    plan = _best(_plans(slider, hand, goal, fixtures, options, seed), options.attempts, progress)
     motion = None
-    if plan.status != PushPlanStatus.NO_TRANSIT and plan.transits:
+    if plan.status in POSSIBLE and plan.transits:
         motion = finger_motion(plan.transits, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
     files, pictures = [], []
     if out is not None:
@@ -70,7 +73,7 @@ def run(
             (out / WAY_POINTS_FILE).unlink(missing_ok=True)  # a robot must not follow the plan of an earlier call
         else:
             files.append(str(_write_way_points(out / WAY_POINTS_FILE, motion)))
-        pictures.append(str(draw(slider, goal, plan, options, out / "plan.png")))
+        pictures.append(str(draw(slider, goal, fixtures, plan, options, out / "plan.png")))
     settings = {"seed": seed} | vars(options)
     return result_record("plan", settings, **_plan_entries(plan, goal, motion), files=files, pictures=pictures)
 
@@ -84,7 +87,9 @@ def _check_finger(shape: pj.Shape, options: Options) -> None:
         raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
 
 
-def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed: int) -> Iterator[PushPlan]:
+def _plans(
+    slider: pj.Slider, hand: pj.Hand, goal: Goal, fixtures: Fixtures, options: Options, seed: int
+) -> Iterator[PushPlan]:
     """Yield the plan of each attempt."""
     longest = _max_push_length(options, float(slider.surface.length))
     # Without a search under sampled friction, the plan is the best one under the mean friction.
@@ -99,6 +104,7 @@ def _plans(slider: pj.Slider, hand: pj.Hand, goal: Goal, options: Options, seed:
             model=pj.FrictionModel(options.dof, options.friction),
             pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
             success=options.success,
+            fixtures=fixtures,
             finger=options.finger,
             **planner,
         )
@@ -128,7 +134,7 @@ def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) 
         progress(len(made), attempts)
         if plan.status == PushPlanStatus.FOUND:
             break
-    return max(made, key=lambda plan: (plan.status != PushPlanStatus.NO_TRANSIT, plan.success))
+    return max(made, key=lambda plan: (plan.status in POSSIBLE, plan.success))
 
 
 def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
@@ -173,6 +179,8 @@ def summary(record: dict[str, Any]) -> str:
             k for k, transit in enumerate(record["transits"]) if transit["status"] != TransitStatus.FOUND.name
         )
         lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['transits'][blocked]['status']})"]
+    elif status == PushPlanStatus.HAND_IN_FIXTURE:
+        lines = ["no plan: in every plan that was found the finger runs into a fixture in a push"]
     elif not len(record["path"]):
         words = "no push is needed" if status == PushPlanStatus.FOUND else "no push that helps was found"
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]

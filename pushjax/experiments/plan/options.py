@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from pushjax._internal.options import cli_option
 
 Pose = tuple[float, float, float]
+FIXTURES = "wall@X,Y,ANGLE of its normal, or SHAPE@X,Y,THETA with a shape as in --shape"
 MAX_ANGLE = 8 * math.pi  # rad; a larger angle is probably in degrees
 
 
@@ -30,6 +31,11 @@ class Options:
     """Number of angles in a full turn at which the block looks the same: 2 for a rectangle, 4 for a square."""
     finger: Annotated[tuple[float, float] | None, cli_option("X Y")] = None
     """Where the center of the finger is now, m. Default: where its first push begins."""
+    fixtures: Annotated[tuple[str, ...], cli_option("FIXTURE ...")] = ()
+    """What stands fixed on the table: walls, wall@X,Y,ANGLE (a point, and the angle of the normal into the free space),
+    and disks or convex bodies at a pose, such as disk:0.02@0.1,0.05,0 (m and rad). Default: nothing."""
+    fixture_friction: float = 0.0
+    """Friction coefficient between fixtures and block."""
     radius: float = 0.005
     """Radius of the finger, m."""
     pushes: int = 3
@@ -71,6 +77,11 @@ class Options:
         for name, pose in (("start", self.start), ("goal", self.goal)):
             if abs(pose[2]) > MAX_ANGLE:
                 raise ValueError(f"--{name}: the angle is in rad, at most {MAX_ANGLE:.1f}; got {pose[2]:g}")
+        for text in self.fixtures:
+            if not text.rpartition("@")[0]:
+                raise ValueError(f"--fixtures: expected {FIXTURES}; got {text!r}")
+        if not 0 <= self.fixture_friction < math.inf:
+            raise ValueError(f"--fixture-friction must not be negative; got {self.fixture_friction:g}")
         if any(not 0 < each < math.inf for each in self.tolerance):
             raise ValueError(f"--tolerance must be positive; got {_joined(self.tolerance)}")
         if any(not 0 < each < math.inf for each in self.speed):

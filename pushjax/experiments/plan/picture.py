@@ -11,16 +11,19 @@ import pushjax as pj
 from pushjax import plot
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import Goal, PushPlan
+from pushjax.plot.parts import draw_fixtures
+from pushjax.simulation.fixtures import Fixtures
 
 DRAWN = 40  # predicted ends
 
 
-def draw(slider: pj.Slider, goal: Goal, plan: PushPlan, options: Options, path: Path) -> Path:
+def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, options: Options, path: Path) -> Path:
     """Draw a plan, and the errors of its predicted ends, and return the path of the picture.
 
     Args:
         slider: The block.
         goal: The goal.
+        fixtures: What stands fixed on the table.
         plan: The plan.
         options: Radius of the finger, and tolerances.
         path: File of the picture.
@@ -29,6 +32,7 @@ def draw(slider: pj.Slider, goal: Goal, plan: PushPlan, options: Options, path: 
         figure, panels = plt.subplots(
             1, 3, figsize=(12.5, 4.6), layout="constrained", gridspec_kw={"width_ratios": [2, 1, 1]}
         )
+        draw_fixtures(panels[0], fixtures)
         _draw_plan(panels[0], slider, goal, plan, options)
         errors = np.asarray(goal.offset(np.asarray(plan.outcomes.pose)), float)
         _draw_positions(panels[1], errors, options.tolerance[0])
