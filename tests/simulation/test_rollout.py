@@ -587,7 +587,7 @@ BAD = [
     ({"pose": np.zeros((1, 3))}, "pose has shape"),
     ({"path": [[0.2, 0.0], [np.inf, 0.0]]}, "path must be finite; 1 configuration.* the first at index 1"),
     ({"path": [[0.2, 0.0]]}, "path needs at least one step"),
-    ({"path": np.zeros((5, 3))}, "path has shape"),
+    ({"path": np.zeros((5, 3))}, "path has 3 columns; a configuration of this hand has 2: x, y"),
     ({"path": [0.2, 0.0]}, "path has shape"),
     ({"friction": -0.1}, "friction must not be negative"),
     ({"friction": np.nan}, "friction must be finite"),
