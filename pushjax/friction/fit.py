@@ -51,7 +51,8 @@ VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
 CLIP_ROUNDS = 4  # rounds of minimization, to find which s_i are clipped
 MAX_STEPS = 500  # of the optimizer, in each round
-GRADIENT_TOLERANCE = 1e-9  # of the optimizer in NumPy
+# Of the optimizer in NumPy, for a loss of order one: where it stops, and up to where it has converged.
+GRADIENT_TOLERANCE, LARGEST_GRADIENT = 1e-9, 1e-6
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
@@ -308,10 +309,8 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
         state = jax.lax.while_loop(is_unfinished, solve_round, state)
     parameters, unclipped, steps, converged, _ = state
     a = _coefficients(xp, _forms(xp, parameters)[1], degree)
-    gradient, given = Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist)
-    across = gradient.cross(given)
     report = FitReport(
-        angle=share @ xp.arctan2(xp.sqrt(across.dot(across)), gradient.dot(given)),
+        angle=share @ angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist), xp),
         loss=_loss(xp, pairs, unclipped, value_weight, ridge).value(a),
         clipped=xp.sum(~unclipped),
         converged=converged,
@@ -410,7 +409,9 @@ def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
 
         options = {"gtol": GRADIENT_TOLERANCE, "maxiter": MAX_STEPS}
         found = minimize(objective, parameters, jac=True, method="BFGS", options=options)
-        return Minimum(found.x, np.int32(found.nit), found.status in (0, 2))  # 2: the line search is down to roundoff
+        # status 2: roundoff has ended the line search, and only the gradient says whether this is a minimum
+        converged = found.status in (0, 2) and np.max(np.abs(found.jac)) < LARGEST_GRADIENT
+        return Minimum(found.x, np.int32(found.nit), converged)
     import optimistix as optx
 
     tolerance = 1e-7 if parameters.dtype == jnp.float64 else 1e-4

@@ -254,9 +254,15 @@ def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
     return value
 
 
-def angle_between(a: Vec3, b: Vec3) -> Scalar:
-    """Return the angle between two vectors, rad. Small angles are accurate too. Zero if a vector is zero."""
-    return jnp.arctan2(norm(a.cross(b)), a.dot(b))
+def angle_between(a: Vec3, b: Vec3, xp: Any = jnp) -> Scalar:
+    """Return the angle between two vectors, rad. Small angles are accurate too. Zero if a vector is zero.
+
+    Args:
+        a: One vector.
+        b: The other.
+        xp: numpy or jax.numpy.
+    """
+    return xp.arctan2(norm(a.cross(b), xp), a.dot(b))
 
 
 def angle_tolerance(angle: Scalar) -> float:
@@ -264,7 +270,7 @@ def angle_tolerance(angle: Scalar) -> float:
     return 1e4 * float(jnp.finfo(angle.dtype).eps)
 
 
-def norm(a: Vec3) -> Scalar:
-    """Return the Euclidean norm. Its derivative at the zero vector is zero."""
+def norm(a: Vec3, xp: Any = jnp) -> Scalar:
+    """Return the Euclidean norm, with numpy or jax.numpy. Its derivative at the zero vector is zero."""
     squared = a.dot(a)
-    return jnp.where(squared > 0, jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
+    return xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1.0)), 0.0)

@@ -67,6 +67,12 @@ NUM_RAYS = 200
 MAX_FRICTION = 5.0  # a larger coefficient of friction is probably in percent
 
 
+def warn_about_percent(friction: float) -> None:
+    """Warn if a coefficient of friction is so large that it is probably in percent."""
+    if friction > MAX_FRICTION:
+        warn(f"friction: mu is up to {friction:.3g}, and rarely more than 1: is it in percent?")
+
+
 class SurfaceSample(NamedTuple):
     """A sampled surface, and how it was repaired.
 
@@ -155,8 +161,8 @@ class FrictionModel(eqx.Module):
         known = concrete(self.friction)
         if known is not None and known[0] > known[1]:
             raise ValueError(f"friction must be (lowest, highest); got ({known[0]:g}, {known[1]:g})")
-        if known is not None and known[1] > MAX_FRICTION:
-            warn(f"friction: mu is up to {known[1]:.3g}, and rarely more than 1: is it in percent?")
+        if known is not None:
+            warn_about_percent(known[1])
 
     def around(self, surface: LimitSurface) -> SurfaceDistribution:
         """Prepare the distribution of surfaces around a mean. This is the expensive part, needed once for many samples.

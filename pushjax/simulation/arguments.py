@@ -21,7 +21,7 @@ from pushjax._internal.checks import (
 )
 from pushjax._internal.warn import warn
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import MAX_FRICTION
+from pushjax.friction.random import warn_about_percent
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.detection import MAX_PENETRATION
@@ -73,8 +73,8 @@ def checked_arguments(
         raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
     check_finite("friction", mu)
     check_non_negative("friction", mu)
-    if not traced((slider, pose, friction, paths)) and np.max(np.asarray(mu), initial=0) > MAX_FRICTION:
-        warn(f"friction: mu is up to {np.max(np.asarray(mu)):.3g}, and rarely more than 1: is it in percent?")
+    if not traced((slider, pose, friction, paths)):
+        warn_about_percent(np.max(np.asarray(mu), initial=0))
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
 
