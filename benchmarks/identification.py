@@ -62,7 +62,7 @@ def run(pushes: int = 50, repetitions: int = 200, noise: float = 0.5) -> dict[st
     square, hand = pj.Polygon.rectangle(2 * HALF, 2 * HALF), pj.Hand.finger(RADIUS)
     mean = pj.fit_limit_surface(*pj.Support.uniform(square).wrench_twist_pairs(jax.random.key(0), 400))
     surfaces = jax.tree.map(lambda leaf: leaf[None], mean)
-    prior = Prior.of(UNKNOWNS, surfaces, jnp.asarray([0.25]), jnp.zeros(2))
+    prior = Prior.of(UNKNOWNS, surfaces, {"friction": jnp.asarray([0.25])}, jnp.zeros(2))
     layout, count = prior.layout, repetitions
     starts, paths = random_pushes(rng, (count, pushes))
     truth, mu = rng.normal(size=(count, layout.size)), rng.uniform(0.1, 0.5, count)

@@ -56,7 +56,7 @@ def one_run(
     import pushjax as pj
     from pushjax.experiments import stochastic_push
 
-    slider, hand, path = stochastic_push.setting(0, steps)
+    slider, hand, path = stochastic_push.push_setup(0, steps)
     model = pj.FrictionModel(dof=20.0, friction=(0.15, 0.35))
 
     def progress(done: int, total: int) -> None:

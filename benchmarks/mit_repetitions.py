@@ -28,7 +28,7 @@ from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, load, padded_pushes
-from pushjax.experiments.table1.methods import TEST_SIZE, UNKNOWNS, Setting, fitted, without_padding
+from pushjax.experiments.table1.methods import TEST_SIZE, UNKNOWNS, ConditionData, fitted, without_padding
 from pushjax.experiments.table1.repeats import relative_motions
 from pushjax.identification.predictive import NoiseParameters, PredictiveModel, predict
 
@@ -90,14 +90,14 @@ def _repetitions(key: Any, log: MitPushes, draws: int, dof: float, half_width: f
     fast, slow = relative_motions(log.fast)[pairs[:, 0]], relative_motions(log.whole)[pairs[:, 1]]
     scale = np.array([1, 1, log.length])
     measured = np.linalg.norm((fast - slow) * scale, axis=1) / np.sqrt(2)
-    setting = Setting.of(log, "quartic", STEPS)
-    found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
+    condition = ConditionData.of(log, "quartic", STEPS)
+    found = fitted(condition.coarse, condition, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
     pushes = padded_pushes(log, log.whole, pairs[:, 1], STEPS, TEST_SIZE)
     dtype = pushes.path.dtype
     mu = jnp.maximum(found.friction + half_width * jnp.array([[-1.0, 1.0]], dtype), 0)
     none, many = jnp.zeros((), dtype), jnp.asarray(1e3, dtype)
     friction_only = NoiseParameters(jnp.asarray(dof, dtype), mu, none, none, jnp.zeros(2, dtype), many)
-    model = PredictiveModel.of(found, pushes, setting.slider, setting.hand, "sum_of_squares")
+    model = PredictiveModel.of(found, pushes, condition.slider, condition.hand, "sum_of_squares")
     ends = without_padding(predict(key, model, friction_only, draws)[0], pushes) * scale
     spread = np.sqrt(np.sum(np.var(ends, axis=1, ddof=1), axis=-1))
     motion = np.linalg.norm(ends.mean(axis=1) - without_padding(pushes.start, pushes) * scale, axis=1)

@@ -27,8 +27,8 @@ from pushjax._internal.record import result_record
 from pushjax.experiments.pusht_mpc import setting
 from pushjax.experiments.pusht_mpc.player import cache_folder, library, planner
 from pushjax.planning import PushController, PushLibrary
-from pushjax.planning.controller import Observation
-from pushjax.planning.friction_filter import FrictionFilter
+from pushjax.planning.feedback.controller import Observation
+from pushjax.planning.feedback.friction_filter import FrictionFilter
 from pushjax.tasks import PushT
 
 Controller = Literal["nominal", "robust", "adapting", "known"]

@@ -19,7 +19,7 @@ import pushjax as pj
 from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
-from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, plan_pushes, push_outcomes
+from pushjax.planning import FinalPose, Goal, PushPlan, PushSequence, plan_pushes, push_outcomes
 from pushjax.plot.files import save
 
 BOX, RADIUS, STEPS, FINER = (0.09, 0.06), 0.005, 12, 4
@@ -55,7 +55,7 @@ def run(
         The record, with a row for each way to plan: how often its plans succeed, with the standard error over goals.
     """
     slider, hand = pj.Slider.uniform(pj.Polygon.rectangle(*BOX), degree=degree), pj.Hand.finger(RADIUS)
-    model, ways = pj.FrictionModel(dof, friction), Pushes(pushes, length=LONGEST, steps=STEPS)
+    model, sequence = pj.FrictionModel(dof, friction), PushSequence(pushes, length=LONGEST, steps=STEPS)
     poses = np.random.default_rng(seed).uniform(-1, 1, (goals, 3)) * [REACH, REACH, np.pi / 2]
     success: dict[str, list[float]] = {"nominal": [], "robust": []}
     predicted: dict[str, list[float]] = {"nominal": [], "robust": []}
@@ -66,7 +66,7 @@ def run(
         for name, settings in (("nominal", {"cost": FinalPose(goal), "search": ()}), ("robust", {})):
             start = time.perf_counter()
             plan = plan_pushes(
-                jax.random.key(seed + k), slider, hand, np.zeros(3), goal, model=model, pushes=ways, **settings
+                jax.random.key(seed + k), slider, hand, np.zeros(3), goal, model=model, pushes=sequence, **settings
             )
             seconds[name].append(time.perf_counter() - start)
             unseen = jax.random.key(10**6 + seed + k)

@@ -25,8 +25,8 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.planning import SqueezeOutcomes, SqueezePlan, Squeezes, plan_squeezes, squeeze_outcomes
 from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
-from pushjax.planning.pose_spread import distances, entropy, most_likely
-from pushjax.planning.squeezes import WIDTH
+from pushjax.planning.squeezes.plan_squeezes import WIDTH
+from pushjax.planning.squeezes.pose_spread import distances, entropy, most_likely
 from pushjax.plot.files import save
 
 HAND = pj.Hand.parallel_jaw(0.07, 0.01)
@@ -78,7 +78,14 @@ def run(
         start, others = _belief(rng, belief), _belief(rng, unseen)
         began = time.perf_counter()
         plan = plan_squeezes(
-            jax.random.key(seed), slider, HAND, start, count=count, symmetry=symmetry, position=POSITION, **how
+            jax.random.key(seed),
+            slider,
+            HAND,
+            start,
+            count=count,
+            symmetry=symmetry,
+            position_tolerance=POSITION,
+            **how,
         )
         seconds = time.perf_counter() - began
         angles = rng.uniform(0, np.pi, (sequences, count, 1))

@@ -25,7 +25,7 @@ import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax._internal.record import result_record
 from pushjax.planning import StableContact, StablePush, shortest_push, stable_contacts
-from pushjax.planning.draws import draw_friction
+from pushjax.planning.friction_samples import draw_friction
 
 BOX, RADIUS, SPACING = pj.Polygon.rectangle(0.09, 0.06), 0.005, 0.04
 HAND = pj.Hand.two_fingers(RADIUS)

@@ -67,7 +67,7 @@ def grasp() -> plot.Animation:
 
 def stochastic() -> plot.Animation:
     """Draw one push with 200 samples of the friction under the square and at the finger."""
-    slider, hand, path = stochastic_push.setting(0, 100)
+    slider, hand, path = stochastic_push.push_setup(0, 100)
     model = pj.FrictionModel(dof=20, friction=(0.15, 0.35))
     many = pj.monte_carlo(
         jax.random.key(1), PUSHES, slider, hand, path, pose=jnp.zeros(3), model=model, trajectories=True

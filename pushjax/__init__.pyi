@@ -20,10 +20,10 @@ from .friction.ellipsoid import Ellipsoid as Ellipsoid
 from .friction.fit import FitReport as FitReport
 from .friction.fit import fit_limit_surface as fit_limit_surface
 from .friction.fit import mean_twist_angle as mean_twist_angle
+from .friction.friction_model import FrictionModel as FrictionModel
 from .friction.limit_surface import InverseMap as InverseMap
 from .friction.limit_surface import LimitSurface as LimitSurface
 from .friction.quartic import Quartic as Quartic
-from .friction.random import FrictionModel as FrictionModel
 from .friction.support import Support as Support
 from .friction.support import WrenchTwistPairs as WrenchTwistPairs
 from .friction.table import Table as Table

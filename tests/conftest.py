@@ -6,6 +6,7 @@ The compiled programs are cached between runs and between pytest's workers if JA
 import gc
 import os
 import sys
+import time
 from pathlib import Path
 
 from compiling import set_quick
@@ -62,6 +63,7 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
 
 # Notebooks that compile programs of their own, which takes a minute each.
 LONG_NOTEBOOKS = (
+    "01_limit_surfaces",
     "02_one_push",
     "03_several_contacts",
     "04_stochastic_pushing",
@@ -71,18 +73,64 @@ LONG_NOTEBOOKS = (
     "08_plans",
 )
 
+# Cases of parametrized tests that are long, by the test and what their names contain. Shorter cases remain.
+LONG_CASES = {
+    "test_conditions_hold_and_jams_have_no_motion": ("[4]",),
+    "test_derivative_of_the_inverse_map": ("quartic",),
+    "test_derivatives_match_central_differences": ("quartic",),
+    "test_examples_run": ("contact.md",),
+    "test_first_and_second_derivatives_of_the_distance": ("waisted",),
+    "test_forces_at_the_contact_points_are_the_wrench": ("pad, L", "finger, T", "jaw"),
+    "test_frictionless_fingers_jam_where_their_forces_balance_to_rounding": ("float32",),
+    "test_laws_of_a_grasp": ("three fingers",),
+    "test_meets_where_brute_force_does": ("butterfly",),
+    "test_one_contact_has_the_same_answer": ("[4]",),
+    "test_random_problems": ("[8-",),
+    "test_recorded_problems": ("[3-", "[4-", "2-ellipsoid"),
+    "test_recorded_pushes": ("ellipsoid",),
+    "test_samples_are_convex_around_their_mean": ("gram-float32",),
+    "test_solvers_agree": ("quartic",),
+    "test_sweep_is_that_of_marching": ("waisted", "oval-0.0-float32"),
+}
+
+
+START = time.monotonic()
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--long-within",
+        type=float,
+        metavar="SECONDS",
+        help="with -m '' and --dist loadgroup: start no long test later than this after the start",
+    )
+
 
 def pytest_collection_modifyitems(items):
     for item in items:
-        if item.path.stem in LONG_NOTEBOOKS:
+        test, _, case = item.name.partition("[")
+        if item.path.stem in LONG_NOTEBOOKS or any(part in f"[{case}" for part in LONG_CASES.get(test, ())):
             item.add_marker("long")
+        # With --dist loadgroup, the long tests of a file come after the others of all files.
+        group = f"long {item.path.stem}" if _is_long(item) else item.path.stem
+        item.add_marker(pytest.mark.xdist_group(group))
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
 
-    def place(item) -> int:
+    def place(item) -> tuple[bool, int]:
         notebook = item.path.suffix == ".ipynb"
-        return order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
+        return _is_long(item), order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
 
     items.sort(key=place)
+
+
+def _is_long(item) -> bool:
+    return item.get_closest_marker("long") is not None
+
+
+def pytest_runtest_setup(item):
+    limit = item.config.getoption("--long-within")
+    if limit is not None and _is_long(item) and time.monotonic() - START > limit:
+        pytest.skip("a long test, and the time for these is over")
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -1,5 +1,6 @@
-"""The rooms (subpackages) of the package: what each may import, and the picture of them."""
+"""The rooms (subpackages) of the package: what each may import, how long its files are, and the picture of them."""
 
+import ast
 import importlib.util
 import re
 from pathlib import Path
@@ -50,3 +51,23 @@ def test_the_picture_is_that_of_the_imports(architecture):
     page = (DOCS / "architecture.md").read_text()
     listed = re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)))
     assert sorted(listed) == sorted(architecture.ROOMS)
+
+
+def test_files_and_functions_stay_short(architecture):
+    """No file has more than 400 lines. No function has more than 60 without its docstring, except in experiments."""
+    for path in sorted(architecture.PACKAGE.rglob("*.py")):
+        text = path.read_text()
+        assert len(text.splitlines()) <= 400, path
+        if "experiments" in path.parts:
+            continue
+        for function in ast.walk(ast.parse(text)):
+            if isinstance(function, ast.FunctionDef):
+                lines = _line_count(function)
+                if ast.get_docstring(function) is not None:
+                    lines -= _line_count(function.body[0])
+                assert lines <= 60, f"{path}: {function.name} has {lines} lines"
+
+
+def _line_count(node: ast.stmt) -> int:
+    assert node.end_lineno is not None
+    return node.end_lineno - node.lineno + 1

@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.peers import contacts, fits
-from pushjax.friction.fit import QUADRATIC_MONOMIALS, VALUE_WEIGHT
+from pushjax.friction.fit import VALUE_WEIGHT
+from pushjax.friction.fit_loss import QUADRATIC_MONOMIALS
 from pushjax.friction.sum_of_squares import TERMS, initial_factors, quadratic_forms, squared_quadratics
 
 FIT_STEPS, FIT_TOLERANCE = 500, 1e-6  # limits of the steps, and of the gradient's norm

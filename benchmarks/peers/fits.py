@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pushjax.friction.fit import QUADRATIC_MONOMIALS, RIDGE, VALUE_WEIGHT
+from pushjax.friction.fit import RIDGE, VALUE_WEIGHT
+from pushjax.friction.fit_loss import QUADRATIC_MONOMIALS
 from pushjax.friction.quartic import MONOMIALS
 
 

@@ -28,16 +28,16 @@ from pushjax.experiments.table1.methods import (
     FRAME_OFFSET,
     HAND_OFFSET,
     INSET,
-    NO_ROOM,
     PRESSURE_CENTER,
     SURFACE_DOF,
-    Setting,
+    ConditionData,
     fitted,
     without_padding,
 )
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
 STEPS = 50
+NO_ROOM = 1e-6  # prior standard deviation of a cause that is switched off
 # Unknowns of each cause, with their prior standard deviations as in `Unknowns`.
 CAUSES: dict[str, dict[str, float]] = {
     "tip offset": {"hand_offset": HAND_OFFSET},
@@ -97,10 +97,10 @@ def run(
     settings = {"seed": seed, "steps": steps, "version": pj.__version__}
     todo = []
     for log in (load(folder, on, target, seed) for on in surface for target in object):
-        setting = cache(partial(Setting.of, log, "quartic", steps))  # made only if a cell is missing
+        condition = cache(partial(ConditionData.of, log, "quartic", steps))  # made only if a cell is missing
         for name, causes in runs().items():
             labels = {"surface": log.surface, "object": log.shape, "run": name}
-            todo.append((labels, partial(_cell, log, setting, causes)))
+            todo.append((labels, partial(_cell, log, condition, causes)))
     cells = CellCache("table1-causes", out, settings).find_or_compute(todo, progress)
     shares = {name: _share(cells, name) for name in runs()}
     surfaces = {name: _deviations([cell for cell in cells if cell["surface"] == name]) for name in surface}
@@ -109,12 +109,12 @@ def run(
     return result_record("table1-causes", settings, cells=cells, shares=shares, surfaces=surfaces, pictures=pictures)
 
 
-def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) -> dict[str, Any]:
+def _cell(log: MitPushes, made: Callable[[], ConditionData], causes: tuple[str, ...]) -> dict[str, Any]:
     """Identify with these causes and predict the test pushes of one object on one surface."""
-    setting = made()
-    found = identified(setting, causes)
-    predicted = found.predict(setting.test, setting.slider, setting.hand)
-    off = deviation_mm(log, without_padding(predicted.pose[:, -1], setting.test))
+    condition = made()
+    found = identified(condition, causes)
+    predicted = found.predict(condition.test, condition.slider, condition.hand)
+    off = deviation_mm(log, without_padding(predicted.pose[:, -1], condition.test))
     parameters = found.parameters._asdict()
     return {
         "mean_mm": float(off.mean()),
@@ -122,23 +122,23 @@ def _cell(log: MitPushes, made: Callable[[], Setting], causes: tuple[str, ...]) 
         "friction": float(found.friction),
         "sigma_mm": 1e3 * float(found.sigma),
         "found": {name: np.asarray(parameters[name], float) for cause in causes for name in CAUSES[cause]},
-        "failed_steps": int(without_padding(predicted.failed, setting.test).sum()),
+        "failed_steps": int(without_padding(predicted.failed, condition.test).sum()),
         "noise_floor_mm": noise_floor_mm(log),
     }
 
 
-def identified(setting: Setting, causes: tuple[str, ...]) -> pj.Identified:
+def identified(condition: ConditionData, causes: tuple[str, ...]) -> pj.Identified:
     """Identify friction, limit surface and center of pressure, together with some causes, from the training pushes.
 
     Args:
-        setting: What the identification needs of one object.
+        condition: What the identification needs of one object.
         causes: Names in `CAUSES`.
     """
     spreads: dict[str, Any] = {name: NO_ROOM for each in CAUSES.values() for name in each}
     spreads |= {name: value for cause in causes for name, value in CAUSES[cause].items()}
-    spreads["overlap"] = NO_ROOM  # imposed, not identified
+    spreads["overlap"] = None  # known, not identified
     unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, pressure_center=PRESSURE_CENTER, sides=SIDES, **spreads)
-    return fitted(setting.coarse, setting, unknowns, overlap=0.0 if "initial overlap" in causes else 1.0)
+    return fitted(condition.coarse, condition, unknowns, overlap=1.0 if "initial overlap" in causes else 0.0)
 
 
 def _without(name: str) -> str:

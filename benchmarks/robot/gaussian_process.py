@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from benchmarks.robot.predicted import turned
 from pushjax.datasets.mit_pushes import StraightPushes
-from pushjax.datasets.pushes import Floats, rotation
+from pushjax.datasets.push_log import Floats, rotation
 
 RESTARTS = 1  # restarts of the optimizer for the kernel's hyperparameters
 

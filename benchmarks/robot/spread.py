@@ -42,7 +42,14 @@ from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
 from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, checked_surfaces, load, padded_pushes
-from pushjax.experiments.table1.methods import TEST_SIZE, TRAINING_SIZE, UNKNOWNS, Setting, fitted, without_padding
+from pushjax.experiments.table1.methods import (
+    TEST_SIZE,
+    TRAINING_SIZE,
+    UNKNOWNS,
+    ConditionData,
+    fitted,
+    without_padding,
+)
 
 STEPS = 25
 FOLDS, FOLD = 3, 48  # number of parts, and largest number of pushes in each
@@ -95,7 +102,7 @@ def run(
     def cell_of(log: MitPushes) -> dict[str, Any]:
         if len(kept.cells) % TOGETHER == 0:
             jax.clear_caches()
-        return _cell(log, Setting.of(log, "quartic", steps), steps, seed)
+        return _cell(log, ConditionData.of(log, "quartic", steps), steps, seed)
 
     logs = [load(folder, on, target, seed) for on in surface for target in object]
     todo = [({"surface": log.surface, "object": log.shape}, partial(cell_of, log)) for log in logs]
@@ -112,22 +119,22 @@ def run(
     return result_record("table1-spread", settings, cells=cells, pooled=pooled, curve=curve, pictures=pictures)
 
 
-def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, Any]:
+def _cell(log: MitPushes, condition: ConditionData, steps: int, seed: int) -> dict[str, Any]:
     """Identify, predict and score with every method, for one object on one surface."""
     rng = np.random.default_rng(seed)
-    slider, hand, length = setting.slider, setting.hand, setting.length
+    slider, hand, length = condition.slider, condition.hand, condition.length
     rows = rng.permutation(np.flatnonzero(log.is_training & log.whole.valid))
-    of_rest, held = _crossed(log, setting, rows, steps, FOLDS, FOLD)
+    of_rest, held = _crossed(log, condition, rows, steps, FOLDS, FOLD)
     first, *keys = jax.random.split(jax.random.key(seed), 6)
     noise = pj.identify_noise(first, of_rest, held, slider, hand, score="density")
     every = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
-    found = fitted(setting.coarse, setting, every)
-    off = without_padding(errors(_ends(of_rest, held, setting), np.asarray(held.end), np.asarray(held.start)), held)
+    found = fitted(condition.coarse, condition, every)
+    off = without_padding(errors(_ends(of_rest, held, condition), np.asarray(held.end), np.asarray(held.start)), held)
     predicted = noise.transferred_to(found)
     process = gaussian_process.learn(log.whole, rows, length)
     first, *keys = keys
-    levels, far = _held(first, log, setting, noise, rows, steps)
-    groups = {"middle": setting.test, "whole": padded_pushes(log, log.whole, log.middle_of, steps, TEST_SIZE)}
+    levels, far = _held(first, log, condition, noise, rows, steps)
+    groups = {"middle": condition.test, "whole": padded_pushes(log, log.whole, log.middle_of, steps, TEST_SIZE)}
     cell: dict[str, Any] = {"learned": len(rows), "tested": len(log.middle)}
     scalars = ("surface_dof", "hand_offset", "sigma", "student_dof")
     numbers: dict[str, Any] = {name: float(getattr(noise, name)) for name in scalars}
@@ -142,7 +149,7 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
         weights = density_ratio(far, reach(draws, start, length))
         methods["calibrated"] = methods["noise"].calibrated(levels, weights)
         cell["levels_of"][group] = effective(weights[0])
-        point = without_padding(_ends(found, pushes, setting), pushes)
+        point = without_padding(_ends(found, pushes, condition), pushes)
         seen = errors(point, ends, start)
         scale = np.array([1, 1, length])
         normal: Any = multivariate_normal  # its type annotations want a number
@@ -156,22 +163,24 @@ def _cell(log: MitPushes, setting: Setting, steps: int, seed: int) -> dict[str, 
             cell["process_mm"] = _deviation_mm(theirs.poses(), ends, length)
         cell[group] = {name: _per_push(each) for name, each in methods.items()}
         cell[f"{group}_mm"] = _deviation_mm(point, ends, length)
-    cell["curve"] = _curve(log, setting, steps, rng)
+    cell["curve"] = _curve(log, condition, steps, rng)
     return cell
 
 
 def _held(
-    key: PRNGKeyArray, log: MitPushes, setting: Setting, noise: pj.Noise, rows: np.ndarray, steps: int
+    key: PRNGKeyArray, log: MitPushes, condition: ConditionData, noise: pj.Noise, rows: np.ndarray, steps: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Predict each training push from nearly all others; return the levels and the predicted `reach`."""
-    of_rest, held = _crossed(log, setting, rows, steps, FINE_FOLDS, FINE_FOLD)
-    draws = without_padding(noise.transferred_to(of_rest).predict(key, held, setting.slider, setting.hand, DRAWS), held)
-    there = scored(draws, without_padding(held.end, held), setting.length)
-    return there.level, reach(draws, without_padding(held.start, held), setting.length)
+    of_rest, held = _crossed(log, condition, rows, steps, FINE_FOLDS, FINE_FOLD)
+    draws = without_padding(
+        noise.transferred_to(of_rest).predict(key, held, condition.slider, condition.hand, DRAWS), held
+    )
+    there = scored(draws, without_padding(held.end, held), condition.length)
+    return there.level, reach(draws, without_padding(held.start, held), condition.length)
 
 
 def _crossed(
-    log: MitPushes, setting: Setting, rows: np.ndarray, steps: int, count: int, most: int
+    log: MitPushes, condition: ConditionData, rows: np.ndarray, steps: int, count: int, most: int
 ) -> tuple[pj.Identified, pj.Pushes]:
     """Split the training pushes into `count` parts, and identify from the rest for each part.
 
@@ -183,11 +192,11 @@ def _crossed(
     held = pj.Pushes.conditions([padded_pushes(log, log.whole, part, steps, most) for part in parts])
     # nothing is shared: each part has its own unknowns, as if the parts were different objects
     apart = pj.Unknowns((0.0, 1.0), **UNKNOWNS, shared=())
-    return fitted(pj.Pushes.conditions(rest), setting, apart), held
+    return fitted(pj.Pushes.conditions(rest), condition, apart), held
 
 
-def _ends(found: pj.Identified, pushes: pj.Pushes, setting: Setting) -> np.ndarray:
-    return np.asarray(found.predict(pushes, setting.slider, setting.hand).pose[..., -1, :], np.float64)
+def _ends(found: pj.Identified, pushes: pj.Pushes, condition: ConditionData) -> np.ndarray:
+    return np.asarray(found.predict(pushes, condition.slider, condition.hand).pose[..., -1, :], np.float64)
 
 
 def _deviation_mm(predicted: np.ndarray, ends: np.ndarray, length: float) -> float:
@@ -199,20 +208,20 @@ def _per_push(each: Scored) -> dict[str, Any]:
     return {"energy_mm": 1e3 * each.energy, "log_density": each.density, "level": each.level} | inside
 
 
-def _curve(log: MitPushes, setting: Setting, steps: int, rng: np.random.Generator) -> list[dict[str, Any]]:
+def _curve(log: MitPushes, condition: ConditionData, steps: int, rng: np.random.Generator) -> list[dict[str, Any]]:
     """Compare physics and Gaussian process by the number of training pushes.
 
     Both use the same whole pushes, in random order.
     """
     rows = rng.permutation(np.flatnonzero(log.whole.valid))
     tests = np.sort(rows[: min(round(CURVE_TESTS * len(rows)), TEST_SIZE)])
-    rest, length, found = rows[len(tests) :], setting.length, []
+    rest, length, found = rows[len(tests) :], condition.length, []
     tested = padded_pushes(log, log.whole, tests, steps, TEST_SIZE)
     ends = log.whole.end[tests]
     for count in (count for count in COUNTS if count <= len(rest)):
         learned = padded_pushes(log, log.whole, rest[:count], steps, TRAINING_SIZE)
-        physics = fitted(learned, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-        point = without_padding(_ends(physics, tested, setting), tested)
+        physics = fitted(learned, condition, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
+        point = without_padding(_ends(physics, tested, condition), tested)
         sigma = float(physics.sigma) / np.array([1, 1, length])
         about = point[:, None] + rng.normal(size=(len(tests), DRAWS, 3)) * sigma
         process = gaussian_process.predict(gaussian_process.learn(log.whole, rest[:count], length), log.whole, tests)

@@ -68,9 +68,9 @@ def on_device(array: np.ndarray) -> jax.Array:
 
 
 def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Evaluate `function` with NumPy if all its arrays are known, and with `jax.numpy` otherwise.
+    """Return a function that evaluates `function` with NumPy if all arrays are known, else with `jax.numpy`.
 
-    Evaluation with NumPy compiles nothing.
+    Evaluation with NumPy compiles nothing. Its results are cast to the common dtype of the arrays.
 
     Args:
         function: Called as `function(np, *arrays)` or `function(jnp, *arrays)`. Keyword arguments are passed on
@@ -153,10 +153,10 @@ def check_non_negative(name: str, value: Any) -> None:
         raise ValueError(f"{name} must not be negative; got {_describe(known)}")
 
 
-def normalized_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
+def checked_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
     """Return the argument `weights` as an array (count,) of non-negative numbers that are not all zero.
 
-    None stands for ones.
+    None stands for ones. The weights are not divided by their sum.
 
     Raises:
         ValueError: If the shape is different, a weight is negative or not finite, or all weights are zero.

@@ -19,10 +19,13 @@ from jaxtyping import Array, Bool, Int
 from pushjax._internal.xla import tree_where, update_if
 
 TILE = 128  # examples that are computed together on a CPU, so that their data stay in the cache
-# The same on an accelerator. There a tile costs the start of its kernels, whatever its size: on an H200, 100 000 grasps
-# take 10 s in tiles of 128 and a quarter of a second in tiles of 8192.
+# The same on an accelerator, also for `Rounds`. There a tile takes the time to start its kernels, whatever its size: on
+# an H200, 100 000 grasps take 10 s in tiles of 128 and a quarter of a second in tiles of 8192. So most batches are one
+# tile.
 ACCELERATOR_TILE = 1 << 17
-PLACES = 256  # examples that advance together in `Rounds` on a CPU, where each round takes the start of its kernels
+# Examples that advance together in `Rounds` on a CPU. They are more than in a tile, because every round, and not only
+# every tile, takes the time to start its kernels.
+PLACES = 256
 
 
 class Rounds(NamedTuple):
@@ -51,10 +54,13 @@ def tile_size(on_cpu: int = TILE) -> int:
     return on_cpu if jax.default_backend() == "cpu" else ACCELERATOR_TILE
 
 
-def only_where(needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any) -> Any:
-    """Return `compute(*args)` where `needed` holds, else `otherwise`.
+def where_needed_without_derivatives(
+    needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any
+) -> Any:
+    """Return `compute(*args)` where `needed` holds, else `otherwise`; it cannot be differentiated.
 
-    It handles one example, or a batch under any number of nested `vmap`. It cannot be differentiated.
+    It handles one example, or a batch under any number of nested `vmap`. In a batch, `compute` runs only for the
+    examples that need it.
 
     Args:
         needed: Whether this example needs the computation.
@@ -81,21 +87,22 @@ def where_needed(
     *args: Any,
     rounds: Rounds | None = None,
 ) -> Any:
-    """Return `compute(*args)` where `needed` holds, else `otherwise`.
+    """Return `compute(*args)` where `needed` holds, else `otherwise`; it can be differentiated.
 
-    In a batch, `compute` runs only for the examples that need it. For derivatives it runs for all of them.
+    In a batch, `compute` runs only for the examples that need it. Where derivatives are taken, it runs for all of them.
 
     Args:
         needed: Whether this example needs the computation.
         compute: Function of `args`. It must not close over anything that is batched or differentiated.
         otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
         *args: Arguments of `compute`, pytrees of arrays.
-        rounds: The same function, which is used where nothing is differentiated.
+        rounds: The same function as `compute`, in rounds. It takes the place of `compute` where no derivatives are
+            taken. None: `compute` is used everywhere.
     """
 
     @eqx.filter_custom_jvp
     def chosen(needed, otherwise, args):
-        return only_where(needed, rounds or compute, otherwise, *args)
+        return where_needed_without_derivatives(needed, rounds or compute, otherwise, *args)
 
     @chosen.def_jvp
     def _(primals, tangents):
@@ -107,7 +114,7 @@ def where_needed(
 
 
 def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed, otherwise, args):
-    """Batching rule of `only_where`: return the result for a batch, and which of its leaves are batched (all are).
+    """Batching rule of `where_needed_without_derivatives`: return the results, and which leaves are batched (all).
 
     Args:
         compute: Function of one example's arguments.
@@ -225,12 +232,14 @@ def _compute_in_rounds(rounds: Rounds, args_batched: Any, needed, otherwise, arg
 
 
 def _gathering(needed: Bool[Array, " batch"], tile: int, args: Any, args_batched: Any):
-    """How the examples that need a computation are gathered.
+    """Prepare to gather the examples that need a computation.
 
     Returns:
-        The indices of these examples, then `batch`, which is out of range, as padding, (batch + tile,); a function that
-        gives the arguments of the examples at some positions, (tile,); and the arguments' axes for `vmap`. At a padded
-        position the arguments are those of the last example.
+        indices: Indices of these examples in the batch, then padding, (batch + tile,). The padding is `batch`, which is
+            out of range.
+        args_at: Function from some of these indices, (tile,), to the arguments of those examples. For padding, they are
+            the arguments of the last example.
+        axes: Axes of the arguments for `vmap`.
     """
     batch = needed.shape[0]
     indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
@@ -243,5 +252,5 @@ def _gathering(needed: Bool[Array, " batch"], tile: int, args: Any, args_batched
 
 
 def _written(results: Any, positions: Int[Array, " tile"], rows: Any) -> Any:
-    """Return the results with rows of a tile at the given positions; those that are out of range are dropped."""
+    """Return the results with the rows of a tile at these indices of the batch; rows of padding are dropped."""
     return jax.tree.map(lambda all_rows, new: all_rows.at[positions].set(new, mode="drop"), results, rows)

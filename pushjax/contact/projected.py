@@ -1,13 +1,12 @@
 """Iterative solver of several contacts: a sequence of projected problems, then an exact finish.
 
-Each iteration linearizes grad H at the last wrench: grad H(F) = A F + c (Josephy and Newton's method). Zhou et al. drop
-the constant c and damp, which converges linearly. Then the iteration sweeps over the contacts: projected Gauss-Seidel
-on normal and tangential force in turn. The result of the sweeps only has to show which cone edges carry
-the force. The systems of the edges with the largest forces are then solved exactly, as in `exhaustive`, and checked
-against every condition.
+Each round linearizes grad H at the last wrench: grad H(F) = A F + c (Josephy and Newton's method). Zhou et al. drop the
+constant c and damp, which converges linearly. Then the round sweeps over the contacts: projected Gauss-Seidel on normal
+and tangential force in turn. The result of the sweeps only has to show which cone edges carry the force. The systems of
+the edges with the largest forces are then solved exactly, as in `exhaustive`, and checked against every condition.
 
-With many contacts this is less work than trying all sets. But finding no solution proves nothing: the status is then
-NOT_CONVERGED, also in a jam.
+With many contacts this is less work than trying all sets of edges, as `exhaustive` does. But finding no solution proves
+nothing: the status is then NOT_CONVERGED, also in a jam.
 
 Reference: Zhou et al. 2017, section IV.B, algorithm 1. Deviations: the constant term, the solver of the linear
 problems, the finish.
@@ -31,8 +30,8 @@ class Projected(ContactSolver):
     """Projected Gauss-Seidel on successive linearizations of grad H, finished exactly.
 
     Attributes:
-        rounds: Number of linearizations.
-        sweeps: Number of sweeps over the contacts in each.
+        rounds: Number of rounds. Each linearizes once.
+        sweeps: Number of sweeps over the contacts in each round.
     """
 
     rounds: int = eqx.field(static=True, default=8)
@@ -76,7 +75,7 @@ class _Linearization(NamedTuple):
 
 
 def _iterate_forces(problem: ScaledProblem, rounds: int, sweeps: int) -> tuple[Vec2, ...]:
-    """Contact forces (n, t) with V = grad H(F), after all iterations."""
+    """Return the contact forces (n, t) after all rounds, in the scale in which the twist is V = grad H(F)."""
     zero = jnp.zeros_like(problem.runtime_scalar)
     start = tuple(
         Vec2(jnp.where(active & (approach.x > 0), jnp.maximum(approach.x, 0), 0.0), zero)
@@ -135,6 +134,7 @@ def _solve_heaviest_edges(problem: ScaledProblem, forces: tuple[Vec2, ...]) -> I
     """Solve the sets of the edges that carry the most force exactly, and keep the best solution that passes."""
     weights = []
     for force, mu in zip(forces, problem.friction, strict=True):
+        # without friction both edges are the normal, and the left one gets the whole force
         tangential = jnp.where(mu > 0, force.y / jnp.where(mu > 0, mu, 1.0), force.x)
         weights += [jnp.maximum((force.x + tangential) / 2, 0), jnp.maximum((force.x - tangential) / 2, 0)]
     edge1 = _heaviest(weights, ())
@@ -147,14 +147,14 @@ def _solve_heaviest_edges(problem: ScaledProblem, forces: tuple[Vec2, ...]) -> I
     contact_weight = [weights[2 * i] + weights[2 * i + 1] for i in range(problem.count)]
     sticking = _heaviest(lighter_edge, ())
     incumbent = solve_two_edges(problem, incumbent, 2 * sticking, 2 * sticking + 1)
-    incumbent = solve_three_edges(problem, incumbent, (sticking, sticking, _heaviest(contact_weight, (sticking,))), 2)
+    contacts = sticking, sticking, _heaviest(contact_weight, (sticking,))
+    incumbent = solve_three_edges(problem, incumbent, contacts, num_choices=2)
     if problem.count == 2:
         return incumbent
     contact1 = _heaviest(contact_weight, ())
     contact2 = _heaviest(contact_weight, (contact1,))
-    return solve_three_edges(
-        problem, incumbent, (contact1, contact2, _heaviest(contact_weight, (contact1, contact2))), 8
-    )
+    contacts = contact1, contact2, _heaviest(contact_weight, (contact1, contact2))
+    return solve_three_edges(problem, incumbent, contacts, num_choices=8)
 
 
 def _heaviest(weights: list[Scalar], excluded: tuple) -> jax.Array:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._internal.autodiff import without_derivatives
-from pushjax._internal.compaction import only_where
+from pushjax._internal.compaction import where_needed_without_derivatives
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Vec2
 from pushjax.contact.contact_plane import Contact
@@ -57,7 +57,7 @@ def single_first(form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[A
 def _solve_one_first(problem: Problem) -> ScalarSolution:
     """Solve one contact alone, and all contacts together only where one is not enough."""
     one_suffices, one = _solve_most_pressed(problem)
-    return only_where(~one_suffices, _together, one, problem)
+    return where_needed_without_derivatives(~one_suffices, _together, one, problem)
 
 
 @_solve_one_first.def_jvp
@@ -86,7 +86,7 @@ def _solve_differentiably(problem: Problem) -> ScalarSolution:
 def _search(one_suffices: Bool[Array, ""], problem: Problem) -> Incumbent:
     """The best set of cone edges, where one contact alone is not enough."""
     form, *_ = problem
-    return only_where(~one_suffices, _enumerated, no_incumbent(form.length), problem)
+    return where_needed_without_derivatives(~one_suffices, _enumerated, no_incumbent(form.length), problem)
 
 
 @jax.jit

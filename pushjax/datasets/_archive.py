@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets.pushes import Floats, LogError
+from pushjax.datasets.push_log import Floats, LogError
 
 Arrays = dict[str, NDArray[np.generic]]
 

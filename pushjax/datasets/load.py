@@ -7,7 +7,7 @@ from pathlib import Path
 from pushjax.datasets._archive import archive_names
 from pushjax.datasets.mit_logs import load_mit_hdf5, load_mit_json, load_mit_npz
 from pushjax.datasets.plain import LAYOUT, load_csv, load_plain_npz
-from pushjax.datasets.pushes import LogError
+from pushjax.datasets.push_log import LogError
 from pushjax.datasets.recordings import Recordings
 from pushjax.datasets.triangle import load_triangle_log
 from pushjax.datasets.triangle_archive import load_push_npz

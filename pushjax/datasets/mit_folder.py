@@ -7,43 +7,24 @@ The result has the form of the curated archives (`mit_pushes`), with these diffe
 - There is no rule that the object's angles at 10 and 90 % of the time lie between those at the ends. The toolbox of
   Zhou, Bagnell, Mason, RSS 2017 needs such a rule, because its angles wrap.
 - Nothing is smoothed, and there are no predictions of another program.
-
-The time from 10 to 90 % is divided into six equal parts. Each part gives one wrench, the mean over its samples, and one
-twist, the displacement of the object. The contact is the point of the outline nearest to the center of the finger. A
-part is left out if the object rests, if the force brakes the object or is weak, or if the force cannot be that of a
-finger pressing at the contact.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets.mit_logs import load_mit_hdf5, load_mit_json
 from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushParameters, parse_push_name
+from pushjax.datasets.mit_push_file import MIDDLE_PART, MitPush, in_body, read_push, training_pairs
 from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, wrap_to_pi
 from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
-from pushjax.datasets.pushes import Floats, LogError, rotation
-from pushjax.datasets.recordings import interpolated
+from pushjax.datasets.push_log import Floats, LogError
 
 MIN_PUSHES = 10  # smallest number of pushes, of which a few are used for training
 SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
-# Fractions of the duration between which pushes are tested and wrenches are taken. Before the first, the tip may not
-# touch the object yet. After the second, the tip may have stopped.
-MIDDLE_PART = (0.1, 0.9)
-NUM_PARTS = 6  # parts of that time, each of which gives one pair of wrench and twist
-# While the tip travels JUMP_WINDOW (m), a pushed object moves by much less than MAX_WINDOW_MOTION (m) and turns by much
-# less than MAX_WINDOW_TURN (rad). A tracker that reports more has jumped.
-JUMP_WINDOW, MAX_WINDOW_MOTION, MAX_WINDOW_TURN = 0.005, 0.020, np.deg2rad(30)
-# Parts of a push with less motion than MIN_MOTION (m) or less force than MIN_FORCE (N) carry no information about
-# friction. Neither do parts whose force is farther than MAX_FORCE_ANGLE (rad) from the contact normal. The force of a
-# sliding tip is some 15 deg from it. A larger angle may come from an offset of the force sensor: in a third of the logs
-# of rect1 on plywood at 100 mm/s, the offset is 1.6 N, with or without contact.
-MIN_MOTION, MIN_FORCE, MAX_FORCE_ANGLE = 0.0002, 0.1, np.deg2rad(30)
 # The rules of the curated archives for pushes whose tracker can be trusted:
 # - At the start, the tip is less than MAX_GAP (m) from the outline, outside or inside.
 # - At the end, it is less than MAX_OVERLAP (m) inside the outline.
@@ -129,7 +110,7 @@ def load_mit_folder(
     test_rows = np.flatnonzero(~is_training)
     pushes = _push_group(whole, (0.0, 1.0), body)
     training_rows = np.flatnonzero(is_training & pushes.valid)
-    pairs = np.array([pair for row in training_rows for pair in _training_pairs(whole[row], body)]).reshape(-1, 2, 3)
+    pairs = np.array([pair for row in training_rows for pair in training_pairs(whole[row], body)]).reshape(-1, 2, 3)
     log = MitPushes(
         whole=pushes,
         middle=_push_group([whole[row] for row in test_rows], MIDDLE_PART, body),
@@ -147,36 +128,6 @@ def load_mit_folder(
         source=str(folder),
     )
     return log, tuple(problems)
-
-
-class _Push(NamedTuple):
-    """A push from the first to the last sample at which tip, object and force are known, in the world frame.
-
-    Attributes:
-        index: Position of the file in `find_mit_pushes`.
-        name: Parameters of the push.
-        time: (m,) times, in s.
-        tip: (m, 2) centers of the tip, in m.
-        pose: (m, 3) poses of the object, in m and rad.
-        force: (m, 2) forces on the object, in N.
-    """
-
-    index: int
-    name: PushParameters
-    time: Floats
-    tip: Floats
-    pose: Floats
-    force: Floats
-
-    def times_at(self, fractions: Sequence[float] | Floats) -> Floats:
-        """Return the times (k,), in s, at these fractions (k,) of the duration."""
-        begin, end = self.time[0], self.time[-1]
-        return np.clip(begin + np.asarray(fractions) * (end - begin), begin, end)  # roundoff might exceed the end
-
-    def states_at(self, fractions: Sequence[float] | Floats) -> tuple[Floats, Floats]:
-        """Return the poses (k, 3) and the centers of the tip (k, 2) at these fractions (k,) of the duration."""
-        times = self.times_at(fractions)
-        return interpolated(times, self.time, self.pose), interpolated(times, self.time, self.tip)
 
 
 def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushParameters, Path]], list[LogError]]:
@@ -208,7 +159,7 @@ def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[Push
 
 def _read_pushes(
     files: list[tuple[int, PushParameters, Path]], speeds: tuple[float, ...], progress: ProgressCallback
-) -> tuple[list[list[_Push]], list[LogError]]:
+) -> tuple[list[list[MitPush]], list[LogError]]:
     """Read the files whose push has one of the wanted speeds.
 
     Args:
@@ -219,7 +170,7 @@ def _read_pushes(
     Returns:
         The pushes of each speed, and one error for each file that cannot be used.
     """
-    pushes: list[list[_Push]] = [[] for _ in speeds]
+    pushes: list[list[MitPush]] = [[] for _ in speeds]
     problems = []
     wanted = [
         (group, *each)
@@ -229,7 +180,7 @@ def _read_pushes(
     ]
     for done, (group, index, name, path) in enumerate(wanted):
         try:
-            group.append(_read_push(index, name, path))
+            group.append(read_push(index, name, path))
         except LogError as error:
             problems.append(error)
         progress(done + 1, len(wanted))
@@ -268,61 +219,7 @@ def _too_few_error(
     return LogError(folder, message)
 
 
-def _read_push(index: int, name: PushParameters, path: Path) -> _Push:
-    """Read the push of a file.
-
-    Raises:
-        LogError: If the file is damaged, or if the tracker lost the object.
-    """
-    (push,) = (load_mit_json if path.suffix.lower() == ".json" else load_mit_hdf5)(path).pushes
-    assert push.force is not None  # these files always have force and time
-    assert push.time is not None
-    rows = _known_span(path, push.time, push.seen & np.isfinite(push.force[:, 0]))
-    time, tip, pose = push.time[rows], push.hand[rows], push.pose[rows]
-    _check_no_jump(path, time, tip, pose)
-    return _Push(index, name, time, tip, pose, push.force[rows])
-
-
-def _known_span(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
-    """Return the range from the first to the last sample (m,) that is known.
-
-    Raises:
-        LogError: If a sample in between is unknown. The object was not seen there, because the force has no gaps.
-    """
-    rows = np.flatnonzero(known)
-    if len(rows) < 2 or time[rows[-1]] == time[rows[0]]:
-        raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
-    lost = rows[0] + np.flatnonzero(~known[rows[0] : rows[-1]])
-    if len(lost):
-        span = f"{time[lost[0]]:.2f} to {time[lost[-1]]:.2f} s"
-        raise LogError(path, f"expected the object to be seen throughout, found it lost from {span}")
-    return slice(rows[0], rows[-1] + 1)
-
-
-def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
-    """Check that the tracker does not jump.
-
-    The test compares all samples of a stretch of the path, not only neighbors. The poses are interpolated at the time
-    stamps of the tip. Where the tracker has fewer samples than the tip, a jump is spread over several samples.
-
-    Raises:
-        LogError: If it jumps.
-    """
-    travel = float(np.linalg.norm(tip[-1] - tip[0]))
-    window = len(time) if travel <= JUMP_WINDOW else max(2, round(len(time) * JUMP_WINDOW / travel))
-    extent = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
-    distance, turn = np.hypot(extent[:, 0], extent[:, 1]), extent[:, 2]
-    excess = np.maximum(distance / MAX_WINDOW_MOTION, turn / MAX_WINDOW_TURN)
-    row = int(np.argmax(excess))
-    if excess[row] > 1:
-        found = f"{1e3 * distance[row]:.0f} mm and {np.rad2deg(turn[row]):.0f} deg"
-        limits = f"{1e3 * MAX_WINDOW_MOTION:g} mm and {np.rad2deg(MAX_WINDOW_TURN):.0f} deg"
-        during = f"while the tip goes {1e3 * JUMP_WINDOW:g} mm"
-        message = f"expected an object that moves by less than {limits} {during}, found {found} from {time[row]:.2f} s"
-        raise LogError(path, f"{message}: the tracker jumps")
-
-
-def _push_group(pushes: Sequence[_Push], fractions: tuple[float, float], body: MitShape) -> StraightPushes:
+def _push_group(pushes: Sequence[MitPush], fractions: tuple[float, float], body: MitShape) -> StraightPushes:
     """Return a group of pushes, each from its state at the first to that at the second fraction of its duration."""
     ends = [push.states_at(fractions) for push in pushes]
     pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
@@ -344,7 +241,7 @@ def _is_trustworthy(pose: Floats, tip: Floats, body: MitShape) -> NDArray[np.boo
     if not len(pose):
         return np.zeros(0, bool)
     before, after = (
-        nearest_on_outline(body.vertices, _in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - body.tip_radius
+        nearest_on_outline(body.vertices, in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - body.tip_radius
         for end in (0, 1)
     )
     moved, path = (np.linalg.norm(each[:, 1, :2] - each[:, 0, :2], axis=1) for each in (pose, tip))
@@ -353,46 +250,7 @@ def _is_trustworthy(pose: Floats, tip: Floats, body: MitShape) -> NDArray[np.boo
     return touching & pushed & (path > MIN_PATH * np.median(path))
 
 
-def _in_body(pose: Floats, vectors: Floats) -> Floats:
-    """Rotate world vectors (k, 2) into the body frames of k poses (k, 3)."""
-    return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
-
-
-def _training_pairs(push: _Push, body: MitShape) -> Iterator[tuple[Floats, Floats]]:
-    """Iterate over the wrenches and displacements of the parts in which the finger pushes.
-
-    Yields:
-        The wrench (3,), in N and N m, and the displacement (3,), in m and rad, both about the body origin and in the
-            body frame at the middle of the part.
-    """
-    tip, force = _in_body(push.pose, push.tip - push.pose[:, :2]), _in_body(push.pose, push.force)
-    distance, contact = nearest_on_outline(body.vertices, tip)
-    inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
-    torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
-    fractions = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
-    poses, _ = push.states_at(fractions)
-    row_at = np.searchsorted(push.time, push.times_at(fractions))
-    for part in range(0, 2 * NUM_PARTS, 2):
-        rows_of_part = slice(row_at[part], row_at[part + 2])
-        if rows_of_part.start == rows_of_part.stop:
-            continue
-        to_body = rotation(poses[part + 1, 2]).T
-        displacement = poses[part + 2] - poses[part]
-        wrench = np.append(to_body @ push.force[rows_of_part].mean(axis=0), torque[rows_of_part].mean())
-        twist = np.append(to_body @ displacement[:2], displacement[2])
-        motion = np.linalg.norm(twist[:2]) + body.length * abs(twist[2])
-        presses = np.abs(np.arctan2(across[rows_of_part].mean(), along[rows_of_part].mean())) < MAX_FORCE_ANGLE
-        strong = np.linalg.norm(wrench[:2]) >= MIN_FORCE
-        if presses and strong and motion >= MIN_MOTION and wrench @ twist > 0:
-            yield wrench, twist
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products (n,) of vectors (n, 2) in the plane."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _repeat_rows(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.int64]:
+def _repeat_rows(fast: Sequence[MitPush], whole: Sequence[MitPush]) -> NDArray[np.int64]:
     """Return the rows (r, 2) in `fast` and `whole` of the same nominal push with the nearest repetition."""
     rows_by_nominal: dict[tuple[float, ...], list[int]] = {}
     for row, push in enumerate(whole):
@@ -405,11 +263,11 @@ def _repeat_rows(fast: Sequence[_Push], whole: Sequence[_Push]) -> NDArray[np.in
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _nominal_push(push: _Push) -> tuple[float, ...]:
+def _nominal_push(push: MitPush) -> tuple[float, ...]:
     """Return side, fraction and angle, which are equal in repetitions of a push."""
     return push.name.side, push.name.fraction, push.name.angle
 
 
-def _repetition(push: _Push) -> int:
+def _repetition(push: MitPush) -> int:
     """Return the number of the repetition; 0 if the push has none."""
     return push.name.repetition or 0

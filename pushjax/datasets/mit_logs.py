@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from pushjax.datasets._archive import Arrays, check_shapes, floats, read_archive
-from pushjax.datasets.pushes import Floats, LogError
+from pushjax.datasets.push_log import Floats, LogError
 from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recordings, collect
 from pushjax.datasets.resampling import Stream, align_streams
 

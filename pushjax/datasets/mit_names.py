@@ -18,7 +18,7 @@ from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
-from pushjax.datasets.pushes import LogError
+from pushjax.datasets.push_log import LogError
 
 SUFFIXES = (".json", ".h5", ".hdf5")  # the first is preferred, because it needs no other package
 PREFIX = "motion_surface="

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pushjax.datasets._archive import Arrays, archive_names, check_shapes, floats, read_archive
-from pushjax.datasets.pushes import Floats, LogError
+from pushjax.datasets.push_log import Floats, LogError
 from pushjax.datasets.records import LARGEST_NUMBER
 
 GROUP_PREFIXES = {"whole": "full", "middle": "eval", "fast": "v20"}

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax.datasets._archive import Arrays, floats, read_archive
-from pushjax.datasets.pushes import Floats, LogError
-from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, check_recording, collect
+from pushjax.datasets.push_log import Floats, LogError
+from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, checked_recording, collect
 from pushjax.datasets.records import ParseError, quoted
 
 # Columns of a table: all of _REQUIRED, and each group of _OPTIONAL_GROUPS either as a whole or not at all.
@@ -117,7 +117,7 @@ def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Re
     def columns(wanted: tuple[str, ...]) -> Floats:
         return np.array([[row[name] for name in wanted] for row in numbers], dtype=np.float64)
 
-    return check_recording(
+    return checked_recording(
         path,
         index,
         columns(tuple(name for name in HAND if name in names)),
@@ -192,7 +192,7 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
     return collect(
         path,
         (
-            check_recording(
+            checked_recording(
                 path, index, hand, pose[index], force=optional_row("force", index), time=optional_row("time", index)
             )
             for index, hand in enumerate(numbers["path"])

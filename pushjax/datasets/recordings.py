@@ -1,6 +1,6 @@
 """Recorded pushes of any hand and object: one structure for all kinds of files.
 
-World frame, body frame and the sign of the force are those of `pushes`.
+World frame, body frame and the sign of the force are those of `push_log`.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets.pushes import Floats, LogError, Push, PushLog, nothing_usable
+from pushjax.datasets.push_log import Floats, LogError, Push, PushLog, nothing_usable
 from pushjax.datasets.records import LARGEST_NUMBER
 
 # Names of the columns, in files and in error messages.
@@ -33,7 +33,8 @@ class Recording:
     Attributes:
         index: Index of the push in its file, from 0.
         hand: (m, dof) configurations of the hand as `pushjax.Hand` takes them, in m and rad, world frame. With dof = 2
-            they are the center (x, y) of a finger. With more they are x, y, theta (continuous), opening.
+            they are the center (x, y) of a finger. With more, the third is the angle theta, which is continuous, and
+            the fourth is the distance d of the hand (the column `hand_distance` of a file).
         pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one seen
             sample to the next. NaN where the object was not seen.
         seen: (m,) whether the object was seen. True for the first and the last sample.
@@ -158,7 +159,7 @@ def collect(path: Path, results: Iterable[Recording | LogError]) -> Recordings:
     return Recordings(pushes, problems, str(path))
 
 
-def check_recording(
+def checked_recording(
     path: Path,
     index: int,
     hand: Floats,
@@ -210,7 +211,7 @@ def check_recording(
 def _find_problem(
     hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, error_at: Callable[[str, int], LogError]
 ) -> LogError | None:
-    """Find the first fault in the arrays of `check_recording`.
+    """Find the first fault in the arrays of `checked_recording`.
 
     `error_at` makes an error of a message and a row of the push.
     """

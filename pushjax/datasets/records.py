@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pushjax.datasets.pushes import Floats, LogError
+from pushjax.datasets.push_log import Floats, LogError
 
 POSE_COLUMNS, COUNT_COLUMNS, FORCE_COLUMNS, ROBOT_COLUMNS = 7, 1, 3, 8
 # A push has about 670 force samples and 220 robot samples. Even a very long push stays far below this.

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets.pushes import Floats, LogError
-from pushjax.datasets.recordings import Recording, check_recording, find_bad_number, interpolated
+from pushjax.datasets.push_log import Floats, LogError
+from pushjax.datasets.recordings import Recording, checked_recording, find_bad_number, interpolated
 
 # If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
 MAX_GAP = 0.5
@@ -73,7 +73,7 @@ def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Reco
         return LogError(path, f"{message} that are not in a gap of {body.name} longer than {MAX_GAP:g} s", push=0)
     span = slice(seen[0], seen[-1] + 1)
     object_force = interpolated(time[span], force_time, force.values)
-    return check_recording(path, 0, hand.values[span], pose[span], force=object_force, time=time[span])
+    return checked_recording(path, 0, hand.values[span], pose[span], force=object_force, time=time[span])
 
 
 def _describe_fault(stream: Stream, max_backstep: float, may_be_missing: bool) -> str | None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pushjax.datasets import triangle_setup
-from pushjax.datasets.pushes import (
+from pushjax.datasets.push_log import (
     Floats,
     LogError,
     Push,

@@ -1,6 +1,6 @@
 """Read curated arrays of one-finger pushes of the triangle: one `.npz` per log, in SI units.
 
-The frames are those of `pushes`.
+The frames are those of `push_log`.
 """
 
 from os import PathLike
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pushjax.datasets._archive import Arrays, floats, read_archive, row_count
-from pushjax.datasets.pushes import (
+from pushjax.datasets.push_log import (
     Floats,
     LogError,
     Push,

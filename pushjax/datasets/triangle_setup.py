@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pushjax.datasets.pushes import Floats
+from pushjax.datasets.push_log import Floats
 
 # Calibration of the motion capture: the center of mass in the corner frame, in m (a third of each leg).
 CENTER_OF_MASS = np.array([0.05, 0.05, 0.0])

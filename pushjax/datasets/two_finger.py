@@ -1,7 +1,7 @@
 """Read pushes of the aluminum triangle with two fingers from curated arrays.
 
 The origin of the hand's frame is midway between the fingers, which are at (0, +-spacing / 2). Its x axis is the
-direction in which the hand first approaches. World frame and body frame are those of `datasets.pushes`. The hand's
+direction in which the hand first approaches. World frame and body frame are those of `datasets.push_log`. The hand's
 path is the *commanded* one: a rigid rotation about a fixed point of the world, or a straight line.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pushjax.datasets._archive import Arrays, check_shapes, read_archive, row_count
-from pushjax.datasets.pushes import Floats, LogError, rotation, wrap_angle
+from pushjax.datasets.push_log import Floats, LogError, rotation, wrap_angle
 
 # Arrays of the archive, with the shape of one push's row (`_PUSH_ARRAYS`) or of the whole array (`_FILE_ARRAYS`).
 _PUSH_ARRAYS = {

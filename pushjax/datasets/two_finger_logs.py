@@ -18,7 +18,7 @@ import numpy as np
 
 from pushjax.datasets import triangle_setup
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.pushes import Floats, LogError, nothing_usable, rotation, wrap_angle
+from pushjax.datasets.push_log import Floats, LogError, nothing_usable, rotation, wrap_angle
 from pushjax.datasets.records import Record, read_records
 from pushjax.datasets.triangle import body_pose
 from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation

@@ -1,4 +1,4 @@
-"""A first push: fit an ellipsoid and a quartic to a square, push it with both, and draw the results."""
+"""A first push: fit two limit surfaces to the friction of a square, push it with both, and draw the results."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +30,7 @@ def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lam
         final pose (m, rad), the number of steps in each contact mode, and the first failed step or -1. `apart_mm` is
         the deviation between the two final poses.
     """
-    say("demo: 64 support points under a square, and the wrenches and twists of its friction")
+    say("demo: computing wrench-twist pairs of the friction at 64 support points under a square")
     key = jax.random.key(seed)
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=64)

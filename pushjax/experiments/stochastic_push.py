@@ -28,13 +28,15 @@ ALONG, TRAVEL = 0.018, 0.05  # m: distance of the tip from the middle of the sid
 SUPPORT_POINTS, PAIRS = 64, 400
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
 HISTOGRAM_BINS, MAX_PLOTTED, MIN_PUSHES = 40, 2000, 20
+SURFACES_AT_ONCE = 2000  # surfaces that are sampled together
 # A surface counts as convex if its least curvature, relative to its largest coefficient, is at least this. It is not
 # zero because the coefficients are rounded to float32.
 MIN_CURVATURE = -3e-7
+# Of each coordinate: the factor from m or rad to the unit in which it is shown, and the label of its axis.
 LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi, "Δθ / °")}
 
 
-def setting(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
+def push_setup(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
     """Build the slider, the hand and the path that all pushes share.
 
     Args:
@@ -86,7 +88,7 @@ def run(
     """
     if n < MIN_PUSHES:
         raise ValueError(f"n must be at least {MIN_PUSHES}, for a test of normality; got {n}")
-    slider, hand, path = setting(seed, steps)
+    slider, hand, path = push_setup(seed, steps)
     model = pj.FrictionModel(dof=dof, friction=friction)
     key = jax.random.key(seed + 1)
     arguments = (key, n, slider, hand, path)
@@ -98,9 +100,8 @@ def run(
     pictures = []
     if out is not None:
         options["trajectories"] = True
-        drawn = (
-            pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **options)
-        )  # the first pushes
+        # with the same key, fewer pushes are the first ones
+        drawn = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **options)
         pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
     settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
@@ -140,7 +141,7 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
     def sampled_coefficients(index):
         return distribution.sample(jax.random.split(jax.random.fold_in(key, index))[0]).surface.coefficients
 
-    chunk, program, curvatures = min(n, MAX_PLOTTED), jax.jit(jax.vmap(sampled_coefficients)), []
+    chunk, program, curvatures = min(n, SURFACES_AT_ONCE), jax.jit(jax.vmap(sampled_coefficients)), []
     for begin in range(0, n, chunk):
         indices = np.minimum(np.arange(begin, begin + chunk), n - 1).astype(np.uint32)
         curvatures.append(least_curvatures(np.asarray(program(indices)))[: n - begin])

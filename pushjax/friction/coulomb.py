@@ -1,4 +1,4 @@
-"""Exact Coulomb friction of support points: the wrench of a twist, and random pairs of both.
+"""Exact Coulomb friction of support points: the wrench for a twist, and random wrench-twist pairs.
 
 What is random is drawn by JAX. The rest is computed with NumPy where values are known, because that compiles nothing.
 """
@@ -18,14 +18,17 @@ FACET_FRACTION = 0.1  # fraction of the wrench-twist pairs that lie on a facet
 
 
 def wrenches(xp, point, limit, twist, in_disk):
-    """Return the wrenches that balance friction for twists (twists, 3); on a facet, `in_disk` chooses one.
+    """Return the wrenches that balance friction for given twists. On a facet, `in_disk` chooses one.
 
     Args:
         xp: numpy or jax.numpy.
-        point: Support points, (points, 2), m.
+        point: Support points, (points, 2), body frame, m.
         limit: Their friction limits, (points,), N.
-        twist: Twists, (twists, 3).
+        twist: Twists (vx, vy, omega), (twists, 3), body frame, m and rad. Only their directions matter.
         in_disk: The force at each point in units of its limit, if it does not slide, (twists, points, 2).
+
+    Returns:
+        Wrenches (fx, fy, tau), (twists, 3), body frame, N and N m. Zero for a zero twist.
     """
     largest = xp.max(xp.abs(twist), axis=1, keepdims=True)
     v = twist / xp.where(largest > 0, largest, 1)  # so that squares neither underflow nor overflow
@@ -42,14 +45,15 @@ def wrenches(xp, point, limit, twist, in_disk):
     return xp.concatenate([xp.sum(force, axis=1), xp.sum(torque, axis=1, keepdims=True)], axis=1)
 
 
-class Draws(NamedTuple):
-    """What is random about pairs.
+class PairDraws(NamedTuple):
+    """What is random about wrench-twist pairs.
 
     Attributes:
-        free: Normalized twists that are not about a support point, before they are scaled to unit norm, (pairs, 3).
-        pivot: Support point of each rotation about one, (pairs, 2), m.
-        positive: Whether that rotation is counterclockwise, (pairs,).
-        on_facet: Which pairs are such rotations, (pairs,).
+        free: Twists (vx, vy, length * omega) of any norm, for the pairs that do not lie on a facet, (pairs, 3).
+        pivot: Support points, for the pairs that lie on a facet: their twist is a rotation about this point, (pairs,
+            2), m.
+        positive: Whether the rotation about `pivot` is counterclockwise, (pairs,).
+        on_facet: Whether the pair lies on a facet, (pairs,).
         uniform: Numbers in [0, 1) that give a point of the unit disk (`in_unit_disk`), (pairs, 2, points).
     """
 
@@ -60,16 +64,16 @@ class Draws(NamedTuple):
     uniform: Float[Array, "pairs 2 points"]
 
 
-def draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> Draws:
+def draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> PairDraws:
     """Draw what is random about `pairs` pairs of support points with these friction limits."""
     return (_draw_alone if outside_trace() else _draw)(key, point, limit, pairs)
 
 
-def _draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> Draws:
+def _draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> PairDraws:
     dtype = point.dtype
     k_free, k_point, k_side, k_facet, k_order = jax.random.split(key, 5)
     facet_pairs = round(FACET_FRACTION * pairs)
-    return Draws(
+    return PairDraws(
         free=jax.random.normal(k_free, (pairs, 3), dtype),
         pivot=jax.random.choice(k_point, point, (pairs,), p=limit / jnp.sum(limit)),
         positive=jax.random.bernoulli(k_side, 0.5, (pairs,)),

@@ -1,7 +1,7 @@
 """Fits of a convex limit surface to wrench-twist pairs.
 
-The wrenches F_i are scaled to unit mean norm and the twists V_i to unit norm, both normalized with the length. The loss
-is
+The wrenches F_i = (fx, fy, tau / length) are divided by their mean norm, and each twist V_i = (vx, vy, length omega) by
+its own norm. The loss is
 
     mean |grad H(F_i) - s_i V_i|^2 + 2 mean (H(F_i) - 1)^2 + 1e-3 |a|^2,     s_i = max(0, grad H(F_i) . V_i),
 
@@ -19,7 +19,7 @@ Reference: Zhou et al. 2016, for the terms of the loss.
 
 import functools
 import warnings
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, Literal, overload
 
 import equinox as eqx
 import jax
@@ -33,30 +33,24 @@ from pushjax._internal.checks import (
     check_finite,
     check_positive,
     check_shape,
+    checked_weights,
     common_dtype,
     concrete,
     in_numpy,
-    normalized_weights,
     on_device,
     traced,
 )
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
+from pushjax.friction.fit_loss import coefficients_of_forms, evaluate_monomials, forms_of, loss_of, minimize
 from pushjax.friction.limit_surface import LimitSurface, angle_between
-from pushjax.friction.quartic import MONOMIALS, Quartic
-from pushjax.friction.sum_of_squares import LOWER_ENTRIES, MONOMIAL_SUMS, TERMS, initial_factors, monomial_sums
+from pushjax.friction.quartic import Quartic
+from pushjax.friction.sum_of_squares import TERMS, initial_factors
 
 VALUE_WEIGHT = 2.0
 RIDGE = 1e-3
-CLIP_ROUNDS = 4  # rounds of minimization, to find which s_i are clipped
-MAX_STEPS = 500  # of the optimizer, in each round
-# Of the optimizer in NumPy, for a loss of order one: where it stops, and up to where it has converged.
-GRADIENT_TOLERANCE, LARGEST_GRADIENT = 1e-9, 1e-6
-
-# Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
-QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
-QUADRATIC_SUMS = monomial_sums(QUADRATIC_MONOMIALS)
+CLIP_ROUNDS = 4  # largest number of rounds of minimization, to find which s_i are clipped
 
 
 class FitReport(eqx.Module):
@@ -66,7 +60,7 @@ class FitReport(eqx.Module):
         angle: Mean angle between predicted and given twists, normalized, rad.
         loss: Loss of the fit, as in the header of this module.
         clipped: Number of pairs with s_i = 0: their predicted twist opposes the given one.
-        converged: Whether the optimizer converged.
+        converged: Whether the optimizer converged, and its last round left the same s_i clipped as the one before.
         steps: Number of optimizer steps, summed over all rounds.
     """
 
@@ -75,57 +69,6 @@ class FitReport(eqx.Module):
     clipped: Int[Array, ""]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
-
-
-class Minimum(NamedTuple):
-    """Result of a minimization.
-
-    Attributes:
-        x: The parameters, (n,).
-        steps: Number of steps.
-        converged: Whether the optimizer converged.
-    """
-
-    x: Any
-    steps: Any
-    converged: Any
-
-
-class _Quadratic(NamedTuple):
-    """The quadratic a'Qa - 2b'a + c."""
-
-    q: Float[Array, "m m"]
-    b: Float[Array, "m"]
-    c: Float[Array, ""]
-
-    def value(self, a: Float[Array, "m"]) -> Float[Array, ""]:
-        return a @ self.q @ a - 2 * self.b @ a + self.c
-
-    def gradient(self, a: Float[Array, "m"]) -> Float[Array, "m"]:
-        return 2 * (self.q @ a - self.b)
-
-
-class _Pairs(NamedTuple):
-    """Pairs in the basis of monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a.
-
-    Attributes:
-        value: The monomials at each F_i, shape (pairs, m).
-        gradient: Their gradients, shape (3, pairs, m).
-        twist: Unit twists V_i, shape (3, pairs).
-        share: Weights of the pairs, shape (pairs,). They sum to one.
-
-    The number of monomials is m.
-    """
-
-    value: Float[Array, "pairs m"]
-    gradient: Float[Array, "3 pairs m"]
-    twist: Float[Array, "3 pairs"]
-    share: Float[Array, "pairs"]
-
-    @property
-    def along(self) -> Float[Array, "pairs m"]:
-        """Components of the gradients along the twists: grad H(F_i) . V_i = along[i] . a."""
-        return (self.gradient * self.twist[:, :, None]).sum(axis=0)
 
 
 @overload
@@ -180,7 +123,7 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
             it with its pairs.
         degree: 2 for an `Ellipsoid`, 4 for a `Quartic`.
         weights: Weight of each pair in the loss and in the mean norm, shape (pairs,). Equal by default. Pairs of zero
-            weight are ignored.
+            weight are ignored, but must be finite unless they are traced.
         value_weight: Factor of the term mean (H - 1)^2 of the loss in the header of this module.
         ridge: Factor of the term |a|^2 of that loss.
         terms: Number of terms of the sum of squares, for degree 4.
@@ -190,10 +133,10 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
         The surface; with `report=True` the surface and a `FitReport`.
 
     Raises:
-        ValueError: If there are fewer pairs than coefficients (6 or 15), an array has the wrong shape or is not
-            finite, a twist is zero or all wrenches are zero (pairs of zero weight aside), the weights are negative or
-            all zero, `length`, `value_weight` or `ridge` is not positive, `terms` is less than one, or the degree is
-            neither 2 nor 4.
+        ValueError: If there are fewer pairs than coefficients (6 or 15), where pairs of zero weight count; if an array
+            has the wrong shape or is not finite; if, among the pairs that have a weight, a twist is zero or all
+            wrenches are zero; if the weights are negative or all zero; if `length`, `value_weight` or `ridge` is not
+            positive; if `terms` is less than one; or if the degree is neither 2 nor 4.
     """
     dtype = common_dtype(wrench, twist, length)
     wrenches, twists, characteristic_length = (
@@ -202,15 +145,15 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
         as_float(length, dtype, "length"),
     )
     check_shape("wrench", wrenches, ("pairs", 3))
-    share = normalized_weights(weights, wrenches.shape[0], dtype)
-    _check_arguments(wrenches, twists, characteristic_length, share, degree)
+    pair_weights = checked_weights(weights, wrenches.shape[0], dtype)
+    _check_arguments(wrenches, twists, characteristic_length, pair_weights, degree)
     for name, value in (("value_weight", value_weight), ("ridge", ridge)):
         check_finite(name, value)
         check_positive(name, value)
     if terms < 1:
         raise ValueError(f"terms must be at least 1; got {terms}")
     factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
-    arrays = [wrenches, twists, characteristic_length, share, *factors]
+    arrays = [wrenches, twists, characteristic_length, pair_weights, *factors]
     fit = _fit_in_jax if traced(arrays) else _fit_in_numpy
     coefficients, fit_report = fit(*arrays, degree=degree, terms=terms if degree == 4 else 1)
     converged = concrete(fit_report.converged)
@@ -278,7 +221,7 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
     """Return the coefficients of H for wrenches in N, 1/N^degree, and the report; with NumPy or with JAX."""
     dtype = wrench.dtype
     share = weights / xp.sum(weights)
-    has_weight = share > 0  # pairs without weight may be padding with any values: replace them
+    has_weight = share > 0  # traced pairs without weight may hold any values, NaN included: replace them
     lengths = xp.stack([xp.ones_like(length), xp.ones_like(length), length])[None]
     f, v = (
         xp.where(has_weight[:, None], each, xp.asarray([[1, 0, 0]], dtype))
@@ -286,7 +229,7 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
     )
     v = v / xp.linalg.norm(v, axis=1, keepdims=True)
     scale = share @ xp.linalg.norm(f, axis=1)
-    pairs = _evaluate_monomials(xp, f / scale, v, share, degree)
+    pairs = evaluate_monomials(xp, f / scale, v, share, degree)
 
     def is_unfinished(state):
         _, _, _, converged, rounds = state
@@ -294,8 +237,8 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
 
     def solve_round(state):
         parameters, unclipped, steps, _, rounds = state
-        found = _minimize(xp, _loss(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
-        unclipped_after = (pairs.along @ _coefficients(xp, _forms(xp, found.x)[1], degree) > 0) | ~has_weight
+        found = minimize(xp, loss_of(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
+        unclipped_after = (pairs.along @ coefficients_of_forms(xp, forms_of(xp, found.x)[1], degree) > 0) | ~has_weight
         settled = found.converged & xp.all(unclipped_after == unclipped)
         return found.x, unclipped_after, steps + found.steps, settled, rounds + 1
 
@@ -308,10 +251,10 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
     else:
         state = jax.lax.while_loop(is_unfinished, solve_round, state)
     parameters, unclipped, steps, converged, _ = state
-    a = _coefficients(xp, _forms(xp, parameters)[1], degree)
+    a = coefficients_of_forms(xp, forms_of(xp, parameters)[1], degree)
     report = FitReport(
         angle=share @ angle_between(Vec3(*(pairs.gradient @ a)), Vec3(*pairs.twist), xp),
-        loss=_loss(xp, pairs, unclipped, value_weight, ridge).value(a),
+        loss=loss_of(xp, pairs, unclipped, value_weight, ridge).value(a),
         clipped=xp.sum(~unclipped),
         converged=converged,
         steps=steps,
@@ -334,90 +277,6 @@ def _fit_in_numpy(*arrays: Array, degree: int, terms: int):
 def _as_given(value: np.ndarray, dtype: Any) -> np.ndarray:
     """Return floats in the dtype of the pairs."""
     return value.astype(dtype) if np.issubdtype(value.dtype, np.floating) else value
-
-
-def _evaluate_monomials(xp, f: Array, v: Array, share: Array, degree: int) -> _Pairs:
-    """Evaluate the monomials and their gradients at the normalized wrenches `f`."""
-    exponents = MONOMIALS if degree == 4 else QUADRATIC_MONOMIALS
-    powers = []  # for each component: 1, f, f^2, ...
-    for column in f.T:
-        powers.append([xp.ones_like(column)])
-        for _ in range(degree):
-            powers[-1].append(powers[-1][-1] * column)
-
-    def product(exponent) -> Array:
-        return powers[0][exponent[0]] * powers[1][exponent[1]] * powers[2][exponent[2]]
-
-    def derivative(exponent, k: int) -> Array:
-        lowered = [max(exponent[j] - (j == k), 0) for j in range(3)]
-        return exponent[k] * product(lowered)
-
-    value = xp.stack([product(exponent) for exponent in exponents.tolist()], axis=1)
-    gradient = xp.stack(
-        [xp.stack([derivative(exponent, k) for exponent in exponents.tolist()], axis=1) for k in range(3)]
-    )
-    return _Pairs(value, gradient, v.T, share)
-
-
-def _loss(xp, pairs: _Pairs, unclipped: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> _Quadratic:
-    """Return the loss as a quadratic in the coefficients a, given which pairs are not clipped.
-
-    For these |g - s V| is the norm of the component of the gradient g perpendicular to V.
-    """
-    across = pairs.gradient - (pairs.twist * unclipped[None])[:, :, None] * pairs.along[None]
-    rows = xp.concatenate([across, xp.sqrt(value_weight) * pairs.value[None]])
-    rows = (rows * xp.sqrt(pairs.share)[None, :, None]).reshape(-1, pairs.value.shape[1])
-    q = rows.T @ rows + ridge * xp.eye(rows.shape[1], dtype=rows.dtype)
-    return _Quadratic(q, value_weight * pairs.share @ pairs.value, value_weight)
-
-
-def _forms(xp, parameters: Float[Array, "n"]) -> tuple[Float[Array, "terms 3 3"], Float[Array, "terms 9"]]:
-    """Return the L_k and the flattened P_k = L_k L_k', given the lower triangles of the L_k."""
-    lower = (parameters.reshape(-1, 6) @ xp.asarray(LOWER_ENTRIES, parameters.dtype)).reshape(-1, 3, 3)
-    return lower, (lower @ xp.swapaxes(lower, 1, 2)).reshape(-1, 9)
-
-
-def _sums(xp, degree: int, dtype: Any) -> Float[Array, "m entries"]:
-    """Return the matrix from the sum of all P_k x P_k (degree 4), or from P_0 (degree 2), to the coefficients of H."""
-    return xp.asarray(MONOMIAL_SUMS if degree == 4 else QUADRATIC_SUMS, dtype)
-
-
-def _coefficients(xp, p: Float[Array, "terms 9"], degree: int) -> Float[Array, "m"]:
-    """Return the coefficients of H, given the flattened P_k."""
-    return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
-
-
-def _minimize(xp, loss: _Quadratic, parameters: Array, degree: int) -> Minimum:
-    """Minimize the loss over the factors of the terms, by BFGS.
-
-    The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
-    needs a factorization, and it slows down where the optimum lies on the border of convexity. With NumPy nothing is
-    compiled, which takes longer than the minimization.
-    """
-
-    def objective(parameters):
-        lower, p = _forms(xp, parameters)
-        a = _coefficients(xp, p, degree)
-        slope = loss.gradient(a) @ _sums(xp, degree, p.dtype)  # symmetric in the indices of each P_k
-        slope = 2 * p @ slope.reshape(9, 9) if degree == 4 else slope
-        by_factor = 2 * slope.reshape(-1, 3, 3) @ lower
-        return loss.value(a), (by_factor.reshape(-1, 9) @ xp.asarray(LOWER_ENTRIES.T, parameters.dtype)).ravel()
-
-    # imported here, because both take as long to import as NumPy or longer
-    if xp is np:
-        from scipy.optimize import minimize
-
-        options = {"gtol": GRADIENT_TOLERANCE, "maxiter": MAX_STEPS}
-        found = minimize(objective, parameters, jac=True, method="BFGS", options=options)
-        # status 2: roundoff has ended the line search, and only the gradient says whether this is a minimum
-        converged = found.status in (0, 2) and np.max(np.abs(found.jac)) < LARGEST_GRADIENT
-        return Minimum(found.x, np.int32(found.nit), converged)
-    import optimistix as optx
-
-    tolerance = 1e-7 if parameters.dtype == jnp.float64 else 1e-4
-    solver = optx.BFGS(rtol=tolerance, atol=tolerance)
-    solution = optx.minimise(lambda x, _: objective(x)[0], solver, parameters, max_steps=MAX_STEPS, throw=False)
-    return Minimum(solution.value, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
 
 
 @in_numpy

@@ -27,17 +27,18 @@ from pushjax._internal.checks import (
     check_non_negative,
     check_positive,
     check_shape,
+    checked_weights,
     common_dtype,
     concrete,
     in_numpy,
-    normalized_weights,
     on_device,
 )
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.coulomb import draw, draw_uniform, in_unit_disk, pairs_of, wrenches
 from pushjax.geometry.disk import Disk
 from pushjax.geometry.ellipse import Ellipse
-from pushjax.geometry.polygon import Polygon, signed_distances
+from pushjax.geometry.polygon import Polygon
+from pushjax.geometry.polygon_numpy import signed_distances
 from pushjax.geometry.shape import Shape
 
 SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
@@ -91,7 +92,7 @@ class Support(eqx.Module):
         Args:
             point: Support points in the body frame, shape (points, 2), m.
             weights: Relative share of each point in the load, shape (points,). Equal by default.
-            load: Total friction limit mu m g, N.
+            load: Total friction limit mu_s m g, N.
 
         Returns:
             The support.
@@ -103,11 +104,11 @@ class Support(eqx.Module):
         dtype = common_dtype(point, weights, load)
         array, total = as_float(point, dtype, "point"), as_float(load, dtype, "load")
         check_shape("point", array, ("points", 2))
-        share = normalized_weights(weights, array.shape[0], dtype)
+        relative = checked_weights(weights, array.shape[0], dtype)
         check_shape("load", total, ())
         check_finite("load", total)
         check_positive("load", total)
-        return Support(array, in_numpy(_distribute)(total, share))
+        return Support(array, in_numpy(_distribute)(total, relative))
 
     @staticmethod
     def tripod(point: ArrayLike, load: ArrayLike = 1.0, center: ArrayLike = (0.0, 0.0)) -> "Support":
@@ -115,15 +116,16 @@ class Support(eqx.Module):
 
         Args:
             point: Support points in the body frame, shape (3, 2), m.
-            load: Total friction limit mu m g, N.
+            load: Total friction limit mu_s m g, N.
             center: Point in the body frame above which the weight acts, shape (2,), m.
 
         Returns:
             The support.
 
         Raises:
-            ValueError: If the center lies outside the triangle (one point would have to pull), or the points lie on a
-                line. Not checked for traced arguments.
+            ValueError: If an array has the wrong shape or is not finite, the load is not positive, the center lies
+                outside the triangle (one point would have to pull), or the points lie on a line. For traced arguments
+                only shapes are checked.
         """
         dtype = common_dtype(point, load, center)
         array, center_point = as_float(point, dtype, "point"), as_float(center, dtype, "center")
@@ -160,13 +162,13 @@ class Support(eqx.Module):
         Args:
             shape: Shape of the slider's base. It must not be traced.
             points: Desired number of support points.
-            load: Total friction limit mu m g, N.
+            load: Total friction limit mu_s m g, N.
 
         Returns:
             The support.
 
         Raises:
-            ValueError: If `points` is less than one, or the shape is traced.
+            ValueError: If `points` is less than one, the shape is traced, or the load is not positive.
         """
         check_count("points", points)
         low, high = (concrete(corner) for corner in shape.bounds)
@@ -179,7 +181,8 @@ class Support(eqx.Module):
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
         grids = [_cells(low, high, spacing) for spacing in spacings]
         max_samples = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
-        tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())  # roundoff would decide
+        # samples nearer to the outline than this count half, because roundoff would decide whether they are inside
+        tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())
         best: tuple[np.ndarray, np.ndarray] | None = None
         for samples, middles in grids:
             padded = np.concatenate([samples, np.broadcast_to(low, (max_samples - len(samples), 2))])
@@ -199,20 +202,20 @@ class Support(eqx.Module):
         Args:
             shape: Shape of the slider's base.
             points: Number of support points on the outline.
-            load: Total friction limit mu m g, N.
+            load: Total friction limit mu_s m g, N.
 
         Returns:
             The support.
 
         Raises:
-            ValueError: If `points` is less than one.
+            ValueError: If `points` is less than one, or the load is not positive.
         """
         check_count("points", points)
         return Support.points(shape.boundary(points), load=load)
 
     @property
     def load(self) -> Float[Array, ""]:
-        """Total friction limit mu m g, N: the force that slides the support without rotation."""
+        """Total friction limit mu_s m g, N: the force that slides the support without rotation."""
         return in_numpy(lambda xp, limit: xp.sum(limit))(self.limit)
 
     @property
@@ -233,7 +236,7 @@ class Support(eqx.Module):
         determine a wrench. Its result is the center of all wrenches, which is zero.
 
         Args:
-            twist: Body twist (vx, vy, omega), shape (3,). Only its direction matters.
+            twist: Body twist (vx, vy, omega), shape (3,), m and rad. Only its direction matters.
             key: PRNG key to draw from a facet, or None for its center.
 
         Returns:

@@ -219,24 +219,3 @@ def _is_convex(vertices: Array, claimed: bool | None) -> bool:
     if claimed and not convex:
         raise ValueError(f"convex is True, but the vertices are not: vertex {innermost} is a reflex corner")
     return convex if claimed is None else bool(claimed)
-
-
-def signed_distances(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the signed distances of known points from a polygon, with NumPy, so that nothing is compiled.
-
-    Args:
-        vertices: Vertices of the polygon, (vertices, 2), m.
-        points: Points, (points, 2), m.
-
-    Returns:
-        The distances, (points,), m, negative inside.
-    """
-    (x, y), (ax, ay) = points.T[:, None], vertices.T[:, :, None]
-    bx, by = np.roll(vertices, -1, axis=0).T[:, :, None]
-    edge_x, edge_y, dx, dy = bx - ax, by - ay, x - ax, y - ay
-    fraction = np.clip((dx * edge_x + dy * edge_y) / (edge_x**2 + edge_y**2), 0, 1)
-    distance = np.sqrt(np.min((dx - fraction * edge_x) ** 2 + (dy - fraction * edge_y) ** 2, axis=0))
-    # inside, if a ray along +x crosses an odd number of edges
-    spans = (ay <= y) != (by <= y)
-    right = dx * np.abs(edge_y) < dy * edge_x * np.sign(edge_y)
-    return np.where(np.sum(spans & right, axis=0) % 2 == 1, -distance, distance)

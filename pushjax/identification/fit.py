@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.jit import quick_jit
-from pushjax.identification.model import Problem
+from pushjax.identification.model import PerKind, Problem
 from pushjax.identification.pushes import Pushes
 
 MAX_STEPS = 60
@@ -19,20 +19,6 @@ FRICTION_RIDGE = 1e-6  # prior precision of a friction: makes the precision matr
 SIGMA_ROUNDS = 6
 MIN_SIGMA = 1e-6  # m, lower bound of sigma: no measurement is more exact
 GAP_SCALE = 3.0  # sigma: beyond this residual of a gap, the finger counts as having lost the slider
-
-
-class PerKind(NamedTuple):
-    """A quantity that exists once for each kind of residual.
-
-    Attributes:
-        poses: Its value for poses.
-        directions: Its value for directions of motion under measured wrenches.
-        gap: Its value for the gap between finger and slider at the end.
-    """
-
-    poses: Any
-    directions: Any
-    gap: Any
 
 
 # Numbers that a push counts as having measured. All its poses together weigh as much as one, and so do its directions.
@@ -46,7 +32,7 @@ class Fit(NamedTuple):
         z: (size,) most probable vector of unknowns.
         sigma: (3,) standard deviations of poses (m), of directions of motion, and of gaps (m).
         precision: (size, size) inverse covariance of z.
-        residual: (conditions, pushes, rows) all residuals, predicted less measured; see `Problem.residuals`.
+        residual: Residuals (conditions, pushes, rows) of each kind, predicted less measured; see `Problem.residuals`.
         information: (conditions, pushes, size) contribution of each push to the diagonal of the precision.
         loss: Minimized sum of squares, prior included.
         steps: Optimizer steps, over all rounds.
@@ -56,7 +42,7 @@ class Fit(NamedTuple):
     z: Float[Array, "size"]
     sigma: Float[Array, "3"]
     precision: Float[Array, "size size"]
-    residual: Float[Array, "conditions pushes rows"]
+    residual: PerKind
     information: Float[Array, "conditions pushes size"]
     loss: Float[Array, ""]
     steps: Int[Array, ""]
@@ -84,6 +70,11 @@ class FixedEntries(NamedTuple):
         return jnp.where(self.mask, self.value, z)
 
 
+def sum_of_squares(residuals: Any, axis: tuple[int, ...] | None = None) -> Array:
+    """Return the sum of the squares of all arrays of a pytree, over all axes or some."""
+    return jax.tree.reduce(jnp.add, jax.tree.map(lambda each: jnp.sum(each**2, axis=axis), residuals))
+
+
 def push_weights(pushes: Pushes) -> PerKind:
     """Return the weight (conditions, pushes) of each push for each kind of residual.
 
@@ -93,14 +84,7 @@ def push_weights(pushes: Pushes) -> PerKind:
     return PerKind(pushes.weight, directions, pushes.weight)
 
 
-def split_kinds(residual: Array, pushes: Pushes) -> PerKind:
-    """Split the last axis of residuals by their kind; a kind that was not measured has no entries."""
-    poses = 3 * len(pushes.observed_steps)
-    directions = poses + 3 * pushes.wrench.shape[-2]
-    return PerKind(residual[..., :poses], residual[..., poses:directions], residual[..., directions:])
-
-
-def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: float | None) -> Array:
+def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Array, robust: float | None) -> PerKind:
     """Return residuals whose squares add up to the data part of the loss.
 
     The poses of each push, and its directions, use the pseudo-Huber loss, which is linear beyond `robust` sigma (None:
@@ -108,16 +92,16 @@ def weighted_residuals(residual: Array, pushes: Pushes, sigma: Array, robust: fl
     influence.
     """
     weighted = []
-    kinds = zip(PerKind._fields, split_kinds(residual, pushes), push_weights(pushes), strict=True)
-    for k, (kind, r, weight) in enumerate(kinds):
-        r = r / sigma[k]
+    kinds = zip(PerKind._fields, residual, push_weights(pushes), sigma, strict=True)
+    for kind, r, weight, std in kinds:
+        r = r / std
         squared = jnp.sum(r**2, axis=-1, keepdims=True)
         if kind == "gap":
             r = r / jnp.sqrt(1 + squared / GAP_SCALE**2)
         elif robust is not None:
             r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
         weighted.append(r * jnp.sqrt(weight)[..., None])
-    return jnp.concatenate(weighted, axis=-1)
+    return PerKind(*weighted)
 
 
 def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
@@ -170,31 +154,25 @@ class _Evidence(NamedTuple):
 
 
 def _evidence(
-    residual: Array, jacobian: Array, pushes: Pushes, fit: Fit, robust: float | None, has_normal_prior
+    residual: PerKind, jacobian: PerKind, pushes: Pushes, fit: Fit, robust: float | None, has_normal_prior
 ) -> _Evidence:
     """Return the precision of z, and sigma as the evidence procedure estimates it.
 
     Args:
-        residual: (conditions, pushes, rows) residuals at the minimizer.
-        jacobian: (conditions, pushes, rows, size) their derivatives with respect to z.
+        residual: Residuals (conditions, pushes, rows) of each kind at the minimizer.
+        jacobian: Their derivatives (conditions, pushes, rows, size) with respect to z.
         pushes: Pushes with a leading axis of conditions.
         fit: The fit before, with the sigma with which the minimizer was found.
         robust: Number of sigma from which a push has less influence. None: least squares.
         has_normal_prior: (size,) 1 for entries of z that have a normal prior, else 0.
     """
     by_kind, information, counts_and_squares = [], jnp.zeros_like(fit.information), []
-    kinds = zip(
-        PerKind._fields,
-        split_kinds(residual, pushes),
-        split_kinds(jnp.moveaxis(jacobian, 3, 0), pushes),
-        push_weights(pushes),
-        strict=True,
-    )
-    for k, (kind, r, derivatives, weight) in enumerate(kinds):
-        robust_weight = _robust_weights(kind, r, weight, fit.sigma[k], robust)
-        scaled = derivatives * (jnp.sqrt(robust_weight) / fit.sigma[k])[None, ..., None]
-        by_kind.append(jnp.einsum("icnr,jcnr->ij", scaled, scaled))
-        information = information + jnp.moveaxis(jnp.sum(scaled**2, axis=3), 0, 2)
+    kinds = zip(PerKind._fields, residual, jacobian, push_weights(pushes), fit.sigma, strict=True)
+    for kind, r, derivatives, weight, std in kinds:
+        robust_weight = _robust_weights(kind, r, weight, std, robust)
+        scaled = derivatives * (jnp.sqrt(robust_weight) / std)[..., None, None]
+        by_kind.append(jnp.einsum("cnri,cnrj->ij", scaled, scaled))
+        information = information + jnp.sum(scaled**2, axis=2)
         counts_and_squares.append((jnp.sum(robust_weight), jnp.sum(robust_weight[..., None] * r**2)))
     precision = sum(by_kind) + jnp.diag(jnp.maximum(has_normal_prior, FRICTION_RIDGE))
     # The trace of a kind's resolution matrix is the number of parameters that this kind determines; it reduces the
@@ -252,21 +230,18 @@ def fit(
         found = least_squares(residuals, before.z, MAX_STEPS, tolerance)
         z, residual = fixed.apply(found.z), found.auxiliary.value
         evidence = _evidence(residual, problem.jacobian(z, found.auxiliary), pushes, before, robust, has_normal_prior)
-        minimum = jnp.sum(weighted_residuals(residual, pushes, sigma, robust) ** 2) + jnp.sum(
-            (has_normal_prior * z) ** 2
-        )
+        weighted = weighted_residuals(residual, pushes, sigma, robust)
+        minimum = sum_of_squares((*weighted, has_normal_prior * z))
         steps = before.steps + found.steps
         new_sigma = jnp.where(sigma_is_given, sigma, jnp.maximum(jnp.stack(evidence.new_sigma), MIN_SIGMA))
         # The last round keeps the sigma with which it fitted.
         sigma = jnp.where(index < rounds - 1, new_sigma, sigma)
         return Fit(z, sigma, evidence.precision, residual, evidence.information, minimum, steps, found.converged)
 
-    leading = pushes.weight.shape
-    rows = 3 * len(pushes.observed_steps) + 3 * pushes.wrench.shape[-2] + problem.contact_at_end
-    size = len(start)
-    precision, residual, information, minimum = (
-        jnp.zeros(shape, start.dtype) for shape in ((size, size), (*leading, rows), (*leading, size), ())
-    )
+    leading, size = pushes.weight.shape, len(start)
+    precision, information, minimum = (jnp.zeros(shape, start.dtype) for shape in ((size, size), (*leading, size), ()))
+    rows = PerKind(3 * len(pushes.observed_steps), 3 * pushes.wrench.shape[-2], int(problem.contact_at_end))
+    residual = PerKind(*(jnp.zeros((*leading, count), start.dtype) for count in rows))
     no_steps, not_converged = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     first = Fit(fixed.apply(start), sigma, precision, residual, information, minimum, no_steps, not_converged)
     return jax.lax.fori_loop(0, rounds, one_round, first)

@@ -1,5 +1,8 @@
 """The function `identify`: from recorded pushes to estimates with their uncertainty."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -16,12 +19,19 @@ from pushjax._internal.checks import (
 )
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.identification.fit import SIGMA_ROUNDS, FixedEntries, Schedule, compiled_fit, weighted_residuals
+from pushjax.identification.fit import (
+    SIGMA_ROUNDS,
+    FixedEntries,
+    Schedule,
+    compiled_fit,
+    sum_of_squares,
+    weighted_residuals,
+)
 from pushjax.identification.model import Problem
 from pushjax.identification.prior import Prior
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified
-from pushjax.identification.unknowns import Unknowns
+from pushjax.identification.unknowns import NORMAL_PRIORS, SIZES, Unknowns
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
@@ -40,6 +50,7 @@ def identify(
     unknowns: Unknowns | None = None,
     *,
     friction: ArrayLike = 0.25,
+    known: Mapping[str, ArrayLike] | None = None,
     length: ArrayLike | None = None,
     robust: float | None = ROBUST,
     sigma: ArrayLike | None = None,
@@ -61,6 +72,9 @@ def identify(
         hand: The hand that pushed.
         unknowns: The parameters to identify, with their prior. Default: friction and limit surface.
         friction: Friction coefficient mu, used if it is not an unknown. A scalar or (conditions,).
+        known: Values of other parameters that are not to be estimated, by the name of the unknown, such as
+            {"overlap": 1.0}. Units are those of `Unknowns`; the angle of `frame_offset` is in rad. Each value may have
+            a leading axis of conditions. Default: all are zero.
         length: Length in m that makes angles commensurate with positions in the loss. Default: that of the limit
             surface (of the first condition).
         robust: Number of sigma from which a push has less influence, by the pseudo-Huber loss. None: least squares.
@@ -77,8 +91,9 @@ def identify(
 
     Raises:
         TypeError: If `pushes`, `slider` or `hand` is of another type.
-        ValueError: If an array has the wrong shape, if a value is not finite or out of range, or if `overlap` or
-            `contact_at_end` is asked for with a hand that is not a single round finger.
+        ValueError: If an array has the wrong shape, if a value is not finite or out of range, if a name in `known` is
+            not that of a parameter or is estimated, or if `overlap` or `contact_at_end` is asked for with a hand that
+            is not a single round finger.
 
     Reference: Extends Zhou et al. 2017, section VI, where only the friction is identified, on a grid. sigma is the
     estimate of the evidence procedure (MacKay 1992).
@@ -91,27 +106,27 @@ def identify(
     one_condition, pushes = pushes.weight.ndim == 1, pushes.as_conditions()
     conditions = pushes.weight.shape[0]
     surface = _surface_per_condition(slider.surface, conditions)
-    known_friction = _known_friction(as_float(friction, dtype, "friction"), conditions)
+    known_values = {"friction": _known_friction(friction, conditions, dtype)}
+    known_values |= _known_parameters(known or {}, unknowns, conditions, dtype)
     metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
     pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
-    _check_settings(pushes, hand, unknowns, metric_length, pose_sigma, robust, contact_at_end)
-    total_weight = jnp.maximum(jnp.sum(pushes.weight), 1.0)
-    origin = jnp.einsum("cn,cni->i", pushes.weight, pushes.start[..., :2]) / total_weight
-    prior = _prior(unknowns, surface, known_friction, origin)
+    needs_round_finger = {"overlap": "overlap" in (*unknowns.names, *known_values), "contact_at_end": contact_at_end}
+    _check_settings(pushes, hand, metric_length, pose_sigma, robust, needs_round_finger)
+    prior = _prior(unknowns, surface, known_values, _mean_start(pushes))
     problem = Problem(slider.shape, hand, surface, prior, metric_length, contact_at_end)
     has_pairs = pushes.wrench.shape[-2] > 0
     # A kind of residual that was not measured has no sigma to estimate.
     sigma_is_given = jnp.array([sigma is not None, not has_pairs, not contact_at_end])
     rounds = 1 if sigma is not None and not (has_pairs or contact_at_end) else SIGMA_ROUNDS
-    start_sigma = jnp.stack(
-        [pose_sigma, *(jnp.asarray(value, dtype) for value in (START_DIRECTION_SIGMA, START_GAP_SIGMA))]
-    )
+    start_sigma = jnp.stack([pose_sigma, *jnp.asarray([START_DIRECTION_SIGMA, START_GAP_SIGMA], dtype)])
     start = _best_start(problem, pushes, start_sigma, robust=robust)
     schedule = Schedule.of(dtype, rounds)
     fitted = compiled_fit(
         problem, pushes, start, start_sigma, sigma_is_given, FixedEntries.none(start), schedule, robust=robust
     )
-    per_push = (_final_pose_residual(fitted.residual, pushes), fitted.information)
+    # The residuals of poses are divided by the root of the number of poses.
+    final_pose_residual = fitted.residual.poses[..., -3:] * len(pushes.observed_steps) ** 0.5
+    per_push = (final_pose_residual, fitted.information)
     residual, information = jax.tree.map(lambda leaf: leaf[0], per_push) if one_condition else per_push
     return Identified(
         z=fitted.z,
@@ -135,16 +150,25 @@ def identify(
 _prior = quick_jit(Prior.of)
 
 
+def _mean_start(pushes: Pushes) -> Array:
+    """Return the weighted mean of the start positions of all pushes, (2,), world, m."""
+    total_weight = jnp.maximum(jnp.sum(pushes.weight), 1.0)
+    return jnp.einsum("cn,cni->i", pushes.weight, pushes.start[..., :2]) / total_weight
+
+
 def _check_settings(
     pushes: Pushes,
     hand: Hand,
-    unknowns: Unknowns,
     length: Array,
     sigma: Array,
     robust: float | None,
-    contact_at_end: bool,
+    needs_round_finger: Mapping[str, bool],
 ) -> None:
-    """Check that the settings fit each other and the hand; the arguments are those of `identify`."""
+    """Check that the settings fit each other and the hand.
+
+    `needs_round_finger` says of arguments for a single round finger whether they were given. The others are as in
+    `identify`.
+    """
     if pushes.path.shape[-1] != hand.dof:
         raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
     for name, value in (("length", length), ("sigma", sigma)):
@@ -153,7 +177,7 @@ def _check_settings(
         check_positive(name, value)
     if robust is not None:
         check_positive("robust", robust)
-    for name, requested in (("overlap", unknowns.overlap is not None), ("contact_at_end", contact_at_end)):
+    for name, requested in needs_round_finger.items():
         if requested and not (len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)):
             raise ValueError(f"{name} is for a single round finger; the hand has {len(hand.fingers)} fingers")
 
@@ -166,23 +190,36 @@ def _surface_per_condition(surface: LimitSurface, conditions: int) -> LimitSurfa
     return surface
 
 
-def _known_friction(friction: Array, conditions: int) -> Array:
-    """Check the friction of all conditions, or of each, and return it."""
-    if friction.shape not in ((), (conditions,)):
+def _known_friction(friction: ArrayLike, conditions: int, dtype: Any) -> Array:
+    """Check the friction of all conditions, or of each, and return it as (conditions,)."""
+    value = as_float(friction, dtype, "friction")
+    if value.shape not in ((), (conditions,)):
         expected = f"a scalar or ({conditions},), one per condition"
-        raise ValueError(f"friction has shape {friction.shape}; expected {expected}")
-    check_finite("friction", friction)
-    check_non_negative("friction", friction)
-    return friction
+        raise ValueError(f"friction has shape {value.shape}; expected {expected}")
+    check_finite("friction", value)
+    check_non_negative("friction", value)
+    return jnp.broadcast_to(value, (conditions,))
 
 
-def _final_pose_residual(residual: Array, pushes: Pushes) -> Array:
-    """Return the residuals (conditions, pushes, 3) of the final poses, m, among those of `Problem.residuals`.
-
-    There, the residuals of poses are divided by the root of the number of poses.
-    """
-    end_row = 3 * len(pushes.observed_steps)
-    return residual[..., end_row - 3 : end_row] * len(pushes.observed_steps) ** 0.5
+def _known_parameters(
+    known: Mapping[str, ArrayLike], unknowns: Unknowns, conditions: int, dtype: Any
+) -> dict[str, Array]:
+    """Check the argument `known` of `identify`, and return its values with a leading axis of conditions."""
+    values = {}
+    for name, value in known.items():
+        if name not in NORMAL_PRIORS:
+            instead = {"friction": "; there is the argument friction", "surface": "; it is that of the slider"}
+            raise ValueError(f"known: {name!r} is not one of {', '.join(NORMAL_PRIORS)}{instead.get(name, '')}")
+        if name in unknowns.names:
+            raise ValueError(f"known: {name!r} is also estimated; leave it out, or pass unknowns with {name}=None")
+        array, size = as_float(value, dtype, f"known[{name!r}]"), SIZES[name] or unknowns.sides
+        shape = (size,) if name == "friction_by_side" or size > 1 else ()
+        if array.shape not in (shape, (conditions, *shape)):
+            expected = f"{shape}, or {(conditions, *shape)} with an axis of conditions"
+            raise ValueError(f"known: {name!r} has shape {array.shape}; expected {expected}")
+        check_finite(f"known[{name!r}]", array)
+        values[name] = jnp.broadcast_to(array, (conditions, *shape))
+    return values
 
 
 @quick_jit
@@ -201,7 +238,7 @@ def _best_start(problem: Problem, pushes: Pushes, sigma: Array, *, robust: float
     def push_losses(value: Array) -> Array:
         residuals = problem.residuals(z.at[positions].set(value), pushes)
         weighted = weighted_residuals(residuals, pushes, sigma, robust)
-        return jnp.sum(weighted**2, axis=(1, 2))
+        return sum_of_squares(weighted, axis=(1, 2))
 
     loss = jax.lax.map(push_losses, candidates)
     if "friction" in layout.shared:

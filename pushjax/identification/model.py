@@ -29,6 +29,20 @@ from pushjax.simulation.trajectory import Trajectory
 DIRECTION_PARTS = 5
 
 
+class PerKind(NamedTuple):
+    """A quantity that exists once for each kind of residual.
+
+    Attributes:
+        poses: Its value for poses.
+        directions: Its value for directions of motion under measured wrenches.
+        gap: Its value for the gap between finger and slider at the end.
+    """
+
+    poses: Any
+    directions: Any
+    gap: Any
+
+
 class Problem(eqx.Module):
     """Everything that stays constant during a fit.
 
@@ -48,16 +62,16 @@ class Problem(eqx.Module):
     length: Float[Array, ""]
     contact_at_end: bool = eqx.field(static=True, default=False)
 
-    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> Float[Array, "conditions pushes rows"]:
-        """Return the residuals of all pushes, predicted less measured.
+    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> PerKind:
+        """Return the residuals (conditions, pushes, rows) of each kind for all pushes, predicted less measured.
 
-        The rows are, in this order: the poses (x, y, length * theta, in m), divided by the root of the number of poses;
-        the directions of motion under the wrenches, divided by the root of the number of pairs; and, with
-        `contact_at_end`, the gap in m between the finger and the slider as it was measured at the end.
+        Poses are x, y, length * theta, in m. They are divided by the root of their number, and so are directions of
+        motion. A gap, in m, is that between the finger and the slider as it was measured at the end. A kind that was
+        not measured has no rows.
         """
         free, parameters = self._free_and_all(z)
         blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
-        return jnp.concatenate([block[0] for block in blocks], axis=-1)
+        return PerKind(*(value for value, _ in blocks))
 
     def linearize(self, z: Float[Array, "size"], pushes: Pushes) -> "Linearized":
         """Return residuals and their Jacobian with respect to the parameters of each push's own condition.
@@ -70,12 +84,12 @@ class Problem(eqx.Module):
         """
         free, parameters = self._free_and_all(jax.lax.stop_gradient(z))
         blocks = self._residual_blocks(lambda f: jax.jacfwd(f, has_aux=True), free, parameters, pushes)
-        jacobian, value = jax.tree.map(lambda *kinds: jnp.concatenate(kinds, axis=2), *blocks)
-        return Linearized(value, jacobian, free)
+        jacobians, values = zip(*blocks, strict=True)
+        return Linearized(PerKind(*values), PerKind(*jacobians), free)
 
     def _residual_blocks(
         self, transformation: Callable, free: dict[str, Array], parameters: Parameters, pushes: Pushes
-    ) -> list:
+    ) -> PerKind:
         """Evaluate each kind of residual over all conditions and pushes.
 
         Args:
@@ -95,41 +109,35 @@ class Problem(eqx.Module):
         def pose_residual(free, parameters, data, constants):
             return _pose_residual(free, parameters, data, constants, steps)
 
-        blocks = [_over_conditions_and_pushes(transformation(pose_residual), free, parameters, data, constants)]
+        poses = _over_conditions_and_pushes(transformation(pose_residual), free, parameters, data, constants)
+        directions = gap = jax.tree.map(lambda leaf: leaf[:, :, :0], poses)  # no rows
         if pushes.wrench.shape[-2]:
             pairs = _WrenchMotionPairs(self.surface, pushes.wrench, pushes.twist, pushes.has_pair)
-            blocks.append(_over_conditions_and_pushes(transformation(_direction_residual), free, parameters, pairs, ()))
+            directions = _over_conditions_and_pushes(transformation(_direction_residual), free, parameters, pairs, ())
         if self.contact_at_end:
-            blocks.append(_over_conditions_and_pushes(transformation(_gap_residual), free, parameters, data, constants))
-        return blocks
+            gap = _over_conditions_and_pushes(transformation(_gap_residual), free, parameters, data, constants)
+        return PerKind(poses, directions, gap)
 
-    def linear_residuals(
-        self, z: Float[Array, "size"], linearized: "Linearized"
-    ) -> Float[Array, "conditions pushes rows"]:
+    def linear_residuals(self, z: Float[Array, "size"], linearized: "Linearized") -> PerKind:
         """Return the residuals at z, to first order about the point of `linearized`.
 
         At that point the values and the derivatives with respect to z are exact, and they cost matrix products only.
         """
         free, _ = self._free_and_all(z)
 
-        def change(name: str) -> Array:
-            """Return the change due to `name`.
+        def extrapolate(value: Array, jacobian: dict[str, Array]) -> Array:
+            """Add to each residual its Jacobian (conditions, pushes, rows, ...) times the changes (conditions, ...)."""
+            changes = []
+            for name, new in free.items():
+                difference = (new - linearized.free[name]).reshape(len(new), -1)
+                by_entry = jacobian[name].reshape(*value.shape, difference.shape[1])
+                changes.append(jnp.einsum("cnri,ci->cnr", by_entry, difference))
+            return value + jnp.sum(jnp.stack(changes), axis=0)
 
-            It is the product of the Jacobian (conditions, pushes, rows, ...) and the difference (conditions, ...).
-            """
-            difference = free[name] - linearized.free[name]
-            return jnp.einsum(
-                "cnri,ci->cnr",
-                linearized.jacobian[name].reshape(*linearized.value.shape, -1),
-                difference.reshape(len(difference), -1),
-            )
+        return PerKind(*map(extrapolate, linearized.value, linearized.jacobian))
 
-        return linearized.value + jnp.sum(jnp.stack([change(name) for name in free]), axis=0)
-
-    def jacobian(
-        self, z: Float[Array, "size"], linearized: "Linearized"
-    ) -> Float[Array, "conditions pushes rows size"]:
-        """Return the Jacobian of the residuals with respect to z."""
+    def jacobian(self, z: Float[Array, "size"], linearized: "Linearized") -> PerKind:
+        """Return the Jacobian (conditions, pushes, rows, size) of each kind of residuals with respect to z."""
         return jax.jacfwd(lambda z: self.linear_residuals(z, linearized))(z)
 
     def _free_and_all(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
@@ -146,13 +154,13 @@ class Linearized(NamedTuple):
     """Residuals and their Jacobian at one point z.
 
     Attributes:
-        value: (conditions, pushes, rows) residuals.
-        jacobian: Derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`.
+        value: Residuals (conditions, pushes, rows) of each kind.
+        jacobian: For each kind, derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`.
         free: Estimated parameters (conditions, ...) by name, at that point.
     """
 
-    value: Float[Array, "conditions pushes rows"]
-    jacobian: dict[str, Array]
+    value: PerKind
+    jacobian: PerKind
     free: dict[str, Array]
 
 

@@ -34,7 +34,7 @@ from pushjax._internal.checks import check_positive
 from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._internal.jit import jit
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.friction.random import FrictionModel, Sampler
+from pushjax.friction.friction_model import FrictionModel, Sampler
 from pushjax.identification.predictive import (
     ConditionSampler,
     NoiseParameters,

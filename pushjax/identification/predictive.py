@@ -14,8 +14,9 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.jit import jit
+from pushjax.friction.friction_model import FrictionModel, Sampler
 from pushjax.friction.quartic import Quartic
-from pushjax.friction.random import FrictionModel, Sampler, SumOfSquaresQuartic, SurfaceDistribution
+from pushjax.friction.surface_distributions import SumOfSquaresQuartic, SurfaceDistribution
 from pushjax.identification.model import Scene, coefficients_of, limit_surfaces, predict_push
 from pushjax.identification.pushes import Pushes, PushInput
 from pushjax.identification.result import Identified

@@ -25,9 +25,14 @@ from jaxtyping import Array, Float
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic
-from pushjax.friction.random import dof_of_terms
 from pushjax.friction.sum_of_squares import TERMS, decompose, squared_quadratics, unpack_lower
+from pushjax.friction.surface_distributions import dof_of_terms
 from pushjax.identification.unknowns import SIZES, Parameters, Unknowns
+
+# Parameters that are zero, rather than None, if they are neither estimated nor known.
+ALWAYS_PRESENT = tuple(
+    name for name in Parameters._fields if name not in ("friction", "surface", *Parameters._field_defaults)
+)
 
 
 class Layout(eqx.Module):
@@ -135,48 +140,46 @@ class Prior(eqx.Module):
 
     Attributes:
         unknowns: What is estimated, and its prior.
-        known_friction: (conditions,) friction, used if it is known.
+        known: Parameters that are known, by name, each with a leading axis of conditions. Units are those of
+            `Parameters`. The friction is always among them, and is used unless it is estimated.
         mean_surface: Mean surfaces, with a leading axis of conditions.
         origin: (2,) world, m, reference point of the table friction.
         layout: Positions of the unknowns in z.
     """
 
     unknowns: Unknowns
-    known_friction: Float[Array, "conditions"]
+    known: dict[str, Array]
     mean_surface: PriorSurface
     origin: Float[Array, "2"]
     layout: Layout = eqx.field(static=True)
 
     @staticmethod
-    def of(unknowns: Unknowns, surface: LimitSurface, friction: Array, origin: Array) -> "Prior":
-        """Return the prior for surfaces with a leading axis of conditions."""
-        conditions = surface.length.shape[0]
-        layout = Layout.of(unknowns, surface.degree, conditions)
-        known = jnp.broadcast_to(friction, (conditions,)).astype(surface.length.dtype)
+    def of(unknowns: Unknowns, surface: LimitSurface, known: dict[str, Array], origin: Array) -> "Prior":
+        """Return the prior for surfaces and known parameters with a leading axis of conditions."""
+        layout = Layout.of(unknowns, surface.degree, surface.length.shape[0])
         return Prior(unknowns, known, PriorSurface.of(surface, unknowns.surface_dof), origin, layout)
 
     def parameters(self, z: Float[Array, "size"]) -> Parameters:
         """Return the physical parameters of every condition."""
         of_conditions = jax.vmap(
-            lambda numbers, *rest: _condition_parameters(numbers, self.layout, self.unknowns, *rest)
+            lambda numbers, *rest: _condition_parameters(_entries_by_name(numbers, self.layout), self.unknowns, *rest)
         )
-        return of_conditions(z[self.layout.positions], self.known_friction, self.mean_surface)
+        return of_conditions(z[self.layout.positions], self.known, self.mean_surface)
 
     def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
         """Return the lower triangular factors L_k of every condition's surface.
 
         A QR decomposition makes them triangular again if the center of pressure is an unknown.
         """
-        of_conditions = jax.vmap(
-            lambda numbers, mean: _surface_factors(_entries_by_name(numbers, self.layout), self.unknowns, mean)
-        )
-        full = of_conditions(z[self.layout.positions], self.mean_surface)
+        center = self.parameters(z).pressure_center
+        of_conditions = jax.vmap(lambda numbers, *rest: _surface_factors(_entries_by_name(numbers, self.layout), *rest))
+        full = of_conditions(z[self.layout.positions], center, self.mean_surface)
         return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
 
     @property
     def mean(self) -> Float[Array, "size"]:
         """The prior mean of z, which is zero."""
-        return jnp.zeros(self.layout.size, self.known_friction.dtype)
+        return jnp.zeros(self.layout.size, self.origin.dtype)
 
 
 def _entries_by_name(z: Array, layout: Layout) -> dict[str, Any]:
@@ -184,19 +187,15 @@ def _entries_by_name(z: Array, layout: Layout) -> dict[str, Any]:
     return {name: z[where] for name, where in layout.slices.items()}
 
 
-def _scaled_entries(entries: dict[str, Any], unknowns: Unknowns, name: str, dtype: Any) -> Array:
-    """Return the entries of an unknown times their standard deviation; zeros if the parameter is known."""
-    std = getattr(unknowns, name)
-    return jnp.zeros(SIZES[name], dtype) if std is None else std.astype(dtype) * entries[name]
-
-
-def _surface_factors(entries: dict[str, Any], unknowns: Unknowns, mean: PriorSurface) -> Float[Array, "terms 3 3"]:
-    """Return factors L_k of the surface, which are not triangular if the center of pressure is an unknown."""
+def _surface_factors(
+    entries: dict[str, Any], pressure_center: Array | None, mean: PriorSurface
+) -> Float[Array, "terms 3 3"]:
+    """Return factors L_k of the surface, which are not triangular if there is a center of pressure."""
     factors = mean.factors
     if "surface" in entries:
         factors = factors + mean.relative_std * factors @ _unit_perturbation(entries["surface"].reshape(-1, 6))
-    if "pressure_center" in entries:
-        cx, cy = _scaled_entries(entries, unknowns, "pressure_center", factors.dtype) / mean.length
+    if pressure_center is not None:
+        cx, cy = pressure_center / mean.length
         row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
         shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
         factors = shift.T[None] @ factors
@@ -204,36 +203,34 @@ def _surface_factors(entries: dict[str, Any], unknowns: Unknowns, mean: PriorSur
 
 
 def _condition_parameters(
-    z: Array, layout: Layout, unknowns: Unknowns, known_friction: Array, mean: PriorSurface
+    entries: dict[str, Any], unknowns: Unknowns, known: dict[str, Array], mean: PriorSurface
 ) -> Parameters:
     """Return the physical parameters of one condition.
 
     Args:
-        z: (entries,) entries of the condition.
-        layout: Positions of the unknowns.
+        entries: Entries of z, by the name of the unknown.
         unknowns: What is estimated, and its prior.
-        known_friction: Friction of the condition, used if it is known.
+        known: Known parameters by name.
         mean: Mean surface of the condition.
     """
-    entries = _entries_by_name(z, layout)
-    mu = known_friction
-    if unknowns.friction is not None:
-        low, high = unknowns.friction.astype(z.dtype)
-        mu = low + (high - low) * jax.nn.sigmoid(entries["friction"][0])
-    factors = _surface_factors(entries, unknowns, mean)
+    values = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), mean.factors.dtype) for name in ALWAYS_PRESENT}
+    values |= known
+    for name, numbers in entries.items():
+        if name == "surface":
+            continue
+        prior = getattr(unknowns, name).astype(numbers.dtype)
+        if name == "friction":
+            values[name] = prior[0] + (prior[1] - prior[0]) * jax.nn.sigmoid(numbers[0])
+        else:
+            value = prior * numbers
+            if name == "frame_offset":
+                value = value.at[2].divide(mean.length)
+            values[name] = value[0] if SIZES[name] == 1 else value
+    has_center = "pressure_center" in entries or "pressure_center" in known
+    factors = _surface_factors(entries, values["pressure_center"] if has_center else None, mean)
     gram = factors @ jnp.swapaxes(factors, 1, 2)
     surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
-
-    def scaled(name: str) -> Array:
-        return _scaled_entries(entries, unknowns, name, z.dtype)
-
-    pressure_center, hand_offset = scaled("pressure_center"), scaled("hand_offset")
-    inset, overshoot, lag_distance = (scaled(name)[0] for name in ("inset", "overshoot", "lag_distance"))
-    optional = {name: scaled(name) for name in Parameters._field_defaults if name in entries}
-    if "frame_offset" in optional:
-        optional["frame_offset"] = optional["frame_offset"].at[2].divide(mean.length)
-    optional = {name: value[0] if SIZES[name] == 1 else value for name, value in optional.items()}
-    return Parameters(mu, surface, pressure_center, inset, overshoot, lag_distance, hand_offset, **optional)
+    return Parameters(surface=surface, **values)
 
 
 def _unit_perturbation(entries: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:

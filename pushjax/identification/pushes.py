@@ -18,10 +18,10 @@ from pushjax._internal.checks import (
     check_type,
     common_dtype,
 )
-from pushjax.datasets.pushes import PushLog
+from pushjax.datasets.push_log import PushLog
 from pushjax.datasets.recordings import Recordings
 from pushjax.geometry.shape import Shape
-from pushjax.identification.recordings import push_arrays
+from pushjax.identification.pushes_of_recordings import push_arrays
 
 STEPS = 50  # default number of steps of each path
 

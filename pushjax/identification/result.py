@@ -22,7 +22,7 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
-FORMAT, VERSION = "pushjax identified", 1
+FORMAT, VERSION = "pushjax identified", 2
 ARRAYS = ("z", "precision", "sigma", "direction_sigma", "gap_sigma", "residual", "information", "loss", "length")
 # Unknowns that slider, hand and path can represent.
 CORRECTABLE = ("friction", "surface", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset")
@@ -206,12 +206,13 @@ class Identified(eqx.Module):
             Slider, hand and path with the identified surface and calibration.
 
         Raises:
-            ValueError: If several conditions were identified, or if an unknown was identified that slider, hand and
-                path cannot represent, such as the table.
+            ValueError: If several conditions were identified, or if a parameter was identified or known that slider,
+                hand and path cannot represent, such as the table.
         """
         if not self.one_condition:
             raise ValueError("corrected is for what was found of one condition; of several there is `predict`")
-        uncorrectable = [name for name in self.prior.layout.names if name not in CORRECTABLE]
+        names = (*self.prior.layout.names, *self.prior.known)
+        uncorrectable = [name for name in names if name not in CORRECTABLE]
         if uncorrectable:
             raise ValueError(
                 f"corrected cannot represent {', '.join(uncorrectable)}; for what was found of them there is `predict`"
@@ -260,7 +261,7 @@ def to_record(found: Identified) -> dict[str, Any]:
     record["sides"] = unknowns.sides
     record["shared"] = unknowns.shared
     record["origin"] = to_list(found.prior.origin)
-    record["known_friction"] = to_list(found.prior.known_friction)
+    record["known"] = {name: to_list(value) for name, value in found.prior.known.items()}
     record["mean_surface"] = {name: to_list(getattr(mean, name)) for name in ("factors", "relative_std", "length")}
     # The estimates are for people who read the file. `from_record` computes them again.
     estimates = found.parameters._asdict()
@@ -279,8 +280,8 @@ def from_record(record: dict[str, Any], dtype: Any) -> Identified:
     mean = PriorSurface(**{name: array(value) for name, value in record["mean_surface"].items()})
     conditions, terms = mean.factors.shape[:2]
     layout = Layout.of(unknowns, 4 if terms > 1 else 2, conditions)
-    origin = array(record["origin"])
-    prior = Prior(unknowns, array(record["known_friction"]), mean, origin, layout)
+    known = {name: array(value) for name, value in record["known"].items()}
+    prior = Prior(unknowns, known, mean, array(record["origin"]), layout)
     arrays = {name: array(record[name]) for name in ARRAYS}
     if arrays["z"].shape != (layout.size,) or arrays["precision"].shape != (layout.size, layout.size):
         raise ValueError(f"its z has shape {arrays['z'].shape}; what it says was unknown has ({layout.size},)")

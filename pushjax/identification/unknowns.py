@@ -35,7 +35,9 @@ def _field_metadata(size: int | None, group: str = "") -> dict[str, Any]:
 class Unknowns(eqx.Module):
     """What `identify` estimates, and the prior of each unknown. A parameter whose prior is None is not estimated.
 
-    Such a parameter is known: friction and surface are those given to `identify`, any other parameter is zero.
+    Such a parameter is known: friction and surface are those given to `identify`. Any other parameter is zero, or has
+    the value in the argument `known` of `identify`.
+
     `friction` is a range and `surface_dof` a number of degrees of freedom. From `pressure_center` to
     `friction_by_side`, each field is the standard deviation, in the unit named, of a normal prior about zero. Their
     default is None.
@@ -165,7 +167,7 @@ TABLE = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "
 class Parameters(NamedTuple):
     """Physical parameters on which the pushes of a condition depend.
 
-    Fields from `frame_offset` on are None if they are not estimated.
+    Fields from `frame_offset` on are None if they are neither estimated nor known.
 
     Attributes:
         friction: Friction coefficient mu.

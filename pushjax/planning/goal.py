@@ -28,16 +28,16 @@ class Goal(eqx.Module):
 
     Args:
         pose: Pose of the slider, (3,), world, m and rad.
-        position: Tolerance of the position of the body origin, m.
-        angle: Tolerance of the angle, rad.
+        position_tolerance: Tolerance of the position of the body origin, m.
+        angle_tolerance: Tolerance of the angle, rad.
         length: Length that weighs the angle in `distance`, m.
         symmetry: Number of angles in a full turn at which the slider looks the same (4 for a square), or a list of the
-            turns after which it does, (turns,), rad.
+            turns after which it does, (turns,), rad. The list must contain zero, or else `pose` itself is no goal.
 
     Attributes:
         pose: The pose, (3,), world, m and rad.
-        position: Tolerance of the position, m.
-        angle: Tolerance of the angle, rad.
+        position_tolerance: Tolerance of the position, m.
+        angle_tolerance: Tolerance of the angle, rad.
         length: Length that weighs the angle, m.
         turns: Turns after which the slider looks the same, (turns,), rad.
 
@@ -52,8 +52,8 @@ class Goal(eqx.Module):
     """
 
     pose: Float[Array, "3"]
-    position: Float[Array, ""]
-    angle: Float[Array, ""]
+    position_tolerance: Float[Array, ""]
+    angle_tolerance: Float[Array, ""]
     length: Float[Array, ""]
     turns: Float[Array, "turns"]
 
@@ -61,34 +61,32 @@ class Goal(eqx.Module):
         self,
         pose: ArrayLike,
         *,
-        position: ArrayLike = 0.005,
-        angle: ArrayLike = ANGLE_TOLERANCE,
+        position_tolerance: ArrayLike = 0.005,
+        angle_tolerance: ArrayLike = ANGLE_TOLERANCE,
         length: ArrayLike = 0.05,
         symmetry: int | ArrayLike = 1,
     ):
-        dtype = common_dtype(pose, position, angle, length)
+        dtype = common_dtype(pose, position_tolerance, angle_tolerance, length)
         self.pose = as_float(pose, dtype, "pose")
         check_shape("pose", self.pose, (3,))
         check_finite("pose", self.pose)
-        self.position, self.angle, self.length = (
-            as_float(value, dtype, name)
-            for name, value in (("position", position), ("angle", angle), ("length", length))
-        )
-        for name in ("position", "angle", "length"):
+        scalars = {"position_tolerance": position_tolerance, "angle_tolerance": angle_tolerance, "length": length}
+        for name, value in scalars.items():
+            setattr(self, name, as_float(value, dtype, name))
             check_shape(name, getattr(self, name), ())
             check_finite(name, getattr(self, name))
             check_positive(name, getattr(self, name))
         self.turns = symmetric_turns(symmetry, dtype)
 
     def offset(self, pose: ArrayLike) -> Float[Array, "*batch 3"]:
-        """Return the offset of poses from the goal, in the orientation of the nearest of the equivalent goals.
+        """Return poses minus the goal, with the angle from the nearest of the equivalent goals.
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
 
         Returns:
-            Pose minus goal, (..., 3), m and rad. The angle is at most half a turn, and its derivative is one
-            everywhere. Where two of the equivalent goals are equally near, it is that of either.
+            Differences (x, y, theta), (..., 3), world, m and rad. The angle is at most half a turn, and its derivative
+            is one everywhere. Where two equivalent goals are equally near, the angle is from one of them.
 
         Raises:
             ValueError: For poses of another shape.
@@ -102,10 +100,10 @@ class Goal(eqx.Module):
         return jnp.concatenate([difference[..., :2], jnp.take_along_axis(angles, nearest, axis=-1)], axis=-1)
 
     def squared_error(self, pose: ArrayLike) -> Float[Array, "*batch"]:
-        """Return the squared error in units of the tolerances: (distance / position)^2 + (turn / angle)^2.
+        """Return the squared error in units of the tolerances, |(x, y)|^2 / p^2 + theta^2 / a^2.
 
-        Its derivative is zero at the goal and finite everywhere. A pose with an error of at most one has reached the
-        goal.
+        Here (x, y, theta) is the `offset`, and p and a are the tolerances of position and angle. The derivative is zero
+        at the goal and finite everywhere. A pose with an error of at most one has reached the goal.
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
@@ -115,13 +113,14 @@ class Goal(eqx.Module):
         """
         offset = self.offset(pose)
         squared = offset[..., 0] ** 2 + offset[..., 1] ** 2
-        return squared / self.position**2 + (offset[..., 2] / self.angle) ** 2
+        return squared / self.position_tolerance**2 + (offset[..., 2] / self.angle_tolerance) ** 2
 
     def distance(self, pose: ArrayLike) -> Float[Array, "*batch"]:
         """Return the distance from the goal, m: that of the positions plus `length` times that of the angles.
 
-        It is `pushjax.deviation` from the nearest of the equivalent goals. It has corners at equal positions and at
-        equal angles, where its derivative is zero.
+        It is `pushjax.deviation` from the nearest of the equivalent goals. The term of the positions is not smooth
+        where the positions are equal, and that of the angles where the angles are equal. Its derivative there is given
+        as zero.
 
         Args:
             pose: Poses, (..., 3), world, m and rad.
@@ -144,7 +143,9 @@ class Goal(eqx.Module):
             ValueError: For poses of another shape.
         """
         offset = self.offset(pose)
-        return jnp.maximum(norm(offset[..., :2]) / self.position, _absolute(offset[..., 2]) / self.angle)
+        return jnp.maximum(
+            norm(offset[..., :2]) / self.position_tolerance, _absolute(offset[..., 2]) / self.angle_tolerance
+        )
 
     def reached(self, pose: ArrayLike) -> Bool[Array, "*batch"]:
         """Return whether poses are within both tolerances.
@@ -167,7 +168,7 @@ def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array
     """Return the turns after which a slider looks the same, (turns,), rad.
 
     Args:
-        symmetry: Number of angles in a full turn at which it looks the same, or the turns.
+        symmetry: Number of angles in a full turn at which it looks the same, or the turns, zero among them.
         dtype: Dtype of the result; by default that of `symmetry`.
 
     Raises:

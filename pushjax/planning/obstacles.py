@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pushjax.geometry.disk import Disk
-from pushjax.planning.clearance import point_clearance, segment_clearance
-from pushjax.planning.poses import to_body, to_world
+from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
+from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.simulation.arguments import checked_fixtures
 from pushjax.simulation.fixtures import Fixture, Wall
 
+OVERLAP_TOLERANCE = 0.005  # overlap that counts as touching, in units of the surface's length
 TOGETHER = 4000  # poses whose distances are computed together, so that their data stay in the cache
 
 
@@ -71,7 +72,7 @@ class Obstacles(NamedTuple):
         for center, radius in zip(self.centers, self.radii, strict=True):
             found = np.minimum(found, np.hypot(*np.moveaxis(points - center, -1, 0)) - radius)
         for body in self.bodies:
-            found = np.minimum(found, point_clearance(body, points))
+            found = np.minimum(found, signed_distances(body, points))
         return found
 
     def segment_clearance(self, start: np.ndarray, end: np.ndarray, enough: float = np.inf) -> np.ndarray:
@@ -90,7 +91,7 @@ class Obstacles(NamedTuple):
             apart = np.array(_from_point(middle, start, end) - np.linalg.norm(body - middle, axis=1).max())
             near = apart < enough
             some = (np.broadcast_to(each, (*apart.shape, 2))[near] for each in (start, end))
-            apart[near] = segment_clearance(body, *some)
+            apart[near] = segment_distances(body, *some)
             found = np.minimum(found, apart)
         return found
 
@@ -120,7 +121,7 @@ class Obstacles(NamedTuple):
             near = np.flatnonzero(apart < enough)
             for some in np.array_split(near, len(near) // TOGETHER + 1):
                 if body is None:
-                    apart[some] = point_clearance(vertices, to_body(flat[some], middle)) - size
+                    apart[some] = signed_distances(vertices, to_body(flat[some], middle)) - size
                 else:
                     apart[some] = _polygons_apart(vertices, flat[some], body, tolerance)
             found = np.minimum(found, apart)
@@ -145,7 +146,7 @@ def _from_point(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.nda
 def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the distance between a polygon at each pose (poses, 3) and a convex one, as in `slider_clearance`."""
     corners, placed = to_world(poses[:, None], vertices), to_body(poses[:, None], body)
-    apart = np.minimum(point_clearance(body, corners).min(1), point_clearance(vertices, placed).min(1))
+    apart = np.minimum(signed_distances(body, corners).min(1), signed_distances(vertices, placed).min(1))
     beyond = _beyond(body, corners)
     # Two polygons overlap if an edge of one has a part in the other, or if one is inside of the other. No part of an
     # edge that merely touches the body is in a body that is smaller by the tolerance.

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from pushjax.geometry.shape import Shape
 from pushjax.plot.animation import Animation
 from pushjax.plot.parts import centroids, draw_fixtures, placed_outline, vertices
-from pushjax.plot.squeeze import SQUEEZE_LABEL
+from pushjax.plot.squeezing import SQUEEZE_LABEL
 from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
 from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
 from pushjax.simulation.fixtures import Fixture, Wall
@@ -59,7 +59,7 @@ def animate(
         forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
             the largest force.
         friction: Coefficient of friction at the contacts, to show the forces that hold the slider at the end of a
-            grasp, per unit of squeeze (`pushjax.plot.squeeze`).
+            grasp, per unit of squeeze (`pushjax.plot.squeezing`).
         fixtures: Walls and bodies that do not move, in every panel.
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.

@@ -1,4 +1,4 @@
-"""Pictures of a contact problem: one contact with its cones, or two contacts that close and may jam."""
+"""Pictures of a contact problem: one contact with its cones, or two fingers that close and may jam."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -26,7 +26,7 @@ def motion_cone_figure(
         shape: Outline of the slider.
         support: Support of the slider.
         surface: Limit surface of the slider.
-        contacts: The contacts in the body frame, m. The first one is drawn.
+        contacts: The contacts in the body frame, m. The first one is drawn. Its displacement must not be zero.
         motion: What `solve_contacts` gives for them.
     """
     with plt.rc_context(STYLE):
@@ -69,7 +69,7 @@ def jam_figure(shape: Shape, panels: list[tuple[Contacts, Motion]]) -> Figure:
 
     Args:
         shape: Outline of the slider.
-        panels: For each panel the two contacts, in the body frame, and their solution.
+        panels: For each panel the two contacts, in the body frame and of equal friction, and their solution.
     """
     with plt.rc_context(STYLE):
         figure, all_axes = panel_row(len(panels), 5.0, 4.6)
@@ -110,7 +110,16 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
 
 
 def _labeled_contact(axes: Axes, name: str, point: np.ndarray, normal: np.ndarray, mu: float, reach: float) -> None:
-    """Draw the normal, the friction cone and the closing finger of a contact at `point` (2,), mm."""
+    """Draw the normal, the friction cone and the closing finger of a contact.
+
+    Args:
+        axes: Axes to draw into.
+        name: Label of the contact.
+        point: The contact point, (2,), mm.
+        normal: Unit normal into the slider, (2,).
+        mu: Coefficient of friction.
+        reach: Length that the lengths of the lines are multiples of, mm.
+    """
     axes.plot(*np.array([point - 2 * reach * normal, point + 2 * reach * normal]).T, "--", color=BLUE, lw=0.9)
     tangent = np.array([-normal[1], normal[0]])
     for side in (1, -1):

@@ -17,6 +17,8 @@ FORCE_X, FORCE_Y, TORQUE = "$f_x$ / load", "$f_y$ / load", r"$\tau$ / (length ·
 CUT_DISTANCE = 0.06  # pairs at most this far from a cut are drawn with it, in units of the load
 ARROW_LENGTH = 0.5  # length of the arrow of a twist, in units of the load
 VIEW = np.radians(30), np.radians(-60)  # elevation and azimuth of the viewer
+# A wrench is on the viewer's side if the cosine of its angle to the direction of the viewer is larger than this.
+MIN_COSINE = 0.25
 
 
 def limit_surfaces(
@@ -29,7 +31,7 @@ def limit_surfaces(
     arrow is normal to the surface.
 
     Args:
-        surfaces: Limit surfaces by name.
+        surfaces: Limit surfaces by name. Their length must be that of the pairs.
         pairs: The pairs that the surfaces were fitted to.
         load: Total friction limit of the support, N.
         arrows: Number of pairs with an arrow, spread over the side that is seen.
@@ -72,9 +74,15 @@ def _draw_level_set(axes: Axes, surface: LimitSurface, load: float, color: str) 
 
 
 def _draw_cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, vertical: int) -> None:
-    """Draw the cut of the level sets with a plane: component `vertical` (1 is f_y, 2 the torque) over f_x.
+    """Draw a cut through the level sets, and the wrenches near it.
 
-    The remaining component, number 3 - vertical, is zero in this plane.
+    Args:
+        axes: Axes to draw into.
+        surfaces: Limit surfaces by name.
+        wrench: Wrenches in units of the load, (pairs, 3).
+        load: Total friction limit of the support, N.
+        vertical: Component on the vertical axis: 1 for f_y, 2 for the torque. On the horizontal axis is f_x. The third
+            component, number 3 - vertical, is zero in the cut.
     """
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))
@@ -91,7 +99,7 @@ def _spread_out(wrench: np.ndarray, count: int) -> np.ndarray:
     """Return indices of up to `count` wrenches on the viewer's side, each as far as possible from those before it."""
     elevation, azimuth = VIEW
     viewer = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    visible = np.flatnonzero(wrench @ viewer > 0.25 * np.linalg.norm(wrench, axis=1))
+    visible = np.flatnonzero(wrench @ viewer > MIN_COSINE * np.linalg.norm(wrench, axis=1))
     if count < 1 or not len(visible):
         return visible[:0]
     chosen = [int(np.argmax(wrench[visible] @ viewer))]

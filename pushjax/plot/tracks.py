@@ -9,7 +9,7 @@ from pushjax.contact.status import ContactMode, Status
 from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import contact_forces
 from pushjax.plot.parts import SMOOTH_OUTLINE_POINTS, centroids, placed_outline, vertices
-from pushjax.plot.squeeze import squeeze_forces
+from pushjax.plot.squeezing import squeeze_forces
 from pushjax.plot.style import MM
 from pushjax.simulation.hand import Hand, Pad
 from pushjax.simulation.trajectory import Trajectory

@@ -20,8 +20,8 @@ from pushjax._internal.checks import (
     traced,
 )
 from pushjax._internal.warn import warn
+from pushjax.friction.friction_model import warn_about_percent
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import warn_about_percent
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.detection import MAX_PENETRATION

@@ -21,7 +21,7 @@ from pushjax._internal.warn import warn
 from pushjax.contact.problem import check_solver
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
-from pushjax.friction.random import FrictionModel
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.table import Table
 from pushjax.simulation.arguments import (
     check_start_among_fixtures,

@@ -22,7 +22,8 @@ from pushjax._internal.jit import without_gc
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.status import ContactMode
 from pushjax.contact.sticking import StickingSolver
-from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.friction.friction_model import FrictionModel
+from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.fixtures import Fixtures

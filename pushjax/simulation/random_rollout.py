@@ -12,8 +12,9 @@ from pushjax._internal.jit import quick_jit
 from pushjax.contact.problem import check_solver, to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.arguments import (

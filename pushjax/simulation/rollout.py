@@ -65,8 +65,8 @@ def step(
 ) -> Step:
     """Move the hand from one configuration to another; this is the one step that `rollout` scans.
 
-    A traced value that is not finite, a traced negative friction, and a finger inside the slider show in the status of
-    the step.
+    Some faults raise no error, but show in the status of the step. It is OVERLAPPING if a finger or a fixture starts
+    too deep in the slider, and INVALID if a traced value is not finite or a traced friction is negative.
 
     Args:
         slider: The slider.
@@ -85,6 +85,7 @@ def step(
     Raises:
         ValueError: For arguments of a wrong shape, and for more contacts than the solver can solve. Where they are not
             traced, also for values that are not finite, a negative friction, or a hand that is closed on itself.
+        TypeError: For a slider, hand, solver, table or fixture of another type.
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, q0, q1)
     ends = as_float(q0, dtype, "q0"), as_float(q1, dtype, "q1")
@@ -145,6 +146,7 @@ def rollout(
         ValueError: As in `step`. Also for a finger or a fixture that starts inside the slider by more than a fifth of
             the surface's length, where this is not traced (a smaller overlap is pushed out in the first step). For
             traced values the `status` of each step shows the failure instead, and `first_failure` gives the step.
+        TypeError: As in `step`.
 
     Examples:
         >>> import numpy as np, pushjax as pj
@@ -229,7 +231,7 @@ def simulate(
     fixtures: Fixtures = (),
     num_steps: Array | None = None,
 ) -> Trajectory:
-    """Roll out a path.
+    """Roll out a path, with arguments that have been checked. `rollout` is the public function.
 
     Args:
         shape: Outline of the slider.
@@ -271,7 +273,7 @@ def divided_push(
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
 ) -> DividedPush:
-    """Return a push of which parts of steps can be tried. Arguments as in `simulate`."""
+    """Prepare a push whose steps can be divided into parts (`substeps`). Arguments as in `simulate`."""
     poses = hand.poses(path)
     if fixtures:
         friction_at = _friction_among(fixtures, friction_at)
@@ -284,7 +286,7 @@ def divided_push(
 
 
 def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
-    """Return the same friction, but NaN, which makes every step INVALID, if the fixtures are not valid."""
+    """Return the same friction, which is NaN if a fixture is not valid, so that every step is INVALID."""
     is_valid = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(fixtures)))
     for fixture in fixtures:
         is_valid &= fixture.friction >= 0

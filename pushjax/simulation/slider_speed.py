@@ -13,27 +13,28 @@ from jaxtyping import Array, Bool
 
 from pushjax._math.vec import Scalar, Vec3
 
-# A slider may move by this multiple of the largest displacement of a finger, and anyway by a fraction of the limit
-# surface's length: the first one in general, the second one in the smallest part of a step. Where a wedge closes and is
-# about to hold the slider, it may be fast even then.
-MAX_RATIO, ALWAYS_ALLOWED, ALLOWED_IN_SMALLEST = 4.0, 0.1, 1.0
+MAX_RATIO = 4.0  # a slider may move by this multiple of the largest displacement of a finger
+ALWAYS_ALLOWED = 0.1  # it may always move by this fraction of the limit surface's length
+# In the smallest part of a step it may move by this fraction. Where a wedge closes and is about to hold the slider, the
+# slider may be fast even then.
+ALLOWED_IN_SMALLEST = 1.0
 
 
-class SliderSpeed(NamedTuple):
+class SpeedJudgment(NamedTuple):
     """Whether a slider moved no farther than it may.
 
     Attributes:
-        allowed: In the part of a step that was computed.
-        in_double: In a part of twice the size, at the same speed.
+        allowed: Whether it did so in the part of the step that was computed.
+        allowed_in_double: Whether it would do so in a part of twice the size, at the same speed.
     """
 
     allowed: Bool[Array, ""]
-    in_double: Bool[Array, ""]
+    allowed_in_double: Bool[Array, ""]
 
 
 def judge_speed(
     before: Vec3, after: Vec3, displacement: Scalar, length: Scalar, is_smallest: Bool[Array, ""]
-) -> SliderSpeed:
+) -> SpeedJudgment:
     """Judge how far a slider moved in a part of a step.
 
     Args:
@@ -50,4 +51,4 @@ def judge_speed(
         return multiple * motion <= jnp.maximum(multiple * MAX_RATIO * displacement, fraction * length)
 
     fraction = jnp.where(is_smallest, ALLOWED_IN_SMALLEST, ALWAYS_ALLOWED)
-    return SliderSpeed(is_allowed(1, fraction), is_allowed(2, ALWAYS_ALLOWED))
+    return SpeedJudgment(is_allowed(1, fraction), is_allowed(2, ALWAYS_ALLOWED))

@@ -43,7 +43,7 @@ from pushjax.simulation.finger_motion import (
     max_displacement,
     max_penetration,
 )
-from pushjax.simulation.slider_speed import SliderSpeed, judge_speed
+from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
 from pushjax.simulation.step import ScalarStep, step_in_scalars
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
@@ -257,7 +257,7 @@ def _decide(
     urgency_after: Urgency | None,
     depth: Scalar,
     tolerance: Scalar,
-    speed: SliderSpeed,
+    speed: SpeedJudgment,
 ) -> Decision:
     """Decide what follows from a trial.
 
@@ -305,7 +305,7 @@ def _next_state(
     outline: Outline,
     part: tuple[FingerMotion, ...],
     tolerance: Scalar,
-    speed: SliderSpeed,
+    speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
 ):
     """Return the state after a trial; and of the trial's step the record, whether it ended, and the index.
@@ -341,7 +341,7 @@ def _next_state(
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
     smaller = jnp.where(decision.joins, state.part, jnp.where(jams, JAM_PART, state.part / 2))
-    larger = jnp.where(state.halved | ~speed.in_double, state.part, 2 * state.part)
+    larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
     next_state = PushState(
         pose=tree_where(ends, end_record.pose, tree_where(continues, pose, state.pose)),
         origin=tree_where(ends, end_record.pose, state.origin),

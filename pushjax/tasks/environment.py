@@ -18,8 +18,9 @@ from pushjax._internal.checks import ArrayLike, as_float, check_shape
 from pushjax._internal.compaction import where_needed
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider

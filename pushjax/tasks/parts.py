@@ -16,7 +16,7 @@ from pushjax._internal.checks import (
     check_type,
 )
 from pushjax._math.vec import Vec2, cos_sin
-from pushjax.friction.random import FrictionModel
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.simulation.slider import Slider
 
 

@@ -1,7 +1,8 @@
 """Pictures of a block, its goal and what pushes it, in the colors and the layout of gym-pusht.
 
-A pixel is drawn from the signed distances of its center. Edges are soft over one pixel of the workspace. In gym-pusht
-they are as soft, because it draws the workspace with hard edges and then resizes the picture linearly.
+The color of a pixel depends on the signed distances of its center from the edges of what is drawn. Across an edge the
+color changes over one pixel of the workspace. So it does in gym-pusht, which draws the workspace with hard edges and
+then resizes the picture with linear interpolation.
 """
 
 from typing import NamedTuple
@@ -18,7 +19,9 @@ from pushjax.tasks.parts import placed
 
 WORKSPACE = 512.0  # side of the drawn square, px
 WALL_LOW, WALL_HIGH = 5.0, 506.0  # center lines of the walls, px
-LINE_HALF_WIDTH = 2.5  # of walls, and of the outline of block and agent, px
+# Half the width of walls and of the outline of the block, px. In `render_table` the border of a round finger, which
+# lies inside its circle, has this width.
+LINE_HALF_WIDTH = 2.5
 AGENT_RADIUS, AGENT_FILL_RADIUS = 15.0, 11.0  # px
 MARKER_ARM, MARKER_HALF_WIDTH = 21.0, 3.4  # of the cross at the action, px
 
@@ -107,8 +110,8 @@ def render_table(
         goal: Vertices of the goal, shape (goal_vertices, 2), m.
         hand: The hand.
         configuration: Its configuration, shape (dof,), m.
-        walls: The walls, m.
-        width: Width of what is drawn, m.
+        walls: The walls. What is behind them is drawn gray.
+        width: Width and height of the part of the table that is drawn, m.
         size: Width and height of the picture in pixels.
 
     Returns:
@@ -159,7 +162,7 @@ class _Pixels(NamedTuple):
 
 
 def _outline(pixels: _Pixels, vertices: Array, seams: tuple[tuple[int, int], ...] = ()) -> tuple[Array, Array]:
-    """Compare all pixels with a polygon.
+    """Return which pixels are inside a polygon, and how far each is from its outline.
 
     Args:
         pixels: The pixels.
@@ -182,12 +185,12 @@ def _outline(pixels: _Pixels, vertices: Array, seams: tuple[tuple[int, int], ...
 
 
 def _squared_distance(pixels: _Pixels, start: tuple[Array, Array], end: tuple[Array, Array]) -> Array:
-    """Return the squared distance of all pixels from a line between two points, shape (size, size), px^2."""
+    """Return the squared distance of all pixels from a line segment, shape (size, size), px^2."""
     edge_x, edge_y = end[0] - start[0], end[1] - start[1]
     scale = 1 / jnp.maximum(edge_x**2 + edge_y**2, jnp.finfo(edge_x.dtype).tiny)
     x, y = pixels.x - start[0], pixels.y - start[1]
-    share = jnp.clip(x * (edge_x * scale) + y * (edge_y * scale), 0, 1)
-    return (x - share * edge_x) ** 2 + (y - share * edge_y) ** 2
+    fraction = jnp.clip(x * (edge_x * scale) + y * (edge_y * scale), 0, 1)  # along the segment, of the nearest point
+    return (x - fraction * edge_x) ** 2 + (y - fraction * edge_y) ** 2
 
 
 class _Picture(NamedTuple):

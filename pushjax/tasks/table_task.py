@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type
 from pushjax._internal.jit import eager_context
 from pushjax._math.vec import cos_sin, norm
-from pushjax.friction.random import FrictionModel
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.intersection import intersection_area
 from pushjax.geometry.polygon import Polygon
 from pushjax.simulation.slider import Slider

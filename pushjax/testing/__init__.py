@@ -18,11 +18,11 @@ convex.
 """
 
 from pushjax.testing.batch import ProblemBatch as ProblemBatch
-from pushjax.testing.conditions import CLEAN as CLEAN
-from pushjax.testing.conditions import Violations as Violations
-from pushjax.testing.conditions import closing as closing
-from pushjax.testing.conditions import violations as violations
-from pushjax.testing.search import Searched as Searched
-from pushjax.testing.search import search as search
-from pushjax.testing.squeeze import squeeze_power as squeeze_power
-from pushjax.testing.squeeze import squeeze_power_enumerated as squeeze_power_enumerated
+from pushjax.testing.condition_violations import CLEAN as CLEAN
+from pushjax.testing.condition_violations import Violations as Violations
+from pushjax.testing.condition_violations import closing as closing
+from pushjax.testing.condition_violations import violations as violations
+from pushjax.testing.independent_search import SearchResult as SearchResult
+from pushjax.testing.independent_search import search as search
+from pushjax.testing.jam_check import squeeze_power as squeeze_power
+from pushjax.testing.jam_check import squeeze_power_enumerated as squeeze_power_enumerated

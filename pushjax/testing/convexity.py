@@ -15,17 +15,19 @@ from jaxtyping import Array, Float
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax.friction.quartic import MONOMIALS
 
-# Directions of the sweep over the half sphere, how many of them are refined, and the rounds of refinement.
-RAYS, REFINED, ROUNDS = 200, 4, 12
+# Number of directions F, on the half sphere, at which the Hessian is evaluated; how many of them are refined; and the
+# rounds of refinement.
+DIRECTIONS, REFINED, ROUNDS = 200, 4, 12
 BATCH = 20_000  # quartics that are checked at once, to bound the memory
 
 
 def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
-    """Return the smallest curvature of each quartic: the minimum of z' hess H(F) z over unit F and z.
+    """Return the smallest curvature that a search finds: the minimum of z' hess H(F) z over unit F and z.
 
-    The Hessian is evaluated at 200 rays. From the four lowest, F and z are improved in turns: z becomes the eigenvector
-    of the smallest eigenvalue of the Hessian at F, then F that of the Hessian at z (the form is symmetric in F and z).
-    Each step can only lower the value. Computed in float64, whatever the dtype of the coefficients.
+    But for roundoff, the result is never below the true minimum. The Hessian is evaluated in 200 directions F. From the
+    four lowest, F and z are improved in turns: z becomes the eigenvector of the smallest eigenvalue of the Hessian at
+    F, then F that of the Hessian at z (the form is symmetric in F and z). Each step can only lower the value. Computed
+    in float64, whatever the dtype of the coefficients.
 
     Args:
         coefficients: Coefficients (n, 15) in the order of `Quartic`.
@@ -37,6 +39,7 @@ def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
     found = []
     for begin in range(0, len(array), BATCH):
         chunk = array[begin : begin + BATCH]
+        # the last chunk is padded, so that one compiled program serves all chunks
         padded = (
             np.concatenate([chunk, np.repeat(chunk[-1:], BATCH - len(chunk), axis=0)]) if len(array) > BATCH else chunk
         )
@@ -55,13 +58,13 @@ def _float64() -> Any:
 def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
     """Return the smallest curvature of each quartic; see `least_curvatures`."""
     c = c / jnp.max(jnp.abs(c), axis=1, keepdims=True)
-    rays = jnp.asarray(fibonacci_hemisphere(RAYS), c.dtype)
+    directions = jnp.asarray(fibonacci_hemisphere(DIRECTIONS), c.dtype)
     table = jnp.asarray(_HESSIAN, c.dtype)  # (6, 6, 15): Hessian entry, product of two coordinates of F, coefficient
-    hessians = jnp.einsum("epm,rp,nm->ern", table, _products(rays), c)
+    hessians = jnp.einsum("epm,rp,nm->ern", table, _products(directions), c)
     lowest = _least_eigenvalue(*hessians)
     best = jax.lax.top_k(-lowest.T, REFINED)[1].T  # (refined, n)
     refine = jax.vmap(jax.vmap(partial(_refined, table)), in_axes=(0, None))
-    return jnp.min(refine(rays[best], c), axis=0)
+    return jnp.min(refine(directions[best], c), axis=0)
 
 
 def _refined(table: Array, f: Float[Array, "3"], c: Float[Array, "15"]) -> Array:

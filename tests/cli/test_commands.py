@@ -71,6 +71,7 @@ def table(data, tmp_path_factory):
     return read(folder / "table2.json")
 
 
+@pytest.mark.long
 def test_table2_is_as_good_as_the_paper(table):
     assert len(table["cells"]) == 32
     ideal = [cell for cell in table["cells"] if cell["method"] == "ideal"]
@@ -119,6 +120,7 @@ def test_table2_no_push_fails_or_blows_up(table):
         assert 0 < cell["ci95_mm"] < cell["mean_mm"]
 
 
+@pytest.mark.long
 def test_jam(tmp_path, capsys):
     cli.main(["reproduce", "jam", "--out", str(tmp_path), "--json", str(tmp_path / "jam.json")])
     record = json.loads((tmp_path / "jam.json").read_text())
@@ -322,6 +324,7 @@ def random_record(tmp_path_factory):
     return run
 
 
+@pytest.mark.long
 def test_stochastic_push(random_record):
     _, record = random_record("stochastic-push")
     assert record["n"] == 60

@@ -75,6 +75,7 @@ move = jax.jit(jax.vmap(moved, in_axes=(0, None)))
 pace = jax.jit(jax.vmap(lambda given: jax.jvp(lambda t: moved(given, t), (0.0,), (1.0,))[1]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.long), 4])
 def test_derivatives_are_those_of_the_solution(count, degree):

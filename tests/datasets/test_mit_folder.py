@@ -20,7 +20,7 @@ from pushjax.datasets import (
     parse_push_name,
 )
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.pushes import rotation
+from pushjax.datasets.push_log import rotation
 
 SAMPLES = {  # in PUSHJAX_DATA/raw/mit_push_full: speed m/s, side, fraction, angle rad
     "motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349.json": (0.15, 1, 0.0, -0.349),

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from pushjax.datasets.pushes import LogError
+from pushjax.datasets.push_log import LogError
 from pushjax.datasets.two_finger import load_two_finger_npz
 from pushjax.datasets.two_finger_logs import load_two_finger_logs
 

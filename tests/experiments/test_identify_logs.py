@@ -21,7 +21,7 @@ from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identification.noise import _LogNoise, _score
 from pushjax.identification.predictive import PredictiveModel
-from pushjax.identification.recordings import screen
+from pushjax.identification.pushes_of_recordings import screen
 from pushjax.identification.uncertainty import bootstrap, profile_interval
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
@@ -116,6 +116,7 @@ def report(log, tmp_path_factory):
     return out, json.loads((out / "id.json").read_text())
 
 
+@pytest.mark.long
 def test_a_csv_tells_friction_and_inset(report):
     out, record = report
     assert (record["experiment"], record["pushes"], record["failed_steps"]) == ("identify", 16, 0)
@@ -328,6 +329,7 @@ def test_logs_that_tell_less_than_others(log, block):
         assert (pushes.poses_between.shape[-2], pushes.wrench.shape[-2]) == shapes
 
 
+@pytest.mark.long
 def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
     """Pushes have no weight here for the surface: it is identified from the wrenches alone."""
     recordings = screen(load_recordings(log), block, pj.Hand.finger(RADIUS))
@@ -360,6 +362,7 @@ def found(few, block, surface):
     return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None, inset=0.002), sigma=NOISE)
 
 
+@pytest.mark.long
 def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.profile(few, slider, hand, "friction", points=3)
@@ -376,6 +379,7 @@ def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
         found.profile(few, slider, hand, "surface.0")
 
 
+@pytest.mark.long
 def test_bootstrap(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     estimates, z = bootstrap(jax.random.key(0), found, few, slider, hand, 40)

@@ -110,6 +110,7 @@ def test_real_archives(logs):
         assert np.mean(means) == pytest.approx(expected, abs=0.3)
 
 
+@pytest.mark.long
 def test_outlines(logs):
     """The outlines agree with the published vertices.
 
@@ -179,6 +180,7 @@ def test_filled_up(logs):
     np.testing.assert_allclose(pushes.path[3, 5], (log.whole.tip_start[rows[3]] + log.whole.tip_end[rows[3]]) / 2)
 
 
+@pytest.mark.long
 def test_experiment(logs, data, monkeypatch, tmp_path):
     """With ellipsoids for one object, results are as good as the paper's from forces, and no worse with calibration."""
     monkeypatch.setattr(experiment, "MODELS", {"ellipsoid": 2})
@@ -207,10 +209,10 @@ def test_an_interrupted_run_goes_on(logs, data, monkeypatch, tmp_path):
         calls.append(setting)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return methods.Predicted(np.zeros((196, 3)), 0.2, 0, None)
+        return methods.Prediction(np.zeros((196, 3)), 0.2, 0, None)
 
     monkeypatch.setattr(experiment, "METHODS", {"identified": guess})
-    monkeypatch.setattr(experiment, "Setting", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
+    monkeypatch.setattr(experiment, "ConditionData", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
     monkeypatch.setattr(experiment, "_draw", lambda cells, out: [])
     choice = {"surface": ("abs",), "object": ("rect1",), "method": ("identified",), "out": tmp_path}
     with pytest.raises(KeyboardInterrupt):

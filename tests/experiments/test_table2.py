@@ -34,6 +34,7 @@ def few(data, tmp_path_factory):
         return table2.run(data, out=out, steps=15, method=("ideal", "wrench_twist")), out
 
 
+@pytest.mark.long
 def test_cells_say_why_they_have_no_figure(few):
     missing = {
         (cell["method"], cell["model"], cell["object"]): cell["missing"]
@@ -93,14 +94,14 @@ def test_few_or_no_pushes():
     train = np.zeros((2, 40), bool)
     train[:, :20] = True
     for method in ("ideal", "wrench_twist", "identified"):
-        assert conditions.obstacle(train, method, "quartic") is None
-        assert conditions.obstacle(None, method, "ellipsoid") == "no log"
-        assert conditions.obstacle(train[:, :1], method, "ellipsoid") == "1 push, needs 2"
+        assert conditions.reason_missing(train, method, "quartic") is None
+        assert conditions.reason_missing(None, method, "ellipsoid") == "no log"
+        assert conditions.reason_missing(train[:, :1], method, "ellipsoid") == "1 push, needs 2"
     for count, model in ((15, "quartic"), (6, "ellipsoid")):
         few, enough = (np.arange(40)[None] < each for each in (count - 1, count))
-        assert conditions.obstacle(enough, "wrench_twist", model) is None
-        assert conditions.obstacle(few, "wrench_twist", model) == f"{count - 1} pairs, needs {count}"
-        assert conditions.obstacle(few, "identified", model) is None
+        assert conditions.reason_missing(enough, "wrench_twist", model) is None
+        assert conditions.reason_missing(few, "wrench_twist", model) == f"{count - 1} pairs, needs {count}"
+        assert conditions.reason_missing(few, "identified", model) is None
         with pytest.raises(ValueError, match=f"{count - 1} pairs; a surface .* needs at least {count}"):
             pj.fit_limit_surface(np.ones((count - 1, 3)), np.ones((count - 1, 3)), 1.0, degree=conditions.MODELS[model])
 

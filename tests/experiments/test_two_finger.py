@@ -187,6 +187,7 @@ def record(data, tmp_path_factory):
     return json.loads((folder / "record.json").read_text())
 
 
+@pytest.mark.long
 def test_predicts_the_real_pushes(record):
     assert [cell["object"] for cell in record["cells"]] == list(OBJECTS)
     for cell in record["cells"]:

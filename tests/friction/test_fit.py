@@ -1,15 +1,11 @@
 """The fit is convex, as good as the semidefinite program, batched, and clear about bad input."""
 
-import importlib
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import pushjax as pj
-
-fit_module = importlib.import_module("pushjax.friction.fit")
 
 # A convex quartic need not be a sum of squared quadratics. This is the loss it may cost compared with the semidefinite
 # program over all sos-convex quartics. The largest on all 22 real sets is 0.4 %.
@@ -107,6 +103,7 @@ def test_quartic_reaches_the_semidefinite_optimum_on_real_pairs(data, name):
     assert surface.is_convex()
 
 
+@pytest.mark.long
 def test_every_real_fit_converges_and_is_convex(data):
     """All 22 real sets converge in one batch, padded to one length with pairs of weight zero."""
     sets = [real_pairs(data, file.stem) for file in sorted((data / "mit_push").glob("*.npz"))]

@@ -10,8 +10,8 @@ import pushjax as pj
 from pushjax._math.vec import Vec3
 from pushjax._math.wishart import sample_wishart
 from pushjax.friction.convexity import Gram, antisymmetric_of, coefficients_of, max_feasible_scale
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.quartic import MONOMIALS, least_curvature
-from pushjax.friction.random import FrictionModel
 from pushjax.friction.sum_of_squares import decompose, squared_quadratics
 from pushjax.testing.convexity import least_curvatures
 
@@ -73,6 +73,7 @@ def test_a_gram_matrix_is_one(quartic, rng):
     np.testing.assert_allclose(antisymmetric_of(gram.symmetric), n, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.long
 def test_certificate_agrees_with_the_sweep(quartic):
     """The certificate agrees with the sweep on Wishart samples before repair, and on the repaired quartics."""
     c, pull = sampled(FrictionModel(dof=12, friction=0.3), quartic)

@@ -106,6 +106,37 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     np.testing.assert_allclose(predicted.pose[:, -1], others.end, atol=2e-6)
 
 
+def test_known_parameters(square, hand, tmp_path):
+    """Friction is recovered from paths as logged if it is known how far off the robot was."""
+    starts, paths = planned(np.random.default_rng(6), 12)
+    surface = pj.Ellipsoid(np.eye(3), 0.03)
+    true_paths = jax.vmap(lambda path: correct_path(path, 0.002, 0.0, jnp.array([0.001, -0.001])))(jnp.asarray(paths))
+    slider = pj.Slider(square, surface)
+    logged = pj.Pushes(starts, paths, pushed(slider, hand, MU, jnp.asarray(starts), true_paths))
+    known = {"overshoot": 0.002, "hand_offset": [0.001, -0.001]}
+    found = pj.identify(logged, slider, hand, pj.Unknowns(surface_dof=None), known=known, sigma=1e-4)
+    assert found.labels == ("friction",)
+    assert float(found.friction) == pytest.approx(MU, rel=1e-4)
+    assert float(jnp.abs(found.residual).max()) < 1e-6
+    found.save(tmp_path / "found.json")
+    again = pj.Identified.load(tmp_path / "found.json")
+    for name, value in known.items():
+        np.testing.assert_array_equal(getattr(again.parameters, name), value)
+    for wrong, message in (
+        ({"overshot": 0.0}, "known: 'overshot' is not one of pressure_center, inset, overshoot"),
+        ({"friction": 0.2}, "known: 'friction' is not one of .*; there is the argument friction"),
+        ({"hand_offset": 0.001}, r"known: 'hand_offset' has shape \(\); expected \(2,\), or \(1, 2\)"),
+        ({"overshoot": np.nan}, r"known\['overshoot'\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            pj.identify(logged, slider, hand, known=wrong)
+    with pytest.raises(ValueError, match="known: 'inset' is also estimated"):
+        pj.identify(logged, slider, hand, pj.Unknowns(inset=0.001), known={"inset": 0.001})
+    two_fingers = pj.Hand.two_fingers(0.002)
+    with pytest.raises(ValueError, match="overlap is for a single round finger"):
+        pj.identify(pj.Pushes(starts, np.zeros((12, 3, 4)), starts), slider, two_fingers, known={"overlap": 1.0})
+
+
 def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     """Noise of half a millimeter is identified, intervals contain the truth, and three outliers have no effect."""
     rng = np.random.default_rng(4)
@@ -195,13 +226,13 @@ def test_conditions_share_the_calibration(square, hand):
 
     # derivatives of the residuals
     surface = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), pj.Ellipsoid(np.eye(3), length))
-    prior = Prior.of(unknowns, surface, jnp.asarray(0.25), jnp.zeros(2))
+    prior = Prior.of(unknowns, surface, {"friction": jnp.full(2, 0.25)}, jnp.zeros(2))
     problem = Problem(square, hand, surface, prior, jnp.asarray(0.05))
     z, h = jnp.asarray([-1.0, 0.3, 0.2, -0.4]), 1e-6
     at = eqx.filter_jit(problem.linearize)(z, many)
-    value, jacobian = at.value, problem.jacobian(z, at)
-    np.testing.assert_array_equal(problem.linear_residuals(z, at), value)
-    residuals = eqx.filter_jit(problem.residuals)
+    value, jacobian = at.value.poses, problem.jacobian(z, at).poses
+    np.testing.assert_array_equal(problem.linear_residuals(z, at).poses, value)
+    residuals = eqx.filter_jit(lambda z, pushes: problem.residuals(z, pushes).poses)
     np.testing.assert_allclose(value, residuals(z, many), atol=1e-15)
     for k in range(4):
         step = h * jnp.eye(4)[k]

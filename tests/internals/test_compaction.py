@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pushjax._internal.compaction import PLACES, TILE, Rounds, only_where, where_needed
+from pushjax._internal.compaction import PLACES, TILE, Rounds, where_needed, where_needed_without_derivatives
 
 
 def work(x, shared):
@@ -13,7 +13,8 @@ def work(x, shared):
 
 
 def chosen(needed, x, shared):
-    return only_where(needed, work, {"square": x, "sign": jnp.zeros((), jnp.int32)}, x, shared)
+    otherwise = {"square": x, "sign": jnp.zeros((), jnp.int32)}
+    return where_needed_without_derivatives(needed, work, otherwise, x, shared)
 
 
 def expected(needed, x, shared):
@@ -76,7 +77,8 @@ def collatz_of(start, limit):
 
 
 def rounds_of(needed, start, limit):
-    return only_where(needed, collatz, {"rounds": jnp.zeros((), jnp.int32), "last": start}, start, limit)
+    otherwise = {"rounds": jnp.zeros((), jnp.int32), "last": start}
+    return where_needed_without_derivatives(needed, collatz, otherwise, start, limit)
 
 
 @pytest.mark.parametrize("size", [1, 3, PLACES, PLACES + 1, 3 * PLACES + 7])

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning import Observation, Pace, PlanStatus, PositionControl, PushController, PushPlanner, Workspace
-from pushjax.planning.approach import TransitStatus
-from pushjax.planning.poses import compose, inverse, to_world
-from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.feedback.push_library import PushLibrary
+from pushjax.planning.transits.roadmap import TransitStatus
 
 shapely = pytest.importorskip("shapely")
 
@@ -100,17 +100,17 @@ def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
     assert 80 < allowed < 400
 
 
-def test_the_table_of_distances(slider, sparse):
-    """Where the slider is near, the table is off by less than three quarters of the spacing of its positions."""
-    rng, table = np.random.default_rng(2), sparse.space.table
+def test_the_grid_of_distances(slider, sparse):
+    """Where the slider is near, the grid is off by less than three quarters of the spacing of its positions."""
+    rng, grid = np.random.default_rng(2), sparse.space.distances
     poses = np.column_stack([rng.uniform(0.1, 0.4, (800, 2)), rng.uniform(-9, 9, 800)])
     apart = np.array([placed(slider, pose).distance(WORLD) for pose in poses])
     near = (apart > 0) & (apart < sparse.clearance)
     assert near.sum() > 10
-    assert np.abs(table(poses) - apart)[near].max() < 0.75 * table.spacing
-    assert (table(poses)[apart > 3 * sparse.clearance] > sparse.clearance).all()
+    assert np.abs(grid(poses) - apart)[near].max() < 0.75 * grid.spacing
+    assert (grid(poses)[apart > 3 * sparse.clearance] > sparse.clearance).all()
     overlap = np.array([placed(slider, pose).intersection(WORLD).area for pose in poses]) > 3e-4
-    assert (table(poses)[overlap] < 0).all()
+    assert (grid(poses)[overlap] < 0).all()
 
 
 def test_plans_run_into_no_fixture(slider, sparse):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pushjax.planning.approach import Roadmap, TransitStatus, run_ups
-from pushjax.planning.clearance import inside, offset_curve, point_clearance, segment_clearance
-from pushjax.planning.poses import to_body, to_world
+from pushjax.geometry.polygon_numpy import inside, offset_curve, segment_distances, signed_distances
+from pushjax.geometry.se2_numpy import to_body, to_world
+from pushjax.planning.transits.roadmap import Roadmap, TransitStatus, run_ups
 from pushjax.planning.workspace import Workspace
 
 shapely = pytest.importorskip("shapely")
@@ -46,9 +46,9 @@ def test_distances_are_those_of_shapely():
         ends = rng.uniform(-0.15, 0.15, (200, 2))
         assert np.array_equal(inside(vertices, points), shapely.contains_xy(polygon, points))
         apart = np.array([polygon.exterior.distance(shapely.Point(p)) for p in points])
-        np.testing.assert_allclose(np.abs(point_clearance(vertices, points)), apart, atol=1e-12)
+        np.testing.assert_allclose(np.abs(signed_distances(vertices, points)), apart, atol=1e-12)
         wanted = [shapely.LineString(pair).distance(polygon) for pair in zip(points, ends, strict=True)]
-        np.testing.assert_allclose(np.maximum(segment_clearance(vertices, points, ends), 0), wanted, atol=1e-12)
+        np.testing.assert_allclose(np.maximum(segment_distances(vertices, points, ends), 0), wanted, atol=1e-12)
 
 
 def test_offset_curve_is_at_its_distance():
@@ -69,7 +69,7 @@ def found_transits():
     for vertices in map(counterclockwise, polygons(40)):
         anywhere = rng.uniform(-0.2, 0.2, (20, 2))
         touching = offset_curve(vertices, RADIUS + 1e-6, 30).points
-        starts = np.concatenate([anywhere[point_clearance(vertices, anywhere) > RADIUS], touching[::6]])
+        starts = np.concatenate([anywhere[signed_distances(vertices, anywhere) > RADIUS], touching[::6]])
         roadmap = Roadmap(vertices, RADIUS, CLEARANCE, np.concatenate([anywhere, touching]))
         pose = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-4, 4)])
         for start in to_world(pose, starts):
@@ -133,7 +133,7 @@ def test_transits_stay_in_the_workspace():
     for _ in range(60):
         pose = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(-4, 4)])
         start = rng.uniform(-0.1, 0.1, 2)
-        if point_clearance(L, to_body(pose, start)) < RADIUS:
+        if signed_distances(L, to_body(pose, start)) < RADIUS:
             continue
         transits = roadmap.transits(start, pose, limits)
         for goal in range(0, len(goals), 7):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning import finger_motion
-from pushjax.planning.approach import TransitStatus
-from pushjax.planning.between_pushes import transits_between
-from pushjax.planning.poses import compose, inverse, to_world
+from pushjax.planning.transits.between_pushes import transits_between
+from pushjax.planning.transits.roadmap import TransitStatus
 
 shapely = pytest.importorskip("shapely")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
+from pushjax.planning.feedback.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 
 RADIUS, STEPS, NOISE = 0.01, 8, 2e-4
 SLIDER = pj.Slider(pj.Polygon.rectangle(0.1, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), 0.04))
@@ -84,6 +84,7 @@ def energy_scores(draws, truth):
     return (to_truth - pairs / (2 * DRAWN * (DRAWN - 1))).mean(1)
 
 
+@pytest.mark.long
 def test_pushes_that_were_not_seen_are_predicted_better_than_before(worlds):
     before, after = (energy_scores(draws, worlds.unseen) for draws in (worlds.prior_draws, worlds.belief_draws))
     gained = before - after

@@ -41,7 +41,7 @@ def moved(push, poses):
 
 @pytest.mark.parametrize("symmetry", [1, 2, 4, (0.0, 1.0)])
 def test_errors_from_the_nearest_equivalent_goal(symmetry):
-    goal = Goal((0.1, -0.2, 3.0), symmetry=symmetry, length=0.04, position=0.005, angle=0.1)
+    goal = Goal((0.1, -0.2, 3.0), symmetry=symmetry, length=0.04, position_tolerance=0.005, angle_tolerance=0.1)
     poses = RNG.normal(size=(200, 3)) * [0.01, 0.01, 9.0] + [0.1, -0.2, 3.0]
     turns = 2 * np.pi * np.arange(symmetry) / symmetry if np.ndim(symmetry) == 0 else np.array(symmetry)
     away = np.abs(np.angle(np.exp(1j * (poses[:, 2:] - 3.0 - turns)))).min(axis=1)
@@ -75,7 +75,7 @@ def test_costs_by_their_definitions(push):
     np.testing.assert_allclose(Travel()(push), np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
     assert Missed(Goal(pose[-1]))(push) == 0
     assert Missed(elsewhere)(push) == 1
-    at_border = Goal(pose[-1] + np.array([0.005, 0, 0]), position=0.005)
+    at_border = Goal(pose[-1] + np.array([0.005, 0, 0]), position_tolerance=0.005)
     np.testing.assert_allclose(Missed(at_border, width=0.3)(push), 0.5, atol=1e-9)
     total = FinalPose(goal) + 3.0 * Travel() + Work() * 2
     np.testing.assert_allclose(total(push), FinalPose(goal)(push) + 3 * Travel()(push) + 2 * Work()(push))
@@ -185,8 +185,8 @@ def test_risks_of_few_and_of_infinite_costs():
 def test_bad_input():
     with pytest.raises(ValueError, match=r"pose has shape \(2,\); expected \(3,\)"):
         Goal((0, 0))
-    with pytest.raises(ValueError, match="position must be positive; got 0"):
-        Goal((0, 0, 0), position=0)
+    with pytest.raises(ValueError, match="position_tolerance must be positive; got 0"):
+        Goal((0, 0, 0), position_tolerance=0)
     with pytest.raises(ValueError, match="symmetry must be a whole number, at least 1; got 0"):
         Goal((0, 0, 0), symmetry=0)
     with pytest.raises(ValueError, match="symmetry must have at least one turn"):

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.geometry import se2
-from pushjax.planning import poses
-from pushjax.planning.cost_to_go import CostToGo, cost_to_go
+from pushjax.geometry import se2, se2_numpy
+from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.feedback.push_library import PushLibrary, digest, fan, pose_features
 from pushjax.planning.pace import Pace
-from pushjax.planning.push_library import PushLibrary, digest, fan
 from pushjax.planning.workspace import Extent, Workspace
 
 RADIUS, FRICTION = 0.01, 0.2
@@ -32,10 +31,10 @@ def test_numpy_poses_agree_with_se2():
     a, b = rng.normal(0, 2, (2, 50, 3))
     points = rng.normal(0, 1, (50, 2))
     close = {"atol": 1e-5}
-    np.testing.assert_allclose(poses.compose(a, b), se2.compose(a, b), **close)
-    np.testing.assert_allclose(poses.inverse(a), se2.inverse(a), **close)
-    np.testing.assert_allclose(poses.to_world(a, points), se2.transform(a, points), **close)
-    np.testing.assert_allclose(poses.to_body(a, poses.to_world(a, points)), points, atol=1e-12)
+    np.testing.assert_allclose(se2_numpy.compose(a, b), se2.compose(a, b), **close)
+    np.testing.assert_allclose(se2_numpy.inverse(a), se2.inverse(a), **close)
+    np.testing.assert_allclose(se2_numpy.to_world(a, points), se2.transform(a, points), **close)
+    np.testing.assert_allclose(se2_numpy.to_body(a, se2_numpy.to_world(a, points)), points, atol=1e-12)
 
 
 def test_features_are_a_distance_of_poses():
@@ -45,14 +44,14 @@ def test_features_are_a_distance_of_poses():
     near = a + 1e-5 * rng.normal(0, 1, 3)
 
     def apart(p, q):
-        return np.linalg.norm(poses.pose_features(p, center, length) - poses.pose_features(q, center, length))
+        return np.linalg.norm(pose_features(p, center, length) - pose_features(q, center, length))
 
-    shift = poses.to_world(near, center) - poses.to_world(a, center)
+    shift = se2_numpy.to_world(near, center) - se2_numpy.to_world(a, center)
     wanted = np.sqrt(np.sum(shift**2) + (length * (near[2] - a[2])) ** 2)
     assert apart(a, near) == pytest.approx(wanted, rel=1e-6)
     assert apart(a, a + np.array([0, 0, 2 * np.pi])) < 1e-12
     # a motion of the world changes no distance
-    assert apart(poses.compose(move, a), poses.compose(move, near)) == pytest.approx(apart(a, near), rel=1e-6)
+    assert apart(se2_numpy.compose(move, a), se2_numpy.compose(move, near)) == pytest.approx(apart(a, near), rel=1e-6)
 
 
 def test_an_outcome_is_that_of_a_push_anywhere(slider, library):
@@ -64,7 +63,7 @@ def test_an_outcome_is_that_of_a_push_anywhere(slider, library):
     path = library.starts[push] + library.travel[: index + 1, None] * library.directions[push]
     hand = pj.Hand.finger(RADIUS)
     moved = pj.rollout(slider, hand, se2.transform(pose, path), pose=pose, friction=FRICTION)
-    np.testing.assert_allclose(moved.pose[-1], poses.compose(pose, library.relative[entry]), atol=1e-5)
+    np.testing.assert_allclose(moved.pose[-1], se2_numpy.compose(pose, library.relative[entry]), atol=1e-5)
 
 
 def test_every_push_moves_the_slider_away_from_the_finger(library):
@@ -74,10 +73,10 @@ def test_every_push_moves_the_slider_away_from_the_finger(library):
     assert library.valid[:, -1].mean() > 0.5
     touched = library.valid[:, -1]
     contact = library.starts + RADIUS * library.directions
-    displacement = poses.to_world(last, contact) - contact
+    displacement = se2_numpy.to_world(last, contact) - contact
     assert ((displacement * library.directions).sum(1)[touched] > 0).mean() > 0.95
     # and the finger does not end in the slider
-    body = poses.to_body(last, finger)
+    body = se2_numpy.to_body(last, finger)
     depth = np.minimum(0.05 + RADIUS - np.abs(body[:, 0]), 0.03 + RADIUS - np.abs(body[:, 1]))
     assert depth.max() < RADIUS + 1e-4
 
@@ -85,10 +84,10 @@ def test_every_push_moves_the_slider_away_from_the_finger(library):
 def test_poses_reaching_a_goal(library):
     """From each of them its push leads to the goal, and the tree finds it there."""
     back = library.poses_reaching(GOAL)
-    reached = poses.compose(back, library.relative)
+    reached = se2_numpy.compose(back, library.relative)
     np.testing.assert_allclose(reached[:, :2], np.broadcast_to(GOAL[:2], reached[:, :2].shape), atol=FLOAT32)
     some = back[::501]
-    wanted = poses.compose(poses.inverse(some), np.broadcast_to(GOAL, some.shape))
+    wanted = se2_numpy.compose(se2_numpy.inverse(some), np.broadcast_to(GOAL, some.shape))
     distance, index = library.nearest(wanted, 3, 0.01)
     assert distance.shape == index.shape == (len(some), 3)
     assert distance[:, 0].max() < 2 * FLOAT32
@@ -177,7 +176,7 @@ def test_cost_to_go_of_pushes(library, costs):
     value, limits, time, vertices = costs
     back = library.poses_reaching(GOAL)
     within = Extent(vertices).outside(back, limits) == 0
-    within &= limits.allows_finger(poses.to_world(back, library.starts[library.entries[:, 0]]))
+    within &= limits.allows_finger(se2_numpy.to_world(back, library.starts[library.entries[:, 0]]))
     excess = value.nearest(back[within]) - (time[within] + 5)
     assert np.median(excess) < 5
     at_goal, beside, far = (value(GOAL + np.array([x, 0, 0.0])) for x in (0.0, -0.06, -0.16))
@@ -195,9 +194,9 @@ def test_cost_to_go_is_a_fixed_point(library, costs):
     for _ in range(40):
         cell = np.array([*rng.integers(6, 30, 2), rng.integers(36)])
         here = np.array([*(value.origin + value.spacing * cell[:2]), cell[2] * np.pi / 18])
-        reached = poses.compose(here, library.relative)
+        reached = se2_numpy.compose(here, library.relative)
         good = Extent(vertices).outside(reached, limits) == 0
-        good &= limits.allows_finger(poses.to_world(here, library.starts[library.entries[:, 0]]))
+        good &= limits.allows_finger(se2_numpy.to_world(here, library.starts[library.entries[:, 0]]))
         best = np.min((time + 5 + value(reached))[good])
         gains.append(float(value(here)) - best)
     # pushes are rounded to cells, so single cells differ by about a step across one cell
@@ -220,7 +219,7 @@ def test_extent_is_that_of_the_corners(slider):
     rng = np.random.default_rng(5)
     where = np.column_stack([rng.uniform(0, 0.5, (200, 2)), rng.uniform(-9, 9, 200)])
     limits = Workspace.rectangle((0.1, 0.05), (0.4, 0.5))
-    corners = poses.to_world(where[:, None], vertices)
+    corners = se2_numpy.to_world(where[:, None], vertices)
     over = np.maximum(limits.slider_low - corners, corners - limits.slider_high).max((1, 2))
     found = Extent(vertices).outside(where, limits)
     assert (found >= np.maximum(over, 0) - 1e-6).all()  # never too small

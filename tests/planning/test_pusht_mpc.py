@@ -10,18 +10,18 @@ import pytest
 import pushjax as pj
 from pushjax.experiments import pusht_mpc
 from pushjax.experiments.pusht_mpc import experiment, player, setting
-from pushjax.planning import push_planner
-from pushjax.planning.clearance import outline_vertices, point_clearance
-from pushjax.planning.controller import Observation, PushController
-from pushjax.planning.coverage_table import CoverageTable
-from pushjax.planning.finger_control import FingerState, PositionControl
-from pushjax.planning.friction_filter import FrictionBelief, FrictionFilter
+from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
+from pushjax.planning.feedback import push_planner
+from pushjax.planning.feedback.controller import Observation, PushController
+from pushjax.planning.feedback.coverage_table import CoverageTable
+from pushjax.planning.feedback.finger_control import FingerState, PositionControl
+from pushjax.planning.feedback.friction_filter import FrictionBelief, FrictionFilter
+from pushjax.planning.feedback.planned_push import PlanStatus
+from pushjax.planning.feedback.push_library import PushLibrary
+from pushjax.planning.feedback.push_planner import PushPlanner
 from pushjax.planning.pace import Pace
-from pushjax.planning.planned_push import PlanStatus
-from pushjax.planning.poses import compose, inverse, to_body, to_world
 from pushjax.planning.push_batch import LEG, simulate_pushes
-from pushjax.planning.push_library import PushLibrary
-from pushjax.planning.push_planner import PushPlanner
 from pushjax.planning.workspace import Workspace
 
 RADIUS, ENOUGH = 0.015, 0.95
@@ -58,7 +58,7 @@ def play(made, seed, steps=150, slider=None, friction=None):
     while True:
         pose = np.array([*rng.uniform(0.12, 0.38, 2), rng.uniform(-3, 3)])
         finger = rng.uniform(0.05, 0.45, 2)
-        if point_clearance(made.planner.vertices, to_body(pose, finger)) > RADIUS:
+        if signed_distances(made.planner.vertices, to_body(pose, finger)) > RADIUS:
             break
     memory = made.initial_memory()
     for step in range(steps):
@@ -96,6 +96,7 @@ def adapting(rectangle):
     return PushController(planner, PositionControl(), friction=0.3, friction_filter=learning, prior=prior)
 
 
+@pytest.mark.long
 def test_an_adapting_controller_finds_the_friction_of_the_plant(adapting):
     """The plants have samples of the library; each of them comes to have most of the weight."""
     found = []

@@ -11,8 +11,8 @@ from pushjax.planning import (
     CrossEntropy,
     Goal,
     GradientRefinement,
-    Pushes,
     PushPlanStatus,
+    PushSequence,
     Selection,
     plan_pushes,
     push_outcomes,
@@ -25,6 +25,7 @@ HAND = pj.Hand.finger(RADIUS)
 MODEL = pj.FrictionModel(dof=50, friction=(0.2, 0.3))
 MINIMA = np.array([[1.0, -2.0, 0.5], [-3.0, 1.0, 2.0]])
 DEPTHS = np.array([1.0, 0.0])  # the second well is deeper
+TOLERANCES = {"position_tolerance": 0.008, "angle_tolerance": 0.3}  # m and rad
 
 
 def wells(parameters):
@@ -73,7 +74,7 @@ def test_a_push_starts_before_its_first_contact(slider, hand):
     """Shapely: disks touch the block where the path is as long as the clearance, and not before."""
     shapely = pytest.importorskip("shapely")
     opening = (0.03,) if hand.dof == 4 else ()
-    pushes = Pushes(length=0.05, steps=30, clearance=0.01, opening=opening)
+    pushes = PushSequence(length=0.05, steps=30, clearance=0.01, opening=opening)
     numbers = pushes.sample(KEY, 40)
     pose = jnp.array([0.3, -0.1, 2.0])
     paths = np.asarray(jax.jit(jax.vmap(lambda n: pushes.path(n, slider, hand, pose)))(jnp.asarray(numbers)))
@@ -91,7 +92,7 @@ def test_a_push_starts_before_its_first_contact(slider, hand):
 
 
 def test_a_bent_push_ends_where_a_straight_one_does(slider):
-    straight, bent = Pushes(length=0.05, steps=10), Pushes(length=0.05, steps=10, bends=2)
+    straight, bent = PushSequence(length=0.05, steps=10), PushSequence(length=0.05, steps=10, bends=2)
     numbers = np.array([0.3, 0.1, 0.7])
     pose = jnp.zeros(3)
     line = np.asarray(straight.path(jnp.asarray(numbers), slider, HAND, pose))
@@ -107,7 +108,7 @@ def test_a_bent_push_ends_where_a_straight_one_does(slider):
 
 SETTINGS = {
     "model": MODEL,
-    "pushes": Pushes(1, length=0.08, steps=8),
+    "pushes": PushSequence(1, length=0.08, steps=8),
     "samples": 16,
     "candidates": 256,
     "warm_up": (Selection(8), CrossEntropy(iterations=6, population=32)),
@@ -120,7 +121,9 @@ def easy(slider):
     """A goal that one push reaches: the mean of where such a push ends."""
     path = pj.line((-0.06, 0.0), (-0.03, 0.0), steps=8)[None]
     done = push_outcomes(KEY, slider, HAND, np.zeros(3), path, model=MODEL)
-    return Goal(np.asarray(done.pose).mean(axis=0), length=slider.surface.length, position=0.008, angle=0.3)
+    return Goal(
+        np.asarray(done.pose).mean(axis=0), length=slider.surface.length, position_tolerance=0.008, angle_tolerance=0.3
+    )
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +131,7 @@ def plan(slider, easy):
     return plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
 
 
+@pytest.mark.long
 def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
     assert plan.status is PushPlanStatus.FOUND
     assert plan.success >= 0.9
@@ -178,7 +182,7 @@ def test_a_belief_over_the_start(slider, easy, plan):
 
 def test_pushes_that_move_nothing_are_left_out(slider, easy):
     """At the goal already, the best push is one that misses the block: the plan has none."""
-    here = Goal((0, 0, 0), length=slider.surface.length, position=0.008, angle=0.3)
+    here = Goal((0, 0, 0), length=slider.surface.length, **TOLERANCES)
     plan = plan_pushes(KEY, slider, HAND, np.zeros(3), here, **SETTINGS)
     assert plan.status is PushPlanStatus.FOUND
     assert plan.success == 1
@@ -187,7 +191,7 @@ def test_pushes_that_move_nothing_are_left_out(slider, easy):
     assert plan.outcomes.poses.shape == (256, 1, 3)
 
 
-class One(Pushes):
+class One(PushSequence):
     """The same push for every candidate."""
 
     def sample(self, key, candidates):
@@ -231,7 +235,7 @@ def test_the_hand_stays_out_of_fixtures(slider, easy, plan):
 
 
 def test_an_unreachable_goal_has_a_status(slider):
-    goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, position=0.008, angle=0.3)
+    goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, **TOLERANCES)
     plan = plan_pushes(KEY, slider, HAND, np.zeros(3), goal, **SETTINGS)
     assert plan.status is PushPlanStatus.UNLIKELY
     assert plan.success == 0
@@ -264,4 +268,4 @@ def test_bad_input(slider, easy):
     with pytest.raises(ValueError, match="rate must be positive and finite; got 0"):
         GradientRefinement(rate=0)
     with pytest.raises(ValueError, match="length must be positive"):
-        Pushes(length=0.0)
+        PushSequence(length=0.0)

@@ -9,8 +9,8 @@ import pytest
 import pushjax as pj
 from pushjax._internal.jit import quick_jit
 from pushjax.planning import StableStatus, shortest_push, stable_contacts, stable_push
-from pushjax.planning.draws import draw_friction
-from pushjax.planning.line_contact import LineContact, turn
+from pushjax.planning.friction_samples import draw_friction
+from pushjax.planning.stable.line_contact import LineContact, turn
 
 WIDTH, HEIGHT, RADIUS, SPACING = 0.09, 0.06, 0.005, 0.04
 BLOCK, HAND = pj.Polygon.rectangle(WIDTH, HEIGHT), pj.Hand.two_fingers(RADIUS)
@@ -86,6 +86,7 @@ def steps_error(pushes):
     return 3 * np.sum(np.abs(turns) ** 3, axis=1, keepdims=True) / 24 * np.hypot(WIDTH, HEIGHT) + 1e-9
 
 
+@pytest.mark.long
 def test_no_slip_for_any_sampled_friction(slider, contacts, goals):
     assert [each.contact.edge for each in contacts] == [0, 1, 2, 3]
     pushes = [shortest_push(contacts, np.zeros(3), goal, steps=STEPS) for goal in goals]

@@ -25,6 +25,7 @@ def total(inputs, weights) -> jax.Array:
     return sum(jnp.sum(w * part) for w, part in zip(weights, (run.twist, run.wrench, run.force), strict=True))
 
 
+@pytest.mark.long
 def test_twist_wrench_and_force_of_every_step():
     """They are finite everywhere, and where a push is smooth they agree with central differences."""
     along = [directions()[k] for k in (0, 2, 3, 4, 13, 20)]
@@ -103,6 +104,7 @@ def one_step():
 AT = -1 / 16 - 1 / 128  # where the finger just touches, exact to the last bit
 
 
+@pytest.mark.long
 def test_a_step_that_moves_nothing_is_the_identity(one_step):
     """The derivative by the pose is the identity and all others are zero, from the side on which nothing happens."""
     rows = {
@@ -196,6 +198,7 @@ def _turns_too_far(forward, like):
 FEW, SLOTS = 240, 2
 
 
+@pytest.mark.long
 def test_forces_and_margin_of_several_contacts():
     """Derivatives by the displacements: forces where the motion is unique, margins everywhere, away from kinks."""
     surface, contacts = first(problems(SLOTS, 2, seed=21, condition=30.0, gaps=0.3), FEW)
@@ -260,6 +263,7 @@ def random_pushes():
     return lambda *given: jax.tree.map(np.asarray, program(jnp.array(given), keys))
 
 
+@pytest.mark.long
 def test_random_pushes_by_the_range_of_friction(random_pushes):
     """For each key, the derivative agrees with the difference of two pushes with it, if their modes are the same."""
     h = 1e-6

@@ -24,6 +24,7 @@ from benchmarks import overlaps, survey  # noqa: E402
 STARTS = 60
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("hand", "shape", "steps", "dtype"),
     [
@@ -139,6 +140,7 @@ def in_place(q):
 PAD, LONG_PAD = (pj.Hand((pj.Polygon.rectangle(*sides),), in_place, 3) for sides in ((0.03, 0.02), (0.05, 0.01)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("short", [0.0, 1e-9, -1e-9])
 @pytest.mark.parametrize("way", [(-1, -1), (-1, -0.3), (-0.3, -1), (-0.05, -1)])
 def test_a_pad_in_an_inner_corner_touches_both_edges(way, short):
@@ -250,6 +252,7 @@ def whole_step(push: pj.Trajectory, path, friction: float) -> pj.Trajectory:
     return pj.rollout(SLIDER, TWO, fine, pose=push.pose[-2], friction=friction)
 
 
+@pytest.mark.long
 def test_a_step_that_is_too_long_is_divided():
     """The last step closes until the rectangle is held, and turns it by 0.27 rad."""
     path = TURNING.at[-1, 3].set(CLOSED)
@@ -267,6 +270,7 @@ def test_a_step_that_is_too_long_is_divided():
     np.testing.assert_allclose(alone.overlap, push.overlap[-1], atol=1e-12)
 
 
+@pytest.mark.long
 def test_pushes_of_a_batch_divide_their_own_steps():
     """Some pushes divide a step, some end early, some never touch: each is the same in a batch as alone."""
     rows = np.array([[0.2, *START, CLOSED], [0.2, *START, 0.1], [0.5, 0, 0, 0, 0.06], [0.3, 0.5, 0, 0, 0.0772]])

@@ -24,7 +24,7 @@ from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parame
 from pushjax.experiments.identify_logs.options import Options
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
-from pushjax.identification.recordings import has_wrenches, observed_often_enough, screen
+from pushjax.identification.pushes_of_recordings import has_wrenches, observed_often_enough, screen
 from pushjax.identification.uncertainty import Profile, profile, scalar_positions
 
 MIN_PUSHES = 3  # pushes; from fewer the size of their errors cannot be told

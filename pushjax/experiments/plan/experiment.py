@@ -20,11 +20,11 @@ from pushjax._internal.record import result_record
 from pushjax.experiments._slider_options import expected_surface, parse_shape, parse_support
 from pushjax.experiments.plan.fixtures import parse_fixtures
 from pushjax.experiments.plan.options import Options
-from pushjax.planning import FinalPose, Goal, Pushes, PushPlan, PushPlanStatus, finger_motion, plan_pushes
-from pushjax.planning.approach import TransitStatus
-from pushjax.planning.between_pushes import FingerMotion
-from pushjax.planning.clearance import outline_vertices, point_clearance
-from pushjax.planning.poses import to_body
+from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import to_body
+from pushjax.planning import FinalPose, Goal, PushPlan, PushPlanStatus, PushSequence, finger_motion, plan_pushes
+from pushjax.planning.transits.between_pushes import FingerMotion
+from pushjax.planning.transits.roadmap import TransitStatus
 from pushjax.simulation.fixtures import Fixtures
 
 WAY_POINTS_FILE = "way_points.csv"
@@ -57,9 +57,14 @@ def run(
     support = parse_support(options.support, shape)
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
     slider = pj.Slider(shape, expected_surface(support, degree, seed))
-    position, angle = options.tolerance
     length = float(slider.surface.length)
-    goal = Goal(np.array(options.goal), position=position, angle=angle, length=length, symmetry=options.symmetry)
+    goal = Goal(
+        np.array(options.goal),
+        position_tolerance=options.tolerance[0],
+        angle_tolerance=options.tolerance[1],
+        length=length,
+        symmetry=options.symmetry,
+    )
     _check_distance(options, length)
     plan = _best(_plans(slider, hand, goal, fixtures, options, seed), options.attempts, progress)
     motion = None
@@ -82,7 +87,7 @@ def _check_finger(shape: pj.Shape, options: Options) -> None:
     """Raise ValueError if the finger overlaps the block, before anything is compiled."""
     if options.finger is None:
         return
-    apart = point_clearance(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
+    apart = signed_distances(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
     if apart < options.radius:
         raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
 
@@ -102,7 +107,7 @@ def _plans(
             np.array(options.start),
             goal,
             model=pj.FrictionModel(options.dof, options.friction),
-            pushes=Pushes(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
+            pushes=PushSequence(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
             success=options.success,
             fixtures=fixtures,
             finger=options.finger,

@@ -14,7 +14,7 @@ import pushjax as pj
 from pushjax.datasets.mit_folder import load_mit_folder
 from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, load_mit_pushes_npz
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.pushes import Floats, rotation
+from pushjax.datasets.push_log import Floats, rotation
 
 ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")

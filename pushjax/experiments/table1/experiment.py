@@ -1,7 +1,8 @@
 """Table 1 of the paper: eleven objects pushed along straight lines on two surfaces, predicted against measured.
 
-Surface and friction are learned from about eighty whole pushes of each object. The other pushes are predicted, from 10
-to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al. 2017, section VI.B, table 1).
+The limit surface and the friction of the finger are learned from about eighty whole pushes of each object. The other
+pushes are predicted, from 10 to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al.
+2017, section VI.B, table 1).
 The curated archives also hold what the authors' toolbox predicts for the same pushes.
 
 Deviations from the paper: there is one split, where the paper has ten. Pushes that the tracker lost are tested too, as
@@ -30,7 +31,7 @@ from pushjax.experiments.table1.conditions import (
     load,
     paper_mm,
 )
-from pushjax.experiments.table1.methods import METHODS, Predicted, Setting
+from pushjax.experiments.table1.methods import METHODS, ConditionData, Prediction
 from pushjax.experiments.table1.repeats import noise_floor_mm
 
 
@@ -74,10 +75,10 @@ def run(
     todo = []
     for log in logs:
         for model in MODELS:
-            setting = cache(partial(Setting.of, log, model, steps))  # made only if a cell is missing
+            condition = cache(partial(ConditionData.of, log, model, steps))  # made only if a cell is missing
             for name in method:
                 labels = {"surface": log.surface, "object": log.shape, "model": model, "method": name}
-                todo.append((labels, partial(_cell, log, model, METHODS[name], setting, seed)))
+                todo.append((labels, partial(_cell, log, model, METHODS[name], condition, seed)))
     cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
     means = {name: {model: _means_by_surface(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
@@ -86,10 +87,14 @@ def run(
 
 
 def _cell(
-    log: MitPushes, model: str, method: Callable[[Setting], Predicted], setting: Callable[[], Setting], seed: int
+    log: MitPushes,
+    model: str,
+    method: Callable[[ConditionData], Prediction],
+    condition: Callable[[], ConditionData],
+    seed: int,
 ) -> dict[str, Any]:
     """Compute the figures of one cell, apart from its labels and run time."""
-    predicted = method(setting())
+    predicted = method(condition())
     deviations = deviation_mm(log, predicted.final)
     toolbox = log.middle.toolbox.get(model)
     return {
@@ -97,12 +102,12 @@ def _cell(
         "ci95_bootstrap_mm": bootstrapped_ci95(deviations, np.random.default_rng(seed)),
         "median_mm": float(np.median(deviations)),
         "worst_mm": float(deviations.max()),
-        "valid_mm": float(deviations[log.middle.valid].mean()),
+        "valid_mm": float(deviations[log.middle.valid].mean()),  # without the pushes that the tracker lost
         "no_motion_mm": float(deviation_mm(log, log.middle.start).mean()),
         "paper_mm": paper_mm(log.surface, log.shape, model),
         "toolbox_mm": None if toolbox is None else float(deviation_mm(log, toolbox).mean()),
         "friction": predicted.friction,
-        "learned": int(np.sum(log.is_training & log.whole.valid)),
+        "learned": int(np.sum(log.is_training & log.whole.valid)),  # number of pushes, as "tested" is
         "tested": len(deviations),
         "failed_steps": predicted.failed,
         **_calibration(predicted),
@@ -110,7 +115,7 @@ def _cell(
     }
 
 
-def _calibration(predicted: Predicted) -> dict[str, Any]:
+def _calibration(predicted: Prediction) -> dict[str, Any]:
     """Return the other identified unknowns and the noise: lengths in mm, angles in degrees; {} if there are none."""
     if predicted.found is None:
         return {}
@@ -147,7 +152,10 @@ def _means_by_surface(cells: list[dict], method: str, model: str) -> dict[str, A
 
 
 def _mean_cell(cells: list[dict], model: str) -> dict[str, float | None]:
-    """Return the means over cells of one method and model."""
+    """Return the means over cells of one method and model.
+
+    `paper_percent` is not of these cells: the paper gives only the mean over all three surfaces.
+    """
     toolbox = [cell["toolbox_mm"] for cell in cells]
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in cells])),
@@ -189,7 +197,7 @@ def summary(record: dict[str, Any]) -> str:
             for surface in surfaces if mean else ():
                 there = mean[surface]
                 toolbox = there["toolbox_mm"]
-                by_toolbox = "" if toolbox is None else f", its program on these pushes {toolbox:.2f}"
+                by_toolbox = "" if toolbox is None else f", the authors' toolbox on these pushes {toolbox:.2f}"
                 lines.append(
                     f"{model:10}{surface:9} mean {there['mean_mm']:.2f} mm (paper {there['paper_mm']:.2f}"
                     f"{by_toolbox}), {there['percent']:.2f} % of the motion"

@@ -12,7 +12,6 @@ identified    Friction, surface, center of pressure, and the true positions of t
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -29,18 +28,16 @@ TRAINING_SIZE, TEST_SIZE = 128, 304
 # Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. All values were chosen
 # on the surface abs.
 SURFACE_DOF, PRESSURE_CENTER, INSET, HAND_OFFSET, FRAME_OFFSET = 10.0, 0.015, 0.001, 0.002, 0.001
-NO_ROOM = 1e-6  # prior standard deviation of what must not be fitted
 UNKNOWNS: dict[str, Any] = {
     "surface_dof": SURFACE_DOF,
     "pressure_center": PRESSURE_CENTER,
     "inset": INSET,
     "hand_offset": HAND_OFFSET,
     "frame_offset": FRAME_OFFSET,
-    "overlap": NO_ROOM,
 }
 
 
-class Predicted(NamedTuple):
+class Prediction(NamedTuple):
     """Predictions of the test pushes.
 
     Attributes:
@@ -56,8 +53,8 @@ class Predicted(NamedTuple):
     found: pj.Identified | None
 
 
-class Setting(NamedTuple):
-    """What both methods need of one object, with pushes as padded arrays.
+class ConditionData(NamedTuple):
+    """One object on one surface as both methods take it, with pushes as padded arrays.
 
     Attributes:
         training: Pushes to learn from.
@@ -78,8 +75,8 @@ class Setting(NamedTuple):
     length: float
 
     @staticmethod
-    def of(log: MitPushes, model: str, steps: int) -> "Setting":
-        """Build the setting of one object.
+    def of(log: MitPushes, model: str, steps: int) -> "ConditionData":
+        """Prepare the data of one object.
 
         Args:
             log: The pushes of the object.
@@ -89,7 +86,7 @@ class Setting(NamedTuple):
         rows = np.flatnonzero(log.is_training & log.whole.valid)
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
-        return Setting(
+        return ConditionData(
             padded_pushes(log, log.whole, rows, steps, TRAINING_SIZE),
             padded_pushes(log, log.whole, rows, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
             padded_pushes(log, log.middle, np.arange(len(log.middle)), steps, TEST_SIZE),
@@ -105,45 +102,47 @@ class Setting(NamedTuple):
         return pj.Slider(self.shape, self.surface)
 
 
-def wrench_twist(setting: Setting) -> Predicted:
+def wrench_twist(condition: ConditionData) -> Prediction:
     """Predict with the fitted surface and the friction that is best for the training pushes, on a grid."""
-    training, test = setting.training, setting.test
-    on_grid, _ = final_poses(setting.slider, setting.hand, training, jnp.asarray(FRICTIONS, training.path.dtype))
-    errors = pj.deviation(on_grid, training.end[None], setting.length)
+    training, test = condition.training, condition.test
+    on_grid, _ = final_poses(condition.slider, condition.hand, training, jnp.asarray(FRICTIONS, training.path.dtype))
+    errors = pj.deviation(on_grid, training.end[None], condition.length)
     best = FRICTIONS[int(np.argmin(np.asarray(errors @ training.weight)))]
-    final, failed = final_poses(setting.slider, setting.hand, test, jnp.asarray([best], training.path.dtype))
+    final, failed = final_poses(condition.slider, condition.hand, test, jnp.asarray([best], training.path.dtype))
     final, failed = (without_padding(values[0], test) for values in (final, failed))
-    return Predicted(final, float(best), int(failed.sum()), None)
+    return Prediction(final, float(best), int(failed.sum()), None)
 
 
-def identified(setting: Setting) -> Predicted:
+def identified(condition: ConditionData) -> Prediction:
     """Predict with everything that is identified from the final poses of the training pushes."""
-    found = fitted(setting.coarse, setting, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
-    predicted = found.predict(setting.test, setting.slider, setting.hand)
-    final, failed = (without_padding(values, setting.test) for values in (predicted.pose[:, -1], predicted.failed))
-    return Predicted(final, float(found.friction), int(failed.sum()), found)
+    found = fitted(condition.coarse, condition, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
+    predicted = found.predict(condition.test, condition.slider, condition.hand)
+    final, failed = (without_padding(values, condition.test) for values in (predicted.pose[:, -1], predicted.failed))
+    return Prediction(final, float(found.friction), int(failed.sum()), found)
 
 
-def fitted(pushes: pj.Pushes, setting: Setting, unknowns: pj.Unknowns, overlap: float = 0.0) -> pj.Identified:
+def fitted(pushes: pj.Pushes, condition: ConditionData, unknowns: pj.Unknowns, overlap: float = 1.0) -> pj.Identified:
     """Identify the unknowns, assuming that the finger touches the object at the end of most pushes.
 
-    Tip and object may overlap at the start of a push. One fraction of the overlap is real and pushes the object. The
-    rest is a measurement error. The fraction is imposed, not fitted. The training pushes are whole, from the touch on,
-    so they carry no information about it.
+    Tip and object may overlap at the start of a push. One part of the overlap is a measurement error, and the rest is
+    real and pushes the object. How large a part is known, not estimated: the training pushes are whole, from the touch
+    on, so they carry no information about it.
 
     Args:
         pushes: Pushes to learn from.
-        setting: The object, its hand and its length.
-        unknowns: What to find, with its priors. `overlap` must be one of the unknowns.
-        overlap: Fraction of the overlap at the start that pushes the object. The unknown `overlap` is one minus this.
-
-    Returns:
-        The result, with the unknown `overlap` imposed and the standard deviation of its prior set to 1.
+        condition: The object, its hand and its length.
+        unknowns: What to find, with its priors.
+        overlap: Fraction of the overlap at the start that is a measurement error, as in `pj.Unknowns`.
     """
-    found = pj.identify(pushes, setting.slider, setting.hand, unknowns, length=setting.length, contact_at_end=True)
-    is_overlap = jnp.asarray([label.startswith("overlap") for label in found.labels])
-    z_with_overlap = jnp.where(is_overlap, 1 - overlap, found.z).astype(found.z.dtype)
-    return eqx.tree_at(lambda f: (f.z, f.prior.unknowns.overlap), found, (z_with_overlap, jnp.ones_like(found.sigma)))
+    return pj.identify(
+        pushes,
+        condition.slider,
+        condition.hand,
+        unknowns,
+        known={"overlap": overlap},
+        length=condition.length,
+        contact_at_end=True,
+    )
 
 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}

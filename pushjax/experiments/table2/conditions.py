@@ -17,7 +17,7 @@ PAIRS, SPLITS = 400, 10
 COEFFICIENTS = {"quartic": 15, "ellipsoid": 6}  # a surface is fitted to at least as many pairs
 
 # Zhou et al. 2017, table 2: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
-# of the ratio of the two in percent.
+# of the ratio of the two in percent. The numbers of a tuple are in the order of OBJECTS.
 PAPER_MM = {
     ("hardboard", "quartic"): (3.52, 2.75, 2.92, 2.80),
     ("hardboard", "ellipsoid"): (3.82, 3.63, 3.35, 3.96),
@@ -43,7 +43,8 @@ class Geometry(NamedTuple):
 
 
 # nominal: the paper's setup. measured: according to the force sensor, contact began with the center of the finger 0.7
-# mm inside the nominal outline; and the log misses the last millimeter of the motion.
+# mm inside the nominal outline, so the finger is a point and the outline is 0.7 mm smaller; and the log misses the last
+# millimeter of the motion.
 GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 0.0007, True)}
 
 
@@ -61,7 +62,7 @@ def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
     if not known:
         first = "_".join(CONDITIONS[0])
         raise ValueError(
-            f"--data: expected {first}.npz, or published logs named {first}….txt, or another condition, in {folder}; "
+            f"folder: expected {first}.npz, or published logs named {first}….txt, or another condition, in {folder}; "
             "found none"
         )
     return known
@@ -87,7 +88,7 @@ def load(folder: Path, surface: str, name: str) -> PushLog | None:
     return load_triangle_log(originals[0], surface=surface, arrangement=name) if originals else None
 
 
-def obstacle(train: np.ndarray | None, method: str, model: str) -> str | None:
+def reason_missing(train: np.ndarray | None, method: str, model: str) -> str | None:
     """Say in a few words why a cell cannot be computed; None if it can.
 
     Args:
@@ -145,7 +146,7 @@ def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray
 
     Args:
         log: The pushes of a condition.
-        share: Fraction of the pushes to learn from.
+        share: Fraction of the pushes to learn from, more than a quarter and less than three quarters.
         rng: Random generator.
 
     Returns:

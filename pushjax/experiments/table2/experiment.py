@@ -40,11 +40,11 @@ from pushjax.experiments.table2.conditions import (
     Geometry,
     ideal_surface,
     load_all,
-    obstacle,
+    reason_missing,
     recorded,
     training,
 )
-from pushjax.experiments.table2.methods import FRICTIONS, Part, Predicted, Setup
+from pushjax.experiments.table2.methods import FRICTIONS, ConditionData, Part, Prediction
 
 Condition = tuple[str, str]  # surface and object
 COLUMN = 20  # width of a column of the printed table
@@ -86,8 +86,8 @@ def run(
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(methods.TRAIN_SHARE)}; got {unknown or 'none'}")
     say("table2: reading the logs")
-    logs, where = load_all(folder / "three_point_push"), GEOMETRIES[geometry]
-    pushes = {condition: recorded(log, where, steps) for condition, log in logs.items()}
+    logs, assumed = load_all(folder / "three_point_push"), GEOMETRIES[geometry]
+    pushes = {condition: recorded(log, assumed, steps) for condition, log in logs.items()}
     done, total = 0, len(MODELS) * sum(SPLITS if name == "identified" else len(logs) for name in method)
 
     @contextmanager
@@ -99,12 +99,12 @@ def run(
         progress(done, total)
 
     cells = [
-        cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, where, seed, part)
+        cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, assumed, seed, part)
     ]
     means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
     pictures = [] if out is None else _draw(cells, out)
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
-    settings |= where._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
+    settings |= assumed._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
     return result_record("table2", settings, cells=cells, means=means, pictures=pictures)
 
 
@@ -113,7 +113,7 @@ def _cells(
     model: str,
     logs: dict[Condition, PushLog],
     pushes: dict[Condition, pj.Pushes],
-    where: Geometry,
+    geometry: Geometry,
     seed: int,
     part: Part,
 ) -> list[dict[str, Any]]:
@@ -122,13 +122,15 @@ def _cells(
     seeds = {condition: seed + k for k, condition in enumerate(CONDITIONS)}
     rngs = {condition: np.random.default_rng(own) for condition, own in seeds.items()}
     train = {condition: training(log, methods.TRAIN_SHARE[method], rngs[condition]) for condition, log in logs.items()}
-    missing = {condition: obstacle(train.get(condition), method, model) for condition in CONDITIONS}
+    missing = {condition: reason_missing(train.get(condition), method, model) for condition in CONDITIONS}
     computed = [condition for condition, reason in missing.items() if reason is None]
-    setups = [
-        Setup(logs[each], pushes[each], ideal_surface(logs[each], model, jax.random.key(seeds[each])), train[each])
+    data = [
+        ConditionData(
+            logs[each], pushes[each], ideal_surface(logs[each], model, jax.random.key(seeds[each])), train[each]
+        )
         for each in computed
     ]
-    predicted = dict(zip(computed, _predict(method, model, setups, where, part), strict=True))
+    predicted = dict(zip(computed, _predict(method, model, data, geometry, part), strict=True))
     cells = []
     for surface, target in CONDITIONS:
         condition = surface, target
@@ -143,21 +145,21 @@ def _cells(
     return cells
 
 
-def _predict(method: str, model: str, setups: list[Setup], where: Geometry, part: Part) -> list[Predicted]:
+def _predict(method: str, model: str, data: list[ConditionData], geometry: Geometry, part: Part) -> list[Prediction]:
     """Predict conditions with one method, each part of the work within `part`."""
     words = f"{method.replace('_', '-')}, {model}"
     if method == "identified":
-        return methods.identified(setups, where, lambda split: part(f"{words}, {split}")) if setups else []
+        return methods.identified(data, geometry, lambda split: part(f"{words}, {split}")) if data else []
     predictions = []
-    for setup in setups:
-        with part(f"{words}, {setup.log.surface} {setup.log.arrangement}"):
+    for each in data:
+        with part(f"{words}, {each.log.surface} {each.log.arrangement}"):
             ideal = method == "ideal"
-            predictions.append(methods.ideal(setup, where) if ideal else methods.wrench_twist(setup, model, where))
+            predictions.append(methods.ideal(each, geometry) if ideal else methods.wrench_twist(each, model, geometry))
     return predictions
 
 
 def _cell(
-    pushes: pj.Pushes, length: float, found: Predicted, train: np.ndarray, rng: np.random.Generator
+    pushes: pj.Pushes, length: float, found: Prediction, train: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Compute the figures of the pushes that were not learned from, over all splits."""
     no_motion = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)

@@ -28,11 +28,11 @@ FRICTIONS = np.linspace(0.0, 0.8, 41)
 TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
 Part = Callable[[str], AbstractContextManager[None]]  # from a description of the work to the context of doing it
 IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same answer with more
-# Priors: the supports are known to about a millimeter, the robot's setup less well.
+# Priors: the supports are known to about a millimeter, the robot's condition less well.
 SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
 
 
-class Setup(NamedTuple):
+class ConditionData(NamedTuple):
     """One condition as the methods take it.
 
     Attributes:
@@ -48,7 +48,7 @@ class Setup(NamedTuple):
     train: np.ndarray
 
 
-class Predicted(NamedTuple):
+class Prediction(NamedTuple):
     """Predictions of one condition.
 
     Attributes:
@@ -62,64 +62,64 @@ class Predicted(NamedTuple):
     failed: int
 
 
-def ideal(setup: Setup, geometry: Geometry) -> Predicted:
+def ideal(condition: ConditionData, geometry: Geometry) -> Prediction:
     """Predict one condition with the known surface and the friction that is best for the training pushes, on a grid.
 
     Args:
-        setup: The condition.
+        condition: The condition.
         geometry: Where the finger really was.
     """
-    errors, failed = _deviations_on_grid(setup, setup.surface, geometry)
-    return _choose_friction(np.broadcast_to(errors, (len(setup.train), *errors.shape)), setup.train, failed)
+    errors, failed = _deviations_on_grid(condition, condition.surface, geometry)
+    return _choose_friction(np.broadcast_to(errors, (len(condition.train), *errors.shape)), condition.train, failed)
 
 
-def wrench_twist(setup: Setup, model: str, geometry: Geometry) -> Predicted:
+def wrench_twist(condition: ConditionData, model: str, geometry: Geometry) -> Prediction:
     """Predict one condition with a surface fitted to measured forces, and the best friction on a grid.
 
     Args:
-        setup: The condition. The fitted surfaces have the characteristic length of its surface.
+        condition: The condition. The fitted surfaces have the characteristic length of its surface.
         model: "quartic" or "ellipsoid".
         geometry: Where the finger really was.
     """
-    length = setup.surface.length
-    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in setup.log.wrench_twist_pairs())
+    length = condition.surface.length
+    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in condition.log.wrench_twist_pairs())
     errors, failed = [], 0
-    for trains in setup.train:
+    for trains in condition.train:
         surface = pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model])
-        split_errors, split_failed = _deviations_on_grid(setup, surface, geometry)
+        split_errors, split_failed = _deviations_on_grid(condition, surface, geometry)
         errors.append(split_errors)
         failed += int(split_failed.sum())
-    return _choose_friction(np.stack(errors), setup.train, np.asarray(failed))
+    return _choose_friction(np.stack(errors), condition.train, np.asarray(failed))
 
 
-def identified(setups: Sequence[Setup], geometry: Geometry, part: Part) -> list[Predicted]:
+def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Part) -> list[Prediction]:
     """Predict conditions with what is identified from the final poses of all of them at once.
 
     The conditions share the robot, whose geometry is not taken as given. The surface of each condition is the mean of
     its prior.
 
     Args:
-        setups: The conditions.
+        conditions: The conditions.
         geometry: Where the finger is assumed to have been, as the mean of the prior.
         part: Context in which each split is computed.
 
     Returns:
         One prediction per condition.
     """
-    first = setups[0]
-    fine = pj.Pushes.conditions([setup.pushes for setup in setups])
+    first = conditions[0]
+    fine = pj.Pushes.conditions([condition.pushes for condition in conditions])
     steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
-    pushes = pj.Pushes.conditions([recorded(setup.log, geometry, steps) for setup in setups])
-    surfaces = jax.tree.map(lambda *each: jnp.stack(each), *(setup.surface for setup in setups))
+    pushes = pj.Pushes.conditions([recorded(condition.log, geometry, steps) for condition in conditions])
+    surfaces = jax.tree.map(lambda *each: jnp.stack(each), *(condition.surface for condition in conditions))
     slider = pj.Slider(outline(first.log, geometry), surfaces)
     unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, inset=INSET, overshoot=OVERSHOOT)
     hand, length = pj.Hand.finger(geometry.radius), first.log.length
-    counts = [setup.train.shape[1] for setup in setups]
-    errors, friction, failed = [], [], np.zeros(len(setups), int)
+    counts = [condition.train.shape[1] for condition in conditions]
+    errors, friction, failed = [], [], np.zeros(len(conditions), int)
     for split in range(len(first.train)):
         weight = np.zeros(pushes.weight.shape)
-        for condition, (setup, count) in enumerate(zip(setups, counts, strict=True)):
-            weight[condition, :count] = setup.train[split]
+        for row, (condition, count) in enumerate(zip(conditions, counts, strict=True)):
+            weight[row, :count] = condition.train[split]
         with part(f"split {split + 1} of {len(first.train)}"):
             found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
             predicted = found.predict(fine, slider, hand)
@@ -128,24 +128,26 @@ def identified(setups: Sequence[Setup], geometry: Geometry, part: Part) -> list[
             failed += np.asarray(predicted.failed).sum(axis=(1, 2))
             friction.append(np.asarray(found.friction))
     return [
-        Predicted(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
+        Prediction(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
         for k, count in enumerate(counts)
     ]
 
 
-def _deviations_on_grid(setup: Setup, surface: pj.LimitSurface, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+def _deviations_on_grid(
+    condition: ConditionData, surface: pj.LimitSurface, geometry: Geometry
+) -> tuple[np.ndarray, np.ndarray]:
     """Return every push's deviation in mm and number of failed steps at every friction, (frictions, pushes)."""
-    log, pushes = setup.log, setup.pushes
+    log, pushes = condition.log, condition.pushes
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
     final, failed = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
     return 1e3 * np.asarray(pj.deviation(final, pushes.end[None], log.length), np.float64), np.asarray(failed)
 
 
-def _choose_friction(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Predicted:
+def _choose_friction(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Prediction:
     """Choose for each split's errors (frictions, pushes) the friction that is best for its training pushes."""
     best = [
         int(np.argmin(split_errors[:, trains].mean(axis=1))) for split_errors, trains in zip(errors, train, strict=True)
     ]
     chosen = np.stack([split_errors[row] for split_errors, row in zip(errors, best, strict=True)])
-    return Predicted(chosen, FRICTIONS[best], int(failed.sum()))
+    return Prediction(chosen, FRICTIONS[best], int(failed.sum()))

@@ -30,7 +30,7 @@ from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz
 from pushjax.datasets.two_finger_logs import load_two_finger_logs
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
-from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, figures
+from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, object_scores
 
 OBJECTS = ("3pts1", "3pts3", "patch")
 
@@ -69,7 +69,8 @@ def run(
         prediction = predict(log, model, jax.random.key(seed + index), steps, batch)
         errors = deviation_mm(log, prediction.final)
         tested = splits(log, errors, np.random.default_rng(seed + index))
-        cells.append({"object": name, "model": model} | figures(log, prediction, errors, tested, seed + index))
+        scores = object_scores(log, prediction, errors, tested, seed + index)
+        cells.append({"object": name, "model": model} | scores)
         by_day += [{"object": name} | day for day in days(log, errors)]
         shown.append((name, log, prediction.final, errors, tested))
         progress(index + 1, len(OBJECTS))

@@ -31,7 +31,7 @@ class Prediction(NamedTuple):
 
 
 class Tested(NamedTuple):
-    """What the splits gave.
+    """The radius and friction that each split chose, and the pushes that it tested.
 
     Attributes:
         chosen: Indices (radius, friction) that each split chose.
@@ -120,7 +120,7 @@ def per_push(values: np.ndarray, tested: Tested) -> np.ndarray:
 
     Args:
         values: (radii, frictions, n).
-        tested: What the splits gave.
+        tested: The choices and the test pushes of the splits.
 
     Returns:
         (n,), NaN where no split tested the push.

@@ -1,7 +1,7 @@
 """How good the predictions of the two-finger pushes are.
 
-Deviations, and agreement on whether the object stuck to the hand, are set beside the differences between repeats of one
-action.
+There are two scores: the deviation of the final pose, and how often prediction and measurement agree on whether the
+object stuck to the hand. The differences between repeats of one action show how good either score can be.
 """
 
 from typing import Any
@@ -20,14 +20,16 @@ MIN_PUSHES_OF_A_DAY = 10
 DAY = 86400.0  # s
 
 
-def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int) -> dict[str, Any]:
-    """Compute every figure of one object.
+def object_scores(
+    log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int
+) -> dict[str, Any]:
+    """Compute every score of one object.
 
     Args:
         log: The n pushes of the object.
-        prediction: Predictions on the grid.
-        errors: (radii, frictions, n), their deviations, mm.
-        tested: What the splits gave.
+        prediction: Predictions of every push with every radius and friction.
+        errors: (radii, frictions, n), deviations of these predictions, mm.
+        tested: The radius and friction that each split chose, and the pushes that it tested.
         seed: Seed of the bootstrap.
     """
     no_motion_errors = deviation_mm(log, log.pose_start)
@@ -59,10 +61,18 @@ def figures(log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, teste
     } | _stick_agreement(log, prediction.final, tested)
 
 
-def _interval(per_push: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
-    """Return half the 95 % interval of the mean, by bootstrap over actions, because repeats are not independent."""
+def _interval(push_errors: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
+    """Return half the width of the 95 % interval of the mean error, in the unit of the errors.
+
+    The bootstrap is over actions, because repeats of an action are not independent.
+
+    Args:
+        push_errors: Error of each push, (n,).
+        group: Number of the action of each push, (n,).
+        rng: Random generator of the bootstrap.
+    """
     actions, action_of_push = np.unique(group, return_inverse=True)
-    total, count = np.bincount(action_of_push, per_push), np.bincount(action_of_push)
+    total, count = np.bincount(action_of_push, push_errors), np.bincount(action_of_push)
     resampled = rng.integers(len(actions), size=(BOOTSTRAP_SAMPLES, len(actions)))
     means = total[resampled].sum(axis=1) / count[resampled].sum(axis=1)
     return float(np.diff(np.quantile(means, [0.025, 0.975]))[0] / 2)
@@ -96,7 +106,7 @@ def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> di
     }
 
 
-def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
+def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
     """Compare the repeats of each action with each other, and with the model on the same pushes.
 
     `floor_mm` is the mean deviation of a push from what its action does on average. It is estimated from the mean of
@@ -113,7 +123,7 @@ def _repeats(log: TwoFingerLog, per_push: np.ndarray) -> dict[str, Any]:
             others = same_action[same_action != push]
             distance = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
             floor.append(1e3 * float(distance) * np.sqrt(len(others) / len(same_action)))
-            model.append(per_push[push])
+            model.append(push_errors[push])
             agree += list(stuck[others] == stuck[push])
     if not floor:
         return {"pushes": 0}

@@ -15,6 +15,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -23,10 +24,10 @@ from scipy.spatial import KDTree
 
 import pushjax
 from pushjax._internal.checks import check_count, check_type
-from pushjax.friction.random import FrictionModel
-from pushjax.planning.clearance import offset_curve, outline_vertices
-from pushjax.planning.draws import draw_friction
-from pushjax.planning.poses import compose, inverse, pose_features
+from pushjax.friction.friction_model import FrictionModel
+from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
+from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.push_batch import simulate_pushes
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
@@ -175,7 +176,7 @@ class PushLibrary:
         try:
             with np.load(path) as file:
                 fields = {name: file[name] for name in PushLibrary.__dataclass_fields__}
-        except (KeyError, ValueError, EOFError, OSError) as error:
+        except (KeyError, ValueError, EOFError, OSError, BadZipFile) as error:
             if isinstance(error, FileNotFoundError):
                 raise
             raise ValueError(f"{path} does not hold a library of pushes: {error}") from error
@@ -267,6 +268,25 @@ class PushLibrary:
             distance_upper_bound=max_distance,
         )
         return np.asarray(distance), np.asarray(index)
+
+
+def pose_features(poses: np.ndarray, center: np.ndarray, length: float) -> np.ndarray:
+    """Return four numbers of each pose whose Euclidean distance is a distance of poses, (..., 4), m.
+
+    They are the position of the center, and `length` times cosine and sine of the angle. So angles that differ by a
+    full turn are the same, and for small differences the distance is sqrt(dx^2 + dy^2 + (length dtheta)^2).
+
+    Args:
+        poses: Poses, (..., 3), m and rad.
+        center: The slider's center, (2,), body frame, m.
+        length: What an angle of one radian counts, m.
+    """
+    theta = poses[..., 2]
+    center_position = to_world(poses, np.asarray(center, poses.dtype))
+    return np.concatenate(
+        [center_position, np.stack([length * np.cos(theta), length * np.sin(theta)], axis=-1).astype(poses.dtype)],
+        axis=-1,
+    )
 
 
 def fan(

@@ -14,15 +14,15 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import KDTree
 
-from pushjax.planning.approach import Roadmap, ShortestTransits, Transit, run_ups
-from pushjax.planning.clearance import outline_vertices, point_clearance
-from pushjax.planning.cost_to_go import CostToGo, cost_to_go
-from pushjax.planning.coverage_table import CoverageTable, Measure
-from pushjax.planning.free_space import TABLE_STRIDE, FreeSpace
+from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
+from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.feedback.coverage_table import CoverageTable, Measure
+from pushjax.planning.feedback.free_space import GRID_STRIDE, FreeSpace
+from pushjax.planning.feedback.planned_push import Candidate, PlannedPush, PlanStatus
+from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.pace import Pace
-from pushjax.planning.planned_push import Candidate, PlannedPush, PlanStatus
-from pushjax.planning.poses import compose, inverse, to_body, to_world
-from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.transits.roadmap import Roadmap, ShortestTransits, Transit, run_ups
 from pushjax.planning.workspace import Extent, Workspace
 from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.slider import Slider
@@ -117,7 +117,7 @@ class PushPlanner:
             pose: Pose of the slider, (3,), world.
             points: Centers of the finger, (..., 2), world.
         """
-        apart = point_clearance(self.vertices, to_body(pose, points))
+        apart = signed_distances(self.vertices, to_body(pose, points))
         if self.space is not None:
             apart = np.minimum(apart, self.workspace.obstacles.point_clearance(points))
         return apart - self.radius
@@ -182,7 +182,7 @@ class PushPlanner:
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self.after_push, self.place, self.searched.tree, self.space and self.space.table
+        _ = self.value, self.after_push, self.place, self.searched.tree, self.space and self.space.distances
 
     def is_at_goal(self, pose: np.ndarray) -> bool:
         """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by the planner's `measure`."""
@@ -303,7 +303,7 @@ class PushPlanner:
         entries = self.coarse[reachable[self.push[self.coarse]]]
         if self.space is not None:
             likely = self.space.probably_free(self.library, pose, np.flatnonzero(reachable))
-            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // TABLE_STRIDE]]
+            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // GRID_STRIDE]]
         here = pose.astype(np.float32)
         entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
         reached = compose(here, self.library.relative[entries])

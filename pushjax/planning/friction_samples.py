@@ -6,8 +6,9 @@ from jaxtyping import PRNGKeyArray
 
 from pushjax._internal.checks import check_count, check_key, check_type
 from pushjax._internal.jit import quick_jit
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import FrictionModel, SurfaceDistribution
+from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.simulation.random_rollout import Draws, draw
 
 

@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
-from pushjax.friction.random import FrictionModel
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon import Polygon
-from pushjax.planning.draws import draw_friction
-from pushjax.planning.dubins import DubinsPath, dubins
-from pushjax.planning.line_contact import LineContact, Turn, hand_front, line_contacts, turn
-from pushjax.planning.poses import compose, inverse
+from pushjax.geometry.se2_numpy import compose, inverse
+from pushjax.planning.friction_samples import draw_friction
+from pushjax.planning.stable.dubins import DubinsPath, dubins
+from pushjax.planning.stable.line_contact import LineContact, Turn, hand_front, line_contacts, turn
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 

@@ -21,7 +21,7 @@ from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
 
 
-class Pushes(eqx.Module):
+class PushSequence(eqx.Module):
     """Several pushes in a row, each given by three numbers and its bends.
 
     The numbers of a push, in units that make all of them of order one:

@@ -34,10 +34,10 @@ from pushjax._internal.checks import (
 )
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
-from pushjax.friction.random import FrictionModel
-from pushjax.planning.draws import draw_friction
+from pushjax.friction.friction_model import FrictionModel
+from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
-from pushjax.planning.pose_spread import entropy, most_likely
+from pushjax.planning.squeezes.pose_spread import entropy, most_likely
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.random_rollout import Draws, rollout_under_draws
@@ -162,8 +162,8 @@ def plan_squeezes(
     squeezes: Squeezes,
     count: int = 3,
     symmetry: int | ArrayLike = 1,
-    position: float = 0.005,
-    angle: float = ANGLE_TOLERANCE,
+    position_tolerance: float = 0.005,
+    angle_tolerance: float = ANGLE_TOLERANCE,
     width: float | None = None,
     samples: int = 64,
     beam: int = 2,
@@ -182,8 +182,8 @@ def plan_squeezes(
         squeezes: The squeezes that can be chosen.
         count: Number of squeezes.
         symmetry: Number of angles in a full turn at which the slider looks the same, or the turns, as in `Goal`.
-        position: Distance within which the final pose counts as known, m.
-        angle: The same of the angle, rad.
+        position_tolerance: Distance within which the final pose counts as known, m.
+        angle_tolerance: The same of the angle, rad.
         width: Width of the kernel of the entropy, m; poses that are nearer count as the same. By default a tenth of the
             length of the limit surface.
         samples: Number of poses of the belief that the search uses. The prediction uses all.
@@ -200,7 +200,7 @@ def plan_squeezes(
     """
     for name, value in (("count", count), ("samples", samples), ("beam", beam)):
         check_count(name, value)
-    for name, value in (("position", position), ("angle", angle)):
+    for name, value in (("position_tolerance", position_tolerance), ("angle_tolerance", angle_tolerance)):
         check_positive(name, value)
     if not 0 <= success <= 1:
         raise ValueError(f"success must be a probability; got {success!r}")
@@ -224,7 +224,7 @@ def plan_squeezes(
         history.append(cost[best][0])
     unseen = jax.random.fold_in(key, 1)
     outcomes = squeeze_outcomes(unseen, slider, hand, poses, jaws[0], model=model, squeezes=squeezes)
-    center, near = most_likely(outcomes.poses[:, -1], turns, position, angle)
+    center, near = most_likely(outcomes.poses[:, -1], turns, position_tolerance, angle_tolerance)
     probability = float(np.mean(near & outcomes.held[:, -1] & ~outcomes.failed.any(axis=1)))
     known = entropy(np.moveaxis(outcomes.poses, 1, 0), turns, length, width)
     status = SqueezeStatus.FOUND if probability >= success else SqueezeStatus.UNLIKELY

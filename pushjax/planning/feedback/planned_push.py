@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.planning.approach import Transit
+from pushjax.planning.transits.roadmap import Transit
 
 
 class PlanStatus(IntEnum):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax.testing.batch import ProblemBatch, products
-from pushjax.testing.conditions import CLEAN, level, violations
+from pushjax.testing.condition_violations import CLEAN, level, violations
 
 # Number of starts that are followed together, so that their numbers stay in the processor's cache.
 CHUNK = 4000
@@ -19,7 +19,7 @@ UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
-class Searched(NamedTuple):
+class SearchResult(NamedTuple):
     """The result of `search`. Twist, force and wrench are those of the first solution found, or zero without one.
 
     Attributes:
@@ -39,12 +39,12 @@ class Searched(NamedTuple):
     reached: np.ndarray
 
 
-def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> Searched:
+def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> SearchResult:
     """Search for any solution of each problem, from random starts.
 
-    From each start the conditions, written as smooth equations (`_Equations`), are solved by the Levenberg-Marquardt
-    method, and the result is accepted if it passes `violations`. A problem whose slider does not move is solved at
-    once, by zero. If the search finds nothing, that proves nothing, but it is stronger evidence with more starts.
+    From each start the conditions, written as equations (`_Equations`), are solved by the Levenberg-Marquardt method,
+    and the result is accepted if it passes `violations`. Where the slider can stay, the solution is zero, and nothing
+    is searched. If the search finds nothing, that proves nothing, but it is stronger evidence with more starts.
 
     Args:
         batch: The problems.
@@ -61,7 +61,7 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     rng = np.random.default_rng(seed)
     twist, force, wrench = np.zeros((n, 3)), np.zeros((*order.shape, 2)), np.zeros((n, 3))
     still = violations(batch, twist, force).worst() <= CLEAN
-    result = Searched(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
+    result = SearchResult(still, twist, force, wrench, np.zeros(n, int), np.zeros(n, int))
     done = 0
     for group_size in (*portions, starts):
         group_size = min(group_size, starts - done)
@@ -79,7 +79,7 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
     return result._replace(force=all_forces)
 
 
-def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searched:
+def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> SearchResult:
     """Return the first solution of each problem that a number of random starts reaches."""
     n = len(batch)
     equations = _Equations(batch, np.repeat(np.arange(n), starts), rng)
@@ -94,22 +94,21 @@ def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searc
     twist, force, wrench = (
         np.where(found.reshape(-1, *[1] * (a.ndim - 1)), a[first], 0.0) for a in (twist, force, wrench)
     )
-    return Searched(found, twist, force, wrench, np.full(n, starts), is_solution.sum(axis=1))
+    return SearchResult(found, twist, force, wrench, np.full(n, starts), is_solution.sum(axis=1))
 
 
 class _Equations:
-    """The conditions as 2 m smooth equations in the 2 m force components, for many starts at once on the last axis.
+    """The conditions as 2 m equations in the 2 m force components, for B starts at once on the last axis.
 
     H is scaled so that its mean Hessian over the sphere has trace 3. Lengths are relative to the problem's speed. The
     equation V = grad H(F) has no free factor, so the size of the forces is an unknown too. The unknowns are y, with
     f = y / rho, where rho is about the derivative of w_n by f_n. With phi(a, b) = a + b - |(a, b)| (Fischer 1992),
-    which is zero where 0 <= a _|_ b >= 0, the equations of a contact are
+    which is zero where 0 <= a _|_ b >= 0 and smooth except at a = b = 0, the equations of a contact are
 
         phi(f_n, w_n + gap) = 0,      phi(mu f_n + f_t, -phi(mu f_n - f_t, -w_t)) = 0.
 
     The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
     where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
-    B is the number of starts.
     """
 
     def __init__(self, batch: ProblemBatch, problem: np.ndarray, rng: np.random.Generator):
@@ -131,7 +130,7 @@ class _Equations:
         self.degree, self.problem = batch.degree, problem
         self.table = per_start(upper)  # (6, q, B)
         self.rows = per_start(flat)  # (2 m, 3, B)
-        self.ahead = per_start(approach.reshape(n, 2 * m))  # (2 m, B)
+        self.approach = per_start(approach.reshape(n, 2 * m))  # (2 m, B)
         self.friction = per_start(np.where(active, batch.friction, 0.0))  # (m, B)
         self.active = per_start(active)  # (m, B)
         rho_factor = np.exp(RHO_SPREAD * rng.normal(size=len(problem)))
@@ -143,11 +142,11 @@ class _Equations:
         """Return the equations of some of the starts, for `descend`; `keep` is a mask over the last axis."""
         part = object.__new__(_Equations)
         part.degree = self.degree
-        for name in ("problem", "table", "rows", "ahead", "friction", "active", "rho"):
+        for name in ("problem", "table", "rows", "approach", "friction", "active", "rho"):
             setattr(part, name, getattr(self, name)[..., keep])
         return part
 
-    def flow(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def evaluate(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the wrench (3, B), the Hessian of H (3, 3, B) and the twist grad H (3, B)."""
         wrench = np.einsum("ib,ijb->jb", y / self.rho, self.rows)
         upper = self.table[:, 0] if self.degree == 2 else np.einsum("ijb,jb->ib", self.table, products(wrench, 4))
@@ -156,8 +155,8 @@ class _Equations:
 
     def slips(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return w (2 m, B), with the gap added to its normal part, and its Jacobian by y (2 m, 2 m, B)."""
-        _, hessian, twist = self.flow(y)
-        slip = np.einsum("ijb,jb->ib", self.rows, twist) - self.ahead
+        _, hessian, twist = self.evaluate(y)
+        slip = np.einsum("ijb,jb->ib", self.rows, twist) - self.approach
         twist_change = np.einsum("ijb,kjb->ikb", hessian, self.rows)
         return slip, np.einsum("kjb,jib->kib", self.rows, twist_change) / self.rho
 
@@ -188,10 +187,10 @@ class _Equations:
         side = rng.uniform(-1, 1, (m, count))
         side = np.where(rng.random((m, count)) < 0.5, np.sign(side), side)
         force = _interleave(normal_force, side * self.friction * normal_force)
-        twist = self.flow(force * self.rho)[2]
+        twist = self.evaluate(force * self.rho)[2]
         motion = np.einsum("ijb,jb->ib", self.rows[0::2], twist)
         numerator, denominator = (
-            (motion * self.ahead[0::2] * normal_force).sum(axis=0),
+            (motion * self.approach[0::2] * normal_force).sum(axis=0),
             (motion**2 * normal_force).sum(axis=0),
         )
         unit_factor = 1 / np.maximum(np.linalg.norm(twist, axis=0), 1e-6)  # scales the twist to norm one
@@ -258,13 +257,13 @@ class _Equations:
                 np.where(better, new, old) for new, old in ((trial, y), (trial_value, value), (trial_by_y, by_y))
             )
             merit = np.where(better, trial_merit, merit)
-            if k % 3:
+            if k % 3:  # looking for finished starts at every step would take longer than it saves
                 continue
-            finished = ~(merit > 1e-26)
+            finished = ~(merit > 1e-26)  # also where the merit is NaN
             if k % 9 == 0:
                 finished |= ~(merit < STALLED * earlier_merit)
                 earlier_merit = merit
-            if k < MOST_STEPS and finished.mean() < 0.1:
+            if k < MOST_STEPS and finished.mean() < 0.1:  # too few to copy all arrays for
                 continue
             end[:, index] = y
             index, equations = index[~finished], equations.take(~finished)
@@ -278,7 +277,7 @@ class _Equations:
     def answer(self, y: np.ndarray, batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return twist (B, 3), force (B, m, 2) and wrench (B, 3) in the units of `batch`, with the wrench on H = 1."""
         force = self.in_cone(y / self.rho)
-        wrench, _, twist = self.flow(force * self.rho)
+        wrench, _, twist = self.evaluate(force * self.rho)
         repeated = batch.take(self.problem)
         size = level(repeated, wrench.T)
         size = np.where(size > 0, size, 1.0)[:, None]

@@ -2,9 +2,11 @@
 
 A slider that looks the same after some turns has equivalent poses, which count as one.
 
-The entropy is that of the samples blurred by a Gaussian kernel of a width h: with distances d of poses,
+The entropy compares every sample i with every sample j, by a Gaussian kernel of the width h:
 
     entropy = -mean over i of log(mean over j of exp(-d_ij^2 / (4 h^2))).
+
+Here d_ij^2 is the squared distance of the positions plus the squared difference of the angles times a length.
 
 It is zero if all samples are the same, log k for k poses far apart that are equally likely, and at most the logarithm
 of the number of samples. So its exponential is the number of poses that can be told apart.
@@ -25,10 +27,10 @@ def distances(poses: np.ndarray, turns: np.ndarray, length: float) -> tuple[np.n
         The distances of the positions, and of the angles times `length`, both (..., samples, samples), m.
     """
     difference = poses[..., :, None, :] - poses[..., None, :, :]
-    apart = np.hypot(difference[..., 0], difference[..., 1])
+    position_distance = np.hypot(difference[..., 0], difference[..., 1])
     angles = difference[..., 2, None] - turns
     angles = np.abs(angles - 2 * np.pi * np.round(angles / (2 * np.pi))).min(axis=-1)
-    return apart, length * angles
+    return position_distance, length * angles
 
 
 def entropy(poses: np.ndarray, turns: np.ndarray, length: float, width: float) -> np.ndarray:
@@ -40,24 +42,24 @@ def entropy(poses: np.ndarray, turns: np.ndarray, length: float, width: float) -
         length: Distance that counts as much as an angle of one radian, m.
         width: Width of the kernel, m: poses that are nearer than about this are the same.
     """
-    apart, turned = distances(poses, turns, length)
-    kernel = np.exp(-(apart**2 + turned**2) / (4 * width**2))
+    position_distance, angle_distance = distances(poses, turns, length)
+    kernel = np.exp(-(position_distance**2 + angle_distance**2) / (4 * width**2))
     return -np.log(kernel.mean(axis=-1)).mean(axis=-1)
 
 
-def most_likely(poses: np.ndarray, turns: np.ndarray, position: float, angle: float) -> tuple[int, np.ndarray]:
-    """Return the sample that most others are near to, and which are.
+def most_likely(poses: np.ndarray, turns: np.ndarray, max_distance: float, max_angle: float) -> tuple[int, np.ndarray]:
+    """Return the sample that has the most other samples near it, and which samples those are.
 
     Args:
         poses: Samples of poses, (samples, 3), m and rad.
         turns: Turns after which the slider looks the same, (turns,), rad.
-        position: Largest distance that counts as near, m.
-        angle: Largest angle that counts as near, rad.
+        max_distance: Largest distance that counts as near, m.
+        max_angle: Largest angle that counts as near, rad.
 
     Returns:
         Index of the sample, and whether each sample is near to it, (samples,).
     """
-    apart, turned = distances(poses, turns, 1.0)
-    near = (apart <= position) & (turned <= angle)
+    position_distance, angle_distance = distances(poses, turns, 1.0)  # with this length the second one is in rad
+    near = (position_distance <= max_distance) & (angle_distance <= max_angle)
     best = int(np.argmax(near.sum(axis=1)))
     return best, near[best]

@@ -7,7 +7,7 @@ import numpy as np
 POSITIONS = 36  # cells along x and y each, of the cost to go
 
 
-class PoseTable(NamedTuple):
+class PoseGrid(NamedTuple):
     """Values of the poses on a grid, and of poses between them by interpolation.
 
     Positions are at equal spacing, and angles, which are periodic, are all around.

@@ -24,9 +24,9 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from pushjax._internal.checks import check_positive
-from pushjax.planning.clearance import point_clearance, segment_clearance, turns
+from pushjax.geometry.polygon_numpy import segment_distances, signed_distances, turns
+from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.poses import to_body, to_world
 from pushjax.planning.workspace import Workspace
 
 ARC_STEP = np.pi / 4  # largest angle between neighboring points around a corner
@@ -105,8 +105,8 @@ class Roadmap:
         self.vertices, self.radius, self.apart = vertices, radius, radius + clearance
         self.clearance, self.goals = clearance, np.asarray(goals, float)
         points = _corner_points(vertices, self.apart * (1 + OUTSIDE))
-        self.nodes = points[point_clearance(vertices, points) >= self.apart]
-        self.goal_clearance = point_clearance(vertices, self.goals)
+        self.nodes = points[signed_distances(vertices, points) >= self.apart]
+        self.goal_clearance = signed_distances(vertices, self.goals)
         self.links = self._lengths(self.nodes[:, None], self.goals, at_end=self.goal_clearance)
 
     def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> ShortestTransits:
@@ -186,7 +186,7 @@ class Roadmap:
         Returns:
             The lengths, (points, goals), m, infinite where there is no transit.
         """
-        at = point_clearance(self.vertices, starts)
+        at = signed_distances(self.vertices, starts)
         direct = self._lengths(starts[:, None], self.goals, at[:, None], self.goal_clearance)
         graph = self._lengths(self.nodes[:, None], self.nodes)
         graph[np.isinf(graph)] = 0
@@ -197,7 +197,7 @@ class Roadmap:
 
     def _lengths(self, start, end, at_start=None, at_end=None) -> np.ndarray:
         """Return the lengths of segments, infinite where they do not keep the distance."""
-        free = segment_clearance(self.vertices, start, end, at_start, at_end) >= self.apart * (1 - 1e-9)
+        free = segment_distances(self.vertices, start, end, at_start, at_end) >= self.apart * (1 - 1e-9)
         return np.where(free, np.linalg.norm(end - start, axis=-1), np.inf)
 
     def _within(self, pose: np.ndarray, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
@@ -228,7 +228,7 @@ class Roadmap:
         ]
         world = to_world(pose, np.concatenate([np.zeros((0, 2)), *around]))
         more = to_body(pose, np.clip(world, workspace.finger_low, workspace.finger_high))
-        more = more[point_clearance(self.vertices, more) >= self.apart]
+        more = more[signed_distances(self.vertices, more) >= self.apart]
         nodes = np.concatenate([nodes, more])
         links = np.concatenate([links, np.linalg.norm(self.goals - more[:, None], axis=-1)])
         keeps = obstacles.point_clearance(nodes) >= self.from_obstacles
@@ -258,7 +258,7 @@ class Roadmap:
 
     def _retreat(self, start: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
         """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2), and the status."""
-        have, have_obstacles = float(point_clearance(self.vertices, start)), float(obstacles.point_clearance(start))
+        have, have_obstacles = float(signed_distances(self.vertices, start)), float(obstacles.point_clearance(start))
         if have >= self.apart and have_obstacles >= self.from_obstacles:
             return start[None], TransitStatus.FOUND
         if have <= 0 or have_obstacles <= 0:
@@ -268,14 +268,14 @@ class Roadmap:
         # out of a wedge between polygon and obstacle it is farther
         reach = missing * np.array([1.0, 1.5, 2.0, 3.0, 5.0, 8.0][: 6 if obstacles.any else 4]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
-        apart = point_clearance(self.vertices, ends)
+        apart = signed_distances(self.vertices, ends)
         halfway = start + 0.2 * (ends - start)
         good = _recedes(
             have,
             self.apart,
             apart,
-            point_clearance(self.vertices, halfway),
-            segment_clearance(self.vertices, start, ends, at_end=apart),
+            signed_distances(self.vertices, halfway),
+            segment_distances(self.vertices, start, ends, at_end=apart),
         )
         if obstacles.any:
             good &= _recedes(
@@ -329,12 +329,12 @@ def run_ups(
     Returns:
         The run-ups, (pushes,), m; NaN where there is none.
     """
-    have = point_clearance(vertices, starts)
+    have = signed_distances(vertices, starts)
     found = np.full(len(starts), np.nan)
     for length in np.linspace(longest, 0.0, 9):
         begin = starts - length * directions
-        apart = point_clearance(vertices, begin)
-        keeps = segment_clearance(vertices, begin, starts, apart, have) >= np.minimum(have, radius + clearance) * 0.999
+        apart = signed_distances(vertices, begin)
+        keeps = segment_distances(vertices, begin, starts, apart, have) >= np.minimum(have, radius + clearance) * 0.999
         found = np.where(np.isnan(found) & keeps & (apart >= radius + clearance), length, found)
     return found
 

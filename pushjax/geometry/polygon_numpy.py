@@ -1,7 +1,7 @@
 """Distances of points and segments from a polygon, and the curve at a given distance around it, in NumPy.
 
-Planners ask for thousands of distances at a time, outside of any compiled program. All points are in the polygon's own
-frame, in m.
+They are for thousands of points at a time, outside of any compiled program. All points are in the polygon's own frame,
+in m.
 """
 
 from typing import NamedTuple
@@ -20,30 +20,37 @@ def outline_vertices(shape: Shape) -> np.ndarray:
     return np.asarray(points, np.float64)
 
 
-def point_clearance(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the distance of points from a polygon, negative inside.
+def signed_distances(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the signed distances of points from a polygon, (...,), m, negative inside.
 
     Args:
-        vertices: Vertices, counterclockwise, (vertices, 2).
-        points: Points, (..., 2).
+        vertices: Vertices, counterclockwise, (vertices, 2), m.
+        points: Points, (..., 2), m.
     """
-    (xa, ya), (ex, ey) = vertices.T, (np.roll(vertices, -1, axis=0) - vertices).T
-    dx, dy = points[..., :1] - xa, points[..., 1:] - ya
-    along = np.clip((dx * ex + dy * ey) / (ex**2 + ey**2), 0, 1)
-    distance = np.sqrt(((dx - along * ex) ** 2 + (dy - along * ey) ** 2).min(-1))
+    # edges come first, so that the longest loops run over the points
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    (ax, ay), (ex, ey) = (_by_edge(each, points.ndim) for each in (vertices, edges))
+    dx, dy = points[..., 0] - ax, points[..., 1] - ay
+    fraction = np.clip((dx * ex + dy * ey) / (ex**2 + ey**2), 0, 1)
+    distance = np.sqrt(np.min((dx - fraction * ex) ** 2 + (dy - fraction * ey) ** 2, axis=0))
     return np.where(inside(vertices, points), -distance, distance)
 
 
+def _by_edge(vectors: np.ndarray, ndim: int) -> np.ndarray:
+    """Return the components (2, edges, 1, ...) of vectors (edges, 2), to be used with points of `ndim` axes."""
+    return vectors.T.reshape(2, len(vectors), *(1,) * (ndim - 1))
+
+
 def inside(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return whether points are inside of a polygon, by the crossings of a ray along +x, (...,)."""
-    (xa, ya), (xb, yb) = vertices.T, np.roll(vertices, -1, axis=0).T
-    x, y = points[..., :1], points[..., 1:]
-    spans = (ya > y) != (yb > y)
-    slope = (xb - xa) / np.where(yb == ya, 1, yb - ya)
-    return ((spans & (x < xa + slope * (y - ya))).sum(-1) % 2).astype(bool)
+    """Return whether points (..., 2) are inside of a polygon, by the crossings of a ray along +x, (...,)."""
+    (ax, ay), (bx, by) = (_by_edge(each, points.ndim) for each in (vertices, np.roll(vertices, -1, axis=0)))
+    x, y = points[..., 0], points[..., 1]
+    spans = (ay <= y) != (by <= y)
+    crosses = (x - ax) * np.abs(by - ay) < (y - ay) * (bx - ax) * np.sign(by - ay)
+    return np.sum(spans & crosses, axis=0) % 2 == 1
 
 
-def segment_clearance(
+def segment_distances(
     vertices: np.ndarray,
     start: np.ndarray,
     end: np.ndarray,
@@ -56,12 +63,12 @@ def segment_clearance(
         vertices: Vertices, counterclockwise, (vertices, 2).
         start: First points, (..., 2).
         end: Last points, (..., 2).
-        at_start: `point_clearance` of the first points where it is known, (...,).
+        at_start: `signed_distances` of the first points where it is known, (...,).
         at_end: The same for the last points.
     """
     start, end = np.broadcast_arrays(start, end)
-    at_start = point_clearance(vertices, start) if at_start is None else at_start
-    at_end = point_clearance(vertices, end) if at_end is None else at_end
+    at_start = signed_distances(vertices, start) if at_start is None else at_start
+    at_end = signed_distances(vertices, end) if at_end is None else at_end
     (xv, yv), (ex, ey) = vertices.T, (np.roll(vertices, -1, axis=0) - vertices).T
     (sx, sy), (ox, oy) = np.split(end - start, 2, axis=-1), (xv - start[..., :1], yv - start[..., 1:])
     length2 = sx**2 + sy**2
@@ -115,7 +122,7 @@ def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCur
     away = np.stack([c * outward[k, 0] - s * outward[k, 1], s * outward[k, 0] + c * outward[k, 1]], axis=1)
     fraction = np.where(on_arc, 1.0, along / length[k])
     points = vertices[k] + fraction[:, None] * edge[k] + distance * away
-    keep = point_clearance(vertices, points) > distance * (1 - 1e-9) - 1e-12
+    keep = signed_distances(vertices, points) > distance * (1 - 1e-9) - 1e-12
     return OffsetCurve(points[keep], -away[keep])
 
 

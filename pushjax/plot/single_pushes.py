@@ -14,7 +14,7 @@ from matplotlib.patches import Circle
 from pushjax.contact.status import Status
 from pushjax.geometry.shape import Shape
 from pushjax.plot.parts import arrow, centroids, draw_fixtures, hand_at, outline, placed_outline, vertices
-from pushjax.plot.squeeze import SQUEEZE_LABEL, SqueezeForces, squeeze_forces
+from pushjax.plot.squeezing import SQUEEZE_LABEL, SqueezeForces, squeeze_forces
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, panel_row, start_to_end_legend
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand

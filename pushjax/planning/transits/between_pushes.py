@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax._internal.checks import check_positive
-from pushjax.planning.approach import Roadmap, Transit, TransitStatus, run_ups
-from pushjax.planning.clearance import point_clearance, segment_clearance
-from pushjax.planning.poses import to_body, to_world
+from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
+from pushjax.geometry.se2_numpy import to_body, to_world
+from pushjax.planning.transits.roadmap import Roadmap, Transit, TransitStatus, run_ups
 from pushjax.planning.workspace import Workspace
 from pushjax.simulation.fixtures import Fixtures
 
@@ -162,7 +162,7 @@ def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray
     blocked = Transit(
         path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, TransitStatus.GOAL_BLOCKED
     )
-    if point_clearance(around.vertices, first) < (1 - TOUCH) * around.radius:
+    if signed_distances(around.vertices, first) < (1 - TOUCH) * around.radius:
         return blocked
     for part in RUN_UPS:
         longest = part * (around.radius + margin)
@@ -202,8 +202,8 @@ def _touches(vertices: np.ndarray, radius: float, points: np.ndarray, samples: n
     A finger that has just pushed touches the slider, so there only what comes nearer counts.
     """
     placed = to_body(samples[:, None], points[None])  # (samples, points, 2)
-    apart = segment_clearance(vertices, placed[:, :-1], placed[:, 1:])
-    at_start = point_clearance(vertices, placed[:, 0])
+    apart = segment_distances(vertices, placed[:, :-1], placed[:, 1:])
+    at_start = signed_distances(vertices, placed[:, 0])
     allowed = np.full(apart.shape, radius)
     if apart.shape[1]:
         allowed[:, 0] = np.minimum(at_start, radius)

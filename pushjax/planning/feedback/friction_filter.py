@@ -38,9 +38,9 @@ from pushjax._internal.checks import (
 )
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import wrap_to_pi
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.friction.random import FrictionModel
-from pushjax.planning.draws import draw_friction
+from pushjax.planning.friction_samples import draw_friction
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.rollout import rollout
 from pushjax.simulation.slider import Slider

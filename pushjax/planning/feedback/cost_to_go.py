@@ -7,42 +7,45 @@ stands for all pushes into that cell, and one sweep of the iteration takes minim
 
 from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from pushjax.planning.free_space import FreeSpace
-from pushjax.planning.pose_table import POSITIONS, PoseTable, grid_spacing
-from pushjax.planning.poses import compose, inverse, to_world
-from pushjax.planning.push_library import PushLibrary
+from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.planning.feedback.free_space import FreeSpace
+from pushjax.planning.feedback.pose_grid import POSITIONS, PoseGrid, grid_spacing
+from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
 
-NEVER = 1e3  # cost of poses from which the goal is not reached
-ANGLES = 36  # cells of the grid around
-SWEEPS = 12
+NEVER = 1e3  # control steps; cost of poses from which the goal is not reached
+ANGLES = 36  # angles of the grid in a full turn
+SWEEPS = 12  # largest number of sweeps over the grid
 CHANGE = 0.5  # control steps; smaller changes end the iteration
 LAST_PUSHES = 6  # pushes to the goal that are tried from each cell, if some may run into an obstacle
 NEAR_CENTER = 0.35  # a push stands for a cell if it ends within this part of a cell from the cell's center
 
 
-class CostToGo(PoseTable):
+class CostToGo(PoseGrid):
     """Cost of the poses on a grid, in control steps, and of poses between them by interpolation."""
 
     def save(self, path: str | Path) -> None:
-        """Write the table to a file in NumPy's format "npz"."""
+        """Write the grid to a file in NumPy's format "npz"."""
         np.savez_compressed(path, **self._asdict())
 
     @staticmethod
     def load(path: str | Path) -> "CostToGo":
-        """Read a table that `save` wrote.
+        """Read what `save` wrote.
 
         Raises:
-            ValueError: If the file holds none.
+            ValueError: If the file does not hold a cost to go.
         """
         try:
             with np.load(path) as file:
                 origin, spacing, values = (file[name] for name in CostToGo._fields)
-        except (KeyError, ValueError, EOFError) as error:
+        except (KeyError, ValueError, EOFError, OSError, BadZipFile) as error:
+            if isinstance(error, FileNotFoundError):
+                raise
             raise ValueError(f"{path} does not hold a cost to go: {error}") from error
         return CostToGo(origin, float(spacing), values)
 
@@ -69,12 +72,13 @@ def cost_to_go(
         workspace: Limits of finger and slider.
         push_time: Control steps of each entry of the library, (entries,).
         usable: Whether the finger can get to the start of each push, (pushes,).
-        tolerance: A push reaches the goal if its final pose is within this distance, m.
+        tolerance: A push reaches the goal if its final pose is within this distance, m, in the metric of
+            `pose_features`.
         between: Control steps between two pushes.
         low: Lowest position of the slider's origin on the grid, (2,), m.
-        high: Highest position, (2,), m.
-        vertices: Vertices of the slider, (vertices, 2), body frame.
-        space: What slider and finger stay out of; its table is in the same place. None: there is nothing.
+        high: Highest position, (2,), m. The grid is square, so along the narrower axis it reaches beyond this.
+        vertices: Vertices of the slider, (vertices, 2), body frame, m.
+        space: Free space among the obstacles, built with the same `low` and `high`. None: there are no obstacles.
     """
     spacing = grid_spacing(low, high)
     axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
@@ -85,11 +89,11 @@ def cost_to_go(
     moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
     allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
     if space is not None:
-        met = space.table.nearest(cells) < space.slider_clearance
+        met = space.distances.nearest(cells) < space.slider_clearance
         blocked |= met
         allowed = [
-            may & space.free_from_grid(library, angle, move.entry)
-            for may, angle, move in zip(allowed, theta, moves, strict=True)
+            is_allowed & space.free_from_grid(library, angle, move.entry)
+            for is_allowed, angle, move in zip(allowed, theta, moves, strict=True)
         ]
     for _ in range(SWEEPS):
         change = 0.0
@@ -100,7 +104,9 @@ def cost_to_go(
             values[:, :, k] = new
         if change < CHANGE:
             break
-    if space is not None:  # poses near such a cell's center may be free: a push leads to the cells around
+    # A cell counts as blocked if the slider is too near to an obstacle at its center. At other poses in the cell the
+    # slider may be free, so the cell gets the cost of the best neighbor, after one more pause between pushes.
+    if space is not None:
         values = np.where(met, _least_around(np.where(met, NEVER, values)) + between, values)
     return CostToGo(np.asarray(low, np.float32), spacing, values)
 
@@ -169,11 +175,11 @@ def _starts_allowed(library: PushLibrary, workspace: Workspace, cells: np.ndarra
 def _best_move(values: np.ndarray, blocked: np.ndarray, k: int, moves: _Moves, allowed: np.ndarray) -> np.ndarray:
     """Return the least cost over the moves from the cells of one angle, (positions, positions)."""
     rows, columns, angles = values.shape
-    beyond = int(np.abs(moves.shift[:, :2]).max(initial=0))
-    wide = np.full((rows + 2 * beyond, columns + 2 * beyond, angles), NEVER, np.float32)
-    wide[beyond : beyond + rows, beyond : beyond + columns] = np.where(blocked, NEVER, values)
+    margin = int(np.abs(moves.shift[:, :2]).max(initial=0))
+    padded = np.full((rows + 2 * margin, columns + 2 * margin, angles), NEVER, np.float32)
+    padded[margin : margin + rows, margin : margin + columns] = np.where(blocked, NEVER, values)
     best = np.full((rows, columns), NEVER, np.float32)
-    for (i, j, turn), cost, may in zip(moves.shift, moves.cost, allowed, strict=True):
-        part = wide[beyond + i : beyond + i + rows, beyond + j : beyond + j + columns, (k + turn) % angles]
-        np.minimum(best, np.where(may, part + cost, NEVER), out=best)
+    for (i, j, turn), cost, is_allowed in zip(moves.shift, moves.cost, allowed, strict=True):
+        shifted = padded[margin + i : margin + i + rows, margin + j : margin + j + columns, (k + turn) % angles]
+        np.minimum(best, np.where(is_allowed, shifted + cost, NEVER), out=best)
     return best

@@ -1,7 +1,7 @@
 """Plans of pushes that reach a goal under friction that is not known.
 
 A plan is open loop: the hand's paths are fixed before the first push. Each push is given in the slider's frame
-(`Pushes`), at the pose that the pushes before it lead to under the mean friction. The search runs in two stages:
+(`PushSequence`), at the pose that the pushes before it lead to under the mean friction. The search runs in two stages:
 
 1. under the mean friction, from many random plans: which ways there are to reach the goal at all;
 2. under sampled friction, the same samples for all candidates: which of these plans does so most surely, and how to
@@ -25,18 +25,17 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
-from pushjax.friction.random import FrictionModel
-from pushjax.planning.approach import Transit, TransitStatus
-from pushjax.planning.between_pushes import TIGHT, transits_between
-from pushjax.planning.clearance import outline_vertices, point_clearance
+from pushjax.friction.friction_model import FrictionModel
+from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import to_body
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
-from pushjax.planning.free_space import OVERLAP_TOLERANCE
 from pushjax.planning.goal import Goal
-from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.poses import to_body
-from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
-from pushjax.planning.pushes import Pushes
+from pushjax.planning.obstacles import OVERLAP_TOLERANCE, Obstacles
+from pushjax.planning.open_loop.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
+from pushjax.planning.open_loop.push_sequence import PushSequence
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
+from pushjax.planning.transits.between_pushes import TIGHT, transits_between
+from pushjax.planning.transits.roadmap import Transit, TransitStatus
 from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
 from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.fixtures import Fixtures
@@ -76,7 +75,7 @@ class PushPlan(NamedTuple):
         pose: Poses of the slider under the mean friction, before the first push and after each, (pushes + 1, 3), world.
         transits: Transits of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other
             hands.
-        parameters: Its parameters, as in `Pushes`, (size,), also of pushes that are left out.
+        parameters: Its parameters, as in `PushSequence`, (size,), also of pushes that are left out.
         outcomes: Predicted poses under friction that the search has not seen.
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
             finger does not touch between pushes.
@@ -103,7 +102,7 @@ def plan_pushes(
     goal: Goal,
     *,
     model: FrictionModel,
-    pushes: Pushes,
+    pushes: PushSequence,
     cost: Cost | None = None,
     risk: Risk | None = None,
     samples: int = 32,
@@ -149,7 +148,7 @@ def plan_pushes(
         TypeError: For arguments of other types, and for a hand with pads.
     """
     check_type("goal", goal, Goal)
-    check_type("pushes", pushes, Pushes)
+    check_type("pushes", pushes, PushSequence)
     check_count("candidates", candidates)
     if not 0 <= success <= 1:
         raise ValueError(f"success must be a probability; got {success!r}")
@@ -271,7 +270,7 @@ def _finger_at(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | N
     check_shape("finger", at, (2,))
     check_finite("finger", at)
     point = to_body(np.mean(np.asarray(problem.start, float), axis=0), np.asarray(at, float))
-    apart = float(point_clearance(outline_vertices(problem.slider.shape), point) - problem.hand.radius[0])
+    apart = float(signed_distances(outline_vertices(problem.slider.shape), point) - problem.hand.radius[0])
     if apart < 0:
         raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-apart:.3g} m")
     beyond = float(Obstacles.of(problem.fixtures).point_clearance(np.asarray(at, float)) - problem.hand.radius[0])

@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, check_shape, common_dtype
 from pushjax._internal.jit import jit, quick_jit
-from pushjax.friction.random import FrictionModel
+from pushjax.friction.friction_model import FrictionModel
 from pushjax.planning.costs import Cost, Risk
-from pushjax.planning.draws import draw_friction, mean_friction
+from pushjax.planning.friction_samples import draw_friction, mean_friction
 from pushjax.planning.goal import Goal
-from pushjax.planning.pushes import Pushes
+from pushjax.planning.open_loop.push_sequence import PushSequence
 from pushjax.planning.search import Objective
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.fixtures import Fixtures
@@ -80,7 +80,7 @@ class PushProblem(eqx.Module):
         fixtures: What the slider may run into.
     """
 
-    pushes: Any  # `Pushes`; None where nothing is searched, as for cost and risk
+    pushes: Any  # `PushSequence`; None where nothing is searched, as for cost and risk
     slider: Slider
     hand: Hand
     start: Float[Array, "samples 3"]
@@ -250,7 +250,7 @@ def push_problem(
     model: FrictionModel,
     samples: int,
     fixtures: Fixtures,
-    search: tuple[Pushes, Cost, Risk] | None,
+    search: tuple[PushSequence, Cost, Risk] | None,
 ) -> PushProblem:
     """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction."""
     check_key(key)

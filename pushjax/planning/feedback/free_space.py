@@ -3,7 +3,7 @@
 As long as nothing else touches the slider, a push has the outcome that the library has. So a push is free if slider and
 finger keep a distance from all obstacles at every pose on the way. Other pushes are not considered at all.
 
-The many pushes from one pose are first judged by a table of the slider's distance from obstacles. The best few of them
+The many pushes from one pose are first judged by a grid of the slider's distance from obstacles. The best few of them
 are then checked exactly.
 """
 
@@ -11,20 +11,21 @@ from functools import cached_property
 
 import numpy as np
 
-from pushjax.planning.approach import Roadmap
-from pushjax.planning.pose_table import POSITIONS, PoseTable, grid_spacing
-from pushjax.planning.poses import compose, to_world
-from pushjax.planning.push_library import PushLibrary
+from pushjax.geometry.se2_numpy import compose, to_world
+from pushjax.planning.feedback.pose_grid import POSITIONS, PoseGrid, grid_spacing
+from pushjax.planning.feedback.push_library import PushLibrary
+from pushjax.planning.obstacles import OVERLAP_TOLERANCE
+from pushjax.planning.transits.roadmap import Roadmap
 from pushjax.planning.workspace import Workspace
 
-# Lengths in units of the surface's length.
-OVERLAP_TOLERANCE = 0.005  # overlap that counts as touching
-MIN_RETREAT = 0.02  # by how much a push must increase the slider's distance from an obstacle that is too near
-# Of the lengths of a push, every so many is checked: by the table, and exactly.
-TABLE_STRIDE, EXACT_STRIDE = 4, 2
-ANGLES = 72  # number of angles in the table
-SUBDIVISIONS = 4  # spacings of the table in one spacing of the grid of the cost to go
-MAX_VERTICES = 24  # number of vertices of the slider for the table
+# By how much a push must increase the slider's distance from an obstacle that is too near, in units of the surface's
+# length.
+MIN_RETREAT = 0.02
+# Of the lengths of a push, every so many is checked: by the grid, and exactly.
+GRID_STRIDE, EXACT_STRIDE = 4, 2
+ANGLES = 72  # number of angles of the grid
+SUBDIVISIONS = 4  # spacings of the grid in one spacing of that of the cost to go
+MAX_VERTICES = 24  # number of vertices of the slider for the grid
 
 
 class FreeSpace:
@@ -37,7 +38,7 @@ class FreeSpace:
         library: Pushes of the slider. Others may have other outcomes, but the same starts, directions and lengths.
         clearance: Distance that slider and finger keep from obstacles, m.
         goal: The goal, (3,), world. If it is nearer to an obstacle, the slider keeps only the distance it has there.
-        low: Lowest position of the slider on the grid of the cost to go, (2,), world, m. The table has the same range.
+        low: Lowest position of the slider on the grid of the cost to go, (2,), world, m. That of `distances` too.
         high: Highest position, (2,), world, m.
 
     Attributes:
@@ -63,7 +64,7 @@ class FreeSpace:
         self.low, self.spacing = low, grid_spacing(low, high) / SUBDIVISIONS
         self.positions = SUBDIVISIONS * (POSITIONS - 1) + 1
         reach = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
-        self.padding = int(np.ceil(reach / self.spacing)) + 1  # cells beyond the table that a push may lead to
+        self.padding = int(np.ceil(reach / self.spacing)) + 1  # cells beyond the grid that a push may lead to
         self.clearance = clearance
         at_goal = float(self.slider_distance(goal))
         if at_goal < -OVERLAP_TOLERANCE * self.length:
@@ -83,7 +84,7 @@ class FreeSpace:
         return self.obstacles.slider_clearance(vertices, poses, 2 * self.clearance, tolerance)
 
     @cached_property
-    def table(self) -> PoseTable:
+    def distances(self) -> PoseGrid:
         """`slider_distance` on a grid of poses, for an outline of at most `MAX_VERTICES` vertices."""
         axes = [low + self.spacing * np.arange(self.positions) for low in self.low]
         theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -91,18 +92,20 @@ class FreeSpace:
         values = [
             self._distance_of(outline, np.stack(np.meshgrid(*axes, [each], indexing="ij"), axis=-1)) for each in theta
         ]
-        return PoseTable(self.low, self.spacing, np.concatenate(values, axis=-1).astype(np.float32))
+        return PoseGrid(self.low, self.spacing, np.concatenate(values, axis=-1).astype(np.float32))
 
     @cached_property
     def _free_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cells that are free, on the grid of the table with `padding` more cells on each side.
+        """Cells that are free, on the grid of `distances` with `padding` more cells on each side.
 
         A tuple of three: those of the slider, (angles, cells, cells), those of the finger during a push, (cells,
         cells), and those of the finger at the start of a run-up, (cells, cells).
         """
         side = (self.padding, self.padding)
         slider = np.pad(
-            np.moveaxis(self.table.values, 2, 0) >= self.slider_clearance, ((0, 0), side, side), constant_values=True
+            np.moveaxis(self.distances.values, 2, 0) >= self.slider_clearance,
+            ((0, 0), side, side),
+            constant_values=True,
         )
         axes = [low + self.spacing * np.arange(-self.padding, self.positions + self.padding) for low in self.low]
         points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
@@ -115,7 +118,7 @@ class FreeSpace:
         return self.workspace.allows_finger(points) & (distance >= self.roadmap.from_obstacles)
 
     def probably_free(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
-        """Return which pushes from one pose are free by the table, each up to every `TABLE_STRIDE`-th length.
+        """Return which pushes from one pose are free by the grid, each up to every `GRID_STRIDE`-th length.
 
         Args:
             library: The pushes.
@@ -125,18 +128,16 @@ class FreeSpace:
         Returns:
             Whether they are free, (pushes, checked lengths).
         """
-        found = np.zeros((len(library.starts), len(range(0, len(library.travel), TABLE_STRIDE))), bool)
-        poses = compose(pose, library.outcomes[0][pushes, ::TABLE_STRIDE])
-        distance = self.table(poses)
+        found = np.zeros((len(library.starts), len(range(0, len(library.travel), GRID_STRIDE))), bool)
+        poses = compose(pose, library.outcomes[0][pushes, ::GRID_STRIDE])
+        distance = self.distances(poses)
         last = self.low + self.spacing * (self.positions - 1)
-        in_table = np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1)
-        ends = (
-            library.starts[pushes, None, :2] + library.travel[::TABLE_STRIDE, None] * library.directions[pushes, None]
-        )
+        in_grid = np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1)
+        ends = library.starts[pushes, None, :2] + library.travel[::GRID_STRIDE, None] * library.directions[pushes, None]
         finger = self.obstacles.point_clearance(to_world(pose, ends)) >= self.radius + self.clearance
-        # A slider that is nearer already may stay so. Its distance in the table can be off by about the spacing.
+        # A slider that is nearer already may stay so. Its distance on the grid can be off by about the spacing.
         required = min(self.slider_clearance, float(self.slider_distance(pose)) - self.spacing)
-        found[pushes] = np.logical_and.accumulate((~in_table | (distance >= required)) & finger, axis=1)
+        found[pushes] = np.logical_and.accumulate((~in_grid | (distance >= required)) & finger, axis=1)
         return found
 
     def free(self, library: PushLibrary, poses: np.ndarray, entries: np.ndarray) -> np.ndarray:
@@ -176,9 +177,9 @@ class FreeSpace:
         return self.obstacles.segment_clearance(start, end, enough) >= enough
 
     def free_from_grid(self, library: PushLibrary, angle: float, entries: np.ndarray) -> np.ndarray:
-        """Return whether pushes are free by the table, from every position on the grid of the cost to go.
+        """Return whether pushes are free by the grid, from every position on the grid of the cost to go.
 
-        Poses on the way and positions of the finger are rounded to the nearest cell of the table.
+        Poses on the way and positions of the finger are rounded to the nearest cell.
 
         Args:
             library: The pushes.
@@ -190,7 +191,7 @@ class FreeSpace:
         """
         slider, finger, run_up = self._free_cells
         push, index = library.entries[entries].T
-        steps = np.minimum(np.arange(0, len(library.travel) + TABLE_STRIDE, TABLE_STRIDE), index[:, None])
+        steps = np.minimum(np.arange(0, len(library.travel) + GRID_STRIDE, GRID_STRIDE), index[:, None])
         here = np.array([0.0, 0.0, angle])
         poses = compose(here, library.outcomes[0][push[:, None], steps].astype(float))
         ends = library.starts[push, None, :2] + library.travel[steps, None] * library.directions[push, None]
@@ -202,7 +203,7 @@ class FreeSpace:
         free = np.ones((len(entries), POSITIONS, POSITIONS), bool)
         for k, free_from in enumerate(free):
             free_from &= self._shifted(run_up, run_up_cells[k])
-            for step in range(-(-index[k] // TABLE_STRIDE) + 1):
+            for step in range(-(-index[k] // GRID_STRIDE) + 1):
                 free_from &= self._shifted(slider[turns[k, step]], slider_cells[k, step])
                 free_from &= self._shifted(finger, finger_cells[k, step])
         return free

@@ -1,0 +1,1 @@
+"""Pushes in a row, planned before the first one starts."""

@@ -1,0 +1,1 @@
+"""Squeezes in a row that make an unknown pose known."""

@@ -1,0 +1,1 @@
+"""Pushes that carry a slider without slip."""

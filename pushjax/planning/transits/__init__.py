@@ -1,0 +1,1 @@
+"""Transits of a round finger from one push to the next."""
