@@ -21,6 +21,7 @@ from pushjax._internal.checks import (
     check_shape,
     common_dtype,
 )
+from pushjax._internal.jit import quick_jit
 
 # The smallest bandwidth of a density estimate, in m. No tracker resolves less, and grasps end in distributions that
 # have no density.
@@ -56,6 +57,12 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
     for name, pose in (("pose_a", a), ("pose_b", b)):
         if pose.ndim == 0 or pose.shape[-1] != 3:
             raise ValueError(f"{name} has shape {pose.shape}; expected (..., 3)")
+    return _deviation(a, b, scale)
+
+
+@quick_jit
+def _deviation(a: Array, b: Array, scale: Array) -> Array:
+    """Return `deviation` for arrays of one dtype, by a single program."""
     shape = jnp.broadcast_shapes(a.shape, b.shape)
     delta = jnp.broadcast_to(a, shape) - jnp.broadcast_to(b, shape)
     squared = delta[..., 0] ** 2 + delta[..., 1] ** 2

@@ -3,10 +3,12 @@
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape, common_dtype
-from pushjax.contact.contact_plane import Contact, LimitCurve
+from pushjax._internal.jit import quick_jit
+from pushjax.contact.contact_plane import LimitCurve
 from pushjax.contact.problem import Contacts, contacts_in_scalars
 from pushjax.friction.limit_surface import LimitSurface
 
@@ -27,8 +29,13 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
         ValueError: If a shape is wrong, a number is not finite, the normal is not of unit length or the friction is
             negative.
     """
-    dtype = common_dtype(normal, friction)
-    contact = _checked_contact(jnp.zeros(2, dtype), normal, friction, dtype)
+    return _force_edges(_checked_contacts(np.zeros(2), normal, friction, common_dtype(normal, friction)))
+
+
+@quick_jit
+def _force_edges(contacts: Contacts) -> Float[Array, "2 2"]:
+    """Return the edges of the friction cone of the first contact."""
+    contact = contacts_in_scalars(contacts, contacts.friction)[0]
     n, mu = contact.normal, contact.friction
     edges = jnp.stack([(n + n.perp().scale(ratio)).array() for ratio in (mu, -mu)])
     return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
@@ -63,7 +70,14 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
 
     Reference: Mason 1986; Zhou et al. 2017, section IV.A.
     """
-    contact = _checked_contact(point, normal, friction, common_dtype(surface, point, normal, friction))
+    dtype = common_dtype(surface, point, normal, friction)
+    return _motion_edges(surface, _checked_contacts(point, normal, friction, dtype))
+
+
+@quick_jit
+def _motion_edges(surface: LimitSurface, contacts: Contacts) -> Float[Array, "2 2"]:
+    """Return the edges of the motion cone of the first contact."""
+    contact = contacts_in_scalars(contacts, contacts.friction)[0]
     curve = LimitCurve.of(surface.form(), contact)
     edges = []
     for ratio in (contact.friction, -contact.friction):
@@ -76,11 +90,10 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
     return jnp.stack(edges)
 
 
-def _checked_contact(point: ArrayLike, normal: ArrayLike, friction: ArrayLike, dtype: Any) -> Contact:
-    """Check the arguments and make a contact with a pusher that does not move."""
+def _checked_contacts(point: ArrayLike, normal: ArrayLike, friction: ArrayLike, dtype: Any) -> Contacts:
+    """Check the arguments and make one contact with a pusher that does not move."""
     p, n, mu = (as_float(value, dtype) for value in (point, normal, friction))
     check_shape("point", p, (2,))
     check_shape("normal", n, (2,))
     check_shape("friction", mu, ())
-    contacts = Contacts(p[None], n[None], jnp.zeros((1, 2), dtype), mu)
-    return contacts_in_scalars(contacts, contacts.friction)[0]
+    return Contacts(p[None], n[None], np.zeros((1, 2), dtype), mu)

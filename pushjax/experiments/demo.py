@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax._internal.jit import quick_jit
 from pushjax._internal.record import result_record
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
@@ -35,7 +33,7 @@ def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lam
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=64)
     pairs = support.wrench_twist_pairs(key, 400)
-    hand, path, start = pj.Hand.finger(RADIUS), pj.line(START, END, STEPS), jnp.zeros(3)
+    hand, path, start = pj.Hand.finger(RADIUS), pj.line(START, END, STEPS), np.zeros(3)
 
     rows, surfaces, pushes = [], {}, {}
     for degree, name in ((2, "ellipsoid"), (4, "quartic")):
@@ -79,12 +77,10 @@ def motion_cone_setup(key: jax.Array):
     block = pj.Polygon.rectangle(SIDE, SIDE)
     support = pj.Support.uniform(block, points=100)
     surface = pj.fit_limit_surface(*support.wrench_twist_pairs(key, 200), degree=4)
-    point, normal = jnp.array([[-0.02, -SIDE / 2]]), jnp.array([[0.0, 1.0]])
-    right = quick_jit(pj.motion_cone)(surface, point[0], normal[0], FRICTION)[1]
+    point, normal = np.array([[-0.02, -SIDE / 2]]), np.array([[0.0, 1.0]])
+    right = np.asarray(pj.motion_cone(surface, point[0], normal[0], FRICTION)[1])
     turn = -np.radians(15)  # the push lies clockwise of the cone's right edge
-    push = jnp.stack(
-        [np.cos(turn) * right[0] - np.sin(turn) * right[1], np.sin(turn) * right[0] + np.cos(turn) * right[1]]
-    )
+    push = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ right
     contacts = pj.Contacts(point, normal, push[None], FRICTION)
     return block, support, surface, contacts, pj.solve_contacts(surface, contacts)
 

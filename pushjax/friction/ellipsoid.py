@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete, in_numpy
 from pushjax._internal.xla import compute_once
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3
@@ -46,6 +46,11 @@ class EllipsoidForm(NamedTuple):
         return a.dot(product_a), 2 * b.dot(product_a), b.dot(product_b)
 
 
+@in_numpy
+def _symmetric_part(xp, matrix: Array) -> Array:
+    return (matrix + matrix.T) / 2
+
+
 class Ellipsoid(LimitSurface):
     """The limit surface of H(F) = F' A F, with the normalized wrench F = (fx, fy, tau / length).
 
@@ -72,7 +77,7 @@ class Ellipsoid(LimitSurface):
             lowest = np.linalg.eigvalsh((known + known.T).astype(np.float64) / 2)[0]
             if not lowest > 0:
                 raise ValueError(f"A must be positive definite; its smallest eigenvalue is {lowest:.3g}")
-        self.A = (matrix + matrix.T) / 2
+        self.A = _symmetric_part(matrix)
         self.length = checked_length(length, matrix.dtype)
 
     def form(self) -> EllipsoidForm:

@@ -31,7 +31,7 @@ from pushjax.identification.model import Problem
 from pushjax.identification.prior import Prior
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified
-from pushjax.identification.unknowns import NORMAL_PRIORS, SIZES, Unknowns
+from pushjax.identification.unknowns import Unknowns, known_parameters
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
@@ -107,7 +107,7 @@ def identify(
     conditions = pushes.weight.shape[0]
     surface = _surface_per_condition(slider.surface, conditions)
     known_values = {"friction": _known_friction(friction, conditions, dtype)}
-    known_values |= _known_parameters(known or {}, unknowns, conditions, dtype)
+    known_values |= known_parameters(known or {}, unknowns, conditions, dtype)
     metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
     pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
     needs_round_finger = {"overlap": "overlap" in (*unknowns.names, *known_values), "contact_at_end": contact_at_end}
@@ -199,27 +199,6 @@ def _known_friction(friction: ArrayLike, conditions: int, dtype: Any) -> Array:
     check_finite("friction", value)
     check_non_negative("friction", value)
     return jnp.broadcast_to(value, (conditions,))
-
-
-def _known_parameters(
-    known: Mapping[str, ArrayLike], unknowns: Unknowns, conditions: int, dtype: Any
-) -> dict[str, Array]:
-    """Check the argument `known` of `identify`, and return its values with a leading axis of conditions."""
-    values = {}
-    for name, value in known.items():
-        if name not in NORMAL_PRIORS:
-            instead = {"friction": "; there is the argument friction", "surface": "; it is that of the slider"}
-            raise ValueError(f"known: {name!r} is not one of {', '.join(NORMAL_PRIORS)}{instead.get(name, '')}")
-        if name in unknowns.names:
-            raise ValueError(f"known: {name!r} is also estimated; leave it out, or pass unknowns with {name}=None")
-        array, size = as_float(value, dtype, f"known[{name!r}]"), SIZES[name] or unknowns.sides
-        shape = (size,) if name == "friction_by_side" or size > 1 else ()
-        if array.shape not in (shape, (conditions, *shape)):
-            expected = f"{shape}, or {(conditions, *shape)} with an axis of conditions"
-            raise ValueError(f"known: {name!r} has shape {array.shape}; expected {expected}")
-        check_finite(f"known[{name!r}]", array)
-        values[name] = jnp.broadcast_to(array, (conditions, *shape))
-    return values
 
 
 @quick_jit

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.special import ndtri
 
+from pushjax._internal.checks import ArrayLike
 from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
@@ -17,7 +18,7 @@ from pushjax.identification import uncertainty
 from pushjax.identification.model import Scene, apply_inset, correct_path, limit_surfaces, predict_pushes
 from pushjax.identification.prior import Layout, Prior, PriorSurface
 from pushjax.identification.pushes import Pushes
-from pushjax.identification.unknowns import NORMAL_PRIORS, Parameters, Unknowns
+from pushjax.identification.unknowns import NORMAL_PRIORS, Parameters, Unknowns, known_parameters
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
@@ -124,6 +125,20 @@ class Identified(eqx.Module):
         per_push = jnp.sum(self.information[..., positions], axis=-1)
         total = jnp.sum(per_push)
         return per_push / jnp.where(total > 0, total, 1.0)
+
+    def with_known(self, **known: ArrayLike) -> "Identified":
+        """Return this result with other values of parameters that were not estimated.
+
+        Args:
+            **known: Values by name, as in the argument `known` of `identify`.
+
+        Raises:
+            ValueError: If a name is not that of a parameter or was estimated, or if a value is not finite or has the
+                wrong shape.
+        """
+        prior = self.prior
+        values = known_parameters(known, prior.unknowns, prior.layout.conditions, self.z.dtype)
+        return eqx.tree_at(lambda found: found.prior.known, self, prior.known | values)
 
     def save(self, path: str | Path) -> None:
         """Write everything to a JSON file that `load` reads back to the same bits."""

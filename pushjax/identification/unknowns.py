@@ -1,10 +1,11 @@
 """The unknowns of identification, and the physical parameters that they stand for."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, concrete
@@ -162,6 +163,38 @@ SIZES = {name: each["size"] for name, each in _DESCRIPTIONS.items()}
 NORMAL_PRIORS = tuple(name for name in NAMES if name not in ("friction", "surface"))
 CALIBRATION = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "calibration")
 TABLE = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "table")
+
+
+def known_parameters(
+    known: Mapping[str, ArrayLike], unknowns: Unknowns, conditions: int, dtype: Any
+) -> dict[str, Array]:
+    """Check the argument `known` of `identify`, and return its values with a leading axis of conditions.
+
+    Args:
+        known: Values of parameters that are not estimated, by name.
+        unknowns: What is estimated.
+        conditions: Number of conditions.
+        dtype: Floating dtype of the result.
+
+    Raises:
+        ValueError: If a name is not that of a parameter or is estimated, or if a value is not finite or has the wrong
+            shape.
+    """
+    values = {}
+    for name, value in known.items():
+        if name not in NORMAL_PRIORS:
+            instead = {"friction": "; there is the argument friction", "surface": "; it is that of the slider"}
+            raise ValueError(f"known: {name!r} is not one of {', '.join(NORMAL_PRIORS)}{instead.get(name, '')}")
+        if name in unknowns.names:
+            raise ValueError(f"known: {name!r} is also estimated; leave it out, or pass unknowns with {name}=None")
+        array, size = as_float(value, dtype, f"known[{name!r}]"), SIZES[name] or unknowns.sides
+        shape = (size,) if name == "friction_by_side" or size > 1 else ()
+        if array.shape not in (shape, (conditions, *shape)):
+            expected = f"{shape}, or {(conditions, *shape)} with an axis of conditions"
+            raise ValueError(f"known: {name!r} has shape {array.shape}; expected {expected}")
+        check_finite(f"known[{name!r}]", array)
+        values[name] = jnp.broadcast_to(array, (conditions, *shape))
+    return values
 
 
 class Parameters(NamedTuple):

@@ -122,6 +122,9 @@ def test_known_parameters(square, hand, tmp_path):
     again = pj.Identified.load(tmp_path / "found.json")
     for name, value in known.items():
         np.testing.assert_array_equal(getattr(again.parameters, name), value)
+    elsewhere = again.with_known(overshoot=0.0)
+    assert float(elsewhere.parameters.overshoot) == 0
+    np.testing.assert_array_equal(elsewhere.parameters.hand_offset, again.parameters.hand_offset)
     for wrong, message in (
         ({"overshot": 0.0}, "known: 'overshot' is not one of pressure_center, inset, overshoot"),
         ({"friction": 0.2}, "known: 'friction' is not one of .*; there is the argument friction"),

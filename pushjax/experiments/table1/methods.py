@@ -125,24 +125,20 @@ def fitted(pushes: pj.Pushes, condition: ConditionData, unknowns: pj.Unknowns, o
     """Identify the unknowns, assuming that the finger touches the object at the end of most pushes.
 
     Tip and object may overlap at the start of a push. One part of the overlap is a measurement error, and the rest is
-    real and pushes the object. How large a part is known, not estimated: the training pushes are whole, from the touch
-    on, so they carry no information about it.
+    real and pushes the object. The training pushes are whole, from the touch on, so they carry no information about it.
+    How large the part is in the pushes to predict is imposed, not estimated.
 
     Args:
         pushes: Pushes to learn from.
         condition: The object, its hand and its length.
         unknowns: What to find, with its priors.
-        overlap: Fraction of the overlap at the start that is a measurement error, as in `pj.Unknowns`.
+        overlap: Fraction of the overlap at the start of the pushes to predict that is a measurement error, as in
+            `pj.Unknowns`.
     """
-    return pj.identify(
-        pushes,
-        condition.slider,
-        condition.hand,
-        unknowns,
-        known={"overlap": overlap},
-        length=condition.length,
-        contact_at_end=True,
+    found = pj.identify(
+        pushes, condition.slider, condition.hand, unknowns, length=condition.length, contact_at_end=True
     )
+    return found.with_known(overlap=overlap)
 
 
 METHODS = {"wrench_twist": wrench_twist, "identified": identified}
