@@ -82,8 +82,8 @@ def energy_score(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> 
     d is the Euclidean distance between points (x, y, length cos theta, length sin theta). For small angles it is the
     distance between points (x, y, length theta). The paper's `deviation` is not suitable as d: the sum of a position
     distance and an angle distance is blind to the correlation of position and angle, and arc length on a circle does
-    not make the score strictly proper. The second mean is over pairs of different samples, so that the expected score
-    does not depend on n. Differentiable in the samples.
+    not make the score strictly proper. E d(X, X') is the mean over pairs of different samples, so that the expected
+    score does not depend on n. Differentiable in the samples.
 
     Args:
         samples: Poses (n, 3) drawn from the prediction, in m and rad; at least two.
@@ -270,8 +270,9 @@ class _Kernel:
         """Return points (k, 3) in coordinates in which the kernel's covariance is the identity."""
         return jax.scipy.linalg.solve_triangular(self.cholesky, points.T, lower=True).T
 
-    def log_densities(self, at: Float[Array, "3"]) -> Float[Array, "n"]:
-        images = jnp.stack([at.at[2].add(k * self.turn) for k in (-1, 0, 1)])
+    def log_densities(self, point: Float[Array, "3"]) -> Float[Array, "n"]:
+        """Return the log density of each sample's kernel, with its repetitions, at a point, m."""
+        images = jnp.stack([point.at[2].add(k * self.turn) for k in (-1, 0, 1)])
         offsets = self.points[None] - self._whitened(images)[:, None]
         return jax.nn.logsumexp(-jnp.sum(offsets**2, axis=2) / 2, axis=0) - self.log_normalization
 

@@ -46,10 +46,10 @@ class Common:
     """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
 
     def check(self) -> None:
-        """Raise ValueError for options that cannot be, as far as that shows without JAX."""
+        """Raise ValueError for invalid options, as far as they can be checked without JAX."""
 
     def settings(self) -> dict[str, Any]:
-        """Return the arguments of the experiment's `run` that are its own; None stands for its default."""
+        """Return the arguments for `run` of the experiment that only this command has, without those that are None."""
         common = {each.name for each in fields(Common)}
         own = {each.name: getattr(self, each.name) for each in fields(self) if each.name not in common}
         return {name: value for name, value in own.items() if value is not None}
@@ -103,7 +103,7 @@ class Table2(Common):
     data: DataFolder = None
     """Folder of the recorded pushes. Default: PUSHJAX_DATA, else what `pushjax data triangle` has fetched."""
     geometry: Literal["nominal", "measured"] = "nominal"
-    """nominal, as in the paper; or measured, contact and the push's end as force sensor and robot command tell."""
+    """nominal: as in the paper. measured: contact begins as the force sensor says, pushes end as the robot was told."""
     method: Annotated[
         tuple[Literal["ideal", "wrench_twist", "identified"], ...], cli_option("{ideal,wrench_twist,identified} …")
     ] = ("ideal", "wrench_twist", "identified")
@@ -275,10 +275,10 @@ Experiment = Union[*(Annotated[kind, tyro.conf.subcommand(name)] for name, kind 
 
 @dataclass
 class Reproduce:
-    """Reproduce an experiment of the paper and compare with the paper's own figures."""
+    """Reproduce an experiment: of the paper, or pusht-mpc. The tables are compared with the paper's own figures."""
 
     experiment: Annotated[Experiment, tyro.conf.arg(name="")]  # pyright: ignore[reportInvalidTypeForm]
-    """Which."""
+    """Name of the experiment."""
 
 
 @dataclass
@@ -296,7 +296,7 @@ class Identify(Options, Common):
     triangle logs (text)."""
 
     def check(self) -> None:
-        """Raise ValueError for options that cannot be, or if there is no log."""
+        """Raise ValueError for invalid options, or if there is no log."""
         Options.check(self)
         if not any(log.exists() for log in self.logs):
             missing = ", ".join(map(str, self.logs)) or "file"
@@ -331,7 +331,8 @@ class Data:
     """Where to. Default: pushjax's data folder of this user, where `reproduce table2` and `two-finger` look."""
 
 
-KINDS: dict[str, type[Common]] = {"demo": Demo, "identify": Identify, "plan": Plan}
+# The commands that are one experiment each, which `reproduce` and `data` are not.
+COMMAND_CLASSES: dict[str, type[Common]] = {"demo": Demo, "identify": Identify, "plan": Plan}
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Reproduce, tyro.conf.subcommand("reproduce")]

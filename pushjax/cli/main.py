@@ -16,7 +16,17 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import tyro
 
-from pushjax.cli.commands import COMMANDS, DATA_SETS, EXPERIMENTS, KINDS, Command, Common, Data, Demo, Reproduce
+from pushjax.cli.commands import (
+    COMMAND_CLASSES,
+    COMMANDS,
+    DATA_SETS,
+    EXPERIMENTS,
+    Command,
+    Common,
+    Data,
+    Demo,
+    Reproduce,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -63,7 +73,7 @@ def parsed(arguments: Sequence[str]) -> Any:
         args=arguments,
         prog="pushjax",
         description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
-        "`pushjax --version` tells which this is.",
+        "`pushjax --version` prints the version.",
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
 
@@ -93,10 +103,10 @@ def _check_word(kind: str, given: list[str], known: Sequence[str]) -> None:
 def _check_counts(given: list[str]) -> None:
     """End with exit status 2 if an option has fewer or more values than it takes.
 
-    tyro names every type that an option may have, of which a reader needs one.
+    It is checked here because tyro's own message lists every type of every value.
     """
     first, second = [*given[:2], "", ""][:2]
-    kind = EXPERIMENTS.get(second) if first == "reproduce" else KINDS.get(first)
+    kind = EXPERIMENTS.get(second) if first == "reproduce" else COMMAND_CLASSES.get(first)
     options = {} if kind is None else get_type_hints(kind, include_extras=True)
     for name, hint in options.items():
         flag, count = "--" + name.replace("_", "-"), _fixed_count(hint)
@@ -173,7 +183,7 @@ def data_folder(given: Path | None) -> Path:
 
 
 def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> None:
-    """Write the record and, except for the demo, its page; then delete the cells that an interrupted run needs."""
+    """Write the record and, except for the demo, its page. Then delete what was saved in case of an interruption."""
     from pushjax._internal.cell_cache import CellCache
     from pushjax._internal.record import write_json
     from pushjax.cli.page import write_page

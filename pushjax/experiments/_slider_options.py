@@ -10,8 +10,8 @@ import pushjax as pj
 
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
-NUM_PAIRS = 400
-NUM_POINTS = 100  # support points under a slider whose pressure is known everywhere
+NUM_PAIRS = 400  # wrench-twist pairs that a limit surface is fitted to
+NUM_POINTS = 100  # points in place of a continuous pressure, "uniform" or "rim"
 
 
 def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj.Ellipse:

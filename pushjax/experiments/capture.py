@@ -2,8 +2,8 @@
 
 A disk of radius 52.5 mm lies under uniform pressure. Two point fingers, 100 mm apart, move 262.5 mm straight ahead. The
 500 start centers are uniform in a circle of radius 78.8 mm ahead of the fingers. A push converges if the center of the
-disk ends within 1 mm of the place where the disk rests on both fingers. The same starts are pushed with every noise and
-every friction.
+disk ends within 1 mm of the place where the disk rests on both fingers. Whether it does is the verdict on its start.
+The same starts are pushed with every noise and every friction.
 
 The paper leaves the following open, and it is chosen here: where the circle lies, how far the fingers go into it, the
 radius of the fingers, the friction, and the criterion of convergence.
@@ -26,14 +26,14 @@ from pushjax._internal.record import result_record
 from pushjax.experiments._starts import uniform_in_circle
 
 DISK_RADIUS, FINGER_RADIUS, FINGER_SPACING, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
-START_RADIUS, START_DISTANCE = (
-    0.0788,
-    0.135,
-)  # m: radius of the circle of start centers, and its distance ahead of the fingers
-N, STEPS, MAX_DRAWN = 500, 525, 100
+START_RADIUS = 0.0788  # m, of the circle of start centers
+START_DISTANCE = 0.135  # m, of that circle's center from the middle between the fingers at the start, ahead of it
+N, STEPS = 500, 525
+MAX_DRAWN = 100  # paths in each panel of the picture
 DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the picture and the record's own figures are of the first friction
 CONVERGED_DISTANCE = 1e-3  # m
-SUPPORT_POINTS, PAIRS, GRID_POINTS = 150, 400, 80
+SUPPORT_POINTS, PAIRS = 150, 400  # of the support, and wrench-twist pairs, for the limit surface
+GRID_POINTS = 80  # on each axis, for the density of start centers in the picture
 
 
 def run(

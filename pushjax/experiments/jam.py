@@ -76,7 +76,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     block, surface_by_name = surfaces(seed)
     near_threshold = threshold() * (1 + THRESHOLD_DISTANCE * jnp.array([-1.0, 1.0]))
     scanned = jnp.sort(jnp.append(jnp.linspace(0.0025, 0.7975, 160), near_threshold))
-    frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # one program solves all
+    frictions = jnp.append(scanned, jnp.array((BELOW, ABOVE)))  # the drawn ones last; one program solves all
     rows, motions = [], {}
     for name, surface in surface_by_name.items():
         motion_by_friction = jax.jit(jax.vmap(lambda mu, s=surface: pj.solve_contacts(s, contacts(mu))))(frictions)

@@ -17,9 +17,10 @@ import numpy as np
 import pushjax as pj
 from pushjax._internal.record import result_record
 
-WIDTH, HEIGHT, FRICTION = 0.050, 0.035, 0.2
-PAD, THICKNESS = 0.027, 0.010
-OPENING, CLOSED = 0.075, 0.0005
+WIDTH, HEIGHT = 0.050, 0.035  # m, of the rectangle
+FRICTION = 0.2
+PAD, THICKNESS = 0.027, 0.010  # m, width and thickness of a pad
+OPENING, CLOSED = 0.075, 0.0005  # m, first and last opening of the jaw
 # Start poses: x (m), y (m), angle (degrees)
 STARTS = {
     "grasped with offset": (0.010, 0.0, 32.0),

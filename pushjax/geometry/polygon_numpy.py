@@ -15,7 +15,10 @@ CURVE_POINTS = 96  # vertices of the polygon that stands for a curved outline
 
 
 def outline_vertices(shape: Shape) -> np.ndarray:
-    """Return the vertices of a polygon, or points on the outline of another shape, counterclockwise, (vertices, 2)."""
+    """Return the vertices of a polygon, or points on the outline of another shape, (vertices, 2), body frame, m.
+
+    They are counterclockwise. A curved outline that is convex reaches a little beyond the polygon of these points.
+    """
     points = shape.vertices if isinstance(shape, Polygon) else shape.boundary(CURVE_POINTS)
     return np.asarray(points, np.float64)
 
@@ -54,21 +57,21 @@ def segment_distances(
     vertices: np.ndarray,
     start: np.ndarray,
     end: np.ndarray,
-    at_start: np.ndarray | None = None,
-    at_end: np.ndarray | None = None,
+    start_distance: np.ndarray | None = None,
+    end_distance: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the distance of segments from a polygon, zero or negative where they touch it.
+    """Return the distance of segments from a polygon, (...,), m, zero or negative where they touch it.
 
     Args:
-        vertices: Vertices, counterclockwise, (vertices, 2).
-        start: First points, (..., 2).
-        end: Last points, (..., 2).
-        at_start: `signed_distances` of the first points where it is known, (...,).
-        at_end: The same for the last points.
+        vertices: Vertices, counterclockwise, (vertices, 2), m.
+        start: First points, (..., 2), m.
+        end: Last points, (..., 2), m.
+        start_distance: `signed_distances` of the first points, (...,), m. None: they are computed.
+        end_distance: The same for the last points.
     """
     start, end = np.broadcast_arrays(start, end)
-    at_start = signed_distances(vertices, start) if at_start is None else at_start
-    at_end = signed_distances(vertices, end) if at_end is None else at_end
+    start_distance = signed_distances(vertices, start) if start_distance is None else start_distance
+    end_distance = signed_distances(vertices, end) if end_distance is None else end_distance
     (xv, yv), (ex, ey) = vertices.T, (np.roll(vertices, -1, axis=0) - vertices).T
     (sx, sy), (ox, oy) = np.split(end - start, 2, axis=-1), (xv - start[..., :1], yv - start[..., 1:])
     length2 = sx**2 + sy**2
@@ -79,7 +82,7 @@ def segment_distances(
     start_side = ey * ox - ex * oy
     end_side = start_side + ex * sy - ey * sx
     crosses = (side * np.roll(side, -1, axis=-1) < 0) & (start_side * end_side < 0)
-    apart = np.minimum(np.minimum(at_start, at_end), from_vertices)
+    apart = np.minimum(np.minimum(start_distance, end_distance), from_vertices)
     return np.where(crosses.any(-1), np.minimum(apart, 0.0), apart)
 
 
@@ -110,12 +113,12 @@ def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCur
     edge = np.roll(vertices, -1, axis=0) - vertices
     length = np.linalg.norm(edge, axis=1)
     outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / length[:, None]
-    turn = turns(vertices)
+    turn = exterior_angles(vertices)
     arc = distance * np.maximum(np.roll(turn, -1), 0)  # at the end of each edge
     ends = np.cumsum(np.stack([length, arc], axis=1).ravel())
-    at = (np.arange(count) + 0.5) / count * ends[-1]
-    piece = np.searchsorted(ends, at, side="right")
-    along = at - np.where(piece > 0, ends[piece - 1], 0.0)
+    arc_length = (np.arange(count) + 0.5) / count * ends[-1]
+    piece = np.searchsorted(ends, arc_length, side="right")
+    along = arc_length - np.where(piece > 0, ends[piece - 1], 0.0)
     k, on_arc = piece // 2, piece % 2 == 1
     angle = np.where(on_arc, along / distance, 0.0)
     c, s = np.cos(angle), np.sin(angle)
@@ -126,7 +129,7 @@ def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCur
     return OffsetCurve(points[keep], -away[keep])
 
 
-def turns(vertices: np.ndarray) -> np.ndarray:
+def exterior_angles(vertices: np.ndarray) -> np.ndarray:
     """Return the angle by which the outline turns at each vertex, rad, positive at convex corners, (vertices,)."""
     after = np.roll(vertices, -1, axis=0) - vertices
     before = np.roll(after, 1, axis=0)

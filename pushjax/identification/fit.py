@@ -154,7 +154,7 @@ class _Evidence(NamedTuple):
 
 
 def _evidence(
-    residual: PerKind, jacobian: PerKind, pushes: Pushes, fit: Fit, robust: float | None, has_normal_prior
+    residual: PerKind, jacobian: PerKind, pushes: Pushes, before: Fit, robust: float | None, has_normal_prior
 ) -> _Evidence:
     """Return the precision of z, and sigma as the evidence procedure estimates it.
 
@@ -162,12 +162,12 @@ def _evidence(
         residual: Residuals (conditions, pushes, rows) of each kind at the minimizer.
         jacobian: Their derivatives (conditions, pushes, rows, size) with respect to z.
         pushes: Pushes with a leading axis of conditions.
-        fit: The fit before, with the sigma with which the minimizer was found.
+        before: Result of the round before. Its sigma is the one with which the minimizer was found.
         robust: Number of sigma from which a push has less influence. None: least squares.
         has_normal_prior: (size,) 1 for entries of z that have a normal prior, else 0.
     """
-    by_kind, information, counts_and_squares = [], jnp.zeros_like(fit.information), []
-    kinds = zip(PerKind._fields, residual, jacobian, push_weights(pushes), fit.sigma, strict=True)
+    by_kind, information, counts_and_squares = [], jnp.zeros_like(before.information), []
+    kinds = zip(PerKind._fields, residual, jacobian, push_weights(pushes), before.sigma, strict=True)
     for kind, r, derivatives, weight, std in kinds:
         robust_weight = _robust_weights(kind, r, weight, std, robust)
         scaled = derivatives * (jnp.sqrt(robust_weight) / std)[..., None, None]
@@ -282,8 +282,8 @@ class Minimum(NamedTuple):
 class _LevenbergMarquardt(optx.LevenbergMarquardt):
     """Levenberg-Marquardt method with another stopping rule and another growth of the trust region.
 
-    It also terminates if a step was rejected and the next trial step is within the tolerance, as MINPACK does. No step
-    is accepted any more at a change of contact mode, or where roundoff hides the improvement.
+    It also terminates if a step was rejected and the next trial step is within the tolerance, as MINPACK does. At a
+    change of contact mode, or where roundoff hides the improvement, it would reject every further step, up to the last.
 
     The trust region grows tenfold if a step achieves three quarters of the predicted reduction. The library's default
     requires nearly all of the predicted reduction, which suits smooth functions. Where contacts change their mode, that

@@ -210,8 +210,8 @@ def _best_start(problem: Problem, pushes: Pushes, sigma: Array, *, robust: float
     z, layout = problem.prior.mean, problem.prior.layout
     if "friction" not in layout.names:
         return z
-    fraction = (jnp.arange(NUM_FRICTIONS, dtype=z.dtype) + 0.5) / NUM_FRICTIONS
-    candidates = jnp.log(fraction / (1 - fraction))
+    fraction = (jnp.arange(NUM_FRICTIONS, dtype=z.dtype) + 0.5) / NUM_FRICTIONS  # of the friction's range
+    candidates = jnp.log(fraction / (1 - fraction))  # the same as entries of z
     positions = layout.positions[:, layout.slices["friction"]][:, 0]
 
     def push_losses(value: Array) -> Array:

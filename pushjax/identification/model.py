@@ -65,9 +65,9 @@ class Problem(eqx.Module):
     def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> PerKind:
         """Return the residuals (conditions, pushes, rows) of each kind for all pushes, predicted less measured.
 
-        Poses are x, y, length * theta, in m. They are divided by the root of their number, and so are directions of
-        motion. A gap, in m, is that between the finger and the slider as it was measured at the end. A kind that was
-        not measured has no rows.
+        Poses are x, y, length * theta, in m. They are divided by the root of their number, so that all poses of a push
+        together weigh as much as one. So are directions of motion. A gap, in m, is that between the finger and the
+        slider as it was measured at the end. A kind that was not measured has no rows.
         """
         free, parameters = self._free_and_all(z)
         blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
@@ -371,6 +371,9 @@ def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset
         overshoot: Distance in m that the hand went on after the end of its path.
         lag_distance: Distance in m by which the hand was behind its logged position.
         hand_offset: (2,) displacement of the hand, world, m.
+
+    Returns:
+        (steps + 1, dof) true path.
     """
     arc = arc_length(path[:, :2])
     length = arc[-1]

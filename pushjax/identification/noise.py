@@ -82,7 +82,7 @@ class Noise(eqx.Module):
         relative_error: (2,) scale of the additional error per distance that the slider moved, and per length * angle
             that it turned.
         student_dof: Degrees of freedom of Student's distribution of all of these errors.
-        score: Mean score of the final poses at the end of the search (energy: m).
+        score: Mean score of the final poses at the end of the search; in m if it is the energy score.
         history: (steps,) mean score during the search.
         sampler: Sampler of the limit surfaces; see `FrictionModel`.
     """
@@ -149,7 +149,7 @@ class Noise(eqx.Module):
         """Return the log of the predicted density at the recorded final poses.
 
         The density is the mean of Student's densities about `n` sampled poses; their width is the error of the final
-        pose. Here this error and the hand's displacement have no common factor.
+        pose. Unlike in `predict`, the random factors of this error and of the hand's displacement are independent.
 
         Args:
             key: PRNG key.

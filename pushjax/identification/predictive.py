@@ -107,7 +107,7 @@ class ConditionSampler(eqx.Module):
         distribution: Distribution of the limit surface.
         parameters: Estimated parameters of the condition.
         pushes: Pushes of the condition.
-        scene: Slider and hand.
+        scene: Slider, hand and reference point of the table.
     """
 
     distribution: SurfaceDistribution
@@ -122,31 +122,31 @@ class ConditionSampler(eqx.Module):
         mu = jax.random.uniform(third, shape, self.pushes.end.dtype)
         return RandomInputs(jax.random.split(first, shape), jax.random.split(second, shape), mu)
 
-    def poses(self, inputs: RandomInputs, values: NoiseParameters, hand_shift: Float[Array, "pushes n 2"]) -> Array:
+    def poses(self, inputs: RandomInputs, noise: NoiseParameters, hand_shift: Float[Array, "pushes n 2"]) -> Array:
         """Return the true final poses (pushes, n, 3), without measurement error.
 
         Args:
             inputs: Random draws.
-            values: Parameters of the noise.
+            noise: Parameters of the noise.
             hand_shift: Displacement of each hand, world, m.
         """
-        return self._over_samples(self._final_pose, inputs, values, hand_shift)
+        return self._over_samples(self._final_pose, inputs, noise, hand_shift)
 
-    def linearize(self, inputs: RandomInputs, values: NoiseParameters) -> tuple[Array, PoseJacobian]:
-        """Return the true final poses without displacement of the hands, and their derivatives."""
+    def linearize(self, inputs: RandomInputs, noise: NoiseParameters) -> tuple[Array, PoseJacobian]:
+        """Return the true final poses (pushes, n, 3) without displacement of the hands, and their derivatives."""
 
         def pose_twice(sample, *rest):
             pose = self._final_pose(sample, *rest)
             return pose, pose
 
         no_shift = jnp.zeros((*inputs.mu.shape, 2), inputs.mu.dtype)
-        jacobian, poses = self._over_samples(jax.jacfwd(pose_twice, has_aux=True), inputs, values, no_shift)
+        jacobian, poses = self._over_samples(jax.jacfwd(pose_twice, has_aux=True), inputs, noise, no_shift)
         return poses, PoseJacobian(*jacobian)
 
-    def _over_samples(self, function: Callable, inputs: RandomInputs, values: NoiseParameters, hand_shift: Array):
+    def _over_samples(self, function: Callable, inputs: RandomInputs, noise: NoiseParameters, hand_shift: Array):
         """Map `function` of (dof, mu, hand shift), key of the surface and push over pushes and samples."""
         over_samples = jax.vmap(function, in_axes=(0, 0, None))
-        samples = (*values.dof_and_friction(inputs), hand_shift)
+        samples = (*noise.dof_and_friction(inputs), hand_shift)
         return jax.vmap(over_samples)(samples, inputs.surface, self.pushes.inputs)
 
     def _final_pose(self, sample: tuple[Array, Array, Array], key, push: PushInput) -> Float[Array, "3"]:
@@ -166,7 +166,7 @@ class PredictiveModel(eqx.Module):
         distribution: Distribution of the limit surface, with a leading axis of conditions.
         parameters: Estimated parameters, with a leading axis of conditions.
         pushes: Pushes, with a leading axis of conditions.
-        scene: Slider and hand.
+        scene: Slider, hand and reference point of the table.
         length: Length in m that makes angles commensurate with positions.
     """
 
@@ -197,24 +197,25 @@ class PredictiveModel(eqx.Module):
         pushes, scene = jax.tree.map(lambda leaf: leaf.astype(found.z.dtype), (pushes.as_conditions(), scene))
         return PredictiveModel(distribution, parameters, pushes, scene, found.length)
 
-    def over_conditions(self, function: Callable, key: PRNGKeyArray, values: NoiseParameters):
+    def over_conditions(self, function: Callable, key: PRNGKeyArray, noise: NoiseParameters):
         """Call `function` with the `ConditionSampler`, the key and the noise parameters of every condition."""
 
         def one_condition(key, distribution, parameters, pushes, friction):
             condition = ConditionSampler(distribution, parameters, pushes, self.scene)
-            return function(condition, key, values._replace(friction=friction))
+            return function(condition, key, noise._replace(friction=friction))
 
         keys = jax.random.split(key, len(self.parameters.friction))
-        return jax.vmap(one_condition)(keys, self.distribution, self.parameters, self.pushes, values.friction)
+        return jax.vmap(one_condition)(keys, self.distribution, self.parameters, self.pushes, noise.friction)
 
     def error_scale(
-        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: NoiseParameters
+        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, noise: NoiseParameters
     ) -> Float[Array, "*pushes n"]:
         """Return the scale in m of the error of each final pose, in x, y and length * theta."""
         moved = poses - pushes.start[..., None, :]
+        # both squared
         distance, turn = moved[..., 0] ** 2 + moved[..., 1] ** 2, (self.length * moved[..., 2]) ** 2
-        of_distance, of_turn = values.relative_error**2
-        return jnp.sqrt(values.sigma**2 + of_distance * distance + of_turn * turn)
+        of_distance, of_turn = noise.relative_error**2
+        return jnp.sqrt(noise.sigma**2 + of_distance * distance + of_turn * turn)
 
     def with_errors(
         self,
@@ -226,46 +227,46 @@ class PredictiveModel(eqx.Module):
         return poses + (error_scale[..., None] * unit_errors[..., 2:]).at[..., 2].divide(self.length)
 
     def log_density(
-        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, values: NoiseParameters
+        self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, noise: NoiseParameters
     ) -> Float[Array, "*pushes"]:
         """Return the log density of the recorded final poses.
 
         The density is the mean of Student's densities about `poses`.
         """
         difference = poses - pushes.end[..., None, :]
-        return log_student_density(difference, self.error_scale(poses, pushes, values), values.student_dof, self.length)
+        return log_student_density(difference, self.error_scale(poses, pushes, noise), noise.student_dof, self.length)
 
 
 @jit
 def predict(
-    key: PRNGKeyArray, predictive: PredictiveModel, values: NoiseParameters, n: int
+    key: PRNGKeyArray, predictive: PredictiveModel, noise: NoiseParameters, n: int
 ) -> Float[Array, "conditions pushes n 3"]:
     """Sample `n` measured final poses of each push."""
 
-    def measured(condition: ConditionSampler, key, values: NoiseParameters):
+    def measured(condition: ConditionSampler, key, noise: NoiseParameters):
         inputs = condition.draw_inputs(key, n)
-        unit_errors = inputs.unit_errors(values.student_dof)
-        poses = condition.poses(inputs, values, values.hand_offset * unit_errors[..., :2])
-        return predictive.with_errors(poses, predictive.error_scale(poses, condition.pushes, values), unit_errors)
+        unit_errors = inputs.unit_errors(noise.student_dof)
+        poses = condition.poses(inputs, noise, noise.hand_offset * unit_errors[..., :2])
+        return predictive.with_errors(poses, predictive.error_scale(poses, condition.pushes, noise), unit_errors)
 
-    return predictive.over_conditions(measured, key, values)
+    return predictive.over_conditions(measured, key, noise)
 
 
 @jit
 def log_density(
-    key: PRNGKeyArray, predictive: PredictiveModel, values: NoiseParameters, n: int
+    key: PRNGKeyArray, predictive: PredictiveModel, noise: NoiseParameters, n: int
 ) -> Float[Array, "conditions pushes"]:
     """Return the log density of the recorded final poses.
 
     The density is the mean of Student's densities about `n` sampled poses of each push.
     """
 
-    def density(condition: ConditionSampler, key, values: NoiseParameters):
+    def density(condition: ConditionSampler, key, noise: NoiseParameters):
         inputs = condition.draw_inputs(key, n)
-        poses = condition.poses(inputs, values, values.hand_offset * inputs.unit_errors(values.student_dof)[..., :2])
-        return predictive.log_density(poses, condition.pushes, values)
+        poses = condition.poses(inputs, noise, noise.hand_offset * inputs.unit_errors(noise.student_dof)[..., :2])
+        return predictive.log_density(poses, condition.pushes, noise)
 
-    return predictive.over_conditions(density, key, values)
+    return predictive.over_conditions(density, key, noise)
 
 
 def log_student_density(

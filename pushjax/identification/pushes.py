@@ -54,7 +54,7 @@ class Pushes(eqx.Module):
             If the wrench or the motion is zero, the pair does not count. Default: none.
         age: (pushes,) time of each push, from 0 (the first) to 1 (the last). The friction may depend on it, if
             `Unknowns.friction_drift` is given. Default: zeros.
-        side: (pushes,) side of the slider that was pushed, from 0. The friction may depend on it, if
+        side: (pushes,) index of the slider's side that was pushed, from 0. The friction may depend on it, if
             `Unknowns.friction_by_side` is given. A side beyond `Unknowns.sides` counts as the last. Default: zeros.
 
     Raises:
@@ -151,14 +151,14 @@ class Pushes(eqx.Module):
             steps: Number of steps of each path.
             parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked
                 during all pushes. Otherwise only the final pose is used.
-            shape: Outline of the slider. If it is given and the forces of a single finger were recorded, wrenches are
-                used too.
+            shape: Outline of the slider. If it is given, and the forces of a single finger were recorded, wrenches are
+                used too: the mean of each part. This needs more than one part.
 
         Returns:
             The pushes.
 
         Raises:
-            ValueError: If `steps` or `parts` is less than one, or if `parts` is not less than `steps`.
+            ValueError: If `steps` or `parts` is less than one, or if several `parts` are not fewer than `steps`.
             TypeError: If `log` is of another type.
         """
         check_type("log", log, PushLog, Recordings)

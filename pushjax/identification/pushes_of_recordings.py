@@ -26,9 +26,8 @@ MIN_TRAVEL = 1e-4  # m, smallest distance that a hand moves
 MAX_CONTACT_GAP = 0.005  # m, largest gap of a hand that touches: trackers and outlines have errors of millimeters
 TRACKER_NOISE = 5e-4  # m, largest displacement that may be noise of the tracker
 MAX_SLIDER_SIZE = 2.0  # m, largest extent of a slider
-MAX_DISTANCE = (
-    30.0  # largest distance from slider to hand, and largest travel of the hand, in units of the slider's size
-)
+# In units of the slider's size: largest distance from slider to hand, and largest travel of the hand.
+MAX_DISTANCE = 30.0
 MAX_TURN = 2 * np.pi  # rad, largest rotation of a slider in a push
 TRAVEL_MARGIN = 0.01  # m, margin for a slider that moves farther than its hand, and for errors of the tracker
 
@@ -74,7 +73,7 @@ def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> s
     moved, turn = float(np.linalg.norm(end[:2] - start[:2])), float(abs(end[2] - start[2]))
     if not (turn <= MAX_TURN and abs(start[2]) <= 2 * MAX_TURN):
         found = f"turns by {turn:.4g}" if not turn <= MAX_TURN else f"starts at {start[2]:.4g}"
-        return f"the object {found} rad; expected at most a turn, from within two of zero: is it in degrees?"
+        return f"the object {found} rad; expected at most a turn, and a start within two turns of 0: is it in degrees?"
     if not (travel <= MAX_DISTANCE * size and distance <= MAX_DISTANCE * size):
         what, found = (
             ("the hand moves", travel) if travel > MAX_DISTANCE * size else ("the hand stays away by", distance)
@@ -121,14 +120,14 @@ def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | N
         steps: Number of steps of each path.
         parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked during
             all pushes. Otherwise only the final pose is used.
-        shape: Outline of the slider. If it is given and the forces of a single finger were recorded, wrenches are used
-            too.
+        shape: Outline of the slider. If it is given, and the forces of a single finger were recorded, wrenches are used
+            too: the mean of each part. This needs more than one part.
 
     Returns:
         Arrays `start`, `path`, `end` and `poses_between`, and `wrench` and `twist` if they are used.
 
     Raises:
-        ValueError: If `steps` or `parts` is less than one, or if `parts` is not less than `steps`.
+        ValueError: If `steps` or `parts` is less than one, or if several `parts` are not fewer than `steps`.
     """
     if steps < 1:
         raise ValueError(f"steps must be at least 1; got {steps}")

@@ -28,7 +28,7 @@ class Profile(NamedTuple):
 
     Attributes:
         label: Label of that number of z.
-        value: (points,) values at which it is held, in its own unit (m; mu).
+        value: (points,) values at which it is held, in the unit that `Parameters` gives.
         rise: (points,) increase of half the loss, which is the negative log posterior density. All other unknowns are
             optimized. A 90 % interval is where it is below 1.35.
         normal: (points,) the same increase if the posterior were normal in z.

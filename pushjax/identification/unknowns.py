@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, concrete
 
-SIDES = 4
+SIDES = 4  # default number of a slider's sides
 
 
 def _optional_array(value: ArrayLike | None) -> Array | None:

@@ -97,6 +97,9 @@ class Missed(Cost):
         goal: The goal.
         width: Zero for a step from 0 to 1 at the tolerance. Otherwise the width of a smooth transition, in tolerances;
             its value at the tolerance is a half.
+
+    Raises:
+        ValueError: For a width that is negative, not finite or not a single number.
     """
 
     goal: Goal
@@ -111,12 +114,12 @@ class Missed(Cost):
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         beyond = self.goal.max_error(_poses(push)[-1]) - 1
         smooth = self.width > 0
-        slope = jax.nn.sigmoid(beyond / jnp.where(smooth, self.width, 1.0).astype(beyond.dtype))
-        return jnp.where(smooth, slope, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))
+        transition = jax.nn.sigmoid(beyond / jnp.where(smooth, self.width, 1.0).astype(beyond.dtype))
+        return jnp.where(smooth, transition, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))
 
 
 class WayPoints(Cost):
-    """Squared errors from several goals on the way, each at the pose that is nearest to it.
+    """Sum of the squared errors from several goals on the way, each at the pose where this error is least.
 
     Attributes:
         goals: The goals, in any order.
@@ -131,7 +134,7 @@ class WayPoints(Cost):
 
 
 class Travel(Cost):
-    """Length of the hand's path, m, from its first two numbers. The transit between pushes is not counted."""
+    """Length of the hand's path, m: of the first two numbers of its configuration. Transits are not counted."""
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         return jnp.sum(norm(jnp.diff(push.configuration[..., :2], axis=-2)))
@@ -145,18 +148,19 @@ class Work(Cost):
 
 
 class Clearance(Cost):
-    """How much nearer than a distance the slider comes to walls and fixtures: squared, in units of the distance.
+    """Penalty for a slider that comes nearer to walls and fixtures than a distance that it should keep.
 
-    The mean over the poses of the push. The distance is that between points on both outlines and the other body, so it
-    is exact for polygons that are apart.
+    The penalty of a pose is the square of what is missing, as a fraction of the distance to keep. The cost is its mean
+    over the poses of the push. What the slider has is measured from points on each outline to the other body, so it is
+    exact for polygons that are apart.
 
     Args:
         shape: Outline of the slider.
         fixtures: Walls and fixtures to stay away from.
-        distance: The distance, m.
+        distance: Distance to keep, m.
 
     Raises:
-        ValueError: For a distance that is not positive.
+        ValueError: For a distance that is not positive, not finite or not a single number.
     """
 
     shape: Shape
@@ -180,26 +184,27 @@ class Clearance(Cost):
         """
         points, found = se2.transform(pose, self.points), [jnp.asarray(jnp.inf, pose.dtype)]
         for each in self.fixtures:
-            found.append(_nearest(each, points))
+            found.append(_fixture_distance(each, points))
             if isinstance(each, Wall):
                 continue
             corners = se2.transform(each.pose, _outline_points(each.shape))
-            found.append(_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
+            found.append(_shape_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
         return jnp.min(jnp.stack(found))
 
 
 class HandClearance(Cost):
-    """How much nearer than a distance a hand of round fingers comes to walls and fixtures: squared, in its units.
+    """Penalty for a hand of round fingers that comes nearer to walls and fixtures than a distance that it should keep.
 
-    It is that of the nearest finger at the nearest point of the path, so it is above one if the hand runs into one.
+    It is the square of what is missing, as a fraction of the distance to keep, for the finger and the point of the path
+    that are nearest to a wall or fixture. So it is above one if the hand runs into one.
 
     Args:
         hand: The hand.
         fixtures: Walls and fixtures to stay away from.
-        distance: The distance, m.
+        distance: Distance to keep, m.
 
     Raises:
-        ValueError: For a distance that is not positive.
+        ValueError: For a distance that is not positive, not finite or not a single number.
     """
 
     hand: Hand
@@ -214,15 +219,15 @@ class HandClearance(Cost):
         found = [jnp.asarray(jnp.inf, centers.dtype)]
         for each in self.fixtures:
             for finger, radius in enumerate(self.hand.radius):
-                found.append(_nearest(each, centers[:, finger]) - radius)
+                found.append(_fixture_distance(each, centers[:, finger]) - radius)
         return (jnp.maximum(self.distance - jnp.min(jnp.stack(found)), 0) / self.distance) ** 2
 
 
-def _nearest(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float[Array, ""]:
+def _fixture_distance(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest distance of points from a wall or fixture, m, negative inside."""
     if isinstance(fixture, Wall):
         return jnp.min((points - fixture.point[None]) @ fixture.normal)
-    return _distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
+    return _shape_distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
 
 
 def _checked_distance(distance: ArrayLike) -> Float[Array, ""]:
@@ -239,7 +244,7 @@ def _outline_points(shape: Shape) -> Float[Array, "points 2"]:
     return jnp.concatenate([shape.vertices, points]) if isinstance(shape, Polygon) else points
 
 
-def _distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
+def _shape_distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest signed distance of points from a shape, both in its body frame, m."""
     outline = shape.outline()
     return jnp.min(jax.vmap(lambda point: outline.closest(Vec2.of(point)).distance)(points))
@@ -276,7 +281,7 @@ class CVaR(Risk):
     """Conditional value at risk: the mean of the worst fraction of the samples.
 
     The fraction need not be a whole number of samples; the last one then counts by a part. A fraction of one gives the
-    mean, and one that is at most one sample the worst.
+    mean. A fraction that amounts to one sample or less gives the worst sample.
 
     Args:
         fraction: The fraction, above 0 and at most 1.

@@ -16,7 +16,7 @@ from pushjax.simulation.arguments import checked_fixtures
 from pushjax.simulation.fixtures import Fixture, Wall
 
 OVERLAP_TOLERANCE = 0.005  # overlap that counts as touching, in units of the surface's length
-TOGETHER = 4000  # poses whose distances are computed together, so that their data stay in the cache
+POSES_AT_A_TIME = 4000  # poses whose distances are computed together, so that their data stay in the cache
 
 
 class Obstacles(NamedTuple):
@@ -38,7 +38,10 @@ class Obstacles(NamedTuple):
 
     @staticmethod
     def of(fixtures: Sequence[Wall | Fixture]) -> "Obstacles":
-        """Return the obstacles that walls and fixed bodies are, in the world.
+        """Return walls and fixed bodies as obstacles, in the world frame.
+
+        Args:
+            fixtures: The walls and fixed bodies.
 
         Raises:
             TypeError: For anything else than a sequence of `Wall` and `Fixture`.
@@ -47,7 +50,7 @@ class Obstacles(NamedTuple):
         walls = [(each.point, each.normal) for each in fixed if isinstance(each, Wall)]
         points, normals = np.moveaxis(np.array(walls, float).reshape(-1, 2, 2), 1, 0)
         bodies, disks = [], []
-        for each in (each for each in fixed if isinstance(each, Fixture)):
+        for each in [fixture for fixture in fixed if isinstance(fixture, Fixture)]:
             if isinstance(each.shape, Disk):
                 disks.append((each.center.x, each.center.y, each.shape.radius))
             else:
@@ -60,15 +63,15 @@ class Obstacles(NamedTuple):
         """Whether there is an obstacle at all."""
         return bool(self.bodies) or len(self.points) + len(self.radii) > 0
 
-    def seen_from(self, pose: np.ndarray) -> "Obstacles":
-        """Return the same obstacles in the frame of a body at a pose, (3,)."""
+    def in_frame(self, pose: np.ndarray) -> "Obstacles":
+        """Return the same obstacles in the frame of a body at a pose, (3,), m and rad."""
         bodies = tuple(to_body(pose, body) for body in self.bodies)
         turned = to_body(np.array([0.0, 0.0, pose[2]]), self.normals)
         return Obstacles(bodies, to_body(pose, self.points), turned, to_body(pose, self.centers), self.radii)
 
     def point_clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of points (..., 2) from the nearest obstacle, negative inside, (...,)."""
-        found = self._behind(points)
+        found = self._wall_clearance(points)
         for center, radius in zip(self.centers, self.radii, strict=True):
             found = np.minimum(found, np.hypot(*np.moveaxis(points - center, -1, 0)) - radius)
         for body in self.bodies:
@@ -79,16 +82,17 @@ class Obstacles(NamedTuple):
         """Return the distance of segments from the nearest obstacle, zero or negative where they touch it, (...,).
 
         Args:
-            start: First points, (..., 2).
-            end: Last points, (..., 2).
-            enough: Distance from which a lower bound of the distance will do, m.
+            start: First points, (..., 2), m.
+            end: Last points, (..., 2), m.
+            enough: Distances larger than this, m, may be too small in the result, but not smaller than this.
         """
-        found = np.minimum(self._behind(start), self._behind(end))
+        found = np.minimum(self._wall_clearance(start), self._wall_clearance(end))
         for center, radius in zip(self.centers, self.radii, strict=True):
-            found = np.minimum(found, _from_point(center, start, end) - radius)
+            found = np.minimum(found, _distance_from_point(center, start, end) - radius)
         for body in self.bodies:
             middle = body.mean(0)
-            apart = np.array(_from_point(middle, start, end) - np.linalg.norm(body - middle, axis=1).max())
+            size = np.linalg.norm(body - middle, axis=1).max()
+            apart = np.array(_distance_from_point(middle, start, end) - size)
             near = apart < enough
             some = (np.broadcast_to(each, (*apart.shape, 2))[near] for each in (start, end))
             apart[near] = segment_distances(body, *some)
@@ -98,13 +102,13 @@ class Obstacles(NamedTuple):
     def slider_clearance(self, vertices: np.ndarray, poses: np.ndarray, enough: float, tolerance: float) -> np.ndarray:
         """Return the distance of a slider from the nearest obstacle, for each pose, (...,), m.
 
-        Where they overlap by more than the tolerance it is negative: minus a distance by which the slider would have to
-        be moved to be out of the obstacle, not always the least.
+        Where they overlap by more than the tolerance it is negative: minus a distance by which the slider can be moved
+        out of the obstacle, not always the least. For a disk in a reflex corner of the slider it may be too small.
 
         Args:
             vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame.
             poses: Poses, (..., 3), world, m and rad.
-            enough: Distance from which a lower bound of the distance will do, m.
+            enough: Distances larger than this, m, may be too small in the result, but not smaller than this.
             tolerance: Overlap that counts as touching, m.
         """
         flat = np.asarray(poses, float).reshape(-1, 3)
@@ -114,20 +118,21 @@ class Obstacles(NamedTuple):
             facing = to_body(flat * np.array([0.0, 0.0, 1.0]), normal)
             found = np.minimum(found, (flat[:, :2] - point) @ normal + (facing @ vertices.T).min(-1))
         reach = np.linalg.norm(vertices, axis=1).max()
-        around = [(body.mean(0), np.linalg.norm(body - body.mean(0), axis=1).max(), body) for body in self.bodies]
-        around += [(center, radius, None) for center, radius in zip(self.centers, self.radii, strict=True)]
-        for middle, size, body in around:
-            apart = np.linalg.norm(flat[:, :2] - middle, axis=1) - reach - size
+        # bounding circles; a disk is its own, and there is no polygon in it
+        circles = [(body.mean(0), np.linalg.norm(body - body.mean(0), axis=1).max(), body) for body in self.bodies]
+        circles += [(center, radius, None) for center, radius in zip(self.centers, self.radii, strict=True)]
+        for middle, radius, body in circles:
+            apart = np.linalg.norm(flat[:, :2] - middle, axis=1) - reach - radius
             near = np.flatnonzero(apart < enough)
-            for some in np.array_split(near, len(near) // TOGETHER + 1):
+            for some in np.array_split(near, len(near) // POSES_AT_A_TIME + 1):
                 if body is None:
-                    apart[some] = signed_distances(vertices, to_body(flat[some], middle)) - size
+                    apart[some] = signed_distances(vertices, to_body(flat[some], middle)) - radius
                 else:
                     apart[some] = _polygons_apart(vertices, flat[some], body, tolerance)
             found = np.minimum(found, apart)
         return found.reshape(np.shape(poses)[:-1])
 
-    def _behind(self, points: np.ndarray) -> np.ndarray:
+    def _wall_clearance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of points (..., 2) from the nearest wall, negative behind it, (...,)."""
         found = np.full(points.shape[:-1], np.inf)
         for point, normal in zip(self.points, self.normals, strict=True):
@@ -135,7 +140,7 @@ class Obstacles(NamedTuple):
         return found
 
 
-def _from_point(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _distance_from_point(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Return the distance of segments from a point, (...,)."""
     (sx, sy), (ox, oy) = np.moveaxis(end - start, -1, 0), np.moveaxis(point - start, -1, 0)
     length2 = sx**2 + sy**2
@@ -147,7 +152,7 @@ def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, t
     """Return the distance between a polygon at each pose (poses, 3) and a convex one, as in `slider_clearance`."""
     corners, placed = to_world(poses[:, None], vertices), to_body(poses[:, None], body)
     apart = np.minimum(signed_distances(body, corners).min(1), signed_distances(vertices, placed).min(1))
-    beyond = _beyond(body, corners)
+    beyond = _edge_distances(body, corners)
     # Two polygons overlap if an edge of one has a part in the other, or if one is inside of the other. No part of an
     # edge that merely touches the body is in a body that is smaller by the tolerance.
     shrunk = beyond + tolerance
@@ -157,13 +162,15 @@ def _polygons_apart(vertices: np.ndarray, poses: np.ndarray, body: np.ndarray, t
     leaves = np.where(slope > 0, crossing, 1.0).min(-1)
     overlap = (np.maximum(enters, 0) < np.minimum(leaves, 1)).any(1)
     overlap |= apart < -tolerance
-    # it is out when it is beyond an edge of the body, or the body beyond an edge that the whole slider is behind
-    hull = _beyond(vertices, vertices).max(0) <= 1e-9 * np.abs(vertices).max()
-    escape = np.maximum(beyond.min(1).max(-1), _beyond(vertices, placed)[..., hull].min(1).max(-1, initial=-np.inf))
+    # The slider is out of the body when all of it is beyond one edge of the body, or when all of the body is beyond
+    # an edge of the slider that is part of its convex hull.
+    hull = _edge_distances(vertices, vertices).max(0) <= 1e-9 * np.abs(vertices).max()
+    body_beyond = _edge_distances(vertices, placed)[..., hull]
+    escape = np.maximum(beyond.min(1).max(-1), body_beyond.min(1).max(-1, initial=-np.inf))
     return np.where(overlap, np.minimum(escape, -tolerance), apart)
 
 
-def _beyond(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _edge_distances(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the distances of points (..., 2) from the lines of a polygon's edges, positive outside, (..., edges)."""
     edge = np.roll(polygon, -1, axis=0) - polygon
     outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)

@@ -28,21 +28,21 @@ def simulate_pushes(
     Args:
         slider: The slider. Leaves of its surface may have a leading axis of pushes.
         hand: The hand.
-        paths: Paths of the hand's configurations, (pushes, steps + 1, dof), m. They are resampled by none: the size
-            of their steps sets the accuracy.
-        poses: Poses of the slider at the start, (pushes, 3), m and rad.
+        paths: Paths of the hand's configurations, (pushes, steps + 1, dof), world. They are simulated step by step as
+            they are, so the size of the steps sets the accuracy.
+        poses: Poses of the slider at the start, (pushes, 3), world, m and rad.
         friction: Coefficient of contact friction, one for all pushes or (pushes,).
 
     Returns:
-        Poses of the slider along each path, (pushes, steps + 1, 3), and the number of steps before the first one that
-        failed or stopped, (pushes,).
+        Poses of the slider along each path, (pushes, steps + 1, 3), world, m and rad, and the number of steps before
+        the first one that failed or stopped, (pushes,).
     """
     count, steps = len(paths), paths.shape[1] - 1
     dtype = np.dtype(jnp.result_type(float))
     mu = np.broadcast_to(np.asarray(friction, dtype), (count,))
     surfaces = _one_surface_each(slider.surface, count)
     found = np.empty((count, steps + 1, 3), dtype)
-    good = np.full(count, steps)
+    valid = np.full(count, steps)
     for first in range(0, count, GROUP):
         group = slice(first, min(first + GROUP, count))
         size = group.stop - first
@@ -58,9 +58,9 @@ def simulate_pushes(
             done = min(LEG, steps - begin)
             found[group, begin + 1 : begin + done + 1] = reached[:size, 1 : done + 1]
             stopped = until[:size] < done
-            good[group] = np.where(stopped, np.minimum(good[group], begin + until[:size]), good[group])
+            valid[group] = np.where(stopped, np.minimum(valid[group], begin + until[:size]), valid[group])
             pose = reached[:, -1]
-    return found, good
+    return found, valid
 
 
 @quick_jit

@@ -2,7 +2,7 @@
 
 A search starts from several candidates and improves each of them by itself, so that different ways to solve a problem
 stay in the race. It returns the best parameters that were ever evaluated for each candidate, and so never makes one
-worse. The cost is a function of many parameters at once, and is evaluated in one compiled program.
+worse. The cost of many parameter vectors is evaluated at once, in one compiled program.
 """
 
 from abc import abstractmethod
@@ -74,6 +74,9 @@ class Selection(Search):
 
     Attributes:
         keep: How many to keep.
+
+    Raises:
+        ValueError: If `keep` is less than one.
     """
 
     keep: int = 16
@@ -121,10 +124,10 @@ class _Sampling(Search):
         for each in noise:
             samples = mean[:, None] + deviation[:, None] * each
             costs = objective.cost(samples.reshape(-1, size)).reshape(count, self.population)
-            first = np.argmin(costs, axis=1)
-            better = costs[np.arange(count), first] < cost
-            best = np.where(better[:, None], samples[np.arange(count), first], best)
-            cost = np.where(better, costs[np.arange(count), first], cost)
+            best_sample = np.argmin(costs, axis=1)
+            better = costs[np.arange(count), best_sample] < cost
+            best = np.where(better[:, None], samples[np.arange(count), best_sample], best)
+            cost = np.where(better, costs[np.arange(count), best_sample], cost)
             history.append(cost.min())
             mean, deviation = self.update(samples, costs, deviation)
         return Candidates.sorted(best, cost), np.array(history)
@@ -201,11 +204,13 @@ class MPPI(_Sampling):
 
 
 class GradientRefinement(Search):
-    """Adam from the best candidates.
+    """Gradient descent by Adam from the best candidates.
+
+    Its history has one more entry than iterations, because the first one is that of the start.
 
     Attributes:
         iterations: Number of iterations.
-        rate: Length of a step, in units of the objective's scale.
+        rate: Learning rate of Adam: about how far a parameter moves in an iteration, in units of the objective's scale.
         keep: Number of candidates that are refined; the others are dropped.
 
     Raises:

@@ -10,16 +10,16 @@ from pushjax.simulation.fixtures import Fixture, Wall
 
 
 class Workspace(NamedTuple):
-    """Limits of the centers of fingers, limits that the slider must stay within, and what both must stay out of.
+    """A rectangle for the center of a finger, one for the whole slider, and the obstacles among which both move.
 
-    The limits are parallel to the axes.
+    The rectangles are parallel to the world's axes.
 
     Attributes:
         finger_low: Lowest x and y of the finger's center, (2,), world, m.
-        finger_high: Highest x and y of the finger's center.
-        slider_low: Lowest x and y of any point of the slider.
-        slider_high: Highest x and y of any point of the slider.
-        obstacles: Walls at any angle and fixed bodies, which the finger keeps its radius away from.
+        finger_high: Highest x and y of the finger's center, (2,), world, m.
+        slider_low: Lowest x and y of any point of the slider, (2,), world, m.
+        slider_high: Highest x and y of any point of the slider, (2,), world, m.
+        obstacles: Walls at any angle and fixed bodies that neither the finger nor the slider may run into.
     """
 
     finger_low: np.ndarray
@@ -51,7 +51,7 @@ class Workspace(NamedTuple):
         return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf), fixtures)
 
     def allows_finger(self, points: np.ndarray) -> np.ndarray:
-        """Return whether a finger's center may be at points (..., 2), as far as the limits go."""
+        """Return whether points (..., 2), world, m, are within the finger's limits; obstacles are not considered."""
         return np.all((points >= self.finger_low) & (points <= self.finger_high), axis=-1)
 
 
@@ -69,12 +69,19 @@ class Extent:
         theta = np.arange(2 * angles) * np.pi / angles
         c, s = np.cos(theta)[:, None], np.sin(theta)[:, None]
         x, y = c * vertices[:, 0] - s * vertices[:, 1], s * vertices[:, 0] + c * vertices[:, 1]
-        reach = np.stack([-x.min(1), -y.min(1), x.max(1), y.max(1)], axis=1)
+        reach = np.stack([-x.min(1), -y.min(1), x.max(1), y.max(1)], axis=1)  # toward -x, -y, +x and +y
         around = np.maximum(np.maximum(np.roll(reach, 1, axis=0), reach), np.roll(reach, -1, axis=0))
         self.reach = around[::2].astype(np.float32)
 
     def outside(self, poses: np.ndarray, workspace: Workspace) -> np.ndarray:
-        """Return how far the slider is outside of the workspace, at most; zero within it, (...,), m."""
+        """Return the largest distance along x or y by which the slider is beyond its limits, (...,), m.
+
+        It is zero within the limits. Obstacles are not considered.
+
+        Args:
+            poses: Poses of the slider, (..., 3), world, m and rad.
+            workspace: The limits.
+        """
         cell = np.round(poses[..., 2] * (self.angles / (2 * np.pi))).astype(np.int32) % self.angles
         reach = self.reach[cell]
         (x, y), low, high = (poses[..., 0], poses[..., 1]), workspace.slider_low, workspace.slider_high

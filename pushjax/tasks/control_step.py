@@ -32,12 +32,12 @@ from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, s
 NEGLIGIBLE = 1e-3
 
 
-class Pushed(NamedTuple):
-    """What a control step leaves.
+class ControlStepResult(NamedTuple):
+    """Where slider and hand are after a control step, and how its steps went.
 
     Attributes:
         pose: Pose of the slider, (3,), world, m and rad.
-        configuration: Configuration of the hand, (dof,).
+        configuration: Configuration of the hand, (dof,), world, m and rad.
         status: `Status` of each of the steps of the path, (steps,).
     """
 
@@ -46,9 +46,9 @@ class Pushed(NamedTuple):
     status: Int[Array, "steps"]
 
     @staticmethod
-    def of(push: Trajectory) -> "Pushed":
-        """The end of a push."""
-        return Pushed(push.pose[-1], push.configuration[-1], push.status)
+    def of(push: Trajectory) -> "ControlStepResult":
+        """Return the result of a push along the whole path."""
+        return ControlStepResult(push.pose[-1], push.configuration[-1], push.status)
 
 
 class _TouchedOnce(Polygon):
@@ -69,11 +69,12 @@ def control_step(
     walls: tuple[Wall, ...],
     path: Float[Array, "steps+1 dof"],
     pose: Float[Array, "3"],
-) -> Pushed:
+) -> ControlStepResult:
     """Push a slider along a short path, among walls.
 
-    A slider that overlaps a finger or a wall deeply at the start is pushed out (`separation`); the status of all steps
-    is then OVERLAPPING.
+    If the hand is one round finger, a slider that overlaps the finger or a wall deeply at the start is pushed out
+    (`separation`), and the status of all steps is then OVERLAPPING. There is an exception among walls, and for a
+    polygon that is not convex: if the push with one contact and without walls is valid, it counts.
 
     Args:
         polygon: Outline of the slider.
@@ -82,19 +83,23 @@ def control_step(
             ellipsoid: programs are then smaller and faster.
         hand: The hand.
         walls: Walls, which the slider cannot pass.
-        path: Configurations of the hand, world, m.
+        path: Configurations of the hand, world, m and rad.
         pose: Pose of the slider at the start, world, m and rad.
+
+    Returns:
+        Where slider and hand end, and the status of each step of the path.
     """
     args = polygon, surface, friction, hand, walls, path, pose
     in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
     if not _is_finger(hand):
-        at_start = Pushed(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
+        # Always needed, and yet `where_needed`: in a batch it computes in rounds, so that no example waits for another.
+        at_start = ControlStepResult(pose, path[-1], jnp.full(len(path) - 1, Status.FREE, jnp.int8))
         return where_needed(jnp.ones((), bool), _with_all_contacts, at_start, *args, rounds=in_rounds)
-    once = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
-    push, allowed = Pushed.of(once), _allowed_overlap(surface, path)
+    with_one_contact = _simulated(_TouchedOnce(polygon), surface, friction, hand, (), path, pose)
+    push, allowed = ControlStepResult.of(with_one_contact), _allowed_overlap(surface, path)
     deep = jax.lax.stop_gradient(_depth_at_start(*args) > jnp.maximum(DEEP * surface.length, allowed))
     if walls or not polygon.convex:  # else there is no other contact
-        valid = jax.lax.stop_gradient(_is_valid(once, polygon, surface, walls, allowed))
+        valid = jax.lax.stop_gradient(_is_valid(with_one_contact, polygon, surface, walls, allowed))
         push = where_needed(~valid & ~deep, _with_all_contacts, push, *args, rounds=in_rounds)
         deep &= ~valid
     return where_needed(deep, _separated, push, *args)
@@ -115,6 +120,7 @@ def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless |
     """The solver of contact problems, and limit surface and friction of a step. Arguments as in `control_step`."""
     mu = jnp.zeros_like(path[0, 0]) if friction is None else friction
     form = to_scalars(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
+    # None: the default solver. It has a closed form for one contact, so `Frictionless` would not be faster there.
     solver = Frictionless() if friction is None and not isinstance(shape, _TouchedOnce) else None
     return solver, lambda step, pose: form
 
@@ -136,9 +142,9 @@ def _allowed_overlap(surface: LimitSurface, path: Float[Array, "steps+1 dof"]) -
 
 
 @jax.jit  # saves tracing time: loops trace their bodies several times
-def _with_all_contacts(*args) -> Pushed:
+def _with_all_contacts(*args) -> ControlStepResult:
     """The control step with all contacts. Arguments as in `control_step`, like those of the functions that follow."""
-    return Pushed.of(_simulated(*args))
+    return ControlStepResult.of(_simulated(*args))
 
 
 def _depth_at_start(polygon, surface, friction, hand, walls, path, pose) -> Scalar:
@@ -150,17 +156,17 @@ def _depth_at_start(polygon, surface, friction, hand, walls, path, pose) -> Scal
     return depth
 
 
-def _separated(polygon, surface, friction, hand, walls, path, pose) -> Pushed:
+def _separated(polygon, surface, friction, hand, walls, path, pose) -> ControlStepResult:
     """The control step of a slider that overlaps something deeply."""
     end = separate(polygon, surface.length, hand.fingers[0].radius, walls, path, pose)
-    return Pushed(end, path[-1], jnp.full(len(path) - 1, Status.OVERLAPPING, jnp.int8))
+    return ControlStepResult(end, path[-1], jnp.full(len(path) - 1, Status.OVERLAPPING, jnp.int8))
 
 
 class _Progress(NamedTuple):
     """State of a control step between two trials of parts of its steps.
 
     Attributes:
-        push: The push.
+        push: State of the push.
         trials_left: Number of trials that may follow.
         status: Status of the steps that are done, (steps,); -1 for the others.
     """
@@ -178,6 +184,7 @@ def _divided(polygon, surface, friction, hand, walls, path, pose) -> DividedPush
 
 @jax.jit
 def _begin(*args) -> _Progress:
+    """Return the state before the first trial."""
     push = _divided(*args)
     trials = jnp.full((), push.max_trials, jnp.int32)
     return _Progress(push.first_state(Vec3.of(args[-1])), trials, jnp.full(push.steps, -1, jnp.int8))
@@ -185,19 +192,23 @@ def _begin(*args) -> _Progress:
 
 @jax.jit
 def _advance(progress: _Progress, *args) -> _Progress:
+    """Try the next part of a step, and note the status of the step if that ended it."""
     state, (record, ended, step) = _divided(*args).trial(progress.push)
     status = progress.status.at[jnp.where(ended, step, len(progress.status))].set(record.status, mode="drop")
     return _Progress(state, progress.trials_left - 1, status)
 
 
 def _is_ongoing(progress: _Progress, *args) -> Bool[Array, ""]:
+    """Whether another trial follows."""
     return (progress.push.step < len(progress.status)) & (progress.trials_left > 0)
 
 
-def _finish(progress: _Progress, *args) -> Pushed:
+def _finish(progress: _Progress, *args) -> ControlStepResult:
+    """Return the result. Steps that were not done have the status that stopped the hand, or NOT_CONVERGED."""
     path, last, steps = args[-2], progress.push, len(progress.status)
     unfinished = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED)
     status = jnp.where(progress.status < 0, unfinished, progress.status).astype(jnp.int8)
+    # The hand is at the end of the path, or within the last step that was done if something stopped it there.
     step = jnp.where(last.stop_status != 0, jnp.sum(progress.status >= 0) - 1, steps)
     before, after = path[step], path[jnp.minimum(step + 1, steps)]
-    return Pushed(last.pose.array(), before + last.done * (after - before), status)
+    return ControlStepResult(last.pose.array(), before + last.done * (after - before), status)

@@ -1,7 +1,7 @@
 """Base class of the tasks: environments with the interface of gymnax 1.x.
 
-An environment is a frozen object without arrays, its parameters and its state are pytrees, and everything can be
-compiled, batched with `vmap` and differentiated. Nothing is imported from gymnax.
+An environment is a frozen object without arrays; its parameters and its state are pytrees. Everything can be compiled,
+batched with `vmap` and differentiated. Nothing is imported from gymnax.
 """
 
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
-from pushjax.tasks.control_step import Pushed, control_step
+from pushjax.tasks.control_step import ControlStepResult, control_step
 from pushjax.tasks.parts import with_noise
 from pushjax.tasks.spaces import Space
 
@@ -52,11 +52,12 @@ class TaskParams(_Replaceable):
 
     Attributes:
         slider: The slider, m. The origin of its frame is the center of gravity.
-        friction: Coefficient of friction between fingers and slider, if `model` is None; None for no friction under an
-            ellipsoid, for which there is a smaller and faster program.
+        friction: Coefficient of friction between fingers and slider, used if `model` is None. None for no friction, in
+            a smaller and faster program; the limit surface must then be an ellipsoid.
         goal: Pose at the goal, in the frame that is observed, (3,), world, length unit of the task and rad.
         model: Distribution of the friction, drawn at each reset for the whole episode; None for none.
-        surfaces: The distribution of limit surfaces that `model` has around that of the slider; None for none.
+        surfaces: Distribution of limit surfaces, of which the slider's is the mean: `model.around(slider.surface)`.
+            None if `model` is None.
         position_noise: Standard deviation of the noise on observed positions, length unit of the task; None for none.
         angle_noise: Standard deviation of the noise on the observed angle, rad; None for none.
         action_noise: Standard deviation of the noise on actions, in their unit; None for none.
@@ -96,6 +97,7 @@ class TaskState(_Replaceable):
     friction: Float[Array, ""] | None = None
 
 
+# Observation, state, reward, whether the episode terminated, whether it was truncated, and `info`.
 Transition = tuple[Any, TaskState, Array, Array, Array, dict[str, Any]]
 
 
@@ -104,8 +106,8 @@ class Environment(ABC):
     """An environment with the interface of gymnax 1.x.
 
     `reset` and `step` are compiled; under `jit` and `vmap` they are part of the surrounding program. A task defines
-    `default_params`, `draw_start`, `walk`, `goal_coverage`, `observe` and the spaces. It may define other `measures`
-    and another `reward`.
+    `default_params`, `hand_model`, `draw_start`, `walk`, `goal_coverage`, `observe` and the spaces. It may also define
+    `fixtures`, `measures`, `reward` and `picture`.
     """
 
     METERS: ClassVar[float] = 1.0  # m, length unit of the task
@@ -136,7 +138,16 @@ class Environment(ABC):
 
     @abstractmethod
     def walk(self, state: TaskState, action: Array) -> tuple[Array, Array]:
-        """Return the path of the hand in a control step, (steps + 1, dof), and its velocity at the end, (dof,)."""
+        """Return how an action moves the hand in a control step.
+
+        Args:
+            state: The state.
+            action: The action, noise included. It may be out of bounds, or not finite.
+
+        Returns:
+            The path of the hand, (steps + 1, dof), world, in the length unit of the task and rad, and the velocity of
+            the hand at its end, (dof,), per second.
+        """
 
     @abstractmethod
     def goal_coverage(self, state: TaskState, params: Any) -> Float[Array, ""]:
@@ -149,7 +160,7 @@ class Environment(ABC):
         Args:
             key: PRNG key of the observation's noise.
             state: The state.
-            action: The action that led to it; not used.
+            action: The action that led to it; None after a reset. No task here uses it.
             params: The parameters.
         """
 
@@ -206,7 +217,8 @@ class Environment(ABC):
         Args:
             key: PRNG key of everything random in the step and in a new start.
             state: The state.
-            action: The action, as in `action_space`. One that is not finite leaves the hand where it is going.
+            action: The action, as in `action_space`. One that is not finite counts as one that leaves the hand in its
+                place.
             params: The parameters; None for `default_params`.
 
         Returns:
@@ -220,7 +232,7 @@ class Environment(ABC):
         return _step(self, key, state, action, self.default_params if params is None else params)
 
     def reset_env(self, key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
-        """Start an episode, as `reset`, which is this compiled."""
+        """Start an episode. `reset` is the compiled form of this method."""
         start_key, friction_key, observation_key = jax.random.split(key, 3)
         pose, hand = self.draw_start(start_key, params)
         state = TaskState(pose, hand, jnp.zeros_like(hand), jnp.zeros((), jnp.int32))
@@ -244,7 +256,7 @@ class Environment(ABC):
         Returns:
             Observation, state, reward, whether the episode terminated, and a dictionary. It has the `measures` of the
             state, among them the "coverage" of the goal and "is_success", and "status", the number of steps of the
-            simulator with each `Status`, (7,). A step that is JAMMED stops the hand for the rest of the control step;
+            simulator with each `Status`, (7,). A JAMMED or GRASPED step stops the hand for the rest of its path;
             the slider stays. A control step with a step that is NOT_CONVERGED is undone: slider and hand stay where
             they were.
         """
@@ -253,7 +265,7 @@ class Environment(ABC):
         check_shape("action", given, self.action_space(params).shape)
         command = with_noise(key_action, given, params.action_noise)
         path, velocity = self.walk(state, command)
-        pushed = self._pushed(state, path, params)
+        pushed = self._push(state, path, params)
         stopped = jnp.any((pushed.status == Status.JAMMED) | (pushed.status == Status.GRASPED))
         unsolved = jnp.any(pushed.status == Status.NOT_CONVERGED)
         pose = jnp.concatenate([pushed.pose[:2] / self.METERS, pushed.pose[2:]])
@@ -270,8 +282,8 @@ class Environment(ABC):
         observation = self.observe(key_observation, new_state, command, params)
         return observation, new_state, reward, measures["is_success"], measures | {"status": counts}
 
-    def _pushed(self, state: TaskState, path: Array, params: Any) -> Pushed:
-        """What the hand's path leaves, m."""
+    def _push(self, state: TaskState, path: Array, params: Any) -> ControlStepResult:
+        """Push along a path of the hand, (steps + 1, dof), in the task's length unit. The result is in m."""
         slider, dtype = params.slider, state.pose.dtype
         hand = jax.tree.map(lambda leaf: leaf.astype(dtype), self.hand_model)
         return control_step(

@@ -1,4 +1,4 @@
-"""Compiled steps of episodes with a PRNG key of their own, and their automatic reset, for `pushjax.tasks.gym`."""
+"""Compiled starts, steps and automatic resets of episodes, each with its own PRNG key, for `pushjax.tasks.gym`."""
 
 from typing import Any
 
@@ -15,11 +15,12 @@ from pushjax.tasks.environment import Environment, TaskState
 
 @quick_jit
 def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, ...]:
-    """Start an episode, at a row of `state_of` if that is given. Return the next key, observation, state and info."""
+    """Start an episode, at `task.state_of(row)` if a row is given. Return the next key, observation, state and info."""
     key, start_key, noise_key = jax.random.split(key, 3)
     observation, state = task.reset_env(start_key, params)
     if row is not None:
         at_row = task.state_of(row, params)
+        # only these two: friction and limit surface stay as they were drawn
         state = state.replace(pose=at_row.pose, hand=at_row.hand)
         observation = task.observe(noise_key, state, None, params)
     info = task.measures(state, params) | {"status": jnp.zeros(len(Status), jnp.int32)}
@@ -51,8 +52,8 @@ def step_all(
         mode: When episodes that have ended are reset: value of an `AutoresetMode` of Gymnasium.
         keys: Keys of the environments.
         states: Their states.
-        ended: Whether the step before ended their episodes.
-        actions: The actions.
+        ended: Whether the step before ended their episodes, (environments,).
+        actions: The actions, (environments, ...).
         params: Parameters of the task.
 
     Returns:
@@ -69,11 +70,11 @@ def step_all(
         next_key, observation, state, reward, terminated, truncated, info = stepped
         otherwise = next_key, observation, state, info
         if mode == "SameStep":
-            now = where_needed(terminated | truncated, restart, otherwise, next_key, params)
-            return (*now[:3], reward, terminated, truncated, now[3]), (observation, info)
-        now = where_needed(ended, restart, otherwise, key, params)
+            after = where_needed(terminated | truncated, restart, otherwise, next_key, params)
+            return (*after[:3], reward, terminated, truncated, after[3]), (observation, info)
+        after = where_needed(ended, restart, otherwise, key, params)
         reward = jnp.where(ended, 0.0, reward)
-        return (*now[:3], reward, terminated & ~ended, truncated & ~ended, now[3]), None
+        return (*after[:3], reward, terminated & ~ended, truncated & ~ended, after[3]), None
 
     return jax.vmap(one)(keys, states, ended, actions)
 

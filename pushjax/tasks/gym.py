@@ -29,13 +29,14 @@ except ImportError as error:
     raise ImportError(f"pushjax.tasks.gym needs Gymnasium 1.1 or later: pip install '.[gym]' ({error})") from None
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-REGISTERED = {
+# Tasks that are registered, and the control steps after which `gymnasium.make` truncates their episodes.
+MAX_EPISODE_STEPS = {
     "PushT": 300,
     "PushBox": 100,
     "PushAlongWall": 100,
     "PushTwoFingers": 100,
     "Squeeze": 100,
-}  # control steps
+}
 
 
 class TaskEnv(gymnasium.Env):
@@ -122,7 +123,10 @@ class TaskEnv(gymnasium.Env):
         return _numpy(observation), float(reward), bool(terminated), truncated, _single_info(info)
 
     def render(self) -> np.ndarray | None:
-        """Return a picture, shape (render_size, render_size, 3), with the last action; None without a render mode."""
+        """Return a picture, shape (render_size, render_size, 3), with the last action.
+
+        None without a render mode, and before the first reset.
+        """
         if self.render_mode is None or self._state is None:
             return None
         return np.array(episodes.picture(self.task, self._state, self._action, self.params, self.render_size))
@@ -131,9 +135,9 @@ class TaskEnv(gymnasium.Env):
 class TaskVectorEnv(VectorEnv):
     """Many environments of a task, computed by one compiled step.
 
-    What Gymnasium's `SyncVectorEnv` returns for as many `TaskEnv` is returned here, in the same arrays, for all three
-    modes of the automatic reset (`metadata["autoreset_mode"]`). With SAME_STEP, "final_obs" and "final_info" are
-    what the last step of an episode returned.
+    `reset` and `step` return what Gymnasium's `SyncVectorEnv` returns for as many `TaskEnv`, in the same arrays, for
+    all three modes of the automatic reset (`metadata["autoreset_mode"]`). With SAME_STEP, "final_obs" and "final_info"
+    are what the last step of an episode returned.
 
     Args:
         task: The task, or the name of one in `pushjax.tasks`.
@@ -197,7 +201,9 @@ class TaskVectorEnv(VectorEnv):
             The observations of all environments, and `info` of those that were reset.
 
         Raises:
-            ValueError: If an option or the seeds have another shape, or a value is not finite.
+            gymnasium.error.ResetNeeded: If "reset_mask" leaves out an environment that had no reset yet.
+            ValueError: If an option or the seeds have another shape, a value is not finite, or the task has no
+                `state_of`.
         """
         super().reset(seed=seed if isinstance(seed, int) else None)
         mask = _reset_mask(options, self.num_envs)
@@ -230,8 +236,9 @@ class TaskVectorEnv(VectorEnv):
         if self._states is None:
             raise gymnasium.error.ResetNeeded("step was called before reset")
         if self.autoreset_mode == AutoresetMode.DISABLED and self._ended.any():
-            ended = ", ".join(str(i) for i in np.flatnonzero(self._ended)[:8])
-            raise gymnasium.error.ResetNeeded(f"reset_mask: these environments ended and need a reset: {ended} ...")
+            ended = np.flatnonzero(self._ended).tolist()
+            named = ", ".join(map(str, ended[:8])) + (f" and {len(ended) - 8} more" if len(ended) > 8 else "")
+            raise gymnasium.error.ResetNeeded(f"reset_mask: these environments ended and need a reset: {named}")
         now, last = episodes.step_all(
             self.task, self.autoreset_mode.value, self._keys, self._states, self._ended,
             _actions(actions, self.action_space), self.params,
@@ -245,7 +252,10 @@ class TaskVectorEnv(VectorEnv):
         return _numpy(self._observations), np.array(reward, np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return a picture of each environment; None without a render mode."""
+        """Return a picture of each environment, without its action.
+
+        None without a render mode, and before the first reset.
+        """
         if self.render_mode is None or self._states is None:
             return None
         states = (jax.tree.map(lambda leaf, i=i: leaf[i], self._states) for i in range(self.num_envs))
@@ -274,8 +284,8 @@ def _task(task: str | Environment, options: dict[str, Any]) -> Environment:
         if options:
             raise TypeError(f"{', '.join(options)}: options go with the name of a task; got the task itself")
         return task
-    if task not in REGISTERED:
-        raise ValueError(f"task must be of {', '.join(REGISTERED)}; got {task!r}")
+    if task not in MAX_EPISODE_STEPS:
+        raise ValueError(f"task must be one of {', '.join(MAX_EPISODE_STEPS)}; got {task!r}")
     return getattr(tasks, task)(**options)
 
 
@@ -344,11 +354,14 @@ def _single_info(info: dict[str, Array]) -> dict[str, Any]:
 
 
 def _vector_info(info: dict[str, Array], mask: np.ndarray) -> dict[str, Any]:
-    """Return what Gymnasium makes of single `info` where `mask` holds: zero elsewhere, with the mask as "_name"."""
+    """Return `info` as Gymnasium's vector environments do.
+
+    Each entry is zero where `mask` does not hold, and has the mask beside it, under the same name with "_" in front.
+    """
     result: dict[str, Any] = {}
     for name, value in info.items():
         array = np.array(value)
-        if array.ndim == 1 and array.dtype != bool:  # Python's numbers in the `info` of one environment
+        if array.ndim == 1 and array.dtype != bool:  # of Python's numbers, Gymnasium makes arrays of 64 bits
             array = array.astype(np.float64 if np.issubdtype(array.dtype, np.floating) else np.int64)
         array[~mask] = 0
         result |= {name: array, f"_{name}": mask.copy()}
@@ -364,7 +377,7 @@ def _final(observations: Any, info: dict[str, Array], ended: np.ndarray) -> dict
     return {"final_obs": final, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}
 
 
-for _name, _steps in REGISTERED.items():
+for _name, _steps in MAX_EPISODE_STEPS.items():
     gymnasium.register(
         f"pushjax/{_name}-v0",
         entry_point="pushjax.tasks.gym:TaskEnv",

@@ -41,8 +41,8 @@ def shared_params(
         max_steps_in_episode: Number of control steps after which an episode is truncated.
 
     Raises:
-        ValueError: For a wrong shape, a value that is not finite, a negative one but in `goal`, a limit of steps that
-            is not positive, or a model that the limit surface does not allow (`FrictionModel.around`).
+        ValueError: For a wrong shape, a value that is not finite, a value outside `goal` that is negative, a limit of
+            steps that is not positive, or a model that the limit surface does not allow (`FrictionModel.around`).
         TypeError: If `model` is no `FrictionModel`.
     """
     check_count("max_steps_in_episode", max_steps_in_episode)
@@ -70,7 +70,7 @@ def checked(name: str, value: ArrayLike, shape: tuple[int, ...], *, signed: bool
 
 
 def with_noise(key: PRNGKeyArray, values: Array, deviation: Array | None) -> Array:
-    """Return values with normal noise of this standard deviation; None for none."""
+    """Return values with normal noise of this standard deviation; None for no noise."""
     return values if deviation is None else values + deviation * jax.random.normal(key, values.shape, values.dtype)
 
 

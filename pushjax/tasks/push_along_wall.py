@@ -16,20 +16,21 @@ from pushjax.tasks.table_task import HALF_WIDTH, TableParams, draw_beside, draw_
 FACE = -0.15  # m, y of the wall's face
 GOAL_X = 0.1  # m
 START_X = (-0.15, -0.05)  # m, of the block
-GAP = 0.05  # m, between wall and block at the start, at most
+GAP = 0.05  # m, at most, between the wall and the circle around the block at the start
 
 
 @dataclass(frozen=True)
 class PushAlongWall(PushBox):
     """A round finger pushes a block against a wall, and along the wall to a goal where it lies flat against it.
 
-    The wall has the face y = -0.15 m, and friction with the block (`wall_friction`). It does not hold the finger, which
-    stays above it anyway. A finger that would press a block into the wall stops.
+    The wall has the face y = -0.15 m, and friction with the block (`wall_friction`). The finger does not reach it,
+    because its motion is limited. A finger that would press a block into the wall stops.
 
     An episode terminates when the block covers 0.9 of the goal, and is truncated after 100 control steps. Actions,
     observations and rewards are those of `PushBox`.
 
-    - Start: the block left of the middle, up to 0.05 m away from the wall and at any angle, and the finger above it.
+    - Start: the block left of the middle and at any angle, and the finger above it. The circle through the corner that
+      is farthest from the block's center is up to 0.05 m away from the wall.
     - Goal: the block at x = 0.1 m, with the angle zero.
 
     Attributes:

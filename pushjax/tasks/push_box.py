@@ -24,8 +24,8 @@ class PushBox(TableTask):
     - Action: motion of the finger in a control step along x and y, (2,), from -1 to 1, in units of 0.02 m.
     - Observation: finger x and y, block x and y, and cosine and sine of its angle times its `symmetry`, which is 2 for
       the default block, (6,).
-    - Reward: minus the distance of the block from the goal, in position and angle, plus a tenth of the distance between
-      the centers of finger and block, in units of 0.1 m.
+    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
+      times the length of the limit surface. b is the distance between the centers of finger and block.
     - Start: the block in a square of 0.2 m, at any angle, and the finger beside it.
 
     Attributes:

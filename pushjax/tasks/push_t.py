@@ -46,14 +46,21 @@ T_CENTER = (0.0, 45.0)  # of gravity: the mean of those of the two bars, not the
 # The corners of the two bars, in the order of gym-pusht's observations.
 T_KEYPOINTS = ((-60, 0), (60, 0), (60, 30), (-60, 30), (-15, 30), (15, 30), (15, 120), (-15, 120))
 T_LENGTH = 3000**0.5  # px
-GOAL = (256.0, 256.0, np.pi / 4)
+GOAL = (256.0, 256.0, np.pi / 4)  # px and rad, of the T's body
 SIZE = 512.0  # px, of the workspace
 WALLS = (7.0, 504.0)  # px, faces of the walls
 AGENT_RADIUS = 15.0  # px
-# Position and velocity of the agent relative to the action, after one physics step of 0.01 s.
-SPRING_STEP = np.array([[1 - 100 * 0.01**2, 0.01 * (1 - 20 * 0.01)], [-100 * 0.01, 1 - 20 * 0.01]])
+STIFFNESS, DAMPING = 100.0, 20.0  # 1/s^2 and 1/s, of the spring and the damper that move the agent
+PHYSICS_TIMESTEP = 0.01  # s
+# Maps position relative to the action, and velocity, of the agent to those after one physics step.
+SPRING_STEP = np.array(
+    [
+        [1 - STIFFNESS * PHYSICS_TIMESTEP**2, PHYSICS_TIMESTEP * (1 - DAMPING * PHYSICS_TIMESTEP)],
+        [-STIFFNESS * PHYSICS_TIMESTEP, 1 - DAMPING * PHYSICS_TIMESTEP],
+    ]
+)
 PHYSICS_STEPS = 10  # in a control step
-TABLE_FRICTION = 0.3
+TABLE_FRICTION = 0.3  # default coefficient of friction between agent and block under physics "table"
 
 
 class PushTParams(TaskParams):
@@ -84,8 +91,9 @@ class PushT(Environment):
 
     Attributes:
         observation: What is observed. "state": agent x and y, block x and y (of its body's origin) and angle modulo 2
-            pi. "environment_state_agent_pos": a dictionary with the block's corners, 16 numbers, and the agent's
-            position. "pixels": an image. "pixels_agent_pos": a dictionary with the image and the agent's position.
+            pi. "environment_state_agent_pos": a dictionary with the block's corners, 16 numbers for the T, and the
+            agent's position. "pixels": an image. "pixels_agent_pos": a dictionary with the image and the agent's
+            position.
         substeps: Steps of the simulator in a control step: 1, 2, 5 or 10.
         walls: Whether the workspace has walls, which hold the block and not the agent.
         image_size: Width and height of images, px.
@@ -110,7 +118,7 @@ class PushT(Environment):
 
     def __post_init__(self):
         if self.observation not in get_args(Observation):
-            raise ValueError(f"observation must be of {', '.join(get_args(Observation))}; got {self.observation!r}")
+            raise ValueError(f"observation must be one of {', '.join(get_args(Observation))}; got {self.observation!r}")
         if self.substeps not in (1, 2, 5, 10):
             raise ValueError(f"substeps must be 1, 2, 5 or 10; got {self.substeps!r}")
         if not self.image_size >= 1:
@@ -157,7 +165,7 @@ class PushT(Environment):
             TypeError: If `block` is no `Polygon`, or `model` no `FrictionModel`.
         """
         if physics not in get_args(Physics):
-            raise ValueError(f"physics must be of {', '.join(get_args(Physics))}; got {physics!r}")
+            raise ValueError(f"physics must be one of {', '.join(get_args(Physics))}; got {physics!r}")
         slider, origin, keypoints = _block(block, physics, self.METERS)
         if friction is None and physics == "table":
             friction = TABLE_FRICTION
@@ -167,7 +175,7 @@ class PushT(Environment):
             origin=origin,
             corners=slider.shape.vertices / self.METERS,  # pyright: ignore[reportAttributeAccessIssue]
             keypoints=keypoints,
-            seams=((7, 2),) if block is None else (),
+            seams=((7, 2),) if block is None else (),  # of the T, where its two bars meet
         )
 
     @property
@@ -261,7 +269,7 @@ class PushT(Environment):
     def state_of(
         self, observation: ArrayLike, params: PushTParams | None = None, *, position_first: bool = True
     ) -> TaskState:
-        """Return the state of an observed row, with the agent at rest.
+        """Return the state that belongs to an observation, with the agent at rest.
 
         Args:
             observation: Agent x and y, block x and y and angle, (5,), px and rad, as in "state" observations and in the
@@ -292,7 +300,12 @@ def _default_params(dtype: Any) -> PushTParams:
 
 
 def _block(block: Polygon | None, physics: Physics, meters: float) -> tuple[Slider, Array, Array]:
-    """Return the slider, m; and the origin of the block's frame and the observed points, px, in the slider's frame."""
+    """Make the slider from a block (None: the T).
+
+    Returns:
+        The slider, m; and in its frame, px, the origin of the block's own frame, (2,), and the observed points,
+        (points, 2).
+    """
     if block is None:
         vertices, center, keypoints = np.array(T_VERTICES, float), np.array(T_CENTER), np.array(T_KEYPOINTS, float)
     else:

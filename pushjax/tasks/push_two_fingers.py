@@ -29,8 +29,8 @@ class PushTwoFingers(TableTask):
       (3,), from -1 to 1.
     - Observation: hand x and y, in the middle between the fingers, cosine and sine of its angle; block x and y, and
       cosine and sine of its angle times its `symmetry`, which is 2 for the default block, (8,).
-    - Reward: minus the distance of the block from the goal, in position and angle, plus a tenth of the distance between
-      the centers of hand and block, in units of 0.1 m.
+    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
+      times the length of the limit surface. b is the distance between the centers of hand and block.
     - Start: the block in a square of 0.2 m, at any angle, and the hand beside it, at any angle.
 
     Attributes:

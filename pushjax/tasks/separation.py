@@ -20,8 +20,8 @@ from pushjax.simulation.candidate import FingerPose, take
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.wall_contact import wall_candidates
 
-# In units of the surface's length: two pixels of PushT, or 1.4 mm of the tasks on a table, whose longest steps may
-# leave as much. Deeper overlaps are treated here.
+# In units of the surface's length. Deeper overlaps are treated here. It is two pixels in PushT, and 1.4 mm in the tasks
+# on a table, where the longest ordinary steps may leave overlaps up to this depth.
 DEEP = 0.04
 ROUNDS = 10  # in a control step of 0.1 s
 OPENING = 1 - 0.9**0.6  # fraction of the depth that pymunk removes in 0.01 s: a tenth in 1/60 s
@@ -51,8 +51,8 @@ def overlap_of_finger(polygon: Polygon, radius: Scalar, center: Vec2, pose: Vec3
 def overlap_of_wall(polygon: Polygon, wall: Wall, pose: Vec3) -> Overlap:
     """Return the overlap of a wall and the slider, at the corner that is deepest behind the wall."""
     angle, normal = cos_sin(pose.z), Vec2.of(wall.normal)
-    seen = FingerPose((Vec2.of(wall.point) - pose.xy).unrotate(angle), normal.unrotate(angle))
-    corners = wall_candidates(polygon.outline(), seen)
+    wall_in_body = FingerPose((Vec2.of(wall.point) - pose.xy).unrotate(angle), normal.unrotate(angle))
+    corners = wall_candidates(polygon.outline(), wall_in_body)
     deepest = take(corners, jnp.argmin(corners.distance))
     return Overlap(-deepest.distance, deepest.point.rotate(angle), normal)
 
@@ -80,25 +80,29 @@ def separate(
     """
     steps = len(path) - 1
     times = jnp.arange(ROUNDS + 1, dtype=path.dtype) * (steps / ROUNDS)
-    fine = jnp.stack([jnp.interp(times, jnp.arange(steps + 1, dtype=path.dtype), column) for column in path.T], axis=1)
+    old_times = jnp.arange(steps + 1, dtype=path.dtype)
+    centers = jnp.stack([jnp.interp(times, old_times, column) for column in path.T], axis=1)  # of the finger
 
-    def pushed(pose: Vec3, overlap: Overlap, approach: Scalar) -> Vec3:
-        """Open a contact by a fraction of its depth, and follow the finger, which approaches by `approach`."""
+    def open_contact(pose: Vec3, overlap: Overlap, approach: Scalar) -> Vec3:
+        """Return the pose after a round: the contact opens by a fraction of its depth, and by `approach`, m.
+
+        That is how far the finger came nearer, or how much deeper the slider was pushed into the wall.
+        """
         touches = overlap.depth > 0
         opening = jnp.where(touches, jnp.maximum(approach, 0) + OPENING * jnp.maximum(overlap.depth, 0), 0.0)
         lever = overlap.point.cross(overlap.normal) / length
-        share = opening / (1 + lever**2)
-        return pose + Vec3(share * overlap.normal.x, share * overlap.normal.y, share * lever / length)
+        shift = opening / (1 + lever**2)
+        return pose + Vec3(shift * overlap.normal.x, shift * overlap.normal.y, shift * lever / length)
 
     def one_round(pose: Vec3, ends: tuple[Array, Array]):
         before, after = (Vec2.of(end) for end in ends)
         depths = [overlap_of_wall(polygon, wall, pose).depth for wall in walls]
         finger = overlap_of_finger(polygon, radius, after, pose)
-        pose = pushed(pose, finger, finger.normal.dot(after - before))
+        pose = open_contact(pose, finger, finger.normal.dot(after - before))
         for wall, depth in zip(walls, depths, strict=True):
             at_wall = overlap_of_wall(polygon, wall, pose)
-            pose = pushed(pose, at_wall, at_wall.depth - jnp.maximum(depth, 0))
+            pose = open_contact(pose, at_wall, at_wall.depth - jnp.maximum(depth, 0))
         return pose, None
 
-    last, _ = jax.lax.scan(one_round, Vec3.of(pose), (fine[:-1], fine[1:]))
+    last, _ = jax.lax.scan(one_round, Vec3.of(pose), (centers[:-1], centers[1:]))
     return last.array()

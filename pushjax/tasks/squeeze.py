@@ -10,7 +10,7 @@ from jaxtyping import Array, PRNGKeyArray
 
 from pushjax.contact.status import Status
 from pushjax.simulation.hand import Hand
-from pushjax.tasks.control_step import Pushed
+from pushjax.tasks.control_step import ControlStepResult
 from pushjax.tasks.environment import TaskState
 from pushjax.tasks.parts import placed
 from pushjax.tasks.table_task import HALF_WIDTH, TableParams, TableTask, draw_beside, draw_pose
@@ -35,10 +35,11 @@ class Squeeze(TableTask):
       how much it opens, in units of 0.02 m, (4,), from -1 to 1.
     - Observation: jaw x and y, cosine and sine of its angle, its opening; block x and y, and cosine and sine of its
       angle times its `symmetry`, which is 2 for the default block, (9,).
-    - Reward: minus the distance of the block from the goal, in position and angle, plus a tenth of the distance between
-      the centers of jaw and block, in units of 0.1 m.
+    - Reward: -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
+      times the length of the limit surface. b is the distance between the centers of jaw and block.
     - Start: the block in a square of 0.2 m, at any angle, and the open jaw around it, at any angle.
-    - `info` also has "is_held": whether the block is between the pads, and both are within 1 mm of it.
+    - `info` also has "is_held": whether the mean of the block's corners is between the pads, and both pads are within
+      1 mm of the block.
 
     Attributes:
         substeps: Steps of the simulator in each of the two parts of a control step.
@@ -57,7 +58,7 @@ class Squeeze(TableTask):
     MOTION: ClassVar[tuple[float, ...]] = (0.02, 0.02, 0.2, 0.02)
     LOWEST: ClassVar[tuple[float, ...]] = (-HALF_WIDTH, -HALF_WIDTH, -np.inf, 0.0)
     HIGHEST: ClassVar[tuple[float, ...]] = (HALF_WIDTH, HALF_WIDTH, np.inf, OPENING)
-    LARGEST: ClassVar[float] = 0.065
+    MAX_RADIUS: ClassVar[float] = 0.065
 
     @property
     def hand_model(self) -> Hand:
@@ -68,6 +69,7 @@ class Squeeze(TableTask):
         block_key, place_key, angle_key = jax.random.split(key, 3)
         dtype = params.goal.dtype
         pose = draw_pose(block_key, (-START, -START), (START, START), dtype)
+        # So near to the block's center that the pads are clear of the block at any angle.
         beside = draw_beside(place_key, jnp.zeros((), dtype), 1.0, (-np.pi, np.pi)) * (OPENING / 2 - params.radius)
         angle = jax.random.uniform(angle_key, (1,), dtype, -np.pi, np.pi)
         return pose, jnp.concatenate([pose[:2] + beside, angle, jnp.full((1,), OPENING, dtype)])
@@ -80,23 +82,25 @@ class Squeeze(TableTask):
         measures = super().measures(state, params)
         return measures | {"is_success": measures["is_success"] & held, "is_held": held}
 
-    def _pushed(self, state: TaskState, path: Array, params: TableParams) -> Pushed:
-        """What the two parts of a control step leave: first the opening changes, then the place."""
-        opens = jnp.array([False, False, False, True])
+    def _push(self, state: TaskState, path: Array, params: TableParams) -> ControlStepResult:
+        """Push along a path of the jaw in two parts: first only its opening changes, then only its pose."""
+        is_opening = jnp.array([False, False, False, True])
 
-        def part(carry: tuple[Array, Array], moves: Array) -> tuple[tuple[Array, Array], Pushed]:
+        def part(carry: tuple[Array, Array], changes: Array) -> tuple[tuple[Array, Array], ControlStepResult]:
+            """Change those coordinates of the jaw for which `changes` holds."""
             pose, hand = carry
-            change = jnp.where(moves[None], path - path[:1], 0)
-            pushed = super(Squeeze, self)._pushed(state.replace(pose=pose), hand[None] + change, params)
-            return (pushed.pose, pushed.configuration), pushed
+            change = jnp.where(changes[None], path - path[:1], 0)
+            result = super(Squeeze, self)._push(state.replace(pose=pose), hand[None] + change, params)
+            return (result.pose, result.configuration), result
 
-        _, parts = jax.lax.scan(part, (state.pose, path[0]), jnp.stack([opens, ~opens]))
-        closed, pushed = (Pushed(*(leaf[k] for leaf in parts)) for k in (0, 1))
-        moved = jnp.where(opens, closed.configuration, path[-1])
-        turn = moved[2:3] - closed.configuration[2:3]
-        place = placed(closed.pose[None, :2] - closed.configuration[None, :2], jnp.concatenate([moved[:2], turn]))[0]
-        carried_pose = jnp.concatenate([place, closed.pose[2:] + turn])
-        carried = Pushed(carried_pose, moved, jnp.full_like(pushed.status, Status.MOVING))
+        _, parts = jax.lax.scan(part, (state.pose, path[0]), jnp.stack([is_opening, ~is_opening]))
+        closed, pushed = (ControlStepResult(*(leaf[k] for leaf in parts)) for k in (0, 1))
+        # The other result of the second part: the jaw carries the block, as one body, to the end of the path.
+        jaw = jnp.where(is_opening, closed.configuration, path[-1])
+        turn = jaw[2:3] - closed.configuration[2:3]
+        position = placed(closed.pose[None, :2] - closed.configuration[None, :2], jnp.concatenate([jaw[:2], turn]))[0]
+        carried_pose = jnp.concatenate([position, closed.pose[2:] + turn])
+        carried = ControlStepResult(carried_pose, jaw, jnp.full_like(pushed.status, Status.MOVING))
         squeezed = jnp.any(closed.status == Status.GRASPED)
-        last = Pushed(*(jnp.where(squeezed, a, b) for a, b in zip(carried, pushed, strict=True)))
+        last = ControlStepResult(*(jnp.where(squeezed, a, b) for a, b in zip(carried, pushed, strict=True)))
         return last._replace(status=jnp.concatenate([closed.status, last.status]))

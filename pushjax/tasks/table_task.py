@@ -1,8 +1,9 @@
 """Tasks on a table: a hand moves a block to a pose, in meters, with friction at the fingers and under the block.
 
 The action says how far the hand moves in a control step of 0.1 s, as a fraction from -1 to 1 of the most that it can.
-The reward is minus the distance of the block from the goal, in position and angle, plus a tenth of the distance of the
-hand from the block, in units of 0.1 m. It is never positive, so an episode that ends early costs less.
+The reward is -(a + b / 10) / 0.1 m. a is the distance of the block from the goal: that of the position, plus the angle
+times the length of the limit surface. b is the distance between the centers of hand and block. The reward is never
+positive, so an episode that ends early costs less.
 
 Poses between which the outline of the block is the same count as equal, in observations, rewards and success.
 """
@@ -33,7 +34,7 @@ BLOCK = (0.09, 0.06)  # m, sides of the default block
 HALF_WIDTH = 0.25  # m, of the square in which the hand moves
 PICTURE_WIDTH = 0.6  # m
 REWARD_LENGTH, REACHING_WEIGHT = 0.1, 0.1  # m; weight of the hand's distance
-MAX_SYMMETRY = 12  # turns by a smaller angle than a full turn divided by this one are not looked for
+MAX_SYMMETRY = 12  # largest `symmetry` that is looked for
 
 
 class TableParams(TaskParams):
@@ -42,7 +43,8 @@ class TableParams(TaskParams):
     Attributes:
         corners: Corners of the block, in the slider's frame, (corners, 2), m.
         wall_friction: Coefficient of friction between the block and a wall.
-        symmetry: The number of angles in a full turn at which the block has the same outline.
+        symmetry: The number of angles in a full turn at which the block has the same outline: 2 for a rectangle. At
+            most 12 is found.
     """
 
     corners: Float[Array, "corners 2"]
@@ -73,11 +75,11 @@ class TableTask(Environment):
 
     substeps: int = 2
 
-    MOTION: ClassVar[tuple[float, ...]]  # by which the coordinates of the hand change at most, m and rad
-    LOWEST: ClassVar[tuple[float, ...]]  # values of the coordinates
+    MOTION: ClassVar[tuple[float, ...]]  # m and rad, largest changes of the hand's coordinates in a control step
+    LOWEST: ClassVar[tuple[float, ...]]  # m and rad, limits of the hand's coordinates
     HIGHEST: ClassVar[tuple[float, ...]]
-    GOAL: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)
-    LARGEST: ClassVar[float] = 0.08  # m, distance of a corner of a block from its center
+    GOAL: ClassVar[tuple[float, float, float]] = (0.0, 0.0, 0.0)  # m and rad, default pose at the goal
+    MAX_RADIUS: ClassVar[float] = 0.08  # m, largest distance of a corner of a block from its center
 
     def __post_init__(self):
         check_count("substeps", self.substeps)
@@ -109,7 +111,8 @@ class TableTask(Environment):
             friction: Coefficient of friction between fingers and block.
             wall_friction: Coefficient of friction between walls and block, for tasks with a wall.
             model: Distribution of friction, drawn at each reset for the whole episode. `friction` is then not used.
-            position_noise: Standard deviation of the noise on the block's observed position, m; None for none.
+            position_noise: Standard deviation of the noise on the block's observed position, m; None for none. The hand
+                is observed without noise.
             angle_noise: Standard deviation of the noise on its observed angle, rad; None for none.
             action_noise: Standard deviation of the noise on actions; None for none.
             success_coverage: Coverage of the goal above which an episode terminates.
@@ -127,8 +130,8 @@ class TableTask(Environment):
         check_type("block", shape, Polygon)
         corners = np.asarray(shape.vertices, float) - np.asarray(shape.centroid, float)
         radius = np.hypot(*corners.T).max()
-        if radius > self.LARGEST:
-            raise ValueError(f"block: a corner may be {self.LARGEST} m from the center; got {radius:.3g} m")
+        if radius > self.MAX_RADIUS:
+            raise ValueError(f"block: a corner may be {self.MAX_RADIUS} m from the center; got {radius:.3g} m")
         slider = Slider.uniform(Polygon(as_float(corners)))
         noise = {"position_noise": position_noise, "angle_noise": angle_noise, "action_noise": action_noise}
         place = self.goal_of(corners) if goal is None else goal
@@ -149,6 +152,7 @@ class TableTask(Environment):
 
     def observation_space(self, params: TableParams | None = None) -> Box:
         """Return the space of observations, m. The noise may exceed it."""
+        # The hand's coordinates, of which an angle counts twice; x, y, cosine and sine of the block.
         return Box(-1.0, 1.0, (4 + len(self.MOTION) + (len(self.MOTION) > 2),), jnp.result_type(float))
 
     def walk(self, state: TaskState, action: Array) -> tuple[Array, Array]:
@@ -178,7 +182,7 @@ class TableTask(Environment):
         return super().measures(state, params) | errors
 
     def reward(self, state: TaskState, measures: dict[str, Array], params: TableParams) -> Float[Array, ""]:
-        """Return minus the distance of the block from the goal, and of the hand from the block, in units of 0.1 m."""
+        """Return -(distance of the block from the goal + distance of the hand from the block / 10) / 0.1 m."""
         from_goal = measures["position_error"] + params.slider.surface.length * measures["angle_error"]
         from_block = norm(state.hand[:2] - state.pose[:2])
         return -(from_goal + REACHING_WEIGHT * from_block) / REWARD_LENGTH
@@ -197,7 +201,11 @@ class TableTask(Environment):
         return render_table(block, goal, self.hand_model, state.hand, walls, PICTURE_WIDTH, size)
 
     def state_of(self, row: ArrayLike, params: TableParams | None = None) -> TaskState:
-        """Return a state of the configuration of the hand, followed by the block's x, y and angle, m and rad.
+        """Return a state with the hand at rest.
+
+        Args:
+            row: Configuration of the hand, and x, y and angle of the block, (dof + 3,), world, m and rad.
+            params: The parameters; None for `default_params`.
 
         Raises:
             ValueError: For a wrong shape; where it is not traced, also for values that are not finite.
@@ -208,7 +216,7 @@ class TableTask(Environment):
 
 
 def draw_beside(key: PRNGKeyArray, nearest: Array, spread: float, angles: tuple[float, float]) -> Array:
-    """Draw a vector, (2,), whose length is from `nearest` to `nearest` + `spread`, m, and its angle between two."""
+    """Draw a vector, (2,), of a length from `nearest` to `nearest` + `spread`, m, in a direction between two angles."""
     length_key, angle_key = jax.random.split(key)
     length = nearest + jax.random.uniform(length_key, (), nearest.dtype, 0.0, spread)
     return length * cos_sin(jax.random.uniform(angle_key, (), nearest.dtype, *angles)).array()

@@ -195,7 +195,10 @@ def test_what_cannot_be_used_is_named_and_counted(report):
         ({"--shape": "disk:a"}, "got 'disk:a'"),
         ({"--hand": "two_fingers"}, "the hand has 2 numbers; a hand two_fingers has 4"),
         ({"--support": "middle"}, "--support: expected uniform, rim, or points"),
-        ({"--friction": ["0.5", "0.2"]}, "--friction must be lowest and highest, both at least 0; got 0.5 0.2"),
+        (
+            {"--friction": ["0.5", "0.2"]},
+            "--friction must be lowest and highest, at least 0 and different; got 0.5 0.2",
+        ),
         ({"--inset": "-1"}, "inset"),
         ({"--steps": "0"}, "steps must be at least 1; got 0"),
         ({"--forces": [], "--parts": "1"}, "--forces needs --parts"),

@@ -82,7 +82,8 @@ def clearances(planner, pose, entry):
 
 def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
     rng, space, allowed = np.random.default_rng(1), sparse.space, 0
-    wanted = np.array([sparse.clearance, sparse.clearance, sparse.roadmap.from_obstacles - RADIUS])
+    before_run_up = sparse.roadmap.min_obstacle_distance - RADIUS
+    wanted = np.array([sparse.clearance, sparse.clearance, before_run_up])
     assert space.slider_clearance == pytest.approx(sparse.clearance)  # the goal is farther away
     for pose, _ in starts(slider, 8, high=0.44):
         before = placed(slider, pose).distance(WORLD)

@@ -78,7 +78,7 @@ def test_a_frame_changes_no_distance():
     rng = np.random.default_rng(1)
     obstacles = Obstacles.of([fixed(rng) for _ in range(8)])
     pose, points = np.array([0.3, -0.1, 2.0]), rng.uniform(-0.3, 0.3, (50, 2))
-    there = obstacles.seen_from(pose).point_clearance(to_body(pose, points))
+    there = obstacles.in_frame(pose).point_clearance(to_body(pose, points))
     np.testing.assert_allclose(there, obstacles.point_clearance(points), atol=1e-12)
 
 

@@ -10,7 +10,7 @@ import pushjax as pj
 from pushjax._internal.jit import quick_jit
 from pushjax.planning import StableStatus, shortest_push, stable_contacts, stable_push
 from pushjax.planning.friction_samples import draw_friction
-from pushjax.planning.stable.line_contact import LineContact, turn
+from pushjax.planning.stable.line_contact import LineContact, tightest_turn
 
 WIDTH, HEIGHT, RADIUS, SPACING = 0.09, 0.06, 0.005, 0.04
 BLOCK, HAND = pj.Polygon.rectangle(WIDTH, HEIGHT), pj.Hand.two_fingers(RADIUS)
@@ -116,7 +116,7 @@ def test_bound_of_an_isotropic_surface(margin):
     frame = np.array([0.0, -depth / 2, np.pi / 2])
     contact = LineContact(0, np.zeros(3), frame, half, 0.0, depth)
     surfaces = jax.tree.map(lambda leaf: leaf[None], isotropic(length))
-    found = turn(contact, surfaces, jnp.array([friction]), margin)
+    found = tightest_turn(contact, surfaces, jnp.array([friction]), margin)
     swing = depth / 2 - found.point  # lateral velocity of the center, per curvature
     by_force = (1 - margin) * friction / abs(swing)
     by_torque = (1 - margin) * half / abs(length**2 + depth / 2 * swing)

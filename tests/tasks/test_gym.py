@@ -262,11 +262,11 @@ def test_goes_on_from_a_pickle(push_t):
         (
             {"task": "PushP"},
             ValueError,
-            "task must be of PushT, PushBox, PushAlongWall, PushTwoFingers, Squeeze; got 'PushP'",
+            "task must be one of PushT, PushBox, PushAlongWall, PushTwoFingers, Squeeze; got 'PushP'",
         ),
         ({"task": 3}, TypeError, "task: expected a Environment; got a int"),
         ({"task": Walk(), "substeps": 2}, TypeError, "substeps: options go with the name of a task"),
-        ({"observation": "pixel"}, ValueError, "observation must be of state"),
+        ({"observation": "pixel"}, ValueError, "observation must be one of state"),
         ({"render_mode": "human"}, ValueError, "render_mode must be 'rgb_array' or None; got 'human'"),
         ({"render_size": 0}, ValueError, "render_size must be a whole number, at least 1; got 0"),
     ],

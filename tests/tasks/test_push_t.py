@@ -149,10 +149,10 @@ def test_derivatives_are_those_of_differences(box, box_steps):
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (lambda: PushT(observation="image"), "observation must be of state"),
+        (lambda: PushT(observation="image"), "observation must be one of state"),
         (lambda: PushT(substeps=3), "substeps must be 1, 2, 5 or 10; got 3"),
         (lambda: PushT(image_size=0), "image_size must be positive"),
-        (lambda: ENV.params("mujoco"), "physics must be of pymunk, table; got 'mujoco'"),
+        (lambda: ENV.params("mujoco"), "physics must be one of pymunk, table; got 'mujoco'"),
         (lambda: ENV.params(goal=(1.0, 2.0)), r"goal has shape \(2,\)"),
         (lambda: ENV.params(friction=-0.1), "friction must not be negative"),
         (lambda: ENV.params(action_noise=np.nan), "action_noise must be finite"),

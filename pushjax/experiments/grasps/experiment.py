@@ -29,7 +29,7 @@ HOLD = 5  # steps for which the closed jaw waits, so that a slider that has slip
 DOF = 250.0
 FRICTION = (0.015, 0.02)
 PAIRS = 400  # wrench-twist pairs that the mean ellipsoid is fitted to
-BINS = 45  # of each histogram
+BINS = 45  # of each histogram in the record; the picture has more
 OUTCOMES = ("grasped", "jammed", "free", "failed")
 
 

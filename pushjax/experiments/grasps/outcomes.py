@@ -1,7 +1,7 @@
 """Outcome of each grasp.
 
 Every slider whose hand stopped is held between both pads. Unlike `MonteCarlo.outcomes`, this module counts a grasp as
-grasped if it is stable: the jaw would have to be wider if the slider turned a little either way. It counts a grasp as
+grasped if it is stable: to turn the slider a little, either way, the jaw would have to open. It counts a grasp as
 jammed if friction alone keeps it: a turn would let the jaw close.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 import pushjax as pj
 from pushjax.experiments._starts import uniform_in_circle
 
-PERTURBATION = np.radians(1.0)
-OUTLINE_POINTS = 500
+PERTURBATION = np.radians(1.0)  # turn either way by which a grasp is tested for stability
+OUTLINE_POINTS = 500  # on a curve, and on each edge of a polygon
 BIN_WIDTH = np.radians(1.0)  # width of a bin of angles in which spikes are looked for
 MIN_SPIKE_SHARE = 0.02  # smallest share of all angles that makes a spike
 
@@ -33,8 +33,8 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     outline = np.asarray(shape.boundary(OUTLINE_POINTS), np.float64)
     if isinstance(shape, pj.Polygon):
         corners = np.asarray(shape.vertices, np.float64)
-        share = np.arange(OUTLINE_POINTS)[:, None, None] / OUTLINE_POINTS
-        outline = (corners + share * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 2)
+        fraction = np.arange(OUTLINE_POINTS)[:, None, None] / OUTLINE_POINTS  # of each edge
+        outline = (corners + fraction * (np.roll(corners, -1, axis=0) - corners)).swapaxes(0, 1).reshape(-1, 2)
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x = poses[:, :1] + c * outline[:, 0] - s * outline[:, 1]
     y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
@@ -42,8 +42,8 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     next_x, next_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
     for side in (-pad / 2, pad / 2):  # where the outline crosses the lines through the pads' corners
         crosses = (x - side) * (next_x - side) < 0
-        share = np.where(crosses, (side - x) / np.where(crosses, next_x - x, 1.0), 0.0)
-        height = y + share * (next_y - y)
+        fraction = np.where(crosses, (side - x) / np.where(crosses, next_x - x, 1.0), 0.0)
+        height = y + fraction * (next_y - y)
         top = np.maximum(top, np.where(crosses, height, -np.inf).max(axis=1))
         bottom = np.minimum(bottom, np.where(crosses, height, np.inf).min(axis=1))
     between_pads = np.abs(x) <= pad / 2

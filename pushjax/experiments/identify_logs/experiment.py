@@ -29,8 +29,8 @@ from pushjax.identification.uncertainty import Profile, profile, scalar_position
 
 MIN_PUSHES = 3  # pushes; from fewer the size of their errors cannot be told
 LEVEL = 0.9
-# The mean deviation must be below the fraction POOR of the mean motion; or below the mean motion and the fraction
-# NO_BETTER of the mean deviation expected before the fit. Otherwise there is a warning.
+# There is no warning if the mean deviation of the predicted final poses is less than POOR times the mean motion. There
+# is none either if it is less than the mean motion, and less than NO_BETTER times the mean deviation before the fit.
 POOR, NO_BETTER = 0.4, 0.9
 
 
@@ -122,7 +122,7 @@ def find(
         raise ValueError("LOGS: give at least one file of recorded pushes")
     options.check()
     say(f"reading {len(logs)} {'log' if len(logs) == 1 else 'logs'}")
-    recordings, unreadable = _each(logs, load_recordings)
+    recordings, unreadable = _for_each(logs, load_recordings)
     shape = setting.shape_of(options.shape, recordings)
     hand = setting.hand_of(options.hand, options.radius, recordings)
     for one in recordings:
@@ -130,7 +130,7 @@ def find(
         if columns != hand.dof:
             raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
     _check_forces(recordings, options)
-    recordings, unusable = _each(recordings, lambda one: screen(one, shape, hand))
+    recordings, unusable = _for_each(recordings, lambda one: screen(one, shape, hand))
     problems = (*unreadable, *unusable, *(problem for one in recordings for problem in one.problems))
     for problem in problems:
         note(f"left out: {problem}")
@@ -156,11 +156,11 @@ def find(
         say("fitting how much friction scatters")
         # Residuals of pushes that were learned from are too small. So the noise is fitted to every second push, about
         # what is identified from the others.
-        odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
-        even = pushes.weighted(pushes.weight * (1 - odd))
-        others = pj.identify(even, slider, hand, unknowns, contact_at_end=options.contact_at_end)
-        second = pushes.weighted(pushes.weight * odd)
-        noise = identify_noise(jax.random.key(seed), others, second, slider, hand, progress=progress)
+        is_odd = jnp.broadcast_to(jnp.arange(pushes.weight.shape[-1]) % 2, pushes.weight.shape)
+        even = pushes.weighted(pushes.weight * (1 - is_odd))
+        found_from_even = pj.identify(even, slider, hand, unknowns, contact_at_end=options.contact_at_end)
+        odd = pushes.weighted(pushes.weight * is_odd)
+        noise = identify_noise(jax.random.key(seed), found_from_even, odd, slider, hand, progress=progress)
     lengths = [one.length for one in recordings if one.length is not None]
     length = lengths[0] if lengths else float(found.length)
     say("predicting the pushes again")
@@ -177,12 +177,16 @@ def _check_forces(recordings: list[Recordings], options: Options) -> None:
             raise ValueError(f"--forces: {one.source} does not have the forces of a single finger for every push")
 
 
-def _each(items: list, of: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
-    """Apply `of` to the items; return its results and the errors of the others. Raise the first error if all fail."""
+def _for_each(items: list, function: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
+    """Return the results of a function of each item, and the errors of the items where it fails.
+
+    Raises:
+        LogError: The first error, if it fails for all.
+    """
     good, bad = [], []
     for item in items:
         try:
-            good.append(of(item))
+            good.append(function(item))
         except LogError as error:
             bad.append(error)
     if not good:
@@ -231,7 +235,7 @@ def conditions(recordings: list[Recordings], shape, options: Options, seed: int)
 
 
 def _warning(predicted: dict[str, Any]) -> str | None:
-    """Return a warning if the fit explains next to nothing, since its friction is worth as little; else None."""
+    """Return a warning if the fit explains next to nothing, because its estimates then mean nothing; else None."""
     mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
     if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
         return None

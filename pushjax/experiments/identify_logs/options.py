@@ -66,12 +66,14 @@ class Options:
             ValueError: For the first option that is invalid.
         """
         low, high = self.friction
-        if not 0 <= low <= high < math.inf:
-            raise ValueError(f"--friction must be lowest and highest, both at least 0; got {low:g} {high:g}")
-        for name in ("radius", "pressure_center", "inset", "overshoot", "lag_distance", "hand_offset", "frame_offset"):
+        if not 0 <= low < high < math.inf:
+            raise ValueError(f"--friction must be lowest and highest, at least 0 and different; got {low:g} {high:g}")
+        if self.radius is not None and not 0 <= self.radius < math.inf:
+            raise ValueError(f"--radius must be a length of at least 0 m; got {self.radius:g}")
+        for name in ("pressure_center", "inset", "overshoot", "lag_distance", "hand_offset", "frame_offset"):
             value = getattr(self, name)
-            if value is not None and not 0 <= value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')} must be a length of at least 0 m; got {value:g}")
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"--{name.replace('_', '-')} must be a positive length in m; got {value:g}")
         if not 0 < self.surface_dof < math.inf:
             raise ValueError(f"--surface-dof must be positive; got {self.surface_dof:g}")
         if self.steps < 1:

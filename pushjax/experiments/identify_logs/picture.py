@@ -57,9 +57,9 @@ def _residuals(findings: Findings, out: Path) -> Path:
         (axes[1], (0, 2), ("x / mm", "length · angle / mm")),
     ):
         panel.plot(residual[:, a], residual[:, b], "o", color=plot.BLUE, ms=4, alpha=0.7)
-        turn = np.linspace(0, 2 * np.pi, 100)
-        for many, dash in ((1, "-"), (2, "--")):
-            panel.plot(many * sigma * np.cos(turn), many * sigma * np.sin(turn), dash, color=plot.GRAY, zorder=0)
+        angle = np.linspace(0, 2 * np.pi, 100)
+        for radius, dash in ((sigma, "-"), (2 * sigma, "--")):
+            panel.plot(radius * np.cos(angle), radius * np.sin(angle), dash, color=plot.GRAY, zorder=0)
         panel.set(xlabel=f"predicted less measured {names[0]}", ylabel=f"predicted less measured {names[1]}")
         panel.set_aspect("equal", adjustable="datalim")
     axes[0].set_title(f"rings: one and two sigma, {sigma:.2g} mm")
@@ -86,9 +86,10 @@ def _profiles(findings: Findings, out: Path) -> Path:
         panel.set_visible(False)
     for panel, each in zip(axes.flat, profiles, strict=False):
         name, scale = unit(each.label)
-        apart = np.sign(np.arange(len(each.normal)) - len(each.normal) // 2) * np.sqrt(2 * each.normal)
-        dense = np.linspace(apart[0], apart[-1], 200)
-        value, rise = (PchipInterpolator(apart, y)(dense) for y in (scale * each.value, each.rise))
+        # Signed distances of the values from the estimate, in standard deviations of z.
+        distance = np.sign(np.arange(len(each.normal)) - len(each.normal) // 2) * np.sqrt(2 * each.normal)
+        dense = np.linspace(distance[0], distance[-1], 200)
+        value, rise = (PchipInterpolator(distance, y)(dense) for y in (scale * each.value, each.rise))
         panel.plot(value, rise, "-", color=plot.BLUE, label="all else at its best")
         panel.plot(scale * each.value, each.rise, "o", color=plot.BLUE, ms=3)
         panel.plot(value, dense**2 / 2, "--", color=plot.ORANGE, label="normal")

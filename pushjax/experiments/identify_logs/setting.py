@@ -36,7 +36,7 @@ def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj
 
     Args:
         text: The kind of hand as an option.
-        radius: Radius of the fingers, m. None: that of the logs.
+        radius: Radius of the fingers, m. None: that of the logs. Not used for a parallel jaw.
         recordings: The logs.
 
     Raises:
@@ -45,19 +45,19 @@ def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj
     kind, _, rest = text.partition(":")
     if kind == "parallel_jaw":
         return pj.Hand.parallel_jaw(*parse_numbers("--hand", text, rest, "x", 2, HANDS))
-    makes: dict[str, Callable[..., pj.Hand]] = {
+    constructors: dict[str, Callable[..., pj.Hand]] = {
         "finger": pj.Hand.finger,
         "two_fingers": pj.Hand.two_fingers,
         "three_fingers": pj.Hand.three_fingers,
     }
-    if kind not in makes or rest:
+    if kind not in constructors or rest:
         raise ValueError(f"--hand: expected {HANDS}; got {text!r}")
     if radius is None:
         known = {one.tip_radius for one in recordings}
         if len(known) > 1 or known == {None}:
             raise ValueError("--radius: the logs do not tell the finger's radius; give it in m")
         radius = known.pop()
-    return makes[kind](radius)
+    return constructors[kind](radius)
 
 
 def support_of(text: str | None, shape: pj.Shape, recordings: Recordings) -> pj.Support:

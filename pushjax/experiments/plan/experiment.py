@@ -98,7 +98,7 @@ def _plans(
     """Yield the plan of each attempt."""
     longest = _max_push_length(options, float(slider.surface.length))
     # Without a search under sampled friction, the plan is the best one under the mean friction.
-    planner: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
+    search_options: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
     for attempt in range(options.attempts):
         yield plan_pushes(
             jax.random.fold_in(jax.random.key(seed), attempt),
@@ -111,7 +111,7 @@ def _plans(
             success=options.success,
             fixtures=fixtures,
             finger=options.finger,
-            **planner,
+            **search_options,
         )
 
 
@@ -132,7 +132,7 @@ def _check_distance(options: Options, length: float) -> None:
 
 
 def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) -> PushPlan:
-    """Return the first plan that is sure enough, or else the surest."""
+    """Return the first plan that is as likely to succeed as asked for, or else the likeliest that can be done."""
     made: list[PushPlan] = []
     for plan in plans:
         made.append(plan)

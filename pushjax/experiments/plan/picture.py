@@ -14,7 +14,7 @@ from pushjax.planning import Goal, PushPlan
 from pushjax.plot.parts import draw_fixtures
 from pushjax.simulation.fixtures import Fixtures
 
-DRAWN = 40  # predicted ends
+DRAWN = 40  # largest number of predicted ends that are drawn
 
 
 def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, options: Options, path: Path) -> Path:

@@ -67,7 +67,7 @@ def run(
             raise ValueError(f"{name} must not be negative; got {value!r}")
     plant = player.make_plant()
     began = time.perf_counter()
-    made, setup = player.controller(
+    push_controller, setup = player.controller(
         lookahead=lookahead,
         cost_to_go=cost_to_go,
         feedback=feedback,
@@ -78,10 +78,11 @@ def run(
     noise = {"actuation_noise": actuation_noise, "observation_noise": observation_noise}
     played = []
     for k in range(episodes):
-        played.append(player.play(plant, made, seed + k, **noise))
+        played.append(player.play(plant, push_controller, seed + k, **noise))
         progress(k + 1, episodes)
     switches = {"lookahead": lookahead, "cost_to_go": cost_to_go, "feedback": feedback}
-    settings = {"seed": seed, "episodes": episodes} | switches | given | noise | {"pace": made.planner.pace._asdict()}
+    settings = {"seed": seed, "episodes": episodes} | switches | given | noise
+    settings["pace"] = push_controller.planner.pace._asdict()
     rows = [{name: value for name, value in asdict(each).items() if "seconds" not in name} for each in played]
     return result_record("pusht-mpc", settings, **_figures(played), setup_seconds=setup, published=PUBLISHED, rows=rows)
 

@@ -35,7 +35,7 @@ class Episode:
         final_coverage: Coverage at the end of the episode.
         pushes: Number of pushes that were planned.
         seconds: Time of the controller in each control step, s.
-        processor_seconds: Processor time of the same, s; it counts less than `seconds` what else the machine does.
+        processor_seconds: Processor time of the same, s; other programs on the machine change it less than `seconds`.
     """
 
     seed: int
@@ -118,7 +118,8 @@ def controller(
         observation_noise: Standard deviation of what is seen, m.
 
     Returns:
-        The controller, and how long its parts took to set up, s.
+        The controller; and how long its parts took to set up, s, by name, with "library_from_file": whether the library
+        was read from a file.
     """
     folder, began = folder or cache_folder(), time.perf_counter()
     slider = setting.slider()
@@ -127,6 +128,7 @@ def controller(
     began = time.perf_counter()
     name = hashlib.sha256(f"{pushes.digest} {setting.pace()} {setting.goal()}".encode()).hexdigest()[:16]
     file = folder / f"cost-{name}.npz"
+    # As in `PushPlanner`: None to compute it, False to do without.
     value: CostToGo | bool | None = (CostToGo.load(file) if file.exists() else None) if cost_to_go else False
     planning = planner(slider, pushes, look_ahead=lookahead, value=value)
     if value is None and planning.value is not None:
@@ -134,36 +136,44 @@ def controller(
     planning.prepare()
     times["tables"] = time.perf_counter() - began
     began = time.perf_counter()
-    made = PushController(
+    push_controller = PushController(
         planning, setting.finger_control(), friction=friction_in_model, feedback=feedback, noise=observation_noise
     )
-    made.prepare()
-    return made, times | {"feedback": time.perf_counter() - began}
+    push_controller.prepare()
+    return push_controller, times | {"feedback": time.perf_counter() - began}
 
 
 def play(
-    plant: Any, made: PushController, seed: int, *, actuation_noise: float = 0.0, observation_noise: float = 0.0
+    plant: Any,
+    push_controller: PushController,
+    seed: int,
+    *,
+    actuation_noise: float = 0.0,
+    observation_noise: float = 0.0,
 ) -> Episode:
     """Play one episode.
 
     Args:
         plant: The environment, from `make_plant`.
-        made: The controller.
+        push_controller: The controller.
         seed: Seed of the start and of the noise.
         actuation_noise: Standard deviation of normal noise on each number of the action, px.
         observation_noise: Standard deviation of normal noise on each position that the controller sees, px, and on the
             angle, in units of the surface's length.
+
+    Returns:
+        How the episode went.
     """
     rng = np.random.default_rng([seed, 1])
-    turn = observation_noise * setting.PIXEL / made.length
+    turn = observation_noise * setting.PIXEL / push_controller.length
     scale = np.array([observation_noise] * 4 + [turn])
     seen, _ = plant.reset(seed=seed)
-    memory, episode, key = made.initial_memory(), Episode(seed), jax.random.key(seed)
+    memory, episode, key = push_controller.initial_memory(), Episode(seed), jax.random.key(seed)
     while True:
         noisy = seen + scale * rng.standard_normal(5)
         began, began_processor = time.perf_counter(), time.process_time()
         observation = Observation(setting.PIXEL * noisy[:2], setting.from_gym(noisy[2:4], noisy[4]))
-        action, memory = made(key, observation, memory)
+        action, memory = push_controller(key, observation, memory)
         episode.seconds.append(time.perf_counter() - began)
         episode.processor_seconds.append(time.process_time() - began_processor)
         action = action / setting.PIXEL + actuation_noise * rng.standard_normal(2)

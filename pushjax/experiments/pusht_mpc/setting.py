@@ -13,7 +13,18 @@ from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.feedback.finger_control import SpringDamper
 from pushjax.planning.pace import Pace
 from pushjax.planning.workspace import Workspace
-from pushjax.tasks.push_t import AGENT_RADIUS, GOAL, SIZE, T_CENTER, T_LENGTH, T_VERTICES
+from pushjax.tasks.push_t import (
+    AGENT_RADIUS,
+    DAMPING,
+    GOAL,
+    PHYSICS_STEPS,
+    PHYSICS_TIMESTEP,
+    SIZE,
+    STIFFNESS,
+    T_CENTER,
+    T_LENGTH,
+    T_VERTICES,
+)
 
 PIXEL = 1e-3  # m
 CENTER_OF_GRAVITY = np.array(T_CENTER)  # px, in the body frame of gym-pusht
@@ -29,14 +40,15 @@ def slider() -> pj.Slider:
 
 
 def workspace() -> Workspace:
-    """Return the limits: of the finger a little within those of actions, of the T a little within the walls."""
+    """Return the limits: the finger stays a little within those of actions, and the T out of the walls."""
     finger_low, finger_high, slider_low, slider_high = (PIXEL * np.full(2, each) for each in (2.0, 510.0, 8.0, 504.0))
     return Workspace(finger_low, finger_high, slider_low, slider_high)
 
 
 def finger_control() -> SpringDamper:
-    """Return the model of the finger: ten substeps of 10 ms."""
-    return SpringDamper(100.0, 20.0, 0.01, 10, low=np.zeros(2), high=np.full(2, SIZE * PIXEL))
+    """Return the model of the finger."""
+    low, high = np.zeros(2), np.full(2, SIZE * PIXEL)
+    return SpringDamper(STIFFNESS, DAMPING, PHYSICS_TIMESTEP, PHYSICS_STEPS, low=low, high=high)
 
 
 def pace() -> Pace:

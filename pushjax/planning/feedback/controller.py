@@ -5,8 +5,8 @@ The controller is a state machine. It plans a push, goes around the slider to it
 Going: the finger follows the transit as fast as its speed limits allow. Each action is tried on the model of the finger
     first; a step that would come too near to the slider or to a fixture is shortened.
 Pushing: in each control step the end of the push is corrected. Rollouts of pushes to ends around it start at the poses
-    that are seen; the end whose final pose is nearest to the target is taken. The push is over once the finger is where
-    the control step before has put its end. So no control step both corrects a push and plans one.
+    that are seen; the end whose final pose is best is taken. The push is over once the finger is at the end that the
+    last control step has chosen. So no control step both corrects a push and plans one.
 Learning: with a `FrictionFilter`, each control step of a push updates a belief about friction. Rollouts of the feedback
     use its mean. If its samples are those of the planner's library, pushes are chosen by their weights.
 """
@@ -30,14 +30,19 @@ from pushjax.simulation.slider import Slider
 # Lengths in units of the surface's length
 ARRIVED = 0.007  # distance from a point at which the finger has arrived
 MOVED = 0.03  # motion of the slider on the way to a push, from which the push is planned anew
-CLOSE = 0.01  # distance of each point of a control step from slider and fixtures on the way, besides the radius
-SLOWER = np.array([1.0, 0.75, 0.5, 0.3, 0.15, 0.05])  # parts of a control step that are tried
+CLOSE = 0.01  # distance that the finger keeps from slider and fixtures on the way to a push
+SLOWER = np.array([1.0, 0.75, 0.5, 0.3, 0.15, 0.05])  # fractions of the speed that are tried
 # Ends of a push that are tried around the planned one, along the push and across, in units of the surface's length
 ALONG = np.array([-0.2, -0.11, -0.06, -0.025, 0, 0.025, 0.06, 0.11, 0.2])
 ACROSS = np.array([-0.12, -0.055, -0.02, 0, 0.02, 0.055, 0.12])
-CORRECTED = 1.3  # the end is corrected from this distance on; longer pushes would be simulated too coarsely
-FINE, FULL = 0.25, 0.73  # the ends are this part as far apart at the end, and at FULL from there as far as above
-LATE = 1.5  # a push is over after its planned number of control steps, times this, and three
+CORRECTED = 1.3  # the end is corrected once it is nearer than this; longer pushes would be simulated too coarsely
+# The offsets above are multiplied by a factor. It is FINE where the finger is at the end, and grows linearly with the
+# finger's distance from the end, up to one at the distance FULL.
+FINE, FULL = 0.25, 0.73
+LATE = 1.5  # a push is over after this times its planned number of control steps, plus three
+# Weights of the cost of an end: of its distance from the end before; and in a push that reaches the goal, of the score
+# that is missing, and of the distance of the final pose from the target.
+SHIFT_WEIGHT, SCORE_WEIGHT, DISTANCE_WEIGHT = 0.02, 7.3, 0.1
 LEARNING_STEPS = 5  # steps of the simulation of a control step that updates the belief about friction
 SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
 
@@ -156,6 +161,9 @@ class PushController:
             key: Key of the random costs that end a cycle of pushes.
             observation: What is seen now.
             memory: Result of the control step before, or `initial_memory`.
+
+        Returns:
+            The action of `control`, (2,), and the memory for the next control step.
         """
         state = FingerState(np.asarray(observation.finger, float), memory.velocity)
         pose = np.asarray(observation.pose, float)
@@ -178,6 +186,7 @@ class PushController:
     def _finish(
         self, state: FingerState, pose: np.ndarray, target: np.ndarray, memory: Memory
     ) -> tuple[np.ndarray, Memory]:
+        """Return the action that brings the finger to `target`, (2,), and the memory with what follows from it."""
         action = self.control.action(state, target)
         memory = memory._replace(velocity=self.control.after(state, action).velocity, last=None)
         if self.friction_filter is not None and memory.pushing:
@@ -209,7 +218,7 @@ class PushController:
         return np.abs(np.random.default_rng(seed).normal(0, pushes, len(self.planner.library.starts)))
 
     def _planner(self, belief: FrictionBelief | None) -> PushPlanner:
-        """Return the planner, with the weights of the belief if its samples are those of the library."""
+        """Return the planner, with the weights of the belief if it has as many samples as the library."""
         if belief is None or len(belief.weight) != len(self.planner.sampled.outcomes):
             return self.planner
         if belief.status == BeliefStatus.PRIOR:
@@ -226,12 +235,12 @@ class PushController:
         points = np.concatenate([push.transit.points, push.start[None]])
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         total, run_up = lengths[-1], lengths[-1] - lengths[-2]
-        pace, left = self.planner.pace, total - memory.along
-        if left <= run_up + self.arrived and left <= pace.push:
+        pace, remaining = self.planner.pace, total - memory.along
+        if remaining <= run_up + self.arrived and remaining <= pace.push:
             return None, memory._replace(pushing=True)
         # slow enough at the start of the push
-        braking = np.sqrt(pace.push**2 + 2 * pace.acceleration * max(left, 0.0))
-        speed = pace.next_speed(memory.speed, left + pace.push, min(pace.free, braking))
+        braking = np.sqrt(pace.push**2 + 2 * pace.acceleration * max(remaining, 0.0))
+        speed = pace.next_speed(memory.speed, remaining + pace.push, min(pace.free, braking))
         ahead = np.minimum(memory.along + speed * SLOWER, total)
         targets = np.stack([np.interp(ahead, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
         motions = self.control.motion(state, self.control.action(state, targets))
@@ -249,29 +258,33 @@ class PushController:
         push, pace = memory.push, self.planner.pace
         assert push is not None
         end = memory.end
-        left = float(np.linalg.norm(end - state.position))
+        remaining = float(np.linalg.norm(end - state.position))
         # a finger that does not go where it should would try forever
         late = memory.taken > LATE * pace.push_time(np.linalg.norm(push.end - push.start)) + 3
         # no correction at the end: it would go on and on for less than the next push gains in the same time
-        if left < self.arrived or late:
+        if remaining < self.arrived or late:
             return None, memory._replace(push=None, pushing=False, speed=0.0)
-        if correct and left < CORRECTED * self.length:
+        if correct and remaining < CORRECTED * self.length:
             end = self._corrected(state.position, pose, end, push, memory.belief)
         ahead = end - state.position
-        left = float(np.linalg.norm(ahead))
-        speed = pace.next_speed(memory.speed, left, pace.push)
-        target = state.position + ahead * min(speed / max(left, 1e-9), 1.0)
+        remaining = float(np.linalg.norm(ahead))
+        speed = pace.next_speed(memory.speed, remaining, pace.push)
+        target = state.position + ahead * min(speed / max(remaining, 1e-9), 1.0)
         return target, memory._replace(end=end, speed=speed, taken=memory.taken + 1)
 
     def _corrected(
         self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
     ) -> np.ndarray:
-        """Return the end, of those around `end`, from which the slider comes nearest to the push's target."""
+        """Return the best of the ends around `end`, (2,), world, m.
+
+        That is the one whose final pose is nearest to the push's target, or, if the push is to reach the goal, the one
+        whose final pose has the best score.
+        """
         ahead = end - finger
-        left = float(np.linalg.norm(ahead))
-        along = ahead / left if left > 1e-9 else np.array([1.0, 0.0])
+        remaining = float(np.linalg.norm(ahead))
+        along = ahead / remaining if remaining > 1e-9 else np.array([1.0, 0.0])
         across = np.array([-along[1], along[0]])
-        scale = min(1.0, FINE + left / (FULL * self.length) * (1 - FINE))
+        scale = min(1.0, FINE + remaining / (FULL * self.length) * (1 - FINE))
         ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)
         paths = finger + (ends - finger)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
         slider, friction = self.planner.slider, self.friction
@@ -282,10 +295,10 @@ class PushController:
         final = poses[:, -1].astype(float)
         features = self.planner.library.features
         missed = np.linalg.norm(features(final) - features(push.target), axis=1)
-        cost = (missed + 0.02 * np.linalg.norm(ends - end, axis=1)) / self.length
+        cost = (missed + SHIFT_WEIGHT * np.linalg.norm(ends - end, axis=1)) / self.length
         if push.status == PlanStatus.ONE_PUSH:
             score = self.planner.measure(compose(inverse(self.planner.goal), final))
-            cost = 7.3 * (1 - score) + 0.1 * cost
+            cost = SCORE_WEIGHT * (1 - score) + DISTANCE_WEIGHT * cost
         return ends[np.argmin(cost)]
 
 

@@ -48,7 +48,7 @@ class CoverageTable:
         self.center, self.length, self.enough = np.asarray(center, float), length, enough
         side, turn = np.linspace(-RANGE, RANGE, POSITIONS) * length, np.linspace(-RANGE, RANGE, ANGLES)
         errors = np.stack(np.meshgrid(side, side, turn, indexing="ij"), axis=-1)
-        # about the center, at which the origin of the table is
+        # the table has the displacement of the center, so the slider turns about its center
         around = jnp.asarray((vertices - self.center) / length, jnp.float32)
         scaled = errors / np.array([length, length, 1.0])
         self.table = np.asarray(_coverage(around, jnp.asarray(scaled.reshape(-1, 3), jnp.float32)))

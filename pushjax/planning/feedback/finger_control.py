@@ -22,7 +22,7 @@ class FingerControl(Protocol):
     """The motion of a finger in one control step, as a function of the action."""
 
     def action(self, state: FingerState, target: np.ndarray) -> np.ndarray:
-        """Return the action after which the finger is at `target`, or as near as actions are allowed, (..., 2)."""
+        """Return the action after which the finger is at `target`, or as near as the limits allow, (..., 2)."""
         ...
 
     def motion(self, state: FingerState, action: np.ndarray) -> np.ndarray:
@@ -77,16 +77,17 @@ class SpringDamper:
         return np.stack([np.linalg.matrix_power(self.once, k) for k in range(1, self.substeps + 1)])
 
     def action(self, state: FingerState, target: np.ndarray) -> np.ndarray:
-        (stay, drift), _ = self.powers[-1]
-        wanted = (target - stay * state.position - drift * state.velocity) / (1 - stay)
+        (by_position, by_velocity), _ = self.powers[-1]
+        wanted = (target - by_position * state.position - by_velocity * state.velocity) / (1 - by_position)
         return np.clip(wanted, self.low, self.high)
 
     def motion(self, state: FingerState, action: np.ndarray) -> np.ndarray:
-        stay, drift = self.powers[:, 0, 0, None], self.powers[:, 0, 1, None]
+        by_position, by_velocity = self.powers[:, 0, 0, None], self.powers[:, 0, 1, None]
         away = (state.position - action)[..., None, :]
-        return action[..., None, :] + stay * away + drift * state.velocity
+        return action[..., None, :] + by_position * away + by_velocity * state.velocity
 
     def after(self, state: FingerState, action: np.ndarray) -> FingerState:
-        (stay, drift), (pull, keep) = self.powers[-1]
+        position_row, velocity_row = self.powers[-1]
         away = state.position - action
-        return FingerState(action + stay * away + drift * state.velocity, pull * away + keep * state.velocity)
+        position = action + position_row[0] * away + position_row[1] * state.velocity
+        return FingerState(position, velocity_row[0] * away + velocity_row[1] * state.velocity)

@@ -35,10 +35,11 @@ class FreeSpace:
         workspace: The obstacles, and limits of the finger.
         roadmap: Vertices of the slider, radius of the finger, and as goals the points where each push of the library
             begins with its run-up.
-        library: Pushes of the slider. Others may have other outcomes, but the same starts, directions and lengths.
+        library: Pushes of the slider. The libraries that the methods take may have other outcomes, but must have the
+            same starts, directions and lengths.
         clearance: Distance that slider and finger keep from obstacles, m.
         goal: The goal, (3,), world. If it is nearer to an obstacle, the slider keeps only the distance it has there.
-        low: Lowest position of the slider on the grid of the cost to go, (2,), world, m. That of `distances` too.
+        low: Lowest position of the slider on the grid of the cost to go and on that of `distances`, (2,), world, m.
         high: Highest position, (2,), world, m.
 
     Attributes:
@@ -115,10 +116,12 @@ class FreeSpace:
     def _run_up_may_start(self, points: np.ndarray) -> np.ndarray:
         """Return whether the finger may start a run-up at points (..., 2), world, m."""
         distance = self.obstacles.point_clearance(points)
-        return self.workspace.allows_finger(points) & (distance >= self.roadmap.from_obstacles)
+        return self.workspace.allows_finger(points) & (distance >= self.roadmap.min_obstacle_distance)
 
     def probably_free(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
         """Return which pushes from one pose are free by the grid, each up to every `GRID_STRIDE`-th length.
+
+        Poses outside of the grid count as free of obstacles for the slider.
 
         Args:
             library: The pushes.

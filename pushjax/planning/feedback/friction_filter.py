@@ -8,8 +8,8 @@ that varies over the table.
 
 A few samples never contain the truth. If each were judged by the whole evidence, soon one would carry all the weight,
 however wrong it is. So the likelihood of all motions together is taken to the largest power, up to one, that leaves a
-number of effective samples (tempering). Samples are not drawn again. Friction is constant, and draws that are new
-know nothing of the motions before them: with resampling, intervals are far too narrow.
+least number of effective samples (tempering). There is no resampling. Friction is constant, and samples that are drawn
+later have not been judged by the motions before; with resampling, intervals are far too narrow.
 
 A limit surface and its multiples move a slider alike. So poses say nothing about the scale of the surface.
 
@@ -113,7 +113,7 @@ class FrictionFilter(eqx.Module):
         hand: The hand.
         model: Distribution of friction; its `resample_every` must be None.
         samples: Number of samples.
-        effective: Number of effective samples that tempering leaves.
+        effective: Least number of effective samples that tempering leaves.
         error: Standard deviation of the error of a motion that is seen, in x, y and length * theta, m. It includes the
             errors of both poses.
         relative_error: Further error, as a fraction of the motion.
@@ -154,8 +154,8 @@ class FrictionFilter(eqx.Module):
             check_finite(name, number)
             (check_non_negative if name == "relative_error" else check_positive)(name, number)
             setattr(self, name, number)
-        most = concrete(self.effective)
-        if most is not None and not 1 <= most <= samples:
+        known = concrete(self.effective)
+        if known is not None and not 1 <= known <= samples:
             raise ValueError(f"effective must be from 1 to the number of samples, {samples}; got {effective!r}")
 
     def init(self, key: PRNGKeyArray) -> FrictionBelief:

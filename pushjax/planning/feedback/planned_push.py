@@ -15,7 +15,8 @@ class PlanStatus(IntEnum):
         ONE_PUSH: It reaches the goal.
         TWO_PUSHES: It is the first of two that reach the goal.
         COST_TO_GO: It leads to where the cost to go is least.
-        NO_TRANSIT: The finger gets to no push; the status of the transit tells why.
+        NO_TRANSIT: The finger gets to no push. The status of the transit tells why. If it is FOUND, the finger gets to
+            where a run-up begins, but each run-up leads out of its limits or into a fixture.
         NO_PUSH: No push stays within the workspace and out of its fixtures.
         START_IN_FIXTURE: The slider is deeper in a fixture than a simulation would start from.
     """
@@ -38,7 +39,7 @@ class PlannedPush(NamedTuple):
 
     Attributes:
         status: What the push is for, or why there is none.
-        transit: Transit of the finger to where the run-up begins, world; its status says why there is none.
+        transit: Transit of the finger to where the run-up begins, world. Without a push it has infinite length.
         start: Where the finger is about to touch the slider, (2,), world, m.
         end: Where the push ends, (2,), world, m.
         target: Pose of the slider that the push is for, (3,), world, m and rad.
@@ -53,7 +54,7 @@ class PlannedPush(NamedTuple):
     cost: float
 
 
-class Candidate(NamedTuple):
+class PushChoice(NamedTuple):
     """A push that may come next: its kind, its entry in the library, the pose it is for, and its predicted cost."""
 
     status: PlanStatus

@@ -10,11 +10,12 @@ POSITIONS = 36  # cells along x and y each, of the cost to go
 class PoseGrid(NamedTuple):
     """Values of the poses on a grid, and of poses between them by interpolation.
 
-    Positions are at equal spacing, and angles, which are periodic, are all around.
+    Positions are at equal spacing, and angles, which are periodic, are all around. A position outside of the grid has
+    the value of the nearest one on its border.
 
     Attributes:
         origin: Position of the first cell, (2,), m.
-        spacing: Distance of the cells, m.
+        spacing: Distance between neighboring cells, m.
         values: Values, (positions, positions, angles).
     """
 
@@ -32,6 +33,7 @@ class PoseGrid(NamedTuple):
         """Return the value of poses (..., 3) by linear interpolation, (...,)."""
         cells = self._cells(poses)
         rows, columns, angles = self.values.shape
+        # a little less than the last cell, so that the next higher one exists
         cells[..., :2] = np.clip(cells[..., :2], 0, np.array([rows - 1.001, columns - 1.001]))
         low = np.floor(cells).astype(np.int32)
         part = cells - low
@@ -51,5 +53,5 @@ class PoseGrid(NamedTuple):
 
 
 def grid_spacing(low: np.ndarray, high: np.ndarray) -> float:
-    """Return the distance of POSITIONS positions from the lowest to the highest along the wider axis, m."""
+    """Return the spacing of POSITIONS positions from the lowest to the highest along the wider axis, m."""
     return float(np.max(high - low)) / (POSITIONS - 1)

@@ -33,8 +33,10 @@ from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length, which is about the slider's radius.
-GAP, STEP, TRAVEL = 0.04, 0.0275, 2.3
-LEAST_MOTION = 0.005  # shorter outcomes are no pushes
+GAP = 0.04  # between finger and slider where a push starts
+STEP = 0.0275  # of the simulation, and between neighboring lengths of a push
+TRAVEL = 2.3  # longest push
+LEAST_MOTION = 0.005  # a push that moves the slider less than this is not valid
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,13 @@ class PushLibrary:
             model: Distribution of friction, as in `build`.
             samples: Number of draws from `model`.
             key: Key of the draws.
+
+        Returns:
+            The library.
+
+        Raises:
+            ValueError: If `samples` is less than one, or if `model` is given without `key`.
+            TypeError: If `slider` is not a `Slider`.
         """
         check_type("slider", slider, Slider)
         check_count("samples", samples)
@@ -143,9 +152,9 @@ class PushLibrary:
             mus = np.asarray(draws.friction[:, 0]).tolist()
         outcomes, valid = [], np.ones((pushes, steps + 1), bool)
         for surface, mu in zip(surfaces, mus, strict=True):
-            poses, good = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
+            poses, valid_steps = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
             moved = np.linalg.norm(poses * np.array([1, 1, length]), axis=-1)
-            valid &= (np.arange(steps + 1) <= good[:, None]) & (moved > LEAST_MOTION * length)
+            valid &= (np.arange(steps + 1) <= valid_steps[:, None]) & (moved > LEAST_MOTION * length)
             outcomes.append(poses)
         return PushLibrary(
             starts=np.asarray(starts, np.float64),
@@ -196,7 +205,7 @@ class PushLibrary:
 
     @cached_property
     def relative(self) -> np.ndarray:
-        """Relative poses of the entries in the first sample, (entries, 3); `averaged` has the means in its only one."""
+        """Relative poses of the entries in the first sample, (entries, 3); after `averaged`, that is their means."""
         return self.outcomes[0].reshape(-1, 3)[self.valid.ravel()]
 
     @cached_property
@@ -258,8 +267,8 @@ class PushLibrary:
             max_distance: Largest distance, m.
 
         Returns:
-            Distances (poses, count), m, infinite where there are fewer, and indices (poses, count) into `entries`, then
-            the number of entries.
+            Distances (poses, count), m, and indices into `entries`, (poses, count). Where fewer are near enough, the
+            rest has infinite distance, and the number of all entries as index.
         """
         wanted = np.arange(1, count + 1)
         distance, index = self.tree.query(

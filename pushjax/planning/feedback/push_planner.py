@@ -19,7 +19,7 @@ from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
 from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
 from pushjax.planning.feedback.coverage_table import CoverageTable, Measure
 from pushjax.planning.feedback.free_space import GRID_STRIDE, FreeSpace
-from pushjax.planning.feedback.planned_push import Candidate, PlannedPush, PlanStatus
+from pushjax.planning.feedback.planned_push import PlannedPush, PlanStatus, PushChoice
 from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.pace import Pace
 from pushjax.planning.transits.roadmap import Roadmap, ShortestTransits, Transit, run_ups
@@ -29,15 +29,22 @@ from pushjax.simulation.slider import Slider
 
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
-TRIED, TOGETHER = 480, 24  # choices that are looked at for a collision, best first, and how many at a time
+CHECKED, CHECKED_AT_A_TIME = 480, 24  # choices that are checked for collisions, best first, and how many at a time
 JUDGED = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
-OUTSIDE = 0.02  # progress of a slider back into the workspace, in units of the surface's length
+# A slider outside of the workspace must come back by twice this, or, where no push does that, go no farther out than
+# this; in units of the surface's length.
+OUTSIDE = 0.02
 AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 RETRY = 10.0  # control steps of another push, if the last one misses the goal
-LOST = 60.0  # control steps of a transit that the table of transits does not have
+NO_TRANSIT_TIME = 60.0  # control steps that count for a transit between two pushes that is not found
+# With known friction: a last push whose score is less than this part of the way from enough to one is at risk, and
+# costs so many control steps for each unit of score below it.
+SAFE_SCORE, RISK_COST = 0.6, 200.0
+INTERPOLATION_FACTOR = 1.2  # factor of costs to go that are interpolated
+STEPS_PER_LENGTH = 20.0  # control steps for each length of distance from the goal, where there is no cost to go
 
 
 class PushPlanner:
@@ -82,6 +89,7 @@ class PushPlanner:
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
         self._weigh(None)
+        # pushes are looked up in this library; `reweighted` changes `library`, but keeps this one and its tree
         self.searched = library = self.library
         starts = library.starts[:, :2]
         self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
@@ -166,11 +174,14 @@ class PushPlanner:
         A row is a place of the finger around the slider; `place` is that of each entry.
         """
         lengths = self.roadmap.between(self.places)
-        return np.where(np.isfinite(lengths), self.pace.free_time(lengths), LOST).astype(np.float32)
+        return np.where(np.isfinite(lengths), self.pace.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Points around the slider where pushes begin, one for each start that some have in common, (places, 2)."""
+        """Points around the slider where run-ups begin, one for each different start of pushes, (places, 2), m.
+
+        Pushes of different directions share a start. Of the points where their run-ups begin, one is taken.
+        """
         _, first = np.unique(self.library.starts[self.usable, :2], axis=0, return_index=True)
         return self.roadmap.goals[self.usable][first]
 
@@ -196,6 +207,9 @@ class PushPlanner:
             pose: Pose of the slider, (3,), world, m and rad.
             finger: Center of the finger, (2,), world, m.
             shake: Control steps that are added to the cost of each push, (pushes,), for another choice than before.
+
+        Returns:
+            The push. Its status says what it is for, or why there is none.
         """
         pose = np.asarray(pose, float)
         transits = self.roadmap.transits(finger, pose, self.workspace)
@@ -219,15 +233,15 @@ class PushPlanner:
             return none._replace(status=PlanStatus.NO_PUSH)
         return self._planned(best, transits, pose)
 
-    def _planned(self, best: Candidate, transits: ShortestTransits, pose: np.ndarray) -> PlannedPush:
+    def _planned(self, best: PushChoice, transits: ShortestTransits, pose: np.ndarray) -> PlannedPush:
         push = int(self.push[best.entry])
         transit = self.roadmap.transit(transits, push, pose)
         start = to_world(pose, self.library.starts[push, :2])
         end = to_world(pose, self.ends[best.entry].astype(float))
         return PlannedPush(best.status, transit, start, end, best.target, best.cost)
 
-    def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> Candidate | None:
-        """Return the push that reaches the goal in the fewest steps; a better score counts some steps."""
+    def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> PushChoice | None:
+        """Return the push that reaches the goal at the least cost: its control steps, and its risk of missing."""
         relative = compose(inverse(pose), self.goal)
         near = self.searched.tree.query_ball_point(self.library.features(relative), self.measure.reach)
         entries = np.asarray(near, int)
@@ -236,20 +250,21 @@ class PushPlanner:
         if not len(entries):
             return None
         back = np.broadcast_to(inverse(relative), (len(entries), 3))
-        cost = self._with_risk(transit_time[self.push[entries]] + self.push_time[entries], back, entries, reach=True)
+        spent = transit_time[self.push[entries]] + self.push_time[entries]
+        cost = self._with_risk(spent, back, entries, must_reach=True)
         best = self._least(cost, (np.broadcast_to(pose, back.shape), entries))
         if best is None:
             return None
-        return Candidate(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
+        return PushChoice(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
-    def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, reach: bool) -> np.ndarray:
+    def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, must_reach: bool) -> np.ndarray:
         """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost.
 
         Args:
             spent: Control steps without the risk, which is never negative, (pushes,).
             back: Pose of the slider before each push, relative to the goal, (pushes, 3).
             entries: The pushes, (pushes,).
-            reach: Whether the cost of pushes that cannot reach the goal is infinite.
+            must_reach: Whether the cost of pushes that cannot reach the goal is infinite.
         """
         cost = np.full(len(entries), np.inf)
         order = np.argsort(spent, kind="stable")
@@ -258,8 +273,8 @@ class PushPlanner:
             some = order[begin : begin + JUDGED]
             if self.space is None and spent[some[0]] > cost.min():  # a fixture may forbid the best
                 break
-            risk, good = self._risk(back[some], entries[some])
-            cost[some] = np.where(good | (not reach), spent[some] + risk, np.inf)
+            risk, may_reach = self._risk(back[some], entries[some])
+            cost[some] = np.where(may_reach | (not must_reach), spent[some] + risk, np.inf)
         return cost
 
     def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -272,14 +287,14 @@ class PushPlanner:
         enough = self.measure.enough
         score = self.measure(compose(back, self.library.relative[entries]))
         if len(self.sampled.outcomes) == 1:
-            margin = enough + 0.6 * (1 - enough)
-            return 200 * np.maximum(margin - score, 0), score > enough
+            safe = enough + SAFE_SCORE * (1 - enough)
+            return RISK_COST * np.maximum(safe - score, 0), score > enough
         push, index = self.library.entries[entries].T
         reached = self.measure(compose(back, self.sampled.outcomes[:, push, index])) > enough
         chance = np.average(reached, axis=0, weights=self.weight)
         return self.retry * (1 - chance), (chance > 0) | (score > enough)
 
-    def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> list[Candidate]:
+    def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> list[PushChoice]:
         """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
         entries, reached = self._first_pushes(pose, transit_time)
         if not len(entries):
@@ -295,7 +310,7 @@ class PushPlanner:
         k = self._least(total, (np.broadcast_to(pose, reached.shape), entries))
         if k is None:
             return []
-        return [Candidate(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
+        return [PushChoice(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
 
     def _first_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
@@ -309,23 +324,23 @@ class PushPlanner:
         reached = compose(here, self.library.relative[entries])
         outside = self.extent.outside(reached, self.workspace)
         # a slider that is outside must come back, or at least not go farther if it cannot
-        now, some = float(self.extent.outside(here, self.workspace)), OUTSIDE * self.library.length
-        good = outside <= max(0.0, now - 2 * some)
+        now, allowance = float(self.extent.outside(here, self.workspace)), OUTSIDE * self.library.length
+        good = outside <= max(0.0, now - 2 * allowance)
         if not good.any():
-            good = outside <= now + some
+            good = outside <= now + allowance
         return entries[good], reached[good]
 
     def _estimate(self, poses: np.ndarray, quick: bool) -> np.ndarray:
         """Return the control steps from poses to the goal."""
         if self.value is not None:
-            return self.value.nearest(poses) if quick else 1.2 * self.value(poses)
+            return self.value.nearest(poses) if quick else INTERPOLATION_FACTOR * self.value(poses)
         goal = self.library.features(self.goal.astype(np.float32))
         apart = np.sqrt(((self.library.features(poses) - goal) ** 2).sum(-1))
-        return 20 * apart / self.library.length
+        return STEPS_PER_LENGTH * apart / self.library.length
 
     def _two_pushes(
         self, pose: np.ndarray, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray
-    ) -> Candidate | None:
+    ) -> PushChoice | None:
         """Return the best of the first pushes that a second one continues to the goal."""
         goal = self.goal.astype(np.float32)
         wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
@@ -339,15 +354,17 @@ class PushPlanner:
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
         between = self.after_push[self.place[entries[first]], self.push[second]]
         total = np.where(allowed, spent[first] + between + self.push_time[second], np.inf)
-        total = self._with_risk(total, inverse(wanted[first]), second, reach=False)
+        total = self._with_risk(total, inverse(wanted[first]), second, must_reach=False)
         k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))
         if k is None:
             return None
-        at = first[k]
-        return Candidate(PlanStatus.TWO_PUSHES, int(entries[at]), reached[at].astype(float), float(total[k]))
+        best = first[k]
+        return PushChoice(PlanStatus.TWO_PUSHES, int(entries[best]), reached[best].astype(float), float(total[k]))
 
     def _least(self, cost: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]) -> int | None:
-        """Return the index of the least cost, if it is finite and no push runs into a fixture.
+        """Return the index of the least finite cost of a choice whose pushes run into no fixture.
+
+        Only the `CHECKED` choices of least cost are considered. The result is None if none of them is free.
 
         Args:
             cost: Costs, (choices,).
@@ -356,9 +373,9 @@ class PushPlanner:
         if self.space is None:
             best = int(np.argmin(cost))
             return best if np.isfinite(cost[best]) else None
-        order = np.argsort(cost, kind="stable")[:TRIED]
+        order = np.argsort(cost, kind="stable")[:CHECKED]
         order = order[np.isfinite(cost[order])]
-        for some in np.split(order, range(TOGETHER, len(order), TOGETHER)):
+        for some in np.split(order, range(CHECKED_AT_A_TIME, len(order), CHECKED_AT_A_TIME)):
             free = [self.space.free(self.library, poses[some], entries[some]) for poses, entries in pushes]
             free = np.all(free, axis=0)
             if free.any():

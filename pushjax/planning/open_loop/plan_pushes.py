@@ -42,9 +42,9 @@ from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider, fixture_overlaps
 
-PREDICTED = 256  # samples of the predicted outcomes
-HAND = 10.0  # cost of a hand that runs into a fixture
-MISSED_WIDTH = 0.5  # width of the border of failure in the default cost, in tolerances
+UNSEEN_SAMPLES = 256  # samples of the predicted outcomes
+HAND_IN_FIXTURE_COST = 10.0  # least cost of a hand that runs into a fixture
+MISSED_WIDTH = 0.5  # width of the smooth transition of `Missed` in the default cost, in tolerances
 WARM_UP = (Selection(64), CrossEntropy(iterations=6, population=16, elites=4))
 SEARCH = (Selection(16), CrossEntropy(iterations=10, population=32))
 
@@ -55,9 +55,10 @@ class PushPlanStatus(IntEnum):
     Attributes:
         FOUND: It reaches the goal with at least the probability that was asked for.
         UNLIKELY: The best plan that was found reaches the goal less surely.
-        NO_TRANSIT: For none of the plans that were found does the finger get from push to push without touching slider
-            or fixtures.
-        HAND_IN_FIXTURE: In all plans that were found the hand runs into a fixture in a push.
+        NO_TRANSIT: No plan that was found can be carried out. In the best one, the finger does not get from push to
+            push without touching slider or fixtures.
+        HAND_IN_FIXTURE: No plan that was found can be carried out. In the best one, the hand runs into a fixture in a
+            push.
     """
 
     FOUND = 0
@@ -78,7 +79,7 @@ class PushPlan(NamedTuple):
         parameters: Its parameters, as in `PushSequence`, (size,), also of pushes that are left out.
         outcomes: Predicted poses under friction that the search has not seen.
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
-            finger does not touch between pushes.
+            finger does not touch between pushes. Zero for a plan that cannot be carried out.
         cost: Its cost in the search.
         history: Least cost after each iteration of the search under sampled friction, (iterations,).
     """
@@ -122,11 +123,12 @@ def plan_pushes(
         slider: The slider.
         hand: The hand, of round fingers.
         start: Pose of the slider at the start, (3,), world, m and rad, or samples of a belief, (poses, 3). Sample k of
-            the friction is that of start k, modulo their number.
+            the friction starts at pose k modulo the number of poses. So of more poses than samples only the first are
+            used, `samples` in the search and 256 in the prediction.
         goal: The goal.
         model: Distribution of limit surface and contact friction.
         pushes: How many pushes, and what is free in each.
-        cost: Cost of a push; by default, failure with a smooth border and a thousandth of the squared error.
+        cost: Cost of a push; by default, `Missed` with a smooth transition and a thousandth of the squared error.
         risk: What is minimized over the samples of the cost; by default the mean.
         samples: Number of samples of friction in the search.
         candidates: Number of random plans that the search starts from.
@@ -158,15 +160,15 @@ def plan_pushes(
     risk = Mean() if risk is None else risk
     fixtures = checked_fixtures(fixtures, jnp.result_type(float))
     if fixtures:
-        cost = cost + HAND * HandClearance(hand, fixtures, TIGHT * pushes.clearance)
-    parts = (pushes, cost, risk)
-    problem = push_problem(key, slider, hand, start, model, samples, fixtures, parts)
+        cost = cost + HAND_IN_FIXTURE_COST * HandClearance(hand, fixtures, TIGHT * pushes.clearance)
+    criteria = (pushes, cost, risk)
+    problem = push_problem(key, slider, hand, start, model, samples, fixtures, criteria)
     _check_poses(problem, goal)
-    at = _finger_at(finger, problem)
+    finger_start = _checked_finger(finger, problem)
     found, history = _search(jax.random.fold_in(key, 1), problem, candidates, warm_up, search)
-    unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, PREDICTED, fixtures, parts)
+    unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, UNSEEN_SAMPLES, fixtures, criteria)
     plans = (
-        _judged(parameters, float(least), problem, unseen, goal, success, at)
+        _judged(parameters, float(least), problem, unseen, goal, success, finger_start)
         for parameters, least in zip(found.parameters, found.cost, strict=True)
     )
     first = next(plans)
@@ -205,7 +207,8 @@ def _judged(
     paths, poses = lay_out(parameters[None], problem)
     _, failed, reached = samples_of(paths, unseen)
     path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
-    good, transits, found = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed), (), True
+    good = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed)
+    transits, has_transits = (), True
     if _is_one_finger(problem.hand):
         between = transits_between(
             outline_vertices(problem.slider.shape),
@@ -217,11 +220,12 @@ def _judged(
             finger,
             problem.fixtures,
         )
-        good, transits, found = good & ~between.touched, between.transits, between.status == TransitStatus.FOUND
+        good, transits = good & ~between.touched, between.transits
+        has_transits = between.status == TransitStatus.FOUND
     hits = _hand_in_fixture(problem, path)
-    probability = float(np.mean(good)) if found and not hits else 0.0
+    probability = float(np.mean(good)) if has_transits and not hits else 0.0
     status = PushPlanStatus.FOUND if probability >= success else PushPlanStatus.UNLIKELY
-    status = status if found else PushPlanStatus.NO_TRANSIT
+    status = status if has_transits else PushPlanStatus.NO_TRANSIT
     status = PushPlanStatus.HAND_IN_FIXTURE if hits else status
     return PushPlan(status, path, poses, transits, parameters, outcomes, probability, cost, np.zeros(0))
 
@@ -260,23 +264,24 @@ def _check_poses(problem: PushProblem, goal: Goal) -> None:
             )
 
 
-def _finger_at(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | None:
+def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | None:
     """Return where the finger is at first, after checks; None if that is free."""
     if finger is None:
         return None
     if not _is_one_finger(problem.hand):
         raise ValueError("finger is for a hand of one finger; this hand has another configuration")
-    at = as_float(finger, problem.start.dtype, "finger")
-    check_shape("finger", at, (2,))
-    check_finite("finger", at)
-    point = to_body(np.mean(np.asarray(problem.start, float), axis=0), np.asarray(at, float))
-    apart = float(signed_distances(outline_vertices(problem.slider.shape), point) - problem.hand.radius[0])
-    if apart < 0:
-        raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-apart:.3g} m")
-    beyond = float(Obstacles.of(problem.fixtures).point_clearance(np.asarray(at, float)) - problem.hand.radius[0])
-    if beyond < 0:
-        raise ValueError(f"finger must not overlap a fixture at the start; got an overlap of {-beyond:.3g} m")
-    return np.asarray(at, float)
+    given = as_float(finger, problem.start.dtype, "finger")
+    check_shape("finger", given, (2,))
+    check_finite("finger", given)
+    center, radius = np.asarray(given, float), problem.hand.radius[0]
+    in_body = to_body(np.mean(np.asarray(problem.start, float), axis=0), center)
+    from_slider = float(signed_distances(outline_vertices(problem.slider.shape), in_body) - radius)
+    if from_slider < 0:
+        raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-from_slider:.3g} m")
+    from_fixtures = float(Obstacles.of(problem.fixtures).point_clearance(center) - radius)
+    if from_fixtures < 0:
+        raise ValueError(f"finger must not overlap a fixture at the start; got an overlap of {-from_fixtures:.3g} m")
+    return center
 
 
 def _is_one_finger(hand: Hand) -> bool:

@@ -26,8 +26,8 @@ from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FAILURE = 1e3  # cost of a rollout that fails, such as a push that would start inside the slider
-BATCH = 256  # candidates that are laid out together
-TOGETHER = 2048  # samples that are simulated together, so that their data stay in the cache
+CANDIDATES_AT_A_TIME = 256  # candidates whose paths are laid out together
+SAMPLES_AT_A_TIME = 2048  # samples that are simulated together, so that their data stay in the cache
 
 
 class Outcomes(NamedTuple):
@@ -69,14 +69,14 @@ class PushProblem(eqx.Module):
     """What candidates are evaluated on.
 
     Attributes:
-        pushes: What the parameters mean.
+        pushes: Turns the parameters of a candidate into paths of the hand.
         slider: The slider.
         hand: The hand.
-        start: Poses of the slider at the start, (samples, 3).
-        mean: Mean friction, in which the paths of later pushes are laid out.
+        start: Poses of the slider at the start, (samples, 3), world, m and rad.
+        mean: Mean friction. Under it the slider is moved to where the path of each later push is laid out.
         draws: Sampled friction, one for each start.
         cost: Cost of one sample.
-        risk: What it counts for all samples.
+        risk: Makes one number of the costs of all samples.
         fixtures: What the slider may run into.
     """
 
@@ -96,29 +96,29 @@ class PushProblem(eqx.Module):
 
         def push(pose: Array, numbers: Array) -> tuple[Array, tuple[Array, Array]]:
             path = self.pushes.path(numbers, self.slider, self.hand, pose)
-            after = self.roll(draw, path, pose).pose[-1]
+            after = self.rollout(draw, path, pose).pose[-1]
             return after, (path, after)
 
         start = jnp.mean(self.start, axis=0)
         paths, poses = jax.lax.scan(push, start, parameters.reshape(self.pushes.count, -1))[1]
         return paths, jnp.concatenate([start[None], poses])
 
-    def roll(self, draw: Draws, path: Array, pose: Array) -> Trajectory:
+    def rollout(self, draw: Draws, path: Array, pose: Array) -> Trajectory:
         """Push once under sampled friction."""
         return rollout_under_draws(draw, self.slider.shape, self.hand, path, pose, None, None, None, self.fixtures)
 
-    def rolls(self, draw: Draws, paths: Array, pose: Array) -> Trajectory:
+    def rollouts(self, draw: Draws, paths: Array, pose: Array) -> Trajectory:
         """Push several times; the result has a leading axis of pushes."""
 
         def push(pose: Array, path: Array) -> tuple[Array, Trajectory]:
-            done = self.roll(draw, path, pose)
+            done = self.rollout(draw, path, pose)
             return done.pose[-1], done
 
         return jax.lax.scan(push, pose, paths)[1]
 
     def sample(self, paths: Array, draw: Draws, pose: Array) -> Sample:
         """Push along paths under sampled friction."""
-        done = self.rolls(draw, paths, pose)
+        done = self.rollouts(draw, paths, pose)
         return Sample(self.cost(done), jnp.any(done.failed), jnp.concatenate([pose[None], done.pose[:, -1]]))
 
     def total(self, costs: Array, failed: Array) -> Float[Array, ""]:
@@ -159,7 +159,7 @@ def _costs_and_gradients(parameters: Array, problem: PushProblem) -> tuple[Array
 
 def lay_out(parameters: np.ndarray, problem: PushProblem) -> tuple[np.ndarray, np.ndarray]:
     """Return the paths of candidates (candidates, pushes, ...), and the poses that they lead to; see `PushProblem`."""
-    rows, shared = _in_batches(len(parameters), BATCH), _without_samples(problem)
+    rows, shared = _in_batches(len(parameters), CANDIDATES_AT_A_TIME), _without_samples(problem)
     given = np.asarray(parameters, problem.start.dtype)
     return _joined([_lay_outs(jnp.asarray(given[each]), shared) for each in rows], len(parameters))
 
@@ -169,7 +169,7 @@ def samples_of(paths: np.ndarray, problem: PushProblem) -> Sample:
     draws, start = jax.tree.map(np.asarray, (problem.draws, problem.start))
     candidates, samples, shared = len(paths), len(start), _without_samples(problem)
     found = []
-    for rows in _in_batches(candidates * samples, TOGETHER):
+    for rows in _in_batches(candidates * samples, SAMPLES_AT_A_TIME):
         candidate, sample = rows // samples, rows % samples
         draw = jax.tree.map(lambda leaf, at=sample: leaf[at], draws)
         found.append(_samples(jnp.asarray(paths[candidate]), draw, jnp.asarray(start[sample]), shared))
@@ -183,7 +183,7 @@ def _without_samples(problem: PushProblem) -> PushProblem:
 
 
 def _in_batches(count: int, size: int) -> list[np.ndarray]:
-    """Return indices below `count` in arrays of one size; the last array begins again at zero."""
+    """Return the indices below `count` in arrays of one size; the last array is filled up with indices from zero on."""
     batches = -(-count // size)
     return np.split(np.arange(batches * size) % count, batches)
 
@@ -198,7 +198,7 @@ def simulated(paths: Array, problem: PushProblem) -> Outcomes:
     """Simulate paths of pushes, (pushes, steps + 1, dof), in all samples."""
 
     def sample(draw: Draws, pose: Array) -> Outcomes:
-        done = problem.rolls(draw, paths, pose)
+        done = problem.rollouts(draw, paths, pose)
         return Outcomes(jnp.concatenate([pose[None], done.pose[:, -1]]), jnp.any(done.failed))
 
     return jax.vmap(sample)(problem.draws, problem.start)
@@ -221,14 +221,15 @@ def push_outcomes(
         key: PRNG key of everything random.
         slider: The slider.
         hand: The hand. It is put at the start of each path, wherever it was before.
-        start: Pose of the slider at the start, (3,), or samples of a belief, (poses, 3), world, m and rad.
+        start: Pose of the slider at the start, (3,), or samples of a belief, (poses, 3), world, m and rad. Sample k
+            starts at pose k modulo the number of poses.
         path: Paths of the hand, (pushes, steps + 1, dof), world.
         model: Distribution of limit surface and contact friction.
         samples: Number of samples.
         fixtures: Walls and fixed bodies that the slider may run into.
 
     Returns:
-        The final poses.
+        Poses before the first push and after each, and whether a rollout failed.
 
     Raises:
         ValueError: For a count below one, and for a start or paths that are not finite or of another shape.
@@ -250,9 +251,12 @@ def push_problem(
     model: FrictionModel,
     samples: int,
     fixtures: Fixtures,
-    search: tuple[PushSequence, Cost, Risk] | None,
+    criteria: tuple[PushSequence, Cost, Risk] | None,
 ) -> PushProblem:
-    """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction."""
+    """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction.
+
+    `criteria` says what candidates are and what they cost; it is None where nothing is searched.
+    """
     check_key(key)
     dtype = common_dtype(slider, hand, start)
     poses = as_float(start, dtype, "start")
@@ -261,7 +265,7 @@ def push_problem(
     check_finite("start", poses)
     draws = draw_friction(key, slider.surface, model, samples)
     poses = poses.reshape(-1, 3)[np.arange(samples) % (poses.size // 3)]
-    pushes, cost, risk = search or (None, None, None)
+    pushes, cost, risk = criteria or (None, None, None)
     parts = (pushes, slider, hand, poses, mean_friction(slider.surface, model), draws, cost, risk, fixtures)
     return jax.tree.map(lambda leaf: leaf.astype(dtype), PushProblem(*parts))
 
@@ -272,7 +276,7 @@ def objective(problem: PushProblem) -> Objective:
 
     def cost(parameters: np.ndarray) -> np.ndarray:
         found = samples_of(lay_out(parameters, problem)[0], problem)
-        rows, shared = _in_batches(len(parameters), BATCH), _without_samples(problem)
+        rows, shared = _in_batches(len(parameters), CANDIDATES_AT_A_TIME), _without_samples(problem)
         totals = [_totals(found.cost[each], found.failed[each], shared) for each in rows]
         return _joined(totals, len(parameters)).astype(np.float64)
 

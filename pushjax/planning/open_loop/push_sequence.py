@@ -39,8 +39,8 @@ class PushSequence(eqx.Module):
         steps: Number of steps of each push.
         clearance: Distance before first contact at which a push starts, m.
         bends: Number of inner control points of the path; zero for a straight line.
-        opening: For a hand that turns: what its configuration has beyond x, y and theta, (dof - 3,). Its x axis points
-            in the direction of the push.
+        opening: For a hand that turns: what its configuration has beyond x, y and theta, (dof - 3,). The x axis of such
+            a hand points in the direction of the push.
 
     Raises:
         ValueError: For a count below one, a negative number of bends, or a length or clearance that is not positive.
@@ -65,7 +65,8 @@ class PushSequence(eqx.Module):
     ):
         check_count("count", count)
         check_count("steps", steps)
-        check_count("bends", bends + 1 if isinstance(bends, int) and bends >= 0 else bends)
+        if not isinstance(bends, (int, np.integer)) or isinstance(bends, bool) or bends < 0:
+            raise ValueError(f"bends must be a whole number, at least 0; got {bends!r}")
         self.count, self.steps, self.bends = int(count), int(steps), int(bends)
         self.length, self.clearance = as_float(length, name="length"), as_float(clearance, name="clearance")
         for name in ("length", "clearance"):
@@ -83,7 +84,7 @@ class PushSequence(eqx.Module):
 
     @property
     def scale(self) -> np.ndarray:
-        """Change of each parameter that makes another push of it, (size,)."""
+        """Change of each parameter that makes a clearly different push, (size,)."""
         return np.tile([0.5, 0.3, 0.3] + [0.2] * self.bends, self.count)
 
     def sample(self, key: PRNGKeyArray, candidates: int) -> np.ndarray:

@@ -55,11 +55,12 @@ class Squeezes(eqx.Module):
         opening: Distance of the pads before a squeeze, m. The slider has to fit between them at any pose of the belief.
         closed: Distance of the pads of the closed jaw, m.
         steps: Number of steps in which the jaw closes.
-        angles: Number of directions, all over half a turn.
+        angles: Number of directions, at equal spacing over half a turn.
         offsets: Displacements of the jaw along its pads, (offsets,), m.
 
     Raises:
-        ValueError: For a count below one, lengths that are not finite, or an opening that is not larger than `closed`.
+        ValueError: For a count below one, lengths that are not finite, a `closed` that is not positive, or an opening
+            that is not larger than `closed`.
     """
 
     opening: Float[Array, ""]
@@ -121,7 +122,7 @@ class SqueezeOutcomes(NamedTuple):
     Attributes:
         poses: Poses of the slider before the first squeeze and after each, (samples, squeezes + 1, 3), world.
         held: Whether the jaw holds the slider at the end of each squeeze, (samples, squeezes).
-        failed: Whether a squeeze failed: its status was no answer in some step, (samples, squeezes).
+        failed: Whether the simulation of a squeeze failed in some step, (samples, squeezes).
     """
 
     poses: np.ndarray
@@ -195,7 +196,7 @@ def plan_squeezes(
 
     Raises:
         ValueError: For a count below one, a belief that is not finite or of another shape, a probability outside
-            [0, 1], tolerances that are not positive, or a hand with another configuration.
+            [0, 1], tolerances or a width that are not positive, or a hand with another configuration.
         TypeError: For arguments of other types.
     """
     for name, value in (("count", count), ("samples", samples), ("beam", beam)):
@@ -224,11 +225,12 @@ def plan_squeezes(
         history.append(cost[best][0])
     unseen = jax.random.fold_in(key, 1)
     outcomes = squeeze_outcomes(unseen, slider, hand, poses, jaws[0], model=model, squeezes=squeezes)
-    center, near = most_likely(outcomes.poses[:, -1], turns, position_tolerance, angle_tolerance)
+    likeliest, near = most_likely(outcomes.poses[:, -1], turns, position_tolerance, angle_tolerance)
     probability = float(np.mean(near & outcomes.held[:, -1] & ~outcomes.failed.any(axis=1)))
-    known = entropy(np.moveaxis(outcomes.poses, 1, 0), turns, length, width)
+    entropies = entropy(np.moveaxis(outcomes.poses, 1, 0), turns, length, width)
     status = SqueezeStatus.FOUND if probability >= success else SqueezeStatus.UNLIKELY
-    return SqueezePlan(status, jaws[0], outcomes.poses[center, -1], probability, known, outcomes, np.array(history))
+    pose = outcomes.poses[likeliest, -1]
+    return SqueezePlan(status, jaws[0], pose, probability, entropies, outcomes, np.array(history))
 
 
 def squeeze_outcomes(

@@ -48,7 +48,7 @@ class DubinsPath(NamedTuple):
         return float(self.lengths.sum())
 
     def poses(self, steps: int) -> np.ndarray:
-        """Poses along the path. The ends of the parts are among them, so that no step bends in two ways.
+        """Return poses along the path. The ends of the parts are among them, so that no step has two curvatures.
 
         Args:
             steps: Number of steps, at least one for each part of the path that has a length.
@@ -78,7 +78,7 @@ def dubins(start: ArrayLike, goal: ArrayLike, left: float, right: float) -> Dubi
         right: Radius of the tightest right turn, m; infinite if it cannot turn right.
 
     Returns:
-        The path, or None if there is none, which needs an infinite radius.
+        The path; None if both radii are infinite, also where the goal is straight ahead.
 
     Raises:
         ValueError: If a pose is not finite or has another shape, or a radius is not positive.
@@ -130,7 +130,7 @@ def _lengths(word: str, start: np.ndarray, goal: np.ndarray, radii: dict[str, fl
         return []
     found = []
     for apex in (1, -1):
-        # angle between D and the side of the triangle; on this side the two turns touch
+        # angle between D and the side of the triangle on which the first turn touches the middle one
         corner = apex * np.arccos(distance / (2 * side))
         # where the tangent point lies in direction u of the center, the heading has the normal -sign * u
         quarter = SIGN[first] * np.pi / 2

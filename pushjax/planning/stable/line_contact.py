@@ -1,6 +1,6 @@
 """A hand that pushes a straight edge of a slider in two places, and how tightly it can turn without slip.
 
-Two round fingers side by side, or a flat pad, touch an edge along a line. All of this module is in the *pushing frame*:
+Two round fingers side by side, or a flat pad, touch an edge along a line. The wrenches here are in the *pushing frame*:
 its origin is midway between the two contacts, its x axis is the inward normal of the edge. Let the contacts be at
 y = +b and y = -b, and their forces in cones of friction mu. Together they can apply exactly the wrenches with
 
@@ -10,14 +10,15 @@ because tangential forces along the line of the contacts have no torque about th
 wrench that the slider's twist needs, by its limit surface, is strictly inside this cone. That the hand then moves the
 slider with it follows for any limit surface; no mode is assumed.
 
-The hand moves along its *heading*, and turns. The point of the slider that follows the path of a car is a point on the
-heading through the origin, at some distance ahead of it. The curvature of that path determines the twist, and the
-wrench. So for one limit surface and one coefficient of friction the curvatures without slip form an interval; for many
-of them it is the intersection. Its ends are found by bisection.
+The hand moves along its *heading*, and turns. One point of the slider moves like a car, always forward along the
+heading: it is on the line through the origin in the direction of the heading, at some distance ahead of the origin.
+The curvature of its path determines the twist, and so the wrench. For one limit surface and one coefficient of friction
+the curvatures without slip form an interval. For many of them it is the intersection, whose ends are found by
+bisection.
 
 Where the point is decides how tight the turn can be: ahead of the center of friction the slider must swing out, which
-takes a tangential force, and in exchange less torque. `turn` tries points over the whole depth of the slider and takes
-the one with the tightest turns.
+takes a tangential force, and in exchange less torque. `tightest_turn` tries points over the whole depth of the slider
+and takes the one with the tightest turns.
 
 Reference: Lynch & Mason 1996, section 3 (stable pushes by line contact). Zhou & Mason 2017 (such a point, and paths of
 bounded curvature).
@@ -38,7 +39,9 @@ from pushjax.geometry.se2_numpy import compose
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
 
-FLAT = 1e-5  # points whose distance along an axis is less than this, in units of the surface's length, are side by side
+# Points are side by side if their distance along an axis is less than this, for a hand in units of the surface's
+# length, and for a slider in units of the edge's length.
+FLAT = 1e-5
 GRID, BISECTIONS = 48, 30  # curvatures tried to either side, and halvings of the interval between two of them
 POINTS = 25  # points that are tried for the one that follows the path
 
@@ -117,13 +120,13 @@ def hand_front(hand: Hand, opening: np.ndarray, length: float) -> HandFront:
 
 
 def line_contacts(slider: Slider, front: HandFront) -> list[LineContact]:
-    """Place a hand on every edge of a slider on which it fits, where it pushes the mean surface straight ahead.
+    """Place a hand on every edge of a slider on which it fits, where it can push straight ahead.
 
-    A normal force moves the slider without turning it if it acts where H is least. The middle of the contact is put
-    there, or as near as the edge allows, and the heading is the direction of that motion.
+    A normal force moves the slider without turning it if its torque makes H least. The middle of the contact is put
+    where the force has this torque, or as near as the edge allows, and the heading is the direction of that motion.
 
     Args:
-        slider: The slider, a polygon.
+        slider: The slider, a polygon. Its surface is the mean of the sampled surfaces.
         front: Foremost points of the hand.
 
     Returns:
@@ -131,17 +134,17 @@ def line_contacts(slider: Slider, front: HandFront) -> list[LineContact]:
     """
     vertices, found = np.asarray(slider.shape.vertices, np.float64), []  # pyright: ignore[reportAttributeAccessIssue]
     for edge, (start, end) in enumerate(zip(vertices, np.roll(vertices, -1, axis=0), strict=True)):
-        length = float(np.hypot(*(end - start)))
-        along = (end - start) / length
+        edge_length = float(np.hypot(*(end - start)))
+        along = (end - start) / edge_length
         normal = np.array([-along[1], along[0]])
         inward = (vertices - start[None]) @ normal
-        if inward.min() < -FLAT * length or (front.high - front.low > length and not front.is_flat):
+        if inward.min() < -FLAT * edge_length or (front.high - front.low > edge_length and not front.is_flat):
             continue
         torque, motion = _straight_push(slider.surface, normal)
         # the torque about the body origin of a force along the normal, which acts at a distance from the start
         distance = torque - (start[0] * normal[1] - start[1] * normal[0])
-        width = min(front.high - front.low, length)
-        middle = start + np.clip(distance, width / 2, length - width / 2) * along
+        width = min(front.high - front.low, edge_length)
+        middle = start + np.clip(distance, width / 2, edge_length - width / 2) * along
         frame = np.array([*middle, np.arctan2(normal[1], normal[0])])
         hand = np.array([-front.x, -(front.low + front.high) / 2, 0.0])
         heading = float(np.arctan2(-motion @ along, motion @ normal))  # the frame's y axis is against the edge
@@ -182,7 +185,7 @@ class Turn(NamedTuple):
         return 1 / self.left if self.left > 0 else np.inf, 1 / self.right if self.right > 0 else np.inf
 
 
-def turn(contact: LineContact, surfaces: LimitSurface, friction: Array, margin: float) -> Turn | None:
+def tightest_turn(contact: LineContact, surfaces: LimitSurface, friction: Array, margin: float) -> Turn | None:
     """Find the tightest turns of a line contact at which both of its ends stick, for all sampled surfaces.
 
     Args:

@@ -26,11 +26,10 @@ from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.stable.dubins import DubinsPath, dubins
-from pushjax.planning.stable.line_contact import LineContact, Turn, hand_front, line_contacts, turn
+from pushjax.planning.stable.line_contact import LineContact, Turn, hand_front, line_contacts, tightest_turn
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
-FULL_TURN = 2 * np.pi
 STEP = 0.05  # default length of a step, in units of the length of the limit surface
 
 
@@ -41,7 +40,8 @@ class StableStatus(IntEnum):
         FOUND: There is one.
         NOT_STABLE: On no edge does the contact stick for every sampled friction, not even when it pushes straight
             ahead.
-        OUT_OF_REACH: No contact can turn to either side without slip, so nearly no pose can be reached.
+        OUT_OF_REACH: No contact can turn to either side without slip. Then no push is planned, not even to a pose
+            straight ahead.
     """
 
     FOUND = 0
@@ -118,7 +118,7 @@ def stable_contacts(
     Raises:
         ValueError: For a hand that touches an edge in one point only or is not a rigid body in x, y and theta, for a
             margin outside [0, 1), and for `samples` below one.
-        TypeError: If the slider is not a polygon.
+        TypeError: If the slider is not a polygon, and for a key, slider, hand or model of another type.
     """
     check_type("slider", slider, Slider)
     check_type("slider.shape", slider.shape, Polygon)
@@ -130,7 +130,7 @@ def stable_contacts(
     front = hand_front(hand, rest, float(slider.surface.length))
     draws = jax.tree.map(lambda leaf: leaf[:, 0], draw_friction(key, slider.surface, model, samples))
     friction = draws.friction.astype(slider.surface.length.dtype)
-    turns = [(each, turn(each, draws.surface, friction, margin)) for each in line_contacts(slider, front)]
+    turns = [(each, tightest_turn(each, draws.surface, friction, margin)) for each in line_contacts(slider, front)]
     return tuple(StableContact(each, found, rest) for each, found in turns if found is not None)
 
 
@@ -233,7 +233,6 @@ def shortest_push(
     path, best = min(found, key=lambda pair: pair[0].length)
     count = steps or max(3, int(np.ceil(path.length / step)))
     pose = compose(path.poses(count), inverse(best.reference))
-    pose[:, 2] += FULL_TURN * np.round((ends[0][2] - pose[0, 2]) / FULL_TURN)
     hand = compose(pose, best.contact.hand)
     rows = np.concatenate([hand, np.tile(best.opening, (len(hand), 1))], axis=1)
     reason = f"edge {best.contact.edge}, {path.word}, {path.length:.3f} m"

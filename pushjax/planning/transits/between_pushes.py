@@ -21,9 +21,10 @@ from pushjax.planning.transits.roadmap import Roadmap, Transit, TransitStatus, r
 from pushjax.planning.workspace import Workspace
 from pushjax.simulation.fixtures import Fixtures
 
-SHARES = (1.0, 0.9, 0.5)  # of the samples, for which the finger keeps its distance, in the order of attempts
-TIGHT = 0.25  # of the clearance, with which the last attempt is made
-RUN_UPS = (1.0, 2.0, 4.0)  # longest run-ups, in units of the distance that the finger keeps
+# Quantiles of the samples' displacement that the finger keeps in addition to its clearance, in the order of attempts.
+QUANTILES = (1.0, 0.9, 0.5)
+TIGHT = 0.25  # the last attempt is made with this fraction of the clearance
+RUN_UPS = (1.0, 2.0, 4.0)  # longest run-ups, in units of the distance that the finger's center keeps
 TOUCH = 1e-4  # overlap that does not count as touching, in units of the finger's radius
 
 
@@ -32,7 +33,8 @@ class Transits(NamedTuple):
 
     Attributes:
         transits: A transit to the start of each push, and the retreat after the last one, (pushes + 1).
-        touched: Whether the finger touches the slider on any way, for each sample of the prediction, (samples,).
+        touched: Whether the finger touches the slider in any transit that was found, for each sample of the
+            prediction, (samples,).
     """
 
     transits: tuple[Transit, ...]
@@ -77,8 +79,9 @@ def transits_between(
         radius: Radius of the finger, m.
         clearance: Distance that the finger keeps from slider and fixtures, m.
         paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
-        predicted: Predicted poses of the slider before the first push and after each, (pushes + 1, 3).
-        samples: Samples of these poses, (samples, pushes + 1, 3).
+        predicted: Predicted poses of the slider before the first push and after each, (pushes + 1, 3), world, m and
+            rad.
+        samples: Samples of these poses, (samples, pushes + 1, 3), world, m and rad.
         start: Where the finger is at first, (2,), world, m. None: where the run-up of the first push begins.
         fixtures: Walls and fixed bodies that the finger stays out of.
 
@@ -88,16 +91,16 @@ def transits_between(
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
         return Transits((), np.zeros(len(samples), bool))
-    around = _Around(vertices, radius, clearance, Workspace.unlimited(fixtures))
+    scene = _Scene(vertices, radius, clearance, Workspace.unlimited(fixtures))
     transits, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
         scatter = _displacement(vertices, pose, samples[:, k])
-        margins = [*(clearance + np.quantile(scatter, share) for share in SHARES), clearance, TIGHT * clearance]
-        tried = (_transit(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
+        margins = [*(clearance + np.quantile(scatter, q) for q in QUANTILES), clearance, TIGHT * clearance]
+        tried = (_transit(scene, margin, paths[k : k + 1], pose, origin) for margin in margins)
         transit = next((each for each in tried if each.status == TransitStatus.FOUND), None)
         if transit is None:  # the last attempt is the least demanding, and tells why
-            transit = _transit(around, margins[-1], paths[k : k + 1], pose, origin)
+            transit = _transit(scene, margins[-1], paths[k : k + 1], pose, origin)
         else:
             touched |= _touches(vertices, radius, transit.points, samples[:, k])
         transits.append(transit)
@@ -105,7 +108,7 @@ def transits_between(
 
 
 def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: float, push: float) -> FingerMotion:
-    """Return the motion of a finger through all ways and pushes, at one speed in pushes and another between them.
+    """Return the motion of a finger through all transits and pushes, at one speed in pushes and another in transits.
 
     Args:
         transits: The transits: one to the start of each push, and the last retreat.
@@ -134,8 +137,8 @@ def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: flo
     return FingerMotion(np.concatenate([[0.0], np.cumsum(duration)]), points, pushes)
 
 
-class _Around(NamedTuple):
-    """What transits go around: the slider's vertices, radius and clearance of the finger, and the fixtures."""
+class _Scene(NamedTuple):
+    """What transits are planned in: the slider's vertices, radius and clearance of the finger, and the fixtures."""
 
     vertices: np.ndarray
     radius: float
@@ -143,51 +146,52 @@ class _Around(NamedTuple):
     workspace: Workspace
 
     def roadmap(self, margin: float, goals: np.ndarray) -> Roadmap:
+        """Return the roadmap for a distance from the slider, m; from fixtures no more than the clearance is kept."""
         return Roadmap(self.vertices, self.radius, margin, goals, min(margin, self.clearance))
 
 
-def _transit(around: _Around, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+def _transit(scene: _Scene, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
     """Return the transit to the start of the first of `paths`, or the retreat if there are none."""
     if len(paths):
-        return _approach(around, margin, paths[0], pose, origin)
+        return _approach(scene, margin, paths[0], pose, origin)
     if origin is None:
         raise ValueError("a retreat begins where a push ends")
-    return around.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose, around.workspace)
+    return scene.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose, scene.workspace)
 
 
-def _approach(around: _Around, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+def _approach(scene: _Scene, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
     """Return the transit to the start of a push, with a run-up from where the finger has its full distance."""
     first, second = to_body(pose, path[:2])
     ahead = (second - first) / np.linalg.norm(second - first)
     blocked = Transit(
         path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, TransitStatus.GOAL_BLOCKED
     )
-    if signed_distances(around.vertices, first) < (1 - TOUCH) * around.radius:
+    if signed_distances(scene.vertices, first) < (1 - TOUCH) * scene.radius:
         return blocked
     for part in RUN_UPS:
-        longest = part * (around.radius + margin)
-        run_up = float(run_ups(around.vertices, around.radius, margin, first[None], ahead[None], longest)[0])
+        longest = part * (scene.radius + margin)
+        run_up = float(run_ups(scene.vertices, scene.radius, margin, first[None], ahead[None], longest)[0])
         begin = (first - run_up * ahead)[None]
-        if np.isfinite(run_up) and _keeps_out(around, margin, to_world(pose, begin[0]), path[0]):
+        if np.isfinite(run_up) and _keeps_out(scene, margin, to_world(pose, begin[0]), path[0]):
             break
     else:
         return blocked
     if origin is None:
         transit = Transit(to_world(pose, begin), 0.0, TransitStatus.FOUND)
     else:
-        roadmap = around.roadmap(margin, begin)
-        transit = roadmap.transit(roadmap.transits(origin, pose, around.workspace), 0, pose)
+        roadmap = scene.roadmap(margin, begin)
+        transit = roadmap.transit(roadmap.transits(origin, pose, scene.workspace), 0, pose)
     if transit.status != TransitStatus.FOUND or run_up == 0:
         return transit
     return Transit(np.concatenate([transit.points, path[:1]]), transit.length + run_up, TransitStatus.FOUND)
 
 
-def _keeps_out(around: _Around, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
+def _keeps_out(scene: _Scene, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
     """Return whether a run-up begins with the clearance from fixtures, and touches none."""
-    obstacles = around.workspace.obstacles
-    if obstacles.point_clearance(begin) < around.radius + min(margin, around.clearance):
+    obstacles = scene.workspace.obstacles
+    if obstacles.point_clearance(begin) < scene.radius + min(margin, scene.clearance):
         return False
-    return bool(obstacles.segment_clearance(begin, start) >= around.radius)
+    return bool(obstacles.segment_clearance(begin, start) >= scene.radius)
 
 
 def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -> np.ndarray:

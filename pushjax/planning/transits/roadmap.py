@@ -24,7 +24,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from pushjax._internal.checks import check_positive
-from pushjax.geometry.polygon_numpy import segment_distances, signed_distances, turns
+from pushjax.geometry.polygon_numpy import exterior_angles, segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.workspace import Workspace
@@ -36,7 +36,16 @@ RETREATS = 24  # directions in which a retreat is tried
 
 
 class TransitStatus(IntEnum):
-    """Why there is a transit, or none."""
+    """Whether there is a transit, or why not.
+
+    Attributes:
+        FOUND: There is one.
+        START_IN_SLIDER: The center of the finger is inside the polygon at the start.
+        NO_RETREAT: The finger is too near to the polygon or to an obstacle at the start, and no segment leads out.
+        GOAL_BLOCKED: The end of the transit, or each run-up to the push, is too near to the polygon or to an obstacle.
+        NO_TRANSIT: No path leads from start to end.
+        START_IN_FIXTURE: The center of the finger is inside an obstacle at the start.
+    """
 
     FOUND = 0
     START_IN_SLIDER = 1
@@ -66,9 +75,11 @@ class ShortestTransits(NamedTuple):
     Attributes:
         lengths: Length of the transit to each goal, (goals,), m, infinite where there is none.
         status: FOUND, or why no goal can be reached at all.
-        points: The corners that transits may have, the start first, (nodes, 2), body frame.
-        previous: For each of these, the one before it on the shortest transit from the start.
-        last: For each goal, the last of the corners on the way to it.
+        points: The corners that transits may have, (nodes, 2), body frame, m. The first one is the start. If the finger
+            must retreat, the first one is where the retreat ends, and the last one is the start.
+        previous: For each of these, the index of the one before it on the shortest transit, (nodes,); negative for the
+            start.
+        last: For each goal, the index of the last of the corners before it, (goals,).
         blocked: Whether a goal itself is too near to the polygon or an obstacle, (goals,).
     """
 
@@ -89,7 +100,14 @@ class Roadmap:
         clearance: Distance that the finger keeps from the polygon on its way, m, positive.
         goals: Ends of the transits, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
             reached.
-        from_obstacles: Distance that the finger keeps from obstacles, m. None: as from the polygon.
+        obstacle_clearance: Distance that the finger keeps from obstacles, m. None: as from the polygon.
+
+    Attributes:
+        min_distance: Distance of the finger's center from the polygon that a transit keeps, m.
+        min_obstacle_distance: Distance of the finger's center from obstacles that a transit keeps, m.
+        nodes: Points around the corners of the polygon, (nodes, 2), body frame, m.
+        links: Lengths of the segments from nodes to goals, (nodes, goals), m, infinite where they come too near.
+        goal_clearance: Signed distances of the goals from the polygon, (goals,), m.
     """
 
     def __init__(
@@ -98,16 +116,16 @@ class Roadmap:
         radius: float,
         clearance: float,
         goals: np.ndarray,
-        from_obstacles: float | None = None,
+        obstacle_clearance: float | None = None,
     ):
         check_positive("clearance", clearance)
-        self.from_obstacles = radius + (clearance if from_obstacles is None else from_obstacles)
-        self.vertices, self.radius, self.apart = vertices, radius, radius + clearance
+        self.min_obstacle_distance = radius + (clearance if obstacle_clearance is None else obstacle_clearance)
+        self.vertices, self.radius, self.min_distance = vertices, radius, radius + clearance
         self.clearance, self.goals = clearance, np.asarray(goals, float)
-        points = _corner_points(vertices, self.apart * (1 + OUTSIDE))
-        self.nodes = points[signed_distances(vertices, points) >= self.apart]
+        points = _corner_points(vertices, self.min_distance * (1 + OUTSIDE))
+        self.nodes = points[signed_distances(vertices, points) >= self.min_distance]
         self.goal_clearance = signed_distances(vertices, self.goals)
-        self.links = self._lengths(self.nodes[:, None], self.goals, at_end=self.goal_clearance)
+        self.links = self._lengths(self.nodes[:, None], self.goals, end_distance=self.goal_clearance)
 
     def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> ShortestTransits:
         """Find the shortest transits from one point to all goals.
@@ -117,10 +135,10 @@ class Roadmap:
             pose: Pose of the polygon, (3,), m and rad.
             workspace: Where the finger may be, and the obstacles.
         """
-        body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.seen_from(pose)
+        body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.in_frame(pose)
         begin, status = self._retreat(body_start, pose, workspace, obstacles)
         if status != TransitStatus.FOUND:
-            return self._none(body_start, status)
+            return self._no_transits(body_start, status)
         nodes, links = self._within(pose, workspace)
         if obstacles.any:
             nodes, links = self._among(nodes, links, pose, workspace, obstacles)
@@ -128,12 +146,12 @@ class Roadmap:
         graph = self._lengths(corners[:, None], corners)
         graph[np.isinf(graph) | ~self._clear(obstacles, corners[:, None], corners)] = 0  # no edge
         distance, previous = dijkstra(graph, indices=0, return_predecessors=True)
-        direct = self._lengths(begin[-1], self.goals, at_end=self.goal_clearance)
+        direct = self._lengths(begin[-1], self.goals, end_distance=self.goal_clearance)
         total = distance[:, None] + np.concatenate([direct[None], links])
         total[:, ~workspace.allows_finger(to_world(pose, self.goals))] = np.inf
-        blocked = self.goal_clearance < self.apart
+        blocked = self.goal_clearance < self.min_distance
         if obstacles.any:
-            blocked |= obstacles.point_clearance(self.goals) < self.from_obstacles
+            blocked |= obstacles.point_clearance(self.goals) < self.min_obstacle_distance
             total[:, blocked] = np.inf
         last = self._last(total, corners, obstacles)
         lengths = total[last, np.arange(len(self.goals))]
@@ -155,9 +173,9 @@ class Roadmap:
         """
         if not np.isfinite(transits.lengths[goal]):
             status = transits.status if transits.status != TransitStatus.FOUND else TransitStatus.NO_TRANSIT
-            reached = status == TransitStatus.NO_TRANSIT and transits.blocked[goal]
-            at = transits.points[:1] if transits.previous[0] < 0 else transits.points[-1:]
-            return Transit(to_world(pose, at), np.inf, TransitStatus.GOAL_BLOCKED if reached else status)
+            is_blocked = status == TransitStatus.NO_TRANSIT and transits.blocked[goal]
+            start = transits.points[:1] if transits.previous[0] < 0 else transits.points[-1:]
+            return Transit(to_world(pose, start), np.inf, TransitStatus.GOAL_BLOCKED if is_blocked else status)
         corner, points = int(transits.last[goal]), [self.goals[goal]]
         while corner >= 0:
             points.append(transits.points[corner])
@@ -172,7 +190,7 @@ class Roadmap:
             pose: Pose of the polygon, (3,), m and rad.
             workspace: Where the finger may be.
         """
-        obstacles = workspace.obstacles.seen_from(pose)
+        obstacles = workspace.obstacles.in_frame(pose)
         points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace, obstacles)
         length = float(np.linalg.norm(points[-1] - points[0])) if status == TransitStatus.FOUND else np.inf
         return Transit(to_world(pose, points), length, status)
@@ -186,19 +204,19 @@ class Roadmap:
         Returns:
             The lengths, (points, goals), m, infinite where there is no transit.
         """
-        at = signed_distances(self.vertices, starts)
-        direct = self._lengths(starts[:, None], self.goals, at[:, None], self.goal_clearance)
+        start_distance = signed_distances(self.vertices, starts)
+        direct = self._lengths(starts[:, None], self.goals, start_distance[:, None], self.goal_clearance)
         graph = self._lengths(self.nodes[:, None], self.nodes)
         graph[np.isinf(graph)] = 0
         from_nodes = np.min(dijkstra(graph)[..., None] + self.links, axis=1)  # (nodes, goals)
-        to_nodes = self._lengths(starts[:, None], self.nodes, at[:, None])
+        to_nodes = self._lengths(starts[:, None], self.nodes, start_distance[:, None])
         through = np.stack([np.min(row[:, None] + from_nodes, axis=0) for row in to_nodes])
         return np.minimum(direct, through)
 
-    def _lengths(self, start, end, at_start=None, at_end=None) -> np.ndarray:
+    def _lengths(self, start, end, start_distance=None, end_distance=None) -> np.ndarray:
         """Return the lengths of segments, infinite where they do not keep the distance."""
-        free = segment_distances(self.vertices, start, end, at_start, at_end) >= self.apart * (1 - 1e-9)
-        return np.where(free, np.linalg.norm(end - start, axis=-1), np.inf)
+        distance = segment_distances(self.vertices, start, end, start_distance, end_distance)
+        return np.where(distance >= self.min_distance * (1 - 1e-9), np.linalg.norm(end - start, axis=-1), np.inf)
 
     def _within(self, pose: np.ndarray, workspace: Workspace) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodes, moved to the limits of the workspace where they are outside, and their links to goals."""
@@ -209,30 +227,34 @@ class Roadmap:
         clipped = np.clip(world, workspace.finger_low, workspace.finger_high)
         nodes = np.where(allowed[:, None], self.nodes, to_body(pose, clipped))
         links = self.links.copy()
-        links[~allowed] = self._lengths(nodes[~allowed][:, None], self.goals, at_end=self.goal_clearance)
+        links[~allowed] = self._lengths(nodes[~allowed][:, None], self.goals, end_distance=self.goal_clearance)
         return nodes, links
 
     def _clear(self, obstacles: Obstacles, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return whether segments keep the distance from obstacles."""
-        enough = self.from_obstacles
+        enough = self.min_obstacle_distance
         return obstacles.segment_clearance(start, end, enough) >= enough * (1 - 1e-9)
 
     def _among(self, nodes: np.ndarray, links: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
-        """Return nodes and links with those of obstacles. Links may run through an obstacle, which `_last` excludes."""
-        around = [_corner_points(body, self.from_obstacles * (1 + OUTSIDE)) for body in obstacles.bodies]
+        """Return nodes and links with those around obstacles.
+
+        All links may run through an obstacle, and those of the new nodes also through the polygon. `_last` excludes
+        them.
+        """
+        around = [_corner_points(body, self.min_obstacle_distance * (1 + OUTSIDE)) for body in obstacles.bodies]
         angle, half = np.arange(DISK_POINTS) * (2 * np.pi / DISK_POINTS), np.pi / DISK_POINTS
         circle = (1 + OUTSIDE) / np.cos(half) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         around += [
-            center + (radius + self.from_obstacles) * circle
+            center + (radius + self.min_obstacle_distance) * circle
             for center, radius in zip(obstacles.centers, obstacles.radii, strict=True)
         ]
         world = to_world(pose, np.concatenate([np.zeros((0, 2)), *around]))
         more = to_body(pose, np.clip(world, workspace.finger_low, workspace.finger_high))
-        more = more[signed_distances(self.vertices, more) >= self.apart]
+        more = more[signed_distances(self.vertices, more) >= self.min_distance]
         nodes = np.concatenate([nodes, more])
         links = np.concatenate([links, np.linalg.norm(self.goals - more[:, None], axis=-1)])
-        keeps = obstacles.point_clearance(nodes) >= self.from_obstacles
-        return nodes[keeps], links[keeps]
+        is_free = obstacles.point_clearance(nodes) >= self.min_obstacle_distance
+        return nodes[is_free], links[is_free]
 
     def _last(self, total: np.ndarray, corners: np.ndarray, obstacles: Obstacles) -> np.ndarray:
         """Return the last corner before each goal on the shortest transit.
@@ -245,44 +267,45 @@ class Roadmap:
         """
         if not obstacles.any:
             return np.argmin(total, axis=0)
-        last, open_goals = np.argmin(total, axis=0), np.flatnonzero(np.isfinite(total).any(0))
+        open_goals = np.flatnonzero(np.isfinite(total).any(0))
         while len(open_goals):
-            last[open_goals] = by = np.argmin(total[:, open_goals], axis=0)
+            last = np.argmin(total[:, open_goals], axis=0)
             ends = self.goals[open_goals]
-            keeps = self._clear(obstacles, corners[by], ends)
-            keeps &= np.isfinite(self._lengths(corners[by], ends, at_end=self.goal_clearance[open_goals]))
-            total[by[~keeps], open_goals[~keeps]] = np.inf
-            open_goals = open_goals[~keeps]
+            is_free = self._clear(obstacles, corners[last], ends)
+            is_free &= np.isfinite(self._lengths(corners[last], ends, end_distance=self.goal_clearance[open_goals]))
+            total[last[~is_free], open_goals[~is_free]] = np.inf
+            open_goals = open_goals[~is_free]
             open_goals = open_goals[np.isfinite(total[:, open_goals]).any(0)]
         return np.argmin(total, axis=0)
 
     def _retreat(self, start: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
         """Return the start, and where the finger has retreated to if it is too near, (1 or 2, 2), and the status."""
-        have, have_obstacles = float(signed_distances(self.vertices, start)), float(obstacles.point_clearance(start))
-        if have >= self.apart and have_obstacles >= self.from_obstacles:
+        distance = float(signed_distances(self.vertices, start))
+        obstacle_distance = float(obstacles.point_clearance(start))
+        if distance >= self.min_distance and obstacle_distance >= self.min_obstacle_distance:
             return start[None], TransitStatus.FOUND
-        if have <= 0 or have_obstacles <= 0:
-            return start[None], TransitStatus.START_IN_SLIDER if have <= 0 else TransitStatus.START_IN_FIXTURE
-        missing = max(self.apart - have, self.from_obstacles - have_obstacles)
+        if distance <= 0 or obstacle_distance <= 0:
+            return start[None], TransitStatus.START_IN_SLIDER if distance <= 0 else TransitStatus.START_IN_FIXTURE
+        missing = max(self.min_distance - distance, self.min_obstacle_distance - obstacle_distance)
         angle = np.arange(RETREATS) * (2 * np.pi / RETREATS)
         # out of a wedge between polygon and obstacle it is farther
         reach = missing * np.array([1.0, 1.5, 2.0, 3.0, 5.0, 8.0][: 6 if obstacles.any else 4]) + 1e-3 * self.clearance
         ends = start + (reach[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
-        apart = signed_distances(self.vertices, ends)
-        halfway = start + 0.2 * (ends - start)
+        end_distance = signed_distances(self.vertices, ends)
+        early = start + 0.2 * (ends - start)
         good = _recedes(
-            have,
-            self.apart,
-            apart,
-            signed_distances(self.vertices, halfway),
-            segment_distances(self.vertices, start, ends, at_end=apart),
+            distance,
+            self.min_distance,
+            end_distance,
+            signed_distances(self.vertices, early),
+            segment_distances(self.vertices, start, ends, end_distance=end_distance),
         )
         if obstacles.any:
             good &= _recedes(
-                have_obstacles,
-                self.from_obstacles,
+                obstacle_distance,
+                self.min_obstacle_distance,
                 obstacles.point_clearance(ends),
-                obstacles.point_clearance(halfway),
+                obstacles.point_clearance(early),
                 obstacles.segment_clearance(start, ends),
             )
         good &= workspace.allows_finger(to_world(pose, ends))
@@ -291,26 +314,28 @@ class Roadmap:
         best = np.argmin(np.where(good, np.linalg.norm(ends - start, axis=1), np.inf))
         return np.stack([start, ends[best]]), TransitStatus.FOUND
 
-    def _none(self, start: np.ndarray, status: TransitStatus) -> ShortestTransits:
+    def _no_transits(self, start: np.ndarray, status: TransitStatus) -> ShortestTransits:
+        """Return the result for a start, (2,), body frame, from which the finger cannot leave."""
         count = len(self.goals)
         none = np.full(count, np.inf)
         return ShortestTransits(
-            none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.apart
+            none, status, start[None], np.array([-1]), np.zeros(count, int), self.goal_clearance < self.min_distance
         )
 
 
-def _recedes(have: float, wanted: float, at_end: np.ndarray, soon: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return whether segments lead from a distance to the wanted one, and are nowhere nearer than at their start.
+def _recedes(start: float, required: float, end: np.ndarray, early: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return whether segments end at the required distance or more, and are nowhere nearer than at their start.
 
     Args:
-        have: Distance at the start.
-        wanted: Distance that is wanted at the end; a start that has it must keep it.
-        at_end: Distance at the ends, (segments,).
-        soon: Distance a little after the start, (segments,). It must have grown, which excludes sliding along an edge.
-        least: Least distance along each segment, (segments,).
+        start: Distance at the start, m.
+        required: Distance that is required at the end, m. Where the start has it, all of the segment must.
+        end: Distance at the end of each segment, (segments,), m.
+        early: Distance a little after the start, (segments,), m. It must have grown, which excludes segments that slide
+            along an edge.
+        least: Least distance along each segment, (segments,), m.
     """
-    grows = True if have >= wanted else soon > have + 0.02 * (wanted - have)
-    return grows & (least >= min(have, wanted) * (1 - 1e-9)) & (at_end >= wanted)
+    grows = True if start >= required else early > start + 0.02 * (required - start)
+    return grows & (least >= min(start, required) * (1 - 1e-9)) & (end >= required)
 
 
 def run_ups(
@@ -327,15 +352,16 @@ def run_ups(
         longest: Largest run-up, m.
 
     Returns:
-        The run-ups, (pushes,), m; NaN where there is none.
+        The run-ups, (pushes,), m: the longest possible of nine lengths from `longest` to zero. NaN where none is.
     """
-    have = signed_distances(vertices, starts)
+    start_distance = signed_distances(vertices, starts)
     found = np.full(len(starts), np.nan)
     for length in np.linspace(longest, 0.0, 9):
         begin = starts - length * directions
         apart = signed_distances(vertices, begin)
-        keeps = segment_distances(vertices, begin, starts, apart, have) >= np.minimum(have, radius + clearance) * 0.999
-        found = np.where(np.isnan(found) & keeps & (apart >= radius + clearance), length, found)
+        least = segment_distances(vertices, begin, starts, apart, start_distance)
+        recedes = least >= np.minimum(start_distance, radius + clearance) * 0.999
+        found = np.where(np.isnan(found) & recedes & (apart >= radius + clearance), length, found)
     return found
 
 
@@ -344,7 +370,7 @@ def _corner_points(vertices: np.ndarray, distance: float) -> np.ndarray:
     edge = np.roll(vertices, -1, axis=0) - vertices
     heading = np.arctan2(edge[:, 1], edge[:, 0])
     points = []
-    for vertex, turn, leaving in zip(vertices, turns(vertices), heading, strict=True):
+    for vertex, turn, leaving in zip(vertices, exterior_angles(vertices), heading, strict=True):
         if turn <= 0:
             continue
         count = max(1, int(np.ceil(turn / ARC_STEP)))
