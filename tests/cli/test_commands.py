@@ -86,6 +86,7 @@ def test_table2_is_as_good_as_the_paper(table):
         assert cell["no_motion_mm"] == pytest.approx(paper, abs=0.8)
 
 
+@pytest.mark.long
 def test_table2_from_forces(table):
     """Surfaces fitted to the forces of about seventeen pushes predict nearly as well as those of the known support."""
     for model in ("quartic", "ellipsoid"):

@@ -134,6 +134,7 @@ def test_nothing_is_nan_in_degenerate_problems(degree):
     assert status["jam"] == pj.Status.JAMMED
 
 
+@pytest.mark.long
 def test_equal_contacts_share_equally():
     """A contact given twice has half the force each, and half the derivatives, when sticking and when sliding."""
     cases = [(slide, mu) for slide in (2e-4, -6e-4) for mu in (1e-7, 1e-6, 1e-4, 1e-2, 0.2, 0.5)]

@@ -137,6 +137,7 @@ def test_a_csv_tells_friction_and_inset(report):
     assert pj.Identified.load(record["identified"]).friction.shape == ()
 
 
+@pytest.mark.long
 def test_the_page_has_words_and_units(report):
     """The table of figures has no key of the record; the whole record is below it, as JSON."""
     out, record = report

@@ -49,6 +49,7 @@ def test_cells_say_why_they_have_no_figure(few):
     assert {cell.get("missing") for cell in few[0]["cells"] if cell["surface"] == "plywood"} == {"no log"}
 
 
+@pytest.mark.long
 def test_other_cells_and_means_are_of_the_few_pushes(few, data):
     record, _ = few
     log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")

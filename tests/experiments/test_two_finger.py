@@ -202,6 +202,7 @@ def test_predicts_the_real_pushes(record):
         assert cell["pushes"] == {"3pts1": 95, "3pts3": 298, "patch": 138}[cell["object"]]
 
 
+@pytest.mark.long
 def test_repeats_bound_what_can_be_predicted(record):
     for cell in record["cells"]:
         repeats = cell["repeats"]

@@ -136,6 +136,7 @@ def test_moments_of_the_ellipsoid(rng):
     assert np.all(np.linalg.eigvalsh(drawn) > 0)
 
 
+@pytest.mark.long
 def test_a_mean_that_is_only_just_convex(tripod):
     c, pull = sampled(FrictionModel(dof=20, friction=0.3), tripod)
     assert np.all(convex(c[:300]))

@@ -124,6 +124,7 @@ def test_a_step_that_moves_nothing_is_the_identity(one_step):
         assert not pose[k].any()
 
 
+@pytest.mark.long
 def test_without_friction_the_derivative_is_that_of_more(one_step):
     """At mu = 0 the derivative is one-sided, because mu cannot be negative."""
     row, h = np.array([0.0, AT - 1e-4, 0.01, AT + 1e-3, 0.0104, 0, 0, 0]), 1e-6
@@ -285,6 +286,7 @@ def test_random_pushes_by_the_range_of_friction(random_pushes):
         np.testing.assert_allclose(slope[:, :, k], part[:, None] * both, rtol=0, atol=1e-9)
 
 
+@pytest.mark.long
 def test_random_pushes_by_dof(random_pushes):
     """Averaged over keys, the derivative by dof is right for a second moment, which depends on dof to first order.
 

@@ -108,6 +108,7 @@ def test_recorded_grasps(grasps, reruns, fingers):
     assert checked >= len(rows) - 3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fingers", [2, 3])
 def test_frozen_and_finite_after_a_jam(grasps, reruns, fingers):
     rows, runs = grasps[fingers].rows, reruns[fingers]
@@ -298,6 +299,7 @@ def test_gradients_through_two_contacts(pushed_by_two):
     np.testing.assert_allclose(by_x.T, central, rtol=0, atol=1e-5)
 
 
+@pytest.mark.long
 def test_gradients_are_finite_at_and_after_a_jam(pushed_by_two):
     """The part of the closing after the jam has no influence on the gradients."""
     path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), GRADIENT_STEPS)

@@ -153,6 +153,7 @@ def test_a_pad_in_an_inner_corner_touches_both_edges(way, short):
     assert push.force.shape == (30, 3, 2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("aside", [-0.0042, 0.0, 0.0049])
 def test_a_pad_across_two_arms_rests_on_its_outermost_places(aside):
     """The contacts were the two nearest places, next to each other on one arm, and the other arm penetrated."""
