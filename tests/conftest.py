@@ -129,10 +129,17 @@ def _is_long(item) -> bool:
     return item.get_closest_marker("long") is not None
 
 
-def pytest_runtest_setup(item):
-    limit = item.config.getoption("--long-within")
-    if limit is not None and _is_long(item) and time.monotonic() - START > limit:
-        pytest.skip("a long test, and the time for these is over")
+class LongTests:
+    """Skips long tests after the time that is given to them. As a plugin, it sees the notebooks too."""
+
+    def pytest_runtest_setup(self, item):
+        limit = item.config.getoption("--long-within")
+        if limit is not None and _is_long(item) and time.monotonic() - START > limit:
+            pytest.skip("a long test, and the time for these is over")
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(LongTests())
 
 
 @pytest.fixture(scope="module", autouse=True)
