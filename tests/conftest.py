@@ -63,7 +63,6 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
 
 # Notebooks that compile programs of their own, which takes a minute each.
 LONG_NOTEBOOKS = (
-    "01_limit_surfaces",
     "02_one_push",
     "03_several_contacts",
     "04_stochastic_pushing",
@@ -73,8 +72,9 @@ LONG_NOTEBOOKS = (
     "08_plans",
 )
 
-# Cases of parametrized tests that are long, by the test and what their names contain. Shorter cases remain.
-LONG_CASES = {
+SLOW_NOTEBOOK = "01_limit_surfaces"
+# Cases of parametrized tests that are slow, by the test and what their names contain. Faster cases remain.
+SLOW_CASES = {
     "test_conditions_hold_and_jams_have_no_motion": ("[4]",),
     "test_derivative_of_the_inverse_map": ("quartic",),
     "test_derivatives_match_central_differences": ("quartic",),
@@ -101,45 +101,47 @@ START = time.monotonic()
 
 def pytest_addoption(parser):
     parser.addoption(
-        "--long-within",
+        "--slow-within",
         type=float,
         metavar="SECONDS",
-        help="with -m '' and --dist loadgroup: start no long test later than this after the start",
+        help="with -m 'not long' and --dist loadgroup: start no slow test later than this after the start",
     )
 
 
 def pytest_collection_modifyitems(items):
     for item in items:
         test, _, case = item.name.partition("[")
-        if item.path.stem in LONG_NOTEBOOKS or any(part in f"[{case}" for part in LONG_CASES.get(test, ())):
+        if item.path.stem in LONG_NOTEBOOKS:
             item.add_marker("long")
-        # With --dist loadgroup, the long tests of a file come after the others of all files.
-        group = f"long {item.path.stem}" if _is_long(item) else item.path.stem
+        if item.path.stem == SLOW_NOTEBOOK or any(part in f"[{case}" for part in SLOW_CASES.get(test, ())):
+            item.add_marker("slow")
+        # With --dist loadgroup, the slow tests of a file come after the others of all files.
+        group = f"slow {item.path.stem}" if _is_slow(item) else item.path.stem
         item.add_marker(pytest.mark.xdist_group(group))
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
 
     def place(item) -> tuple[bool, int]:
         notebook = item.path.suffix == ".ipynb"
-        return _is_long(item), order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
+        return _is_slow(item), order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
 
     items.sort(key=place)
 
 
-def _is_long(item) -> bool:
-    return item.get_closest_marker("long") is not None
+def _is_slow(item) -> bool:
+    return item.get_closest_marker("slow") is not None
 
 
-class LongTests:
-    """Skips long tests after the time that is given to them. As a plugin, it sees the notebooks too."""
+class SlowTests:
+    """Skips slow tests after the time that is given to them. As a plugin, it sees the notebooks too."""
 
     def pytest_runtest_setup(self, item):
-        limit = item.config.getoption("--long-within")
-        if limit is not None and _is_long(item) and time.monotonic() - START > limit:
-            pytest.skip("a long test, and the time for these is over")
+        limit = item.config.getoption("--slow-within")
+        if limit is not None and _is_slow(item) and time.monotonic() - START > limit:
+            pytest.skip("a slow test, and the time for these is over")
 
 
 def pytest_configure(config):
-    config.pluginmanager.register(LongTests())
+    config.pluginmanager.register(SlowTests())
 
 
 @pytest.fixture(scope="module", autouse=True)

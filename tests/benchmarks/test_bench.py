@@ -16,7 +16,7 @@ from benchmarks.peers.figure import speed_figure
 from pushjax.testing.problems import random_contacts_problem
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_errors_fall_with_the_square_of_the_step():
     by_steps = tasks.errors("quartic", "float64")
     assert by_steps[8] < tasks.ALLOWED_MM < by_steps[5]
@@ -39,7 +39,7 @@ def test_no_slip_where_it_sticks():
         rows.slip_um("float64", (0.03,))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows(tmp_path):
     """There is one row per case, type and batch; `slower` compares cost, and a record is not slower than itself."""
     seen = []
@@ -262,7 +262,7 @@ def test_tiles_change_nothing(monkeypatch):
     np.testing.assert_array_equal(tiled, np.asarray(jax.jit(cases.push("float64", 40).function)(*work.args)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_float32_beside_float64(monkeypatch):
     monkeypatch.setattr(numerics, "MODELS", ("quartic",))
     monkeypatch.setattr(numerics, "STEPS", (8,))

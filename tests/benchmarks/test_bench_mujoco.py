@@ -213,7 +213,7 @@ def test_fewer_steps_slip_more():
     assert 10 * many < few < 1.0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pushjax_converges_over_the_pushes_of_mujoco():
     with both_dtypes():
         errors = [rows.same_fan_error_mm("float64", steps) for steps in (4, 8, 16)]
@@ -301,7 +301,7 @@ AMONG_FIXTURES = {
 }
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["along a wall", pytest.param("around a peg", marks=pytest.mark.long)])
 def test_pushes_among_fixtures_agree(name):
     """The poses agree to what a quartic and soft contacts allow; without the fixture they are far apart."""

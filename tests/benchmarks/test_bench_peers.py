@@ -71,7 +71,7 @@ def test_jaxopt_has_the_same_optimum(degree):
     assert np.all(theirs.steps < by_jaxopt.FIT_STEPS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_problems_that_jaxopt_solves_have_the_same_answers():
     pytest.importorskip("jaxopt")
     surface, problem = cases.solve("float64", 60, 1).args

@@ -71,7 +71,7 @@ def table(data, tmp_path_factory):
     return read(folder / "table2.json")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_table2_is_as_good_as_the_paper(table):
     assert len(table["cells"]) == 32
     ideal = [cell for cell in table["cells"] if cell["method"] == "ideal"]
@@ -86,7 +86,7 @@ def test_table2_is_as_good_as_the_paper(table):
         assert cell["no_motion_mm"] == pytest.approx(paper, abs=0.8)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_table2_from_forces(table):
     """Surfaces fitted to the forces of about seventeen pushes predict nearly as well as those of the known support."""
     for model in ("quartic", "ellipsoid"):
@@ -121,7 +121,7 @@ def test_table2_no_push_fails_or_blows_up(table):
         assert 0 < cell["ci95_mm"] < cell["mean_mm"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_jam(tmp_path, capsys):
     cli.main(["reproduce", "jam", "--out", str(tmp_path), "--json", str(tmp_path / "jam.json")])
     record = json.loads((tmp_path / "jam.json").read_text())
@@ -325,7 +325,7 @@ def random_record(tmp_path_factory):
     return run
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_stochastic_push(random_record):
     _, record = random_record("stochastic-push")
     assert record["n"] == 60

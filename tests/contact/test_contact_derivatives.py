@@ -75,7 +75,7 @@ move = jax.jit(jax.vmap(moved, in_axes=(0, None)))
 pace = jax.jit(jax.vmap(lambda given: jax.jvp(lambda t: moved(given, t), (0.0,), (1.0,))[1]))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.long), 4])
 def test_derivatives_are_those_of_the_solution(count, degree):
@@ -134,7 +134,7 @@ def test_nothing_is_nan_in_degenerate_problems(degree):
     assert status["jam"] == pj.Status.JAMMED
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_equal_contacts_share_equally():
     """A contact given twice has half the force each, and half the derivatives, when sticking and when sliding."""
     cases = [(slide, mu) for slide in (2e-4, -6e-4) for mu in (1e-7, 1e-6, 1e-4, 1e-2, 0.2, 0.5)]

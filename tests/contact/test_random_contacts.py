@@ -112,7 +112,7 @@ def test_one_contact_has_the_same_answer(degree):
     assert worst[moving].max() < CONDITIONS
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_order_frame_mirror_and_padding_do_not_matter():
     surface, contacts = problems(3, seed=3, slots=slots(3))
     order = np.random.default_rng(0).permutation(MOST)
@@ -209,7 +209,7 @@ def test_a_receding_pusher_can_drag_the_slider_along(degree, rng):
     assert not np.any(other & np.asarray(motion.unique))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_float32():
     """In float32 no answer is wrong either.
 
@@ -233,7 +233,7 @@ def test_float32():
     assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.999
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_projected_is_right_where_it_answers(count):
     surface, contacts = problems(count, seed=9, condition=100.0)

@@ -115,7 +115,7 @@ def test_free_is_not_unique_where_a_pusher_could_drag():
         assert not motion.unique
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_light_and_small_pushes_in_float32():
     """Solve a contact with almost no pressure beside a fast one, and a hand that hardly moves."""
     as32 = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), square(4))

@@ -22,7 +22,7 @@ def solved(problem, solver, displacement):
     return found.twist.array(), found.status, found.unique
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(("contacts", "with_derivatives"), [(2, False), pytest.param(4, True, marks=pytest.mark.long)])
 def test_the_same_motion_or_a_second_one(contacts, with_derivatives):
     """On random problems, the answer and its derivative are those of `Exhaustive`, unless the motion is not unique."""
@@ -87,7 +87,7 @@ def test_a_coarse_grasp_goes_on_as_a_fine_one(grasps):
     assert np.median(error) < np.median(other) / 4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_coarse_grasp_stops_where_a_fine_one_does(grasps):
     """A coarse grasp locates its jam to a sixteenth of a step; the earlier steps move the jam a little."""
     step = (OPEN - CLOSED) / 100

@@ -116,7 +116,7 @@ def report(log, tmp_path_factory):
     return out, json.loads((out / "id.json").read_text())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_csv_tells_friction_and_inset(report):
     out, record = report
     assert (record["experiment"], record["pushes"], record["failed_steps"]) == ("identify", 16, 0)
@@ -137,7 +137,7 @@ def test_a_csv_tells_friction_and_inset(report):
     assert pj.Identified.load(record["identified"]).friction.shape == ()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_page_has_words_and_units(report):
     """The table of figures has no key of the record; the whole record is below it, as JSON."""
     out, record = report
@@ -333,7 +333,7 @@ def test_logs_that_tell_less_than_others(log, block):
         assert (pushes.poses_between.shape[-2], pushes.wrench.shape[-2]) == shapes
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_wrenches_alone_tell_a_surface(log, block, rollouts, surface):
     """Pushes have no weight here for the surface: it is identified from the wrenches alone."""
     recordings = screen(load_recordings(log), block, pj.Hand.finger(RADIUS))
@@ -366,7 +366,7 @@ def found(few, block, surface):
     return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None, inset=0.002), sigma=NOISE)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.profile(few, slider, hand, "friction", points=3)
@@ -383,7 +383,7 @@ def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
         found.profile(few, slider, hand, "surface.0")
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bootstrap(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     estimates, z = bootstrap(jax.random.key(0), found, few, slider, hand, 40)

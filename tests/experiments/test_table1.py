@@ -110,7 +110,7 @@ def test_real_archives(logs):
         assert np.mean(means) == pytest.approx(expected, abs=0.3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_outlines(logs):
     """The outlines agree with the published vertices.
 
@@ -180,7 +180,7 @@ def test_filled_up(logs):
     np.testing.assert_allclose(pushes.path[3, 5], (log.whole.tip_start[rows[3]] + log.whole.tip_end[rows[3]]) / 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_experiment(logs, data, monkeypatch, tmp_path):
     """With ellipsoids for one object, results are as good as the paper's from forces, and no worse with calibration."""
     monkeypatch.setattr(experiment, "MODELS", {"ellipsoid": 2})

@@ -97,7 +97,7 @@ def test_the_motion_is_read_as_written(pushes, published):
             np.testing.assert_allclose(np.diff(found[:, 2]), np.diff(expected[:, 2]), rtol=0, atol=TURN)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_table1_reads_json_and_hdf5_alike(pushes, published, monkeypatch, tmp_path):
     """The command gives the same cell from both forms; it predicts far better than that nothing moves."""
     monkeypatch.setattr(experiment, "MODELS", {"ellipsoid": 2})

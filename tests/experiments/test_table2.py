@@ -34,7 +34,7 @@ def few(data, tmp_path_factory):
         return table2.run(data, out=out, steps=15, method=("ideal", "wrench_twist")), out
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cells_say_why_they_have_no_figure(few):
     missing = {
         (cell["method"], cell["model"], cell["object"]): cell["missing"]
@@ -49,7 +49,7 @@ def test_cells_say_why_they_have_no_figure(few):
     assert {cell.get("missing") for cell in few[0]["cells"] if cell["surface"] == "plywood"} == {"no log"}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_other_cells_and_means_are_of_the_few_pushes(few, data):
     record, _ = few
     log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")

@@ -187,7 +187,7 @@ def record(data, tmp_path_factory):
     return json.loads((folder / "record.json").read_text())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_predicts_the_real_pushes(record):
     assert [cell["object"] for cell in record["cells"]] == list(OBJECTS)
     for cell in record["cells"]:
@@ -202,7 +202,7 @@ def test_predicts_the_real_pushes(record):
         assert cell["pushes"] == {"3pts1": 95, "3pts3": 298, "patch": 138}[cell["object"]]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_repeats_bound_what_can_be_predicted(record):
     for cell in record["cells"]:
         repeats = cell["repeats"]

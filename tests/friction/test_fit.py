@@ -103,7 +103,7 @@ def test_quartic_reaches_the_semidefinite_optimum_on_real_pairs(data, name):
     assert surface.is_convex()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_real_fit_converges_and_is_convex(data):
     """All 22 real sets converge in one batch, padded to one length with pairs of weight zero."""
     sets = [real_pairs(data, file.stem) for file in sorted((data / "mit_push").glob("*.npz"))]

@@ -73,7 +73,7 @@ def test_a_gram_matrix_is_one(quartic, rng):
     np.testing.assert_allclose(antisymmetric_of(gram.symmetric), n, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_certificate_agrees_with_the_sweep(quartic):
     """The certificate agrees with the sweep on Wishart samples before repair, and on the repaired quartics."""
     c, pull = sampled(FrictionModel(dof=12, friction=0.3), quartic)
@@ -136,7 +136,7 @@ def test_moments_of_the_ellipsoid(rng):
     assert np.all(np.linalg.eigvalsh(drawn) > 0)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_mean_that_is_only_just_convex(tripod):
     c, pull = sampled(FrictionModel(dof=20, friction=0.3), tripod)
     assert np.all(convex(c[:300]))

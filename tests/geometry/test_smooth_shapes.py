@@ -392,7 +392,7 @@ def test_sweep_is_that_of_marching(shape, radius, dtype):
         assert (found[hit] >= expected[hit] - 1e-9).mean() > 0.97
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_nothing_slips_into_a_hollow_that_is_too_tight_for_it():
     """A disk of 10 mm does not enter notches of down to 2 mm: dense paths across the whole outline."""
     shape = Curve(wavy(24, 9) * (1 + 0.4 * (np.arange(24) % 2))[:, None])

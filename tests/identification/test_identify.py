@@ -106,7 +106,7 @@ def test_recovers_friction_and_surface(pushes, square, expected, real, hand):
     np.testing.assert_allclose(predicted.pose[:, -1], others.end, atol=2e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_known_parameters(square, hand, tmp_path):
     """Friction is recovered from paths as logged if it is known how far off the robot was."""
     starts, paths = planned(np.random.default_rng(6), 12)

@@ -123,7 +123,7 @@ def test_pushes_turn_with_the_world():
     np.testing.assert_allclose(compose(inverse(turn), moved.pose), here.pose, atol=1e-10)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_and_bad_tables():
     """Derivatives by a table are right, also at an even one; a table that is not finite shows in the status."""
 

@@ -84,7 +84,7 @@ def energy_scores(draws, truth):
     return (to_truth - pairs / (2 * DRAWN * (DRAWN - 1))).mean(1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pushes_that_were_not_seen_are_predicted_better_than_before(worlds):
     before, after = (energy_scores(draws, worlds.unseen) for draws in (worlds.prior_draws, worlds.belief_draws))
     gained = before - after

@@ -96,7 +96,7 @@ def adapting(rectangle):
     return PushController(planner, PositionControl(), friction=0.3, friction_filter=learning, prior=prior)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_adapting_controller_finds_the_friction_of_the_plant(adapting):
     """The plants have samples of the library; each of them comes to have most of the weight."""
     found = []

@@ -131,7 +131,7 @@ def plan(slider, easy):
     return plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
     assert plan.status is PushPlanStatus.FOUND
     assert plan.success >= 0.9

@@ -86,7 +86,7 @@ def steps_error(pushes):
     return 3 * np.sum(np.abs(turns) ** 3, axis=1, keepdims=True) / 24 * np.hypot(WIDTH, HEIGHT) + 1e-9
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_slip_for_any_sampled_friction(slider, contacts, goals):
     assert [each.contact.edge for each in contacts] == [0, 1, 2, 3]
     pushes = [shortest_push(contacts, np.zeros(3), goal, steps=STEPS) for goal in goals]

@@ -226,7 +226,7 @@ def test_jam_figure(block):
     np.testing.assert_allclose(axes.lines[-4].get_xydata(), MM * np.asarray(point))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_fixtures_are_drawn_and_a_jammed_finger_stays_where_it_stopped(block):
     """A block is pushed against a wall; the finger's path goes on through it."""
     slider, hand = pj.Slider(block, pj.Ellipsoid(np.eye(3), 0.03)), pj.Hand.finger(RADIUS)

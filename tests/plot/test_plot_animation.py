@@ -154,7 +154,7 @@ def test_nothing_leaves_the_range_or_is_cut_off(block, finger, push):
     assert len({picture.size for picture in pictures}) == 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_push_in_a_flat_panel_has_its_legend_and_words_whole(block, finger, push):
     away = np.linspace(0, 0.12, 8)[:, None] * np.array([1.0, 0.0, 0.0])
     moving = plot.animate(block, finger, push, measured={"": away})
@@ -243,7 +243,7 @@ def test_refuses(block, finger):
         plot.animate(block, finger, plot.RecordedPush(real.pose, real.configuration[1:]))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gif(tmp_path, block, finger):
     """The GIF repeats forever, all frames differ, it pauses on the last one, and it is small."""
     moving = plot.animate(block, finger, {"a": recorded(61), "b": recorded(61)}, frames=60, seconds=3)

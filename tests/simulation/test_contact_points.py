@@ -65,7 +65,7 @@ def test_forces_at_the_contact_points_are_the_wrench(name):
     assert np.all(np.asarray(distance(jnp.asarray(point + depth * normal))) < -0.5 * depth)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contacts_are_finite_and_zero_where_nothing_pushes():
     """Before the finger arrives, and in steps that fail because the path is not finite."""
     push = pushed("finger, square")[1]

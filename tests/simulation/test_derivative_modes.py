@@ -25,7 +25,7 @@ def total(inputs, weights) -> jax.Array:
     return sum(jnp.sum(w * part) for w, part in zip(weights, (run.twist, run.wrench, run.force), strict=True))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_twist_wrench_and_force_of_every_step():
     """They are finite everywhere, and where a push is smooth they agree with central differences."""
     along = [directions()[k] for k in (0, 2, 3, 4, 13, 20)]
@@ -104,7 +104,7 @@ def one_step():
 AT = -1 / 16 - 1 / 128  # where the finger just touches, exact to the last bit
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_step_that_moves_nothing_is_the_identity(one_step):
     """The derivative by the pose is the identity and all others are zero, from the side on which nothing happens."""
     rows = {
@@ -124,7 +124,7 @@ def test_a_step_that_moves_nothing_is_the_identity(one_step):
         assert not pose[k].any()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_without_friction_the_derivative_is_that_of_more(one_step):
     """At mu = 0 the derivative is one-sided, because mu cannot be negative."""
     row, h = np.array([0.0, AT - 1e-4, 0.01, AT + 1e-3, 0.0104, 0, 0, 0]), 1e-6
@@ -199,7 +199,7 @@ def _turns_too_far(forward, like):
 FEW, SLOTS = 240, 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_forces_and_margin_of_several_contacts():
     """Derivatives by the displacements: forces where the motion is unique, margins everywhere, away from kinks."""
     surface, contacts = first(problems(SLOTS, 2, seed=21, condition=30.0, gaps=0.3), FEW)
@@ -264,7 +264,7 @@ def random_pushes():
     return lambda *given: jax.tree.map(np.asarray, program(jnp.array(given), keys))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_pushes_by_the_range_of_friction(random_pushes):
     """For each key, the derivative agrees with the difference of two pushes with it, if their modes are the same."""
     h = 1e-6
@@ -286,7 +286,7 @@ def test_random_pushes_by_the_range_of_friction(random_pushes):
         np.testing.assert_allclose(slope[:, :, k], part[:, None] * both, rtol=0, atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_pushes_by_dof(random_pushes):
     """Averaged over keys, the derivative by dof is right for a second moment, which depends on dof to first order.
 

@@ -27,7 +27,7 @@ def straight(start, end):
     return pj.line(start, end, STEPS)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_slider_pivots_on_the_corner_that_a_wall_supports():
     """One small step in closed form: a frictionless finger above the center, on a slider that lies on a wall."""
     a, h, way = HALF[0], 0.02, 1e-6
@@ -93,7 +93,7 @@ def test_pushes_far_from_fixtures_are_those_without():
     np.testing.assert_array_equal(with_walls.status, without.status)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.long)])
 def test_derivatives_by_a_wall_are_those_of_differences(mode):
     """A slider that is pushed flat along a wall and turns on its corner: by place, direction and friction of a wall."""
@@ -186,14 +186,14 @@ def test_a_normal_of_length_zero_has_the_derivative_zero():
     np.testing.assert_array_equal(jax.jit(derivative)(jnp.zeros(2)), np.zeros((2, 2)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_one_step_takes_fixtures():
     ends = (TOUCH, 0.001), (TOUCH + 1e-3, 0.0009)
     moved = pj.step(slider, hand, *ends, pose=(0.0, 0.0, 0.0), friction=0.3, fixtures=(FLOOR,))
     np.testing.assert_allclose(moved.pose, [1e-3, 0, 0], atol=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_thin_wedge_squirts_out_and_then_rests():
     """A frictionless finger presses a wedge against a wall, in a single step.
 

@@ -83,7 +83,7 @@ def reruns(grasps) -> dict[int, pj.Trajectory]:
     return {fingers: each.again() for fingers, each in grasps.items()}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("fingers", [2, 3])
 def test_recorded_grasps(grasps, reruns, fingers):
     record, rows, runs = grasps[fingers].record, grasps[fingers].rows, reruns[fingers]
@@ -108,7 +108,7 @@ def test_recorded_grasps(grasps, reruns, fingers):
     assert checked >= len(rows) - 3
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("fingers", [2, 3])
 def test_frozen_and_finite_after_a_jam(grasps, reruns, fingers):
     rows, runs = grasps[fingers].rows, reruns[fingers]
@@ -131,7 +131,7 @@ def test_frozen_and_finite_after_a_jam(grasps, reruns, fingers):
     assert np.min(np.sum(np.asarray(runs.twist) * np.asarray(runs.wrench), axis=-1)) >= -1e-15
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_recorded_drift_violates_the_conditions(grasps):
     """In two recorded runs the slider moves at the end as no solution does; ours there is clean and unique."""
     record, rows, hand, _ = grasps[2]
@@ -173,7 +173,7 @@ def test_recorded_drift_violates_the_conditions(grasps):
         assert cosine < 0.95
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_two_fingers_center_a_disk():
     disk = pj.Disk(0.03)
     pairs = pj.Support.uniform(disk, points=64).wrench_twist_pairs(jax.random.key(0), 300)
@@ -218,7 +218,7 @@ def test_what_is_held_turns_with_the_hand_and_no_step_turns_it_too_far():
     assert np.max(np.abs(np.diff(pose[3, :, 2]))) <= 0.5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_wide_flat_push_sticks_with_no_slip():
     """One pad of a wide open jaw pushes a square block that is flat against it, also sideways."""
     block = pj.Slider(pj.Polygon.rectangle(0.09, 0.09), pj.Ellipsoid(np.diag([1.0, 1.3, 0.8]), 0.03))
@@ -233,7 +233,7 @@ def test_wide_flat_push_sticks_with_no_slip():
     np.testing.assert_allclose(push.pose[:, 2], 0, atol=1e-15)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_squeeze_ends_as_the_paper_says():
     record = squeeze.run(steps=750)
     assert [row["outcome"] for row in record["rows"]] == ["grasped", "jammed", "grasped", "slipped out"]
@@ -283,7 +283,7 @@ def push_of(x):
     return path, x[4:7], x[7]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradients_through_two_contacts(pushed_by_two):
     """Two fingers push the block, both in contact: gradients by friction, pose and path."""
     h = 1e-6
@@ -299,7 +299,7 @@ def test_gradients_through_two_contacts(pushed_by_two):
     np.testing.assert_allclose(by_x.T, central, rtol=0, atol=1e-5)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gradients_are_finite_at_and_after_a_jam(pushed_by_two):
     """The part of the closing after the jam has no influence on the gradients."""
     path = pj.line((0.0, 0.0, 0.0, 0.12), (0.0, 0.0, 0.0, 0.06), GRADIENT_STEPS)

@@ -58,7 +58,7 @@ def finish(process: subprocess.Popen) -> str:
     return out
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_push_is_that_of_its_key(whole):
     """A push is the one of its key, and its friction is the sample of the model for that key."""
     given = setting()
@@ -164,7 +164,7 @@ def test_bits_do_not_depend_on_devices(whole, tmp_path):
         assert same(dict(np.load(tmp_path / f"{devices}.npz")), arrays(whole))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bits_do_not_depend_on_processes(whole, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

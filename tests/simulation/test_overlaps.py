@@ -24,7 +24,7 @@ from benchmarks import overlaps, survey  # noqa: E402
 STARTS = 60
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("hand", "shape", "steps", "dtype"),
     [
@@ -140,7 +140,7 @@ def in_place(q):
 PAD, LONG_PAD = (pj.Hand((pj.Polygon.rectangle(*sides),), in_place, 3) for sides in ((0.03, 0.02), (0.05, 0.01)))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("short", [0.0, 1e-9, -1e-9])
 @pytest.mark.parametrize("way", [(-1, -1), (-1, -0.3), (-0.3, -1), (-0.05, -1)])
 def test_a_pad_in_an_inner_corner_touches_both_edges(way, short):
@@ -153,7 +153,7 @@ def test_a_pad_in_an_inner_corner_touches_both_edges(way, short):
     assert push.force.shape == (30, 3, 2)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("aside", [-0.0042, 0.0, 0.0049])
 def test_a_pad_across_two_arms_rests_on_its_outermost_places(aside):
     """The contacts were the two nearest places, next to each other on one arm, and the other arm penetrated."""
@@ -253,7 +253,7 @@ def whole_step(push: pj.Trajectory, path, friction: float) -> pj.Trajectory:
     return pj.rollout(SLIDER, TWO, fine, pose=push.pose[-2], friction=friction)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_step_that_is_too_long_is_divided():
     """The last step closes until the rectangle is held, and turns it by 0.27 rad."""
     path = TURNING.at[-1, 3].set(CLOSED)
@@ -271,7 +271,7 @@ def test_a_step_that_is_too_long_is_divided():
     np.testing.assert_allclose(alone.overlap, push.overlap[-1], atol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pushes_of_a_batch_divide_their_own_steps():
     """Some pushes divide a step, some end early, some never touch: each is the same in a batch as alone."""
     rows = np.array([[0.2, *START, CLOSED], [0.2, *START, 0.1], [0.5, 0, 0, 0, 0.06], [0.3, 0.5, 0, 0, 0.0772]])

@@ -207,7 +207,7 @@ def test_derivatives_are_finite_where_they_are_singular(derivatives):
     np.testing.assert_array_equal(np.asarray(jacobian.pose)[free], np.diag([1 / LENGTH, 1 / LENGTH, 1.0]))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_in_float32(derivatives):
     """In float32 derivatives are finite everywhere, and close to float64's where the push is smooth."""
     *_, exact = derivatives

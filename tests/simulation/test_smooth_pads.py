@@ -123,7 +123,7 @@ def test_places_are_at_their_distance(name):
         assert min(float(d) for d in touches.distance) == pytest.approx(-float(deep(at)), abs=1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_jaw_closes_to_the_width():
     """A wide jaw closes to the ellipse's width.
 

@@ -122,7 +122,7 @@ def test_friction_is_drawn_at_the_reset(box, box_steps):
     assert np.abs(ends[0] - ends[1]).max() > 0.05
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(box, box_steps):
     """Of the coverage at the end, in the actions: a box is pushed to the goal, off its center."""
     params = box.replace(goal=jnp.array([300.0, 262.0, 0.3]))

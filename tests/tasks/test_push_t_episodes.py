@@ -17,7 +17,7 @@ ENV = PushT()
 PARAMS = ENV.default_params
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_steps_are_finite_and_episodes_follow_one_another():
     keys = jax.random.split(jax.random.key(0), BATCH)
     _, states = jax.vmap(ENV.reset, in_axes=(0, None))(keys, PARAMS)
