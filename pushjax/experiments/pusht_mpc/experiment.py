@@ -81,7 +81,7 @@ def run(
         played.append(player.play(plant, push_controller, seed + k, **noise))
         progress(k + 1, episodes)
     switches = {"lookahead": lookahead, "cost_to_go": cost_to_go, "feedback": feedback}
-    settings = {"seed": seed, "episodes": episodes} | switches | given | noise
+    settings: dict[str, Any] = {"seed": seed, "episodes": episodes} | switches | given | noise
     settings["pace"] = push_controller.planner.pace._asdict()
     rows = [{name: value for name, value in asdict(each).items() if "seconds" not in name} for each in played]
     return result_record("pusht-mpc", settings, **_figures(played), setup_seconds=setup, published=PUBLISHED, rows=rows)
