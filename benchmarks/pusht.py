@@ -3,7 +3,7 @@
 Needs gym-pusht: pip install 'gym-pusht==0.1.8' 'pymunk<7'. The episodes start at its own resets, and both get the same
 actions: positions 20 px ahead of the agent, toward a random point of the T. Speeds are of gym-pusht, of pymunk alone
 (no observation and no coverage) and of `pushjax.tasks.PushT` (observation, coverage, reward and automatic resets
-included), in one process.
+included), in one process. So are the times of a picture, the observation "pixels".
 """
 
 import time
@@ -25,6 +25,7 @@ from pushjax.tasks import PushT, TaskState
 AT_ONCE = 64  # episodes in one program
 REACH = 2.5  # px, from the faces of the walls, where pymunk's margin still holds the T
 ACTIONS = "steered", "uniform"
+PICTURES = 512  # pictures that are drawn together
 LIMITS = {"free": (1.5, 1.0), "walls": (3.0, np.inf)}  # px and degrees
 
 
@@ -72,7 +73,8 @@ def run(
     rows: list[dict[str, Any]] = []
     speeds: dict[str, dict[str, float]] = {}
     settings = {"seeds": seeds, "steps": steps, "substeps": substeps, "batch": batch, "seed": seed}
-    record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds)
+    pictures: dict[str, float] = {}
+    record = result_record("pusht", settings, rows=rows, control_steps_per_second=speeds, seconds_per_picture=pictures)
     parts = 1 + len(substeps) * (1 + len(ACTIONS) * bool(batch))
     episodes = recorded(seeds, steps, seed)
     progress(1, parts)
@@ -90,6 +92,8 @@ def run(
             keep(record)
             done += 1
             progress(done, parts)
+    if batch:
+        pictures |= {"gym-pusht": _gym_picture_seconds(), "pushjax": _picture_seconds()}
     return record
 
 
@@ -108,6 +112,7 @@ def summary(record: dict[str, Any]) -> str:
         lines += [f"    farther off: {each}" for each in row["farther_off"]]
     for kind, speeds in record["control_steps_per_second"].items():
         lines += [f"{name:24}{speed:12,.0f} control steps/s, {kind} actions" for name, speed in speeds.items()]
+    lines += [f"{name:24}{1e3 * each:12.3f} ms a picture" for name, each in record["seconds_per_picture"].items()]
     return "\n".join(lines)
 
 
@@ -132,13 +137,13 @@ def recorded(seeds: int, steps: int, seed: int = 0) -> Recorded:
     return Recorded(np.array(starts), taken, seen, covered, np.array(at_wall))
 
 
-def make_gym() -> Any:
-    """Return gym-pusht's environment, without Gymnasium's wrappers."""
+def make_gym(observation: str = "state") -> Any:
+    """Return gym-pusht's environment with a kind of observation, without Gymnasium's wrappers."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import gym_pusht.envs
 
-        return gym_pusht.envs.PushTEnv(obs_type="state")
+        return gym_pusht.envs.PushTEnv(obs_type=observation)
 
 
 def random_action(env: Any, rng: np.random.Generator) -> np.ndarray:
@@ -253,3 +258,31 @@ def _gym_speed(whole: bool, kind: str, seconds: float = 3.0) -> float:
                 env.space.step(env.dt)
         done += 1
     return done / (time.process_time() - start)
+
+
+def _gym_picture_seconds(steps: int = 100) -> float:
+    """Return the CPU time of a picture of gym-pusht: of a control step with pictures, less that of one without."""
+    seconds = []
+    for observation in ("pixels", "state"):
+        env, rng = make_gym(observation), np.random.default_rng(0)
+        env.reset(seed=0)
+        start = time.process_time()
+        for _ in range(steps):
+            env.step(rng.uniform(0, 512, 2))
+        seconds.append((time.process_time() - start) / steps)
+    return seconds[0] - seconds[1]
+
+
+def _picture_seconds(repeats: int = 5) -> float:
+    """Return the CPU time of a picture of PushT in a batch of `PICTURES`, the median of some."""
+    env, keys = PushT(observation="pixels"), jax.random.split(jax.random.key(0), PICTURES)
+    params = env.default_params
+    _, states = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
+    draw = jax.jit(jax.vmap(lambda key, state: env.observe(key, state, None, params)))
+    jax.block_until_ready(draw(keys, states))
+    seconds = []
+    for _ in range(repeats):
+        start = time.process_time()
+        jax.block_until_ready(draw(keys, states))
+        seconds.append((time.process_time() - start) / PICTURES)
+    return float(np.median(seconds))
