@@ -136,10 +136,14 @@ def test_clearance_of_a_hand_is_that_of_its_nearest_finger(push):
     hand, triangle = pj.Hand.two_fingers(0.005), np.array([(0, 0), (0.05, 0), (0, 0.04)])
     body = Fixture(pj.Polygon(triangle), (0.02, 0.03, 0.0))
     judge = shapely.Polygon(triangle + np.array([0.02, 0.03]))
-    configuration = RNG.uniform(-0.1, 0.1, (3, 4)) + np.array([0.0, -0.1, 0.0, 0.15])
+    rng = np.random.default_rng(5)
+    configuration = rng.uniform(-0.1, 0.1, (3, 4)) + np.array([0.0, -0.1, 0.0, 0.15])
     at = pj.Trajectory(**{**vars(push), "configuration": jnp.asarray(configuration)})
     centers = np.asarray(hand.poses(at.configuration))[..., :2].reshape(-1, 2)
-    apart = min(min(judge.distance(shapely.Point(p)), p[1] + 0.3) for p in centers) - 0.005
+    outline = [
+        judge.exterior.distance(point) * (-1 if judge.contains(point) else 1) for point in map(shapely.Point, centers)
+    ]
+    apart = min(*outline, *(centers[:, 1] + 0.3)) - 0.005
     cost = HandClearance(hand, (body, Wall((0.0, -0.3), (0.0, 1.0))), 0.2)(at)
     np.testing.assert_allclose(cost, max(1 - apart / 0.2, 0) ** 2, rtol=1e-9)
     inside = HandClearance(hand, (Wall((0.0, 1.0), (0.0, 1.0)),), 0.01)
