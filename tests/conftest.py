@@ -104,44 +104,38 @@ def pytest_addoption(parser):
         "--slow-within",
         type=float,
         metavar="SECONDS",
-        help="with -m 'not long' and --dist loadgroup: start no slow test later than this after the start",
+        help="start no slow test later than this after the start",
     )
 
 
 def pytest_collection_modifyitems(items):
-    for item in items:
+    order = {f"test_{name}": place for place, name in enumerate(LONG)}
+
+    def place(item) -> int:
+        notebook = item.path.suffix == ".ipynb"
+        return order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
+
+    items.sort(key=place)
+
+
+class Marks:
+    """Marks tests as long and slow, and skips slow ones after their time. As a plugin, it sees the notebooks too."""
+
+    def pytest_itemcollected(self, item):
         test, _, case = item.name.partition("[")
         if item.path.stem in LONG_NOTEBOOKS:
             item.add_marker("long")
         if item.path.stem == SLOW_NOTEBOOK or any(part in f"[{case}" for part in SLOW_CASES.get(test, ())):
             item.add_marker("slow")
-        # With --dist loadgroup, the slow tests of a file come after the others of all files.
-        group = f"slow {item.path.stem}" if _is_slow(item) else item.path.stem
-        item.add_marker(pytest.mark.xdist_group(group))
-    order = {f"test_{name}": place for place, name in enumerate(LONG)}
-
-    def place(item) -> tuple[bool, int]:
-        notebook = item.path.suffix == ".ipynb"
-        return _is_slow(item), order.get(item.path.stem, len(LONG) if notebook else len(LONG) + 1)
-
-    items.sort(key=place)
-
-
-def _is_slow(item) -> bool:
-    return item.get_closest_marker("slow") is not None
-
-
-class SlowTests:
-    """Skips slow tests after the time that is given to them. As a plugin, it sees the notebooks too."""
 
     def pytest_runtest_setup(self, item):
         limit = item.config.getoption("--slow-within")
-        if limit is not None and _is_slow(item) and time.monotonic() - START > limit:
+        if limit is not None and item.get_closest_marker("slow") and time.monotonic() - START > limit:
             pytest.skip("a slow test, and the time for these is over")
 
 
 def pytest_configure(config):
-    config.pluginmanager.register(SlowTests())
+    config.pluginmanager.register(Marks())
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -43,7 +43,7 @@ from pushjax._internal.checks import (
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
 from pushjax.friction.ellipsoid import Ellipsoid
-from pushjax.friction.fit_loss import coefficients_of_forms, evaluate_monomials, forms_of, loss_of, minimize
+from pushjax.friction.fit_loss import coefficients_of_forms, evaluate_monomials, forms_of, loss_of, minimize_loss
 from pushjax.friction.limit_surface import LimitSurface, angle_between
 from pushjax.friction.quartic import Quartic
 from pushjax.friction.sum_of_squares import TERMS, initial_factors
@@ -237,7 +237,7 @@ def _fit(xp, wrench, twist, length, weights, value_weight, ridge, *, degree: int
 
     def solve_round(state):
         parameters, unclipped, steps, _, rounds = state
-        found = minimize(xp, loss_of(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
+        found = minimize_loss(xp, loss_of(xp, pairs, unclipped, value_weight, ridge), parameters, degree)
         unclipped_after = (pairs.along @ coefficients_of_forms(xp, forms_of(xp, found.x)[1], degree) > 0) | ~has_weight
         settled = found.converged & xp.all(unclipped_after == unclipped)
         return found.x, unclipped_after, steps + found.steps, settled, rounds + 1

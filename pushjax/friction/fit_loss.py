@@ -125,7 +125,7 @@ def coefficients_of_forms(xp, p: Float[Array, "terms 9"], degree: int) -> Float[
     return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
 
 
-def minimize(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimum:
+def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimum:
     """Minimize the loss over the factors of the terms, by BFGS.
 
     The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each

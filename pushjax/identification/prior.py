@@ -171,9 +171,12 @@ class Prior(eqx.Module):
 
         A QR decomposition makes them triangular again if the center of pressure is an unknown.
         """
-        center = self.parameters(z).pressure_center
-        of_conditions = jax.vmap(lambda numbers, *rest: _surface_factors(_entries_by_name(numbers, self.layout), *rest))
-        full = of_conditions(z[self.layout.positions], center, self.mean_surface)
+
+        def of_condition(numbers: Array, known: dict[str, Array], mean: PriorSurface) -> Array:
+            entries = _entries_by_name(numbers, self.layout)
+            return _surface_factors(entries, _values(entries, self.unknowns, known, mean.length), mean)
+
+        full = jax.vmap(of_condition)(z[self.layout.positions], self.known, self.mean_surface)
         return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
 
     @property
@@ -188,14 +191,14 @@ def _entries_by_name(z: Array, layout: Layout) -> dict[str, Any]:
 
 
 def _surface_factors(
-    entries: dict[str, Any], pressure_center: Array | None, mean: PriorSurface
+    entries: dict[str, Any], values: dict[str, Array], mean: PriorSurface
 ) -> Float[Array, "terms 3 3"]:
     """Return factors L_k of the surface, which are not triangular if there is a center of pressure."""
     factors = mean.factors
     if "surface" in entries:
         factors = factors + mean.relative_std * factors @ _unit_perturbation(entries["surface"].reshape(-1, 6))
-    if pressure_center is not None:
-        cx, cy = pressure_center / mean.length
+    if "pressure_center" in values:
+        cx, cy = values["pressure_center"] / mean.length
         row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
         shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
         factors = shift.T[None] @ factors
@@ -213,8 +216,17 @@ def _condition_parameters(
         known: Known parameters by name.
         mean: Mean surface of the condition.
     """
-    values = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), mean.factors.dtype) for name in ALWAYS_PRESENT}
-    values |= known
+    values = _values(entries, unknowns, known, mean.length)
+    factors = _surface_factors(entries, values, mean)
+    gram = factors @ jnp.swapaxes(factors, 1, 2)
+    surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
+    zeros = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), gram.dtype) for name in ALWAYS_PRESENT}
+    return Parameters(surface=surface, **(zeros | values))
+
+
+def _values(entries: dict[str, Any], unknowns: Unknowns, known: dict[str, Array], length: Array) -> dict[str, Array]:
+    """Return the parameters of one condition that are known or estimated, by name, but for the surface."""
+    values = dict(known)
     for name, numbers in entries.items():
         if name == "surface":
             continue
@@ -224,13 +236,9 @@ def _condition_parameters(
         else:
             value = prior * numbers
             if name == "frame_offset":
-                value = value.at[2].divide(mean.length)
+                value = value.at[2].divide(length)
             values[name] = value[0] if SIZES[name] == 1 else value
-    has_center = "pressure_center" in entries or "pressure_center" in known
-    factors = _surface_factors(entries, values["pressure_center"] if has_center else None, mean)
-    gram = factors @ jnp.swapaxes(factors, 1, 2)
-    surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
-    return Parameters(surface=surface, **values)
+    return values
 
 
 def _unit_perturbation(entries: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:

@@ -185,7 +185,7 @@ def summary(record: dict[str, Any]) -> str:
         )
         lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['transits'][blocked]['status']})"]
     elif status == PushPlanStatus.HAND_IN_FIXTURE:
-        lines = ["no plan: in every plan that was found the finger runs into a fixture in a push"]
+        lines = ["no plan: in the best one that was found the finger runs into a fixture in a push"]
     elif not len(record["path"]):
         words = "no push is needed" if status == PushPlanStatus.FOUND else "no push that helps was found"
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
