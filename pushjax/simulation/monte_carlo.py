@@ -213,6 +213,8 @@ class _Run:
         self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
         self.start, self.path = start, path
         self.setups, self.round = copy_to_devices(setup, devices), tile * devices.count
+        # A CPU runs one tile in less time than it compiles it. This must not depend on the number of devices.
+        self.quick = n <= tile and devices.local[0].platform == "cpu"
 
     def in_all_processes(self, action: Callable[[], Any]) -> Any:
         """Return `action()`; if it fails in one process, fail in all, so that none waits for another."""
@@ -276,7 +278,15 @@ class _Run:
         # a path that all pushes share is sent once
         paths = self.path if self.path.ndim == 2 else self.path[indices]
         device_results = start_round(
-            self.setups, self.impl, self.devices, indices, poses, paths, self.keep_trajectories, pool
+            self.setups,
+            self.impl,
+            self.devices,
+            indices,
+            poses,
+            paths,
+            self.keep_trajectories,
+            self.quick,
+            pool,
         )
         return first, last, device_results
 

@@ -7,9 +7,8 @@ from a program for a single device: of a million draws, some thousands differed 
 either.
 """
 
-from collections.abc import Sequence
-from concurrent.futures import Executor
-from functools import partial
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -18,7 +17,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import Array
 
-from pushjax._internal.jit import without_gc
+from pushjax._internal.jit import QUICK_OPTIONS, without_gc
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.status import ContactMode
 from pushjax.contact.sticking import StickingSolver
@@ -130,6 +129,7 @@ def start_round(
     poses: np.ndarray,
     paths: np.ndarray,
     keep_trajectories: bool,
+    quick: bool,
     pool: Executor,
 ) -> list[PushResults]:
     """Start one round, and return its results on each device of this process without waiting for them.
@@ -142,16 +142,22 @@ def start_round(
         poses: Poses of the slider at the start, (devices, tile, 3), for the devices of all processes.
         paths: Configurations of the hand, (steps + 1, dof) for all pushes, or (devices, tile, steps + 1, dof).
         keep_trajectories: Whether to keep trajectories.
+        quick: Whether to compile for a short compile time, with `QUICK_OPTIONS`.
         pool: Threads, one for each device of this process.
     """
+    programs = _PROGRAMS[quick]
 
     def start_on(k: int) -> PushResults:
         setup, device_index = setups[k], devices.first + k
         path = paths if paths.ndim == 2 else paths[device_index]
         index, pose, path = jax.device_put((indices[device_index], poses[device_index], path), devices.local[k])
-        draws = _draw(impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index)
         shared = setup.shape, setup.hand, setup.solver, setup.table, setup.fixtures
-        return _push(setup.model.resample_every, keep_trajectories, draws, shared, path, pose)
+        draw_args = impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index
+
+        def push_args(draws) -> tuple:
+            return setup.model.resample_every, keep_trajectories, draws, shared, path, pose
+
+        return programs.push(*push_args(_draw_while_tracing(programs, draw_args, push_args)))
 
     # in parallel, because each device compiles its own program, once
     return list(pool.map(start_on, range(len(setups))))
@@ -165,16 +171,12 @@ def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
     return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), local)
 
 
-@without_gc
-@partial(jax.jit, static_argnums=(0, 1))
-def _draw(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array):
+def _draw_tile(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array):
     root = jax.random.wrap_key_data(key, impl=impl)
     return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), surfaces, model, steps))(index)
 
 
-@without_gc
-@partial(jax.jit, static_argnums=(0, 1))
-def _push(
+def _push_tile(
     resample_every: int | None, keep_trajectories: bool, draws, shared: tuple, paths: Array, poses: Array
 ) -> PushResults:
     axes = (0, None if paths.ndim == 2 else 0, 0)
@@ -201,3 +203,43 @@ def _push_results(draws, shared: tuple, path, pose, resample_every, keep_traject
         draws.shrinkage,
         push.pose if keep_trajectories else None,
     )
+
+
+class _Programs(NamedTuple):
+    """The two programs of a tile, compiled by JAX at their first call.
+
+    Attributes:
+        draw: `_draw_tile`.
+        push: `_push_tile`.
+    """
+
+    draw: Any
+    push: Any
+
+    @staticmethod
+    def of(options: dict[str, str | bool | int] | None) -> "_Programs":
+        """Return the programs for options of the compiler."""
+        return _Programs(
+            *(jax.jit(tile, static_argnums=(0, 1), compiler_options=options) for tile in (_draw_tile, _push_tile))
+        )
+
+
+@without_gc
+def _draw_while_tracing(programs: _Programs, draw_args: tuple, push_args: Callable[[Any], tuple]) -> Any:
+    """Return the draws of a tile, and trace the program of the pushes while that of the draws is compiled.
+
+    XLA compiles without Python's lock. JAX keeps what is traced for the call that follows.
+    """
+    (device,) = draw_args[-1].devices()
+    sharding = jax.sharding.SingleDeviceSharding(device)
+    draws = jax.tree.map(
+        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
+        programs.draw.eval_shape(*draw_args),
+    )
+    with ThreadPoolExecutor(1) as thread:
+        drawn = thread.submit(programs.draw, *draw_args)
+        programs.push.lower(*push_args(draws))
+        return drawn.result()
+
+
+_PROGRAMS = {False: _Programs.of(None), True: _Programs.of(QUICK_OPTIONS)}
