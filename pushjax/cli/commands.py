@@ -114,7 +114,7 @@ class Table2(Common):
 
 @dataclass
 class TwoFinger(Common):
-    """The triangle pushed by two fingers: predicted against measured poses (section V-B).
+    """The triangle pushed by two fingers: predicted against measured poses (not in the paper).
 
     Takes about 90 s of processor time, most of it to compile.
     """

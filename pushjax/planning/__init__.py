@@ -14,6 +14,9 @@ from pushjax.planning.costs import Worst as Worst
 from pushjax.planning.feedback.controller import Observation as Observation
 from pushjax.planning.feedback.controller import PushController as PushController
 from pushjax.planning.feedback.coverage_table import CoverageTable as CoverageTable
+from pushjax.planning.feedback.coverage_table import Measure as Measure
+from pushjax.planning.feedback.finger_control import FingerControl as FingerControl
+from pushjax.planning.feedback.finger_control import FingerState as FingerState
 from pushjax.planning.feedback.finger_control import PositionControl as PositionControl
 from pushjax.planning.feedback.finger_control import SpringDamper as SpringDamper
 from pushjax.planning.feedback.friction_filter import BeliefStatus as BeliefStatus
