@@ -18,6 +18,9 @@ MAX_STEPS = 500  # of the optimizer, in each round
 # stays large for hundreds of steps that lower the loss by less than 1e-8.
 GRADIENT_TOLERANCE, LARGEST_DECREASE = 1e-9, 1e-10
 
+# Of an ellipsoid, in units of the mean wrench: so its limit is finite in every direction, at most 100 mean wrenches.
+LEAST_EIGENVALUE = 1e-4
+
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
 QUADRATIC_MONOMIALS = np.array([(2, 0, 0), (0, 2, 0), (0, 0, 2), (1, 1, 0), (1, 0, 1), (0, 1, 1)])
 QUADRATIC_SUMS = monomial_sums(QUADRATIC_MONOMIALS)
@@ -121,8 +124,12 @@ def _sums(xp, degree: int, dtype: Any) -> Float[Array, "m entries"]:
 
 
 def coefficients_of_forms(xp, p: Float[Array, "terms 9"], degree: int) -> Float[Array, "m"]:
-    """Return the coefficients of H, given the flattened P_k."""
-    return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0])
+    """Return the coefficients of H, given the flattened P_k.
+
+    H is the sum of (F' P_k F)^2 for degree 4, and F' (P_0 + `LEAST_EIGENVALUE` I) F for degree 2.
+    """
+    floor = xp.asarray(LEAST_EIGENVALUE * np.eye(3).ravel(), p.dtype)
+    return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0] + floor)
 
 
 def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimum:
@@ -156,3 +163,28 @@ def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimu
     solver = optx.BFGS(rtol=tolerance, atol=tolerance)
     solution = optx.minimise(lambda x, _: objective(x)[0], solver, parameters, max_steps=MAX_STEPS, throw=False)
     return Minimum(solution.value, solution.stats["num_steps"], solution.result == optx.RESULTS.successful)
+
+
+def leave_saddle(xp, loss: Quadratic, parameters: Array) -> tuple[Array, Float[Array, ""]]:
+    """Move the factor L of an ellipsoid off a point where its gradient is zero, but the loss of P = L L' is not least.
+
+    There L is singular, and the loss decreases along P + t v v', with v in the null space of L'. The step t is that of
+    least loss.
+
+    Args:
+        loss: The loss.
+        parameters: Lower triangle of L, (6,).
+
+    Returns:
+        The lower triangle after the step, and the decrease of the loss: zero if there is no such direction.
+    """
+    lower, p = forms_of(xp, parameters)
+    sums = _sums(xp, 2, parameters.dtype)
+    slope = (loss.gradient(coefficients_of_forms(xp, p, 2)) @ sums).reshape(3, 3)
+    eigenvalues, eigenvectors = xp.linalg.eigh(slope)
+    v = eigenvectors[:, 0]
+    change = sums @ xp.outer(v, v).ravel()
+    step = xp.maximum(-eigenvalues[0], 0) / (2 * change @ loss.q @ change)
+    # [L, sqrt(t) v] has one column too many; its triangular factor has the same product with its transpose
+    columns = xp.concatenate([lower[0], xp.sqrt(step) * v[:, None]], axis=1)
+    return xp.linalg.qr(columns.T)[1].T[np.tril_indices(3)], xp.maximum(-eigenvalues[0], 0) * step / 2

@@ -65,8 +65,9 @@ def monte_carlo(
     """Push the slider `n` times along one path, each time under other friction.
 
     Push i is `random_rollout(fold_in(key, i), ...)`. Its bits depend on key, `batch_size`, `trajectories` and machine,
-    but not on the number of devices and processes. Each device compiles its own program, once. Memory does not depend
-    on `n`, except for the results, some 60 bytes a push.
+    and on whether `n` exceeds `batch_size`, but not on the number of devices and processes. Each device compiles its
+    own program, once. On a CPU up to `batch_size` pushes are compiled for a short compile time, more for a short run
+    time. Memory does not depend on `n`, except for the results, some 60 bytes a push.
 
     This function runs on the host. Under `jit`, `vmap` or `grad`, use `random_rollout`.
 
@@ -213,7 +214,8 @@ class _Run:
         self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
         self.start, self.path = start, path
         self.setups, self.round = copy_to_devices(setup, devices), tile * devices.count
-        # A CPU runs one tile in less time than it compiles it. This must not depend on the number of devices.
+        # A CPU runs one tile in less time than it compiles it. That one tile is enough must not depend on the number of
+        # devices, as the bits do not.
         self.quick = n <= tile and devices.local[0].platform == "cpu"
 
     def in_all_processes(self, action: Callable[[], Any]) -> Any:

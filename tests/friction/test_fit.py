@@ -148,6 +148,34 @@ def test_ellipsoid_is_the_minimum(rng):
         assert stated_loss(other, wrench, twist, length) > base
 
 
+def test_useless_pairs_have_the_least_loss_and_a_bounded_ellipsoid(rng):
+    """Where twists have nothing to do with wrenches, the search meets singular matrices: it must not stay there."""
+    wrench, twist = rng.normal(size=(2, 40, 8, 3)) * [[[[1, 0.3, 2]]], [[[1, 1, 1]]]]
+    fit = jax.jit(jax.vmap(lambda w, v: pj.fit_limit_surface(w, v, 1.0, degree=2)))
+    batch = fit(wrench, twist)
+    nearly_singular = 0
+    for k in range(40):
+        surface, report = pj.fit_limit_surface(wrench[k], twist[k], 1.0, degree=2, report=True)
+        if not report.converged:  # which twists are clipped does not settle
+            continue
+        scale = np.linalg.norm(wrench[k], axis=1).mean() ** 2
+        eigenvalues = np.linalg.eigvalsh(surface.A) * scale
+        assert eigenvalues[0] > 0.99e-4
+        nearly_singular += eigenvalues[0] < 1e-3
+
+        def loss(change, k=k, surface=surface, scale=scale):
+            return stated_loss(pj.Ellipsoid(surface.A + change / scale, 1.0), wrench[k], twist[k], 1.0)
+
+        slope = np.zeros((3, 3))
+        for i, j in zip(*np.triu_indices(3), strict=True):
+            unit = np.zeros((3, 3))
+            unit[i, j] = unit[j, i] = 2e-5
+            slope[i, j] = slope[j, i] = (loss(unit) - loss(-unit)) / (4e-5 if i == j else 8e-5)
+        assert np.linalg.eigvalsh(slope)[0] > -1e-4
+        assert np.allclose(batch.A[k] * scale, surface.A * scale, atol=2e-3)
+    assert nearly_singular >= 2
+
+
 def test_an_ellipsoid_and_its_square_are_recovered(rng):
     """From pairs of a known ellipsoid, degree two finds it, and degree four its square, up to the ridge."""
     m = rng.normal(size=(3, 3))
