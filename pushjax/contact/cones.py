@@ -82,9 +82,8 @@ def _motion_edges(surface: LimitSurface, contacts: Contacts) -> Float[Array, "2 
     edges = []
     for ratio in (contact.friction, -contact.friction):
         motion = curve.motion(ratio)
-        motion = motion.scale(
-            1 / jnp.maximum(jnp.abs(motion.x), jnp.abs(motion.y))
-        )  # first, because the squares below may underflow
+        # Divided by the larger component first, because the squares below may underflow.
+        motion = motion.scale(1 / jnp.maximum(jnp.abs(motion.x), jnp.abs(motion.y)))
         motion = motion.scale(1 / jnp.sqrt(motion.dot(motion)))
         edges.append((contact.normal.scale(motion.x) + contact.normal.perp().scale(motion.y)).array())
     return jnp.stack(edges)
@@ -92,7 +91,8 @@ def _motion_edges(surface: LimitSurface, contacts: Contacts) -> Float[Array, "2 
 
 def _checked_contacts(point: ArrayLike, normal: ArrayLike, friction: ArrayLike, dtype: Any) -> Contacts:
     """Check the arguments and make one contact with a pusher that does not move."""
-    p, n, mu = (as_float(value, dtype) for value in (point, normal, friction))
+    p, n = as_float(point, dtype, "point"), as_float(normal, dtype, "normal")
+    mu = as_float(friction, dtype, "friction")
     check_shape("point", p, (2,))
     check_shape("normal", n, (2,))
     check_shape("friction", mu, ())

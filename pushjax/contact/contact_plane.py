@@ -1,12 +1,14 @@
 """One contact in its contact plane, where the limit surface reduces to a curve.
 
-The wrenches that one contact can apply are F = J'(f_n n + f_t t), a plane. On it H becomes the binary form
+J maps a twist of the slider to the motion of the contact point. Its transpose J' maps a contact force to its wrench.
+The wrenches that one contact can apply, F = J'(f_n n + f_t t), form a plane. On it H becomes the binary form
 h(f_n, f_t) = H(J'(f_n n + f_t t)), convex and homogeneous of the same degree d. The contact point of the slider moves,
 in (n, t), along grad h. So a single contact is a limit curve h = 1 in the plane of contact forces, whatever the limit
 surface: a force f moves the contact point along the curve's normal at f.
 
-Along the friction cone let f = (1, s) and h(s) = h(1, s). Then the motion is (d h - s h', h'). By convexity its angle
-phi(s) = atan2(h', d h - s h') increases with s, and it stays within 90 degrees of the angle of f:
+Along the friction cone let f = (1, s) and h(s) = h(1, s). Then the motion is (d h - s h', h'). Its angle
+phi(s) = atan2(h', d h - s h') stays within 90 degrees of the angle of f, because f . grad h = d h > 0. By convexity the
+angle increases with s:
 
     (d h - s h') h'' - h' (d h - s h')' = d h h'' - (d - 1) h'^2 >= 0.
 

@@ -15,10 +15,8 @@ from pushjax.friction.limit_surface import Form
 
 Cubic = tuple[Scalar, Scalar, Scalar, Scalar]  # coefficients, constant first
 
-ITERATIONS = {
-    4: 7,
-    8: 8,
-}  # iterations of the search for a cubic's root, by the size of the floating-point type in bytes
+# Iterations of the search for a cubic's root, by the size of the floating-point type in bytes.
+ITERATIONS = {4: 7, 8: 8}
 
 
 class WrenchSegment(NamedTuple):
@@ -135,7 +133,7 @@ class _Search(NamedTuple):
     """State of the bracketed search for a root of a cubic.
 
     Attributes:
-        s: Estimate of the root, between `near` and `far`.
+        s: Estimate of the root, a value of the cubic's variable u between `near` and `far`.
         near: One end of the bracket; at first `origin`.
         far: Other end of the bracket.
         origin: Where the search began: the point where the cubic is smallest, an end of the interval or zero.

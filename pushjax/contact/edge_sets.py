@@ -175,8 +175,8 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
         incumbent: The best set so far.
         contacts: Numbers of the three contacts. If the first two are the same, both edges of that one are in the set
             and it sticks.
-        num_choices: How many choices of edges to try: 8, or 2 where one contact sticks, and 2 more for every other
-            contact that touches.
+        num_choices: How many choices of edges to try: 8, or 2 where one contact sticks. In the latter case, if a
+            further contact touches, both edges of every contact but the first are tried instead.
 
     Returns:
         The best set so far, these included.
@@ -223,7 +223,7 @@ def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tu
         return best_share, weight, edges
 
     no_edges = tuple(jnp.full(h.shape, NO_EDGE, jnp.int32) for _ in contacts)
-    start = (jnp.full_like(h, -1.0), Vec3(h, h, h), no_edges)
+    start = (jnp.full_like(h, -1.0), Vec3(h, h, h), no_edges)  # the weights are placeholders
     best_share, weight, best_edges = jax.lax.fori_loop(0, num_choices, try_choice, start)
     return _update_incumbent(
         incumbent,

@@ -2,8 +2,8 @@
 
 Where more than three cone edges are admissible under the motion (two fingers flat against an edge, say) the twist and
 the wrench are determined but the forces are not. Of all distributions that make up the wrench, this module gives the
-one with the least sum of squared edge weights, as if the fingers were equally soft. It does not depend on the order of
-the contacts, on the frame or on a mirror.
+one with the least sum of squared edge weights. It is that of equally soft fingers whose compliance along the tangent is
+1 / mu^2 times that along the normal. It does not depend on the order of the contacts, on the frame or on a mirror.
 
 The problem is min 1/2 sum alpha_e^2 with sum alpha_e g_e = F, alpha >= 0. By duality alpha_e = max(0, g_e . y), where y
 is the minimizer of the convex, piecewise quadratic phi(y) = 1/2 sum max(0, g_e . y)^2 - F . y. Newton's method with an

@@ -1,22 +1,25 @@
 """Solver of contacts without friction under an ellipsoidal limit surface.
 
-With V = A sum_i f_i n_i, f_i >= 0, the conditions 0 <= f_i  _|_  n_i . V - b_i >= 0 are those of a convex program:
-minimize V' A^-1 V subject to n_i . V >= b_i. Its solution is unique, and loads at most three contacts. So every set of
-one, two or three contacts is tried, each in closed form, and the one whose motion violates the conditions least is it.
-If that motion violates one of them clearly, no motion satisfies all: a jam.
+Under an ellipsoid the twist is V = A sum_i f_i n_i, where A is the Hessian of H, n_i the normal rows of the contacts
+(`scaled_problem`) and f_i >= 0 their forces. The conditions 0 <= f_i  _|_  n_i . V - b_i >= 0 are those of a convex
+program: minimize V' A^-1 V subject to n_i . V >= b_i. Its solution is unique, and loads at most three contacts. So
+every set of one, two or three contacts is tried, each in closed form, and the one whose motion violates the conditions
+least is the solution. If that motion violates one of them clearly, no motion satisfies all: a jam.
 """
 
 from itertools import combinations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import compute_once, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution, ScaledProblem
 from pushjax.contact.status import ContactMode, Status
 
-# Violation of a condition, in units of the longest displacement of a finger, that passes; and the largest motion.
+# Largest violation of a condition that passes, and largest motion that can be an answer. Both are dimensionless, in
+# units of `ScaledProblem.displacement_unit`. The other solvers are much stricter (`tolerances`).
 TOLERANCE, MAX_MOTION = 1e-3, 1e3
 # Keyed by the bytes of a float: determinants smaller than this, relative to the product of the diagonal, count as zero.
 SINGULAR = {4: 1e-5, 8: 1e-11}
@@ -32,14 +35,14 @@ class Frictionless(ContactSolver):
             problem: The contact problem; its form must be that of an ellipsoid.
 
         Returns:
-            The motion, which can be differentiated.
+            The motion, which can be differentiated. Its margin is always infinite. A contact that touches without
+            force has the mode SEPARATED.
         """
         count, scalar = problem.count, problem.runtime_scalar
         zero = jnp.zeros_like(scalar)
         motions = tuple(problem.form.gradient(n) for n in problem.normal)  # by a unit force at each contact
-        gram = compute_once(
-            tuple(tuple(n.dot(motion) for motion in motions) for n in problem.normal), scalar
-        )  # symmetric
+        # the Delassus matrix of the normals, which is symmetric
+        gram = compute_once(tuple(tuple(n.dot(motion) for motion in motions) for n in problem.normal), scalar)
         goal = tuple(b.x for b in problem.approach)
         best_twist, best_force = Vec3(zero, zero, zero), (zero,) * count
         best = jnp.full_like(zero, jnp.inf)
@@ -55,8 +58,8 @@ class Frictionless(ContactSolver):
                     violation = jnp.maximum(violation, -force * gram[i][i])
                 for n, b, active in zip(problem.normal, goal, problem.active, strict=True):
                     violation = jnp.maximum(violation, jnp.where(active, b - n.dot(twist), 0.0))
-                size_of = jnp.abs(twist.x) + jnp.abs(twist.y) + jnp.abs(twist.z)
-                usable = ~singular & (size_of < MAX_MOTION)
+                twist_size = jnp.abs(twist.x) + jnp.abs(twist.y) + jnp.abs(twist.z)
+                usable = ~singular & (twist_size < MAX_MOTION)
                 for i in chosen:
                     usable &= problem.active[i]
                 violation = compute_once(jnp.where(usable, violation, jnp.inf), scalar)
@@ -71,7 +74,7 @@ class Frictionless(ContactSolver):
         return _answer(problem, best_twist, best_force, status)
 
 
-def _solve(gram: list[list[Scalar]], goal: list[Scalar]) -> tuple[list[Scalar], Scalar]:
+def _solve(gram: list[list[Scalar]], goal: list[Scalar]) -> tuple[list[Scalar], Bool[Array, ""]]:
     """Solve a symmetric system of up to three equations by Cramer's rule; also return whether it is singular."""
     size = len(goal)
 

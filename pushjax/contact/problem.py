@@ -42,7 +42,7 @@ class Contacts(eqx.Module):
         friction: Coefficient of friction mu, (contacts,), or one for all.
         gap: Distance still to close along the normal, m, (contacts,), or one for all; negative in penetration.
         active: False for a contact that is only padding, (contacts,), or one for all. Other entries of such a contact
-            may be anything.
+            may be anything. But where `active` is traced, entries that are not traced are checked in every contact.
 
     Raises:
         ValueError: If shapes do not match, a number is not finite, a normal is not of unit length or a friction is
@@ -102,8 +102,8 @@ class Motion(eqx.Module):
     """The answer to a contact problem.
 
     Attributes:
-        twist: Twist of the slider over the step, (3,), (m, m, rad). Zero where the slider does not move.
-        wrench: Wrench on H = 1, (3,), N and N m. Zero where the slider does not move.
+        twist: Twist of the slider over the step, (3,), body frame, m and rad. Zero where the slider does not move.
+        wrench: Wrench on H = 1, (3,), body frame, N and N m. Zero where the slider does not move.
         force: Contact forces along the normal and the tangent t = (-n_y, n_x), (contacts, 2), N. They sum to the
             wrench. Where several distributions do, this is the one of evenly soft fingers
             (`pushjax.contact.force_distribution`).
@@ -119,7 +119,8 @@ class Motion(eqx.Module):
             the fingers do in a step on forces that cancel through the slider. A positive margin guarantees a motion,
             and is how far the fingers may still close on each other. Where the status is JAMMED the margin is negative,
             and its size is how far the fingers would have to open. It is infinite where no forces can cancel, as with
-            one contact. It is seldom negative where there is a motion; then a jam is possible too.
+            one contact. It is seldom negative where there is a motion. The fingers can then also press on each other
+            through the slider, so a real hand may jam there.
         unique: False where another twist satisfies every condition too. Only twists that the solver tries count;
             `Exhaustive` tries all.
     """
@@ -138,9 +139,9 @@ def solve_contacts(
 ) -> Motion:
     """Find the slider's motion under given displacements of its pushers.
 
-    Friction is Coulomb's at each contact, and that of the limit surface under the slider. The motion is the twist V,
-    with forces f, for which V = k grad H(sum J'f), k > 0, and, with the relative motion w = J V - displacement at each
-    contact,
+    Friction is Coulomb's at each contact, and that of the limit surface under the slider. J maps a twist to the motion
+    of a contact point, in (n, t). The motion is the twist V, with forces f, for which V = k grad H(sum J'f), k > 0,
+    and, with the relative motion w = J V - displacement at each contact,
 
         0 <= f_n  _|_  w_n + gap >= 0,   |f_t| <= mu f_n,   f_t = +mu f_n where w_t < 0,  -mu f_n where w_t > 0.
 
@@ -166,6 +167,7 @@ def solve_contacts(
 
     Raises:
         ValueError: For no contact, for more than eight, or for more than one with a solver of one contact.
+        TypeError: For a surface, contacts or a solver of another type.
 
     Examples:
         >>> import numpy as np, pushjax as pj
@@ -238,7 +240,7 @@ def solve_in_scalars(
     Raises:
         ValueError: As for `solve_contacts`.
     """
-    _check_num_contacts(len(contacts))  # also for the contacts of a hand
+    _check_num_contacts(len(contacts))  # also for callers other than `solve_contacts`
     if solver is None:
         if len(contacts) > 1 and not margin:
             return single_first(form, contacts, active)
@@ -268,8 +270,8 @@ def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
         H in scalars, and the coefficients of friction.
     """
     form = surface.form()
-    known = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
-    return jax.tree.map(lambda entry: jnp.where(known, entry, 1.0), form), jnp.where(known, friction, jnp.nan)
+    usable = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
+    return jax.tree.map(lambda entry: jnp.where(usable, entry, 1.0), form), jnp.where(usable, friction, jnp.nan)
 
 
 def contacts_in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, ...]:

@@ -1,6 +1,6 @@
 """Iterative solver of several contacts: a sequence of projected problems, then an exact finish.
 
-Each round linearizes grad H at the last wrench: grad H(F) = A F + c (Josephy and Newton's method). Zhou et al. drop the
+Each round linearizes grad H at the last wrench: grad H(F) = A F + c (the Josephy-Newton method). Zhou et al. drop the
 constant c and damp, which converges linearly. Then the round sweeps over the contacts: projected Gauss-Seidel on normal
 and tangential force in turn. The result of the sweeps only has to show which cone edges carry the force. The systems of
 the edges with the largest forces are then solved exactly, as in `exhaustive`, and checked against every condition.

@@ -308,9 +308,9 @@ def _passes_final_check(
 
 
 def _modes(problem: ScaledProblem, slips: tuple[Vec2, ...], tolerance: Scalar):
-    """The mode of each contact, from the motion alone.
+    """Yield the mode of each contact, from the motion alone.
 
-    So the modes do not depend on which of several possible force distributions is returned.
+    The modes must not depend on which of several possible force distributions is returned.
     """
     for slip, active in zip(slips, problem.active, strict=True):
         sliding = jnp.where(slip.y < 0, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT)

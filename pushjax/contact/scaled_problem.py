@@ -156,7 +156,7 @@ def nondimensionalize(
         valid &= (contact.friction >= 0) | ~is_active
     zero, one = jnp.zeros_like(contacts[0].gap), jnp.ones_like(contacts[0].gap)
     zero_vector = Vec2(zero, zero)
-    # This is not a compile-time constant if any input is traced.
+    # This is not a compile-time constant if the length, a point or a displacement is an argument of the program.
     runtime_scalar = form.length + sum((contact.point.x + contact.displacement.x for contact in contacts), zero)
     # Without `compute_once`, the sum over all inputs would be recomputed for every row below.
     valid, runtime_scalar = compute_once((valid, runtime_scalar), runtime_scalar)

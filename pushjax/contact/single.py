@@ -38,11 +38,12 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     """Compute the slider's twist from the pusher's displacement at one contact.
 
     The contact point follows the pusher exactly along the normal. Along the tangent it follows the pusher exactly where
-    the contact sticks, else it moves along the motion cone's edge. This part of the twist is never computed from the
-    surface, so a sticking contact has zero slip up to roundoff. Only the rotation is computed from the surface.
+    the contact sticks, else it moves along the motion cone's edge. So where the contact sticks, only the rotation is
+    computed from the surface, and the slip is zero up to roundoff.
 
     A sliding motion is scaled by v_n / motion_n, where v is `Contact.approach`. This needs no guard against a small
-    motion_n: sliding left means motion_n v_t > motion_t v_n, so the factor stays below v_t / motion_t.
+    motion_n. Sliding left means motion_n v_t > motion_t v_n, so for motion_t > 0 the factor stays below v_t / motion_t.
+    For motion_t <= 0 motion_n is not small, because motion_n = d h - mu motion_t >= d h by Euler's identity.
 
     Args:
         form: H of the limit surface, in scalars.
@@ -54,7 +55,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
     Reference: Zhou et al. 2017, section IV.A.
     """
-    known, contact = _replace_invalid(contact)
+    usable, contact = _replace_invalid(contact)
     # The motion does not depend on the scale of H, but squares of H overflow or underflow in float32. So h is divided
     # by its own size, which is a constant to every derivative too.
     curve = LimitCurve.of(form, contact)
@@ -63,7 +64,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     curve, size = compute_once((LimitCurve(tuple(c / size for c in curve.c)), size), contact.approach().x)
     mu = contact.friction
     v = contact.approach()
-    valid = known & jnp.isfinite(sum(curve.c))
+    valid = usable & jnp.isfinite(sum(curve.c))
     pushes = decide(valid & (v.x > 0), v.x)
     v = tree_where(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # placeholder where nothing pushes
     curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
@@ -115,15 +116,16 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
 def _replace_invalid(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
     """Whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
-    known = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
-    return known, contact.where(known)
+    usable = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
+    return usable, contact.where(usable)
 
 
 def _can_drag(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
     """Whether a pusher that does not approach could also hold on to the slider and drag it along.
 
-    Where the motion cone opens beyond 90 degrees, a push along the surface or slightly off it lies inside the cone. But
-    the slider may also stay behind, which satisfies every condition too. That is the answer given: nothing pushes.
+    Where the motion cone opens beyond 90 degrees, a pusher that moves along the surface, or slightly away from it, may
+    move inside the cone. But the slider may also stay behind, which satisfies every condition too. That is the answer
+    given: nothing pushes.
     """
     left, right = curve.motion(mu), curve.motion(-mu)
     drags_left = (left.x < 0) & (v.y > 0) & (left.cross(v) < 0)

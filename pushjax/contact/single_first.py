@@ -1,4 +1,4 @@
-"""Solver of several contacts for a hand on its way, where mostly one contact does all the work.
+"""Solver of several contacts for rollouts, in which mostly one contact does all the work.
 
 The contact that is pressed most is solved alone, as if there were no other (`single`). The result is a solution of the
 whole problem if every other contact separates: the other contacts then bear no force, and no condition requires one. If
@@ -32,6 +32,7 @@ from pushjax.friction.limit_surface import Form
 # How far a contact has to separate to be left out, in units of the distance that passes as touching.
 CLEARANCE = 4
 
+# H of the limit surface, the contacts, and for each contact whether it is active.
 Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
 
 

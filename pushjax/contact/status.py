@@ -10,7 +10,7 @@ class ContactMode(IntEnum):
     tangent t = (-n_y, n_x). When the pusher slides left, the friction on the slider is +mu f_n.
 
     Attributes:
-        SEPARATED: The contact does not touch. Also given where the slider does not move.
+        SEPARATED: The contact does not touch. Every contact also has this mode where the slider does not move.
         STICKING: The contact touches and does not slip.
         SLIDING_LEFT: The pusher slips to the left.
         SLIDING_RIGHT: The pusher slips to the right.
@@ -50,5 +50,5 @@ class Status(IntEnum):
 
     @property
     def failed(self) -> bool:
-        """Whether the step's result is not an answer to the question asked (jams and grasps are answers)."""
+        """Whether the solve or the step found no valid answer. A jam and a grasp are valid answers."""
         return self in (Status.NOT_CONVERGED, Status.OVERLAPPING, Status.INVALID)

@@ -133,7 +133,7 @@ class ScalarRoot(StickingSolver):
     from the third iteration on, where they are still more than 30 degrees apart.
 
     Four iterations (five in float64) without a bracket come first and are enough for nearly all contacts. A contact
-    that has not converged then continues with the bracket. In a batch that loop costs nothing unless some have not
+    that has not converged then continues with the bracket. In a batch that loop costs nothing if all contacts have
     converged.
 
     An ellipsoid takes none of these iterations, because its root has a closed form. For a quartic the default of 12 is
@@ -203,10 +203,10 @@ class HessianIteration(StickingSolver):
     """The paper's iteration, reduced to the contact plane and damped so that it becomes Newton's method.
 
     The paper iterates F <- A_t^-1 D^-1 V_p with A_t = hess H(F_t), where V_p is the push and D the paper's 3 x 3
-    matrix. With a sticking contact F stays in the plane F = J'f, and A_t and D reduce to the 2 x 2 Hessian J hess H J'
-    of the limit curve's h. By Euler's identity the paper's step, damped by 1/(d - 1), is Newton's step on
-    grad h(f) = v / (d - 1). It converges quadratically. The paper halves its step instead, which only halves the error
-    in each iteration. Without damping the iteration diverges for d = 4.
+    matrix. With a sticking contact F stays in the plane F = J'f (J as in `contact_plane`), and A_t and D reduce to the
+    2 x 2 Hessian J hess H J' of the limit curve's h. By Euler's identity the paper's step, damped by 1/(d - 1), is
+    Newton's step on grad h(f) = v / (d - 1). It converges quadratically. The paper halves its step instead, which only
+    halves the error in each iteration. Without damping the iteration diverges for d = 4.
 
     v - grad h is minus the gradient of the convex function h(f) - v . f, so a line search on that function makes the
     step safe. The line search tries the step and its halvings down to 1/512, and takes the one where the slope along

@@ -59,6 +59,10 @@ def checked_arguments(
 
     Returns:
         Slider, hand, pose, friction (fingers,), and the dtype.
+
+    Raises:
+        TypeError: For a slider or hand of another type, or a pose or friction that does not consist of real numbers.
+        ValueError: For a wrong shape, a number that is not finite, or a negative friction.
     """
     check_slider_and_hand(slider, hand)
     dtype = common_dtype(slider, hand, pose, friction, *paths)
@@ -73,7 +77,7 @@ def checked_arguments(
         raise ValueError(f"friction has shape {mu.shape}; expected a scalar or ({fingers},), one per finger")
     check_finite("friction", mu)
     check_non_negative("friction", mu)
-    if not traced((slider, pose, friction, paths)):
+    if not traced((slider, pose, friction, paths, mu)):  # inside `jit`, `mu` is traced even if `friction` is known
         warn_about_percent(np.max(np.asarray(mu), initial=0))
     cast = jax.tree.map(lambda leaf: leaf.astype(dtype), (slider, hand))
     return *cast, start, jnp.broadcast_to(mu, (fingers,)), dtype
@@ -110,16 +114,14 @@ def checked_rollout_arguments(
     arguments are as in `checked_arguments`.
     """
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
-    if pushes is not None and np.ndim(path) == 3:
-        path_array = as_float(path, dtype, "path")
-        _check_columns(path_array, hand)
+    path_array = as_float(path, dtype, "path")
+    _check_columns(path_array, hand)
+    if pushes is not None and path_array.ndim == 3:
         check_shape("path", path_array, (pushes, "steps + 1", hand.dof))
         check_finite("path", path_array)
         if path_array.shape[1] < 2:
             raise ValueError(f"path must have at least two configurations; got shape {path_array.shape}")
     else:
-        path_array = as_float(path, dtype, "path")
-        _check_columns(path_array, hand)
         path_array = checked_path(path_array, hand.dof)
     warn_about_units(slider, start, path_array)
     check_opening(hand, path_array)

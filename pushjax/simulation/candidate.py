@@ -16,7 +16,7 @@ class FingerPose(NamedTuple):
 
     Attributes:
         center: Center of the finger, or a point of the wall, m.
-        angle: Angle as the unit vector (cos, sin), which is the normal of a wall; None for a finger that never turns.
+        angle: Angle of a pad as the unit vector (cos, sin), or unit normal of a wall; None for a round finger.
     """
 
     center: Vec2

@@ -82,7 +82,7 @@ class Checkpoint:
         try:
             existing = json.loads(path.read_text())
             different = [name for name in {**wanted, **existing} if existing.get(name) != wanted.get(name)]
-        except (ValueError, AttributeError, OSError) as error:
+        except (ValueError, TypeError, OSError) as error:  # TypeError: JSON that is no object
             reason = error.strerror if isinstance(error, OSError) else "it is damaged"
             raise CheckpointError(f"checkpoint: {path} cannot be read ({reason}); give another folder") from None
         if different:

@@ -22,6 +22,9 @@ from pushjax.simulation.hand import Finger, Pad
 # Two candidates nearer to each other than this, in units of the limit surface's length, count as one. The first is for
 # a polygon. The second is for a smooth outline, where a corner of a pad and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
+# In units of the same length. A candidate that is farther than the nearest by more than this does not exist
+# (`OUT_OF_REACH`).
+EXISTING = 1e3
 
 
 def select_contacts(
@@ -54,7 +57,7 @@ def select_contacts(
     offset = candidates.point - nearest.point
     separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
     is_other = offset.dot(offset) > (separation * length) ** 2
-    is_other = decide(is_other & (distance < nearest.distance + 1e3 * length), length)
+    is_other = decide(is_other & (distance < nearest.distance + EXISTING * length), length)
     second = jnp.where(jnp.any(is_other), jnp.argmin(jnp.where(is_other, distance, jnp.inf)), first)
     return first.astype(jnp.int32), second.astype(jnp.int32)
 
@@ -67,7 +70,8 @@ def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""]
     """
     chosen = [jnp.argmin(candidates.distance).astype(jnp.int32)]
     nearest = take(candidates, chosen[0])
-    eligible, travel = candidates.distance < nearest.distance + 1e3 * length, jnp.zeros_like(candidates.distance)
+    eligible = candidates.distance < nearest.distance + EXISTING * length
+    travel = jnp.zeros_like(candidates.distance)
     previous = nearest
     for _ in range(2):
         differs, distance = _distances_in_other_directions(candidates, previous, length)
@@ -125,9 +129,8 @@ def track_contacts(
     if not isinstance(finger, Pad) or not isinstance(candidates, Candidate) or not is_nonconvex_polygon(outline):
         return chosen
     pad_corners = len(edges(finger.shape.outline()))
-    twin_offset = (
-        candidates.distance.size - pad_corners
-    )  # index offset from (corner, nearest edge) to (same corner, next edge)
+    # Index offset from a corner of the pad with its nearest edge to the same corner with its next nearest edge.
+    twin_offset = candidates.distance.size - pad_corners
     indices = []
     for index, original in zip(chosen, at_start, strict=True):
         twin = jnp.where(

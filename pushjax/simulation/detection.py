@@ -351,7 +351,9 @@ def edges(outline: Outline) -> tuple[Edge, ...]:
         raise TypeError(f"not a polygon's outline: {type(outline).__name__}")
     if isinstance(outline.edges, Edge):
         count = outline.edges.start_x.shape[0]
-        raise ValueError(f"hand: pads can touch a Polygon of up to twelve vertices; got {count}")
+        raise ValueError(
+            f"hand: pads can touch a Polygon of up to twelve vertices; got {count}, in a pad or in the polygon"
+        )
     return outline.edges
 
 

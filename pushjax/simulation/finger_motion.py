@@ -15,9 +15,9 @@ from pushjax.simulation.detection import penetration_depth
 from pushjax.simulation.fixtures import Fixtures, Wall
 from pushjax.simulation.hand import Finger, Hand, Pad
 
-# A jam is a grasp if every finger is nearer to the slider than this, in units of the length, or than four times the
-# hand's displacement in the step. The margin is needed because a jam is detected before the last gap is closed, and
-# because the slider swings faster than the fingers close.
+# A jam is a grasp if every finger is nearer to the slider than this, in units of the limit surface's length, or than
+# four times the largest displacement of a finger in the step. The margin is needed because a jam is detected before the
+# last gap is closed, and because the slider swings faster than the fingers close.
 GRASP_GAP = 1e-4
 # After a step a finger may be this deep in the slider, as a fraction of the largest displacement of the fingers in the
 # step, if it was not deeper before: the midpoint rule leaves that much at a corner. The floor is in units of the length
@@ -26,7 +26,7 @@ DEPTH_PER_DISPLACEMENT, DEPTH_FLOOR = 0.1, 1e-5
 
 
 class BodyFrame(NamedTuple):
-    """A pose with the unit vector of its angle, which is kept because sines cost as much as a contact.
+    """A pose with the unit vector of its angle, which is kept because a sine costs as much as solving a contact.
 
     Attributes:
         pose: Pose of the slider, world.
@@ -184,7 +184,7 @@ def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: V
 
 
 def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:
-    """Largest displacement of a finger's center in the step, m, along a straight line. Not differentiated."""
+    """Largest displacement of a finger's center in the step, m, without its turn. Not differentiated."""
     paths = jax.lax.stop_gradient([motion.path for motion in motions])
     return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
 

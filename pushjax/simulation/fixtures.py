@@ -118,6 +118,7 @@ Fixtures = tuple[Wall | Fixture, ...]
 
 
 def _checked_friction(friction: ArrayLike, dtype: Any) -> Float[Array, ""]:
+    """Return a coefficient of friction as an array; raise ValueError unless it is a finite scalar, not negative."""
     mu = as_float(friction, dtype, "friction")
     check_shape("friction", mu, ())
     check_finite("friction", mu)

@@ -127,7 +127,8 @@ class Hand(eqx.Module):
     def three_fingers(radius: ArrayLike = 0.0) -> "Hand":
         """Three round fingers at distance d from the hand's origin, 120 degrees apart, the first on the hand's +y axis.
 
-        The configuration is (x, y, theta, d): the pose of the hand, world, m and rad, and the distance d, m.
+        The fingers are numbered clockwise. The configuration is (x, y, theta, d): the pose of the hand, world, m and
+        rad, and the distance d, m.
 
         Args:
             radius: Radius of all fingers, m.
@@ -139,7 +140,7 @@ class Hand(eqx.Module):
         """Two rectangular pads that face each other along the hand's y axis.
 
         The configuration is (x, y, theta, d): the pose of the hand, world, m and rad, and the opening d between the
-        faces, m. The pose of a pad is that of the middle of its face.
+        faces, m. The pose of a pad is that of the middle of its face. The first pad is at y = d/2 in the hand's frame.
 
         Args:
             width: Width of the faces along the hand's x axis, m.

@@ -62,12 +62,13 @@ def monte_carlo(
     checkpoint: str | Path | None = None,
     progress: bool | ProgressCallback = False,
 ) -> MonteCarlo:
-    """Push the slider `n` times along one path, each time under other friction.
+    """Push the slider `n` times along a path, each time under other friction.
 
     Push i is `random_rollout(fold_in(key, i), ...)`. Its bits depend on key, `batch_size`, `trajectories` and machine,
     and on whether `n` exceeds `batch_size`, but not on the number of devices and processes. Each device compiles its
-    own program, once. On a CPU up to `batch_size` pushes are compiled for a short compile time, more for a short run
-    time. Memory does not depend on `n`, except for the results, some 60 bytes a push.
+    own program, once. On a CPU, the program of a run of at most `batch_size` pushes is compiled for a short compile
+    time, and that of a longer run for a short run time. Memory does not depend on `n`, except for the results, some 60
+    bytes a push, and for paths and starts of each push.
 
     This function runs on the host. Under `jit`, `vmap` or `grad`, use `random_rollout`.
 
@@ -97,10 +98,11 @@ def monte_carlo(
         The pushes, in numpy.
 
     Raises:
-        ValueError: As in `rollout` and `FrictionModel.around`. Also for `n` or `batch_size` below one.
+        ValueError: As in `rollout` and `FrictionModel.around`. Also for a key that is not one PRNG key, for `n` or
+            `batch_size` below one, and for devices that are neither of this process nor equally many of each process.
         CheckpointError: A ValueError, for a checkpoint that belongs to another run, is damaged, or cannot be written.
             What the folder holds is kept.
-        TypeError: Under `jit`, `vmap` or `grad`.
+        TypeError: Under `jit`, `vmap` or `grad`. Also as in `rollout`, and for a model of another type.
 
     Reference: Zhou et al. 2017, sections V and VI.
     """
@@ -164,7 +166,7 @@ def _progress_report(progress: bool | ProgressCallback, n: int) -> Iterator[Prog
     if progress is not True:
         yield progress or no_progress
         return
-    # drawing on terminals is not needed by those who only import this
+    # imported here, because nothing but a progress bar needs it
     from pushjax._internal.progress_bar import progress_bar
 
     with progress_bar() as reporter:
@@ -214,12 +216,12 @@ class _Run:
         self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
         self.start, self.path = start, path
         self.setups, self.round = copy_to_devices(setup, devices), tile * devices.count
-        # A CPU runs one tile in less time than it compiles it. That one tile is enough must not depend on the number of
-        # devices, as the bits do not.
+        # A CPU runs one tile in less time than it takes to compile it. This compares `n` with a tile and not with a
+        # round, because the bits must not depend on the number of devices.
         self.quick = n <= tile and devices.local[0].platform == "cpu"
 
     def in_all_processes(self, action: Callable[[], Any]) -> Any:
-        """Return `action()`; if it fails in one process, fail in all, so that none waits for another."""
+        """Return `action()`; if one process raises CheckpointError, all do, so that none waits for another."""
         error, value = None, None
         try:
             value = action()
@@ -245,6 +247,7 @@ class _Run:
     def _compute_rounds(
         self, saved: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor
     ) -> PushResults:
+        """Compute the pushes round by round; as `compute_all`, with one thread of `pool` for each device."""
         parts, done = self._saved_blocks(saved)
         # block: results that are not in the checkpoint yet; block_begin: index of their first push
         block, block_begin, block_time = [], done, time.perf_counter()

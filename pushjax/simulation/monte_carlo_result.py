@@ -58,7 +58,8 @@ class MonteCarlo:
         """Count the pushes by outcome; the counts add up to n.
 
         Returns:
-            Counts of "grasped", "jammed", "free" (neither grasped nor jammed) and "failed" (a step failed).
+            Counts of "grasped", "jammed", "free" (none of the others, which is not `Status.FREE`) and "failed" (a step
+            failed, whatever came after it).
         """
         failed = self.failed > 0
         grasped, jammed = (~failed & (self.status == status) for status in (Status.GRASPED, Status.JAMMED))

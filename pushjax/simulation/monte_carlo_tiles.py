@@ -100,7 +100,8 @@ class Devices(NamedTuple):
             devices: Devices to use, as JAX lists them; None for all devices of all processes.
 
         Raises:
-            ValueError: For no devices, or unless they are this process's own or as many of each process.
+            ValueError: If there are no devices, or if they are neither all of this process nor equally many of each
+                process.
         """
         all_devices = list(jax.devices() if devices is None else devices)
         if not all_devices:
@@ -109,7 +110,7 @@ class Devices(NamedTuple):
         by_process = [[d for d in all_devices if d.process_index == process] for process in range(jax.process_count())]
         counts = [len(devices) for devices in by_process if devices]
         if len(counts) not in (1, jax.process_count()) or len(set(counts)) != 1 or not by_process[this_process]:
-            raise ValueError("devices must be this process's own, or as many of each of all processes")
+            raise ValueError("devices must all be of this process, or equally many of each process")
         multiprocess = len(counts) > 1
         first = this_process * counts[0] if multiprocess else 0
         writes = this_process == 0 or not multiprocess
@@ -172,6 +173,7 @@ def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
 
 
 def _draw_tile(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array):
+    """Sample the friction of each push of a tile; `index` has the indices of the pushes, (tile,)."""
     root = jax.random.wrap_key_data(key, impl=impl)
     return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), surfaces, model, steps))(index)
 
@@ -179,6 +181,7 @@ def _draw_tile(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution,
 def _push_tile(
     resample_every: int | None, keep_trajectories: bool, draws, shared: tuple, paths: Array, poses: Array
 ) -> PushResults:
+    """Make the pushes of a tile; `paths` is (steps + 1, dof) for all of them or (tile, steps + 1, dof)."""
     axes = (0, None if paths.ndim == 2 else 0, 0)
 
     def push_once(draws, path, pose) -> PushResults:
@@ -188,6 +191,7 @@ def _push_tile(
 
 
 def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:
+    """Make one push, and keep of it what `PushResults` holds."""
     shape, hand, solver, table, fixtures = shared
     push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table, fixtures)
     mode = push.mode

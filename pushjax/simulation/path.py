@@ -68,7 +68,8 @@ def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Fl
     """
     _check_steps(steps)
     dtype = common_dtype(start, center, angle)
-    start_array, center_array, angle_array = (as_float(value, dtype) for value in (start, center, angle))
+    start_array, center_array = as_float(start, dtype, "start"), as_float(center, dtype, "center")
+    angle_array = as_float(angle, dtype, "angle")
     check_shape("start", start_array, ("dof",))
     if start_array.shape[0] < 2:
         raise ValueError(f"start must hold at least x and y; got shape {start_array.shape}")
@@ -99,7 +100,7 @@ def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Arra
         steps: Number of equal steps on each stretch between waypoints: one number for all stretches, or one for each.
 
     Returns:
-        The path, with one row more than it has steps.
+        The path, (sum of all steps + 1, dof).
 
     Raises:
         ValueError: For fewer than two waypoints, for fewer than one step on a stretch, for a wrong number of `steps`,
@@ -154,7 +155,7 @@ def interpolate_arc_length(path: Array, arc: Float[Array, "points"], at: Float[A
     Args:
         path: Points of the path, (points, dof).
         arc: Length from the first point to each point, as from `arc_length`.
-        at: Lengths at which the result is wanted.
+        at: Lengths at which the result is wanted. Beyond an end of the path, the result is that end.
     """
     return jnp.stack([jnp.interp(at, arc, column) for column in path.T], axis=1)
 

@@ -133,8 +133,8 @@ def random_rollout(
     """Push the slider along a path under friction sampled from `model` around the slider's surface.
 
     The result is differentiable as that of `rollout`, and also in the range of the model's friction and in its `dof`.
-    Derivatives in `dof` are correct in the mean over keys, not for a single key, whose sample jumps; with the sampler
-    "gram" they are correct except for its repairs.
+    Derivatives in `dof` are correct in the mean over keys. For a single key they are not, because its sample jumps.
+    With the sampler "gram", the mean leaves out how the shrinkage of repaired samples changes.
 
     Use `vmap` over keys for batches. For large batches `monte_carlo` is faster and shows progress.
 
@@ -154,6 +154,8 @@ def random_rollout(
 
     Raises:
         ValueError: As in `rollout` and `FrictionModel.around`.
+        TypeError: As in `rollout` and `FrictionModel.around`. Also for a key that is no array, or a model of another
+            type.
 
     Reference: Zhou et al. 2017, section V.
     """

@@ -71,8 +71,8 @@ def step(
     Args:
         slider: The slider.
         hand: The hand.
-        q0: Configuration of the hand before the step, (dof,), world, m.
-        q1: Configuration of the hand after the step, (dof,), world, m.
+        q0: Configuration of the hand before the step, (dof,), world, m and rad.
+        q1: Configuration of the hand after the step, (dof,), world, m and rad.
         pose: Pose of the slider before the step, (3,), world, m and rad.
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems, as in `rollout`.
@@ -122,6 +122,7 @@ def rollout(
     """Push the slider along a path of hand configurations.
 
     There is no state besides the slider's pose: a push continues with `rollout(..., rest_of_path, pose=push.pose[-1])`.
+    The exception is a failed last step: within one rollout, the step after a failed one is not divided.
 
     The result is differentiable, in forward and reverse mode, in slider, hand, path, pose, friction and table. Use
     `vmap` for batches.
@@ -129,8 +130,8 @@ def rollout(
     Args:
         slider: The slider.
         hand: The hand.
-        path: Configurations of the hand, (steps + 1, dof), world, m (`line`, `resample` or any recording). The size of
-            the steps sets the accuracy.
+        path: Configurations of the hand, (steps + 1, dof), world, m and rad (`line`, `resample` or any recording). The
+            size of the steps sets the accuracy.
         pose: Pose of the slider at the start, (3,), world, m and rad.
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems. The default suits every hand. Where several motions satisfy all contacts,
@@ -190,7 +191,7 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
 @partial(jax.jit, static_argnums=1)
 def _first_steps(push: Trajectory, steps: int) -> Trajectory:
     """The first steps of a push."""
-    extra = {"pose": 1, "configuration": 1}  # before the first step
+    extra = {"pose": 1, "configuration": 1}  # these have one row more than there are steps, the start
     return Trajectory(
         **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in Trajectory.__dataclass_fields__}
     )

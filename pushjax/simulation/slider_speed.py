@@ -40,7 +40,7 @@ def judge_speed(
     Args:
         before: Pose of the slider at the start, world.
         after: Its pose at the end.
-        displacement: Largest displacement of a finger, m.
+        displacement: Largest displacement of a finger in this part, m.
         length: Length of the limit surface, m. It makes angles distances.
         is_smallest: Whether the part cannot be divided any more.
     """

@@ -1,6 +1,6 @@
 """One step of all fingers, or a part of one, in scalars.
 
-A step has three phases (body frame, after the hand's displacement is rotated by the slider's angle):
+A step has three phases. They are computed in the slider's body frame, to which the motion of the hand is rotated.
 
 1. free motion: the hand travels until a finger meets the slider (exactly, see `detection`), and the rest of the step
    pushes;
@@ -9,9 +9,9 @@ A step has three phases (body frame, after the hand's displacement is rotated by
 
 This is the midpoint rule. It is of second order within a mode. With one finger it is of second order across changes of
 mode, too, because the motion is continuous. In the contact problem, predictor and corrector both use the gaps from the
-start of the step. So a second finger that arrives within the step has no separate event and is treated to first order
-only; an overlap is removed within one step; and position errors of the rule do not accumulate (the paper's open problem
-2: Zhou et al. 2017, section VII).
+start of the step. So an overlap is removed within one step, and position errors of the rule do not accumulate (open
+problem 2 of Zhou et al. 2017, section VII). A second finger that arrives within the step has no event of its own and is
+treated to first order only.
 
 The contact point of the slider moves in the world exactly as the contact problem says, and the rest of the slider turns
 about it. With several contacts this point is the mean of the contact points, weighted by normal force. So where a
@@ -117,8 +117,8 @@ class Stage(NamedTuple):
         still, nowhere = Vec3(zero, zero, zero), Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
         none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
         at_start = tuple((nowhere,) * n for n in counts)
-        no_status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
-        return Stage(still, Vec2(zero, zero), start.angle, no_status, at_start, none, no, urgency)
+        moving, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)  # MOVING is 0
+        return Stage(still, Vec2(zero, zero), start.angle, moving, at_start, none, no, urgency)
 
 
 class FingerContacts(NamedTuple):

@@ -50,7 +50,8 @@ from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 SMALLEST_PART = 1 / 256  # of a step
 JAM_PART = 1 / 16  # of a step that jams as a whole: size of the part that has to jam, too
 # A path of n steps has at most TRIALS_PER_STEP * n + EXTRA_TRIALS trials. The steps that are left after that are
-# NOT_CONVERGED. A grasp of a slider with many corners takes 1.1 trials per step.
+# NOT_CONVERGED, and the slider stays where the last accepted part left it. A grasp of a slider with many corners takes
+# 1.1 trials per step.
 TRIALS_PER_STEP, EXTRA_TRIALS = 4, 64
 MAX_SWAPS = 3  # changes of the working set before a part is divided
 # A contact that is not in the contact problem may be violated by this fraction of the allowed penetration.
@@ -74,8 +75,8 @@ class PushState(NamedTuple):
         stop_status: Status that stopped the hand, or zero.
         abandon_status: Status of a step that is given up, or zero.
         failed: Whether the previous step failed.
-        accepted_parts: One record of the parts of the step that are done: the sum of their twists, and otherwise what
-            the last of them in which the slider moved left.
+        accepted_parts: One record for the parts of the step that are done. Its twist is the sum of their twists, and
+            its pose and overlap are the present ones. The rest is that of the last part in which the slider moved.
     """
 
     pose: Vec3
@@ -95,7 +96,7 @@ class PushState(NamedTuple):
 
 
 class DividedPush(NamedTuple):
-    """A push in whose rounds parts of its steps are tried: what is the same in all of them.
+    """A push whose steps can be divided: everything that stays the same from trial to trial.
 
     Attributes:
         outline: The slider's outline.
@@ -318,7 +319,7 @@ def _next_state(
         part: Motion of each finger over the part of the step that was tried, and the fixtures.
         tolerance: How much deeper a finger may be after a whole step, m.
         speed: Whether the slider moved no farther than it may.
-        steps: Number of steps of the path.
+        steps: Number of steps to simulate.
     """
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)

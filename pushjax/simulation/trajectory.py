@@ -78,7 +78,7 @@ class Trajectory(eqx.Module):
             nothing pushes. Not differentiated.
         mode: `ContactMode` of each contact, (steps, contacts).
         status: `Status` of each step, (steps,).
-        overlap: Depth of the deepest finger in the slider after each step, (steps,), m. Not differentiated.
+        overlap: Depth of the deepest finger or fixture in the slider after each step, (steps,), m. Not differentiated.
     """
 
     pose: Float[Array, "steps+1 3"]

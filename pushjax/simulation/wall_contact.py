@@ -15,9 +15,10 @@ from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, FingerPose, take
 
-# Of candidates whose distances differ by less than this fraction of how far they are from the middle, the outermost
-# counts as the nearest. The second contact is at least this far from the first, in units of the surface's length.
-SAME_DISTANCE, SAME_PLACE = 1e-5, 1e-3
+# A candidate counts as nearer to the wall by this fraction of its distance along the wall from the middle of all
+# candidates. So of candidates that are equally near up to roundoff, the outermost is selected.
+SAME_DISTANCE = 1e-5
+SAME_PLACE = 1e-3  # least distance of the second contact from the first, in units of the surface's length
 
 
 def wall_candidates(outline: Outline, wall: FingerPose) -> Candidate:

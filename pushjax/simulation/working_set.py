@@ -16,7 +16,7 @@ from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.scaled_problem import ScalarSolution
 
-MAX_SOLVED = 4  # friction cone edges that balance each other, at most; each may belong to another contact
+MAX_SOLVED = 4  # a jam is proved by up to four cone edges that balance, which may belong to four contacts
 LOADED = 1e6  # m, urgency of a contact that carries a force: above that of any other
 
 # Urgency of having each contact in the set, m: by how much a solution without the contact violates it.
@@ -25,6 +25,8 @@ Urgency = Float[Array, " contacts"]
 
 def initial_urgency(counts: list[int], like: Scalar) -> Urgency | None:
     """The urgency before anything has been solved; None if all contacts are solved together.
+
+    Only the order of these numbers has a meaning: the first contacts of all fingers come first, then the second ones.
 
     Args:
         counts: Number of contacts of each finger and fixture. The contacts of a finger are sorted, the likeliest first.
