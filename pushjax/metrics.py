@@ -42,7 +42,7 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
         The distances, in m.
 
     Raises:
-        ValueError: If a pose has another shape, or `length` is not positive and finite.
+        ValueError: If a pose has another shape, the shapes do not broadcast, or `length` is not positive and finite.
 
     Examples:
         >>> print(f"{1e3 * deviation((0.003, 0.004, 0.0), (0.0, 0.0, 0.1), length=0.05):.1f} mm")
@@ -53,7 +53,8 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
     check_finite("length", length)
     check_positive("length", length)
     dtype = common_dtype(pose_a, pose_b, length)
-    a, b, scale = (as_float(value, dtype) for value in (pose_a, pose_b, length))
+    named = (("pose_a", pose_a), ("pose_b", pose_b), ("length", length))
+    a, b, scale = (as_float(value, dtype, name) for name, value in named)
     for name, pose in (("pose_a", a), ("pose_b", b)):
         if pose.ndim == 0 or pose.shape[-1] != 3:
             raise ValueError(f"{name} has shape {pose.shape}; expected (..., 3)")
@@ -298,7 +299,8 @@ def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array,
 def _checked(samples: ArrayLike, observed: ArrayLike, length: ArrayLike) -> tuple[Array, Array, Array]:
     """Return the arguments as arrays of one dtype, or raise ValueError."""
     dtype = common_dtype(samples, observed, length)
-    x, y, scale = (as_float(value, dtype) for value in (samples, observed, length))
+    named = (("samples", samples), ("observed", observed), ("length", length))
+    x, y, scale = (as_float(value, dtype, name) for name, value in named)
     if x.ndim != 2 or x.shape[1] != 3 or x.shape[0] < 2:
         raise ValueError(f"samples has shape {x.shape}; expected (n, 3), at least two")
     if y.ndim not in (1, 2) or y.shape[-1] != 3:

@@ -47,7 +47,9 @@ class CellCache:
         todo: Sequence[tuple[Labels, Callable[[], dict[str, Any]]]],
         progress: ProgressCallback = no_progress,
     ) -> list[dict[str, Any]]:
-        """Return the cells of a run: those with the labels that are known, and the others computed and saved.
+        """Return the cells of a run, and compute those that are not known.
+
+        A cell is known if there is one with its labels. The others are computed and saved.
 
         Args:
             todo: Labels of each cell, and the function that computes the rest of it.

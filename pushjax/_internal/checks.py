@@ -160,8 +160,9 @@ def checked_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
 
     Raises:
         ValueError: If the shape is different, a weight is negative or not finite, or all weights are zero.
+        TypeError: If the weights are not real numbers.
     """
-    value = as_float(np.ones(count) if weights is None else weights, dtype)
+    value = as_float(np.ones(count) if weights is None else weights, dtype, "weights")
     check_shape("weights", value, (count,))
     check_finite("weights", value)
     check_non_negative("weights", value)

@@ -25,7 +25,7 @@ OBJECTS_OF_A_TRACE = 50_000  # a call that has created at least this many Python
 FROZEN_AT_IMPORT = gc.get_freeze_count()  # objects that the interpreter itself has frozen
 
 
-# Later versions no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
+# JAX 0.11 and later no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
 HAS_FUSION_EMITTERS = jax.__version_info__ < (0, 11)
 # A program that is called by itself runs once or a few times, on one example, for milliseconds, so the user waits only
 # for its compilation. Level 0 is not an option: without fusion emitters, one solve in a hundred then does not converge.

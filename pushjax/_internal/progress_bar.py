@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-SILENCE, LONGEST_SILENCE = 10.0, 60.0  # s without a line in a pipe: at first, and after minutes of the same work
+# Without a terminal, a line is printed after so many s without one: at first, and after minutes of the same work.
+SILENCE, LONGEST_SILENCE = 10.0, 60.0
 
 
 class _Rate(ProgressColumn):
@@ -23,15 +24,16 @@ class _Rate(ProgressColumn):
 class Reporter:
     """Reports progress: a bar on a terminal, or lines on standard error without a terminal.
 
-    Call it with `(done, total)` to report how far the work has come. Without a terminal that is a line for every tenth
-    of the work, and a line after every ten seconds without one, later every minute.
+    Call it with `(done, total)` to report how far the work has come. Without a terminal, it prints a line for every
+    tenth of the work. It prints one too if the last line is ten seconds old, later a minute.
     """
 
     def __init__(self, bar: Progress):
         self.bar = bar
         self.task = bar.add_task("", total=None)
         self.words, self.done, self.total = "working", 0, 0
-        self.tenth, self.begin, self.time = 0, time.monotonic(), time.monotonic()  # of the words, and of the last line
+        # `begin` is when the present words were first shown, `time` when the last line was printed.
+        self.tenth, self.begin, self.time = 0, time.monotonic(), time.monotonic()
 
     def __call__(self, done: int, total: int) -> None:
         self.bar.update(self.task, completed=done, total=total)

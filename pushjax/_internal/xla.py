@@ -92,7 +92,7 @@ def structure_and_shapes(tree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
 
 
 def map_items(function: Callable, items: tuple) -> tuple:
-    """Return `(of(item), ...)` for all items, in a loop if they have the same structure, shapes and dtypes.
+    """Return `(function(item), ...)` for all items, in a loop if they have the same structure, shapes and dtypes.
 
     A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
     Compilation takes most of the time of a first call.
@@ -101,7 +101,6 @@ def map_items(function: Callable, items: tuple) -> tuple:
         function: Function of one item.
         items: Pytrees of arrays.
     """
-
     if len(items) == 1 or len({structure_and_shapes(item) for item in items}) > 1:
         return tuple(function(item) for item in items)
     stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))

@@ -32,7 +32,7 @@ class Symmetric3(NamedTuple):
         )
 
     def solve(self, v: Vec3) -> Vec3:
-        """Return u with self u = v, by the adjugate; zero where the matrix is singular up to roundoff."""
+        """Return u with self u = v, by the adjugate; zero where |det| <= eps^2 |trace|^3."""
         axx = self.yy * self.zz - self.yz * self.yz
         axy = self.xz * self.yz - self.xy * self.zz
         axz = self.xy * self.yz - self.xz * self.yy

@@ -40,7 +40,7 @@ def bracketed_root(
         iterations: Number of iterations.
 
     Returns:
-        The last point. Reverse mode cannot differentiate it.
+        The last point. Its derivatives would be those of the iterations; callers stop them with `stop_gradient`.
     """
 
     def iterate(_, carry):

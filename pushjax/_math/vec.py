@@ -134,5 +134,5 @@ def wrap_to_pi(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
 def norm(vector: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     """Return the Euclidean norm along the last axis. Its derivative at the zero vector is zero."""
     squared = jnp.sum(vector**2, axis=-1)
-    moves = squared > 0
-    return jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
+    nonzero = squared > 0
+    return jnp.where(nonzero, jnp.sqrt(jnp.where(nonzero, squared, 1.0)), 0.0)

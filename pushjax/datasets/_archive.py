@@ -77,7 +77,8 @@ def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -
     count = len(data["push_index"]) if data["push_index"].ndim else -1
     for name, row_shape in shapes.items():
         if data[name].shape != (count, *row_shape):
-            raise LogError(path, f"expected {name} of shape (n, *{row_shape}) for n pushes, found {data[name].shape}")
+            wanted = ", ".join(map(str, ("n", *row_shape)))
+            raise LogError(path, f"expected {name} of shape ({wanted}) for n pushes, found {data[name].shape}")
     return count
 
 

@@ -45,8 +45,8 @@ def fetch_triangle(to: str | PathLike[str] | None = None, *, progress: ProgressC
     """Fetch the logs of the triangle, pushed by one finger and by two: 118 files, 34 MB.
 
     Args:
-        to: Folder in which `three_point_push` and `two_finger_push` are created. Default: the one in which `find_data`
-            looks if no environment variable names another.
+        to: Folder in which `three_point_push` and `two_finger_push` are created. Default: a folder for the user's data.
+            `find_data` looks there, unless PUSHJAX_DATA names another folder.
         progress: Called with the number of bytes that are there and their total.
 
     Returns:

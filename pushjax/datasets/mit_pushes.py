@@ -196,7 +196,7 @@ def _check_finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
 def wrap_to_pi(angle: Floats) -> Floats:
     """Wrap angles, in rad, to [-pi, pi).
 
-    `pushes.wrap_angle` wraps to (-pi, pi] and rounds differently. Both are kept, because the poses that are read from
+    `push_log.wrap_angle` wraps to (-pi, pi] and rounds differently. Both are kept, because the poses that are read from
     the two data sets would otherwise change in their last bits.
     """
     return (angle + np.pi) % (2 * np.pi) - np.pi

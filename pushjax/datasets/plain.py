@@ -17,7 +17,7 @@ from pushjax.datasets.push_log import Floats, LogError
 from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, checked_recording, collect
 from pushjax.datasets.records import ParseError, quoted
 
-# Columns of a table: all of _REQUIRED, and each group of _OPTIONAL_GROUPS either as a whole or not at all.
+# Columns of a table: all of _REQUIRED, and any groups of _OPTIONAL_GROUPS, each as a whole.
 _PUSH = "push"
 _REQUIRED = (_PUSH, *HAND[:2], *OBJECT)
 _OPTIONAL_GROUPS = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)

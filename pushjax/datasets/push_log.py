@@ -64,7 +64,7 @@ class LogError(ValueError):
 
 
 def _rebuild_error(path: str, message: str, push: int | None, line: int | None) -> LogError:
-    """Rebuild an unpickled error."""
+    """Rebuild a pickled error."""
     return LogError(path, message, push=push, line=line)
 
 

@@ -272,7 +272,7 @@ def _find_next_record(lines: list[str], start: int, fault_at: int) -> int:
 
     Args:
         lines: Lines of the log.
-        candidate: Line index at which the damaged record starts.
+        start: Line index at which the damaged record starts.
         fault_at: Line index of the fault.
 
     Returns:

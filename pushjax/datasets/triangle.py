@@ -65,7 +65,8 @@ def load_triangle_log(
         The usable pushes, and the problems of the others.
 
     Raises:
-        LogError: If no push is usable, or if the file is missing, empty or no such log.
+        LogError: If no push is usable, or if the file is missing, empty or no such log. With `strict`, for the first
+            problem.
         ValueError: If `arrangement` is unknown, or if the support points cannot carry the object.
 
     Reference: Layout and processing are as in the toolbox of Zhou et al. 2017. The rule for jumps is our own.

@@ -38,7 +38,7 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
 
     The order of the rows is kept, and `Push.index` is the `push_index` of the row. A row becomes a problem if it is
     marked invalid or has numbers that are not finite. The constants at the top of this file list the arrays that are
-    read, and their shapes.
+    read.
 
     Args:
         path: The file.

@@ -120,8 +120,8 @@ def stick_deviation(
 ) -> Floats:
     """Return the motion of the object relative to the hand from start to end.
 
-    It is the length of the translation plus `length` times the angle of the rotation.
-    It is zero if both moved as one body. Closing an initial gap between hand and object counts as relative motion too.
+    It is the length of the translation plus `length` times the angle of the rotation. It is zero if both moved as one
+    body. Closing an initial gap between hand and object counts as relative motion too.
 
     Args:
         hand_start: (..., 3) poses of the hand before the push, in m and rad, world frame.

@@ -65,7 +65,7 @@ class PairDraws(NamedTuple):
 
 
 def draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> PairDraws:
-    """Draw what is random about `pairs` pairs of support points with these friction limits."""
+    """Draw what is random about `pairs` wrench-twist pairs, given the support points and their friction limits."""
     return (_draw_alone if outside_trace() else _draw)(key, point, limit, pairs)
 
 

@@ -9,11 +9,11 @@ where a is the vector of the coefficients of the monomials of H. H and its gradi
 convex quadratic a'Qa - 2b'a + c in few coefficients, once it is known which s_i are not clipped. The pairs enter only
 through Q and b. A few rounds of minimization find which s_i are clipped.
 
-H is convex by construction: H(F) = sum_k (F' L_k L_k' F)^(d/2). For the ellipsoid one term represents every ellipsoid,
-with a small multiple of F'F added, so that its limit is finite in every direction whatever the pairs.
-For the quartic there are five terms. With these the loss came within 0.4 % of the optimum over all sos-convex quartics
-(a semidefinite program) on every set of pairs tried, and for most sets it agreed to all digits. The minimization is
-unconstrained and uses gradients, so fits can be batched; the semidefinite program cannot.
+H is convex by construction: H(F) = sum_k (F' L_k L_k' F)^(d/2). For the ellipsoid there is one term, to which a small
+multiple of F'F is added, so that the limit is finite in every direction, whatever the pairs. For the quartic there are
+five terms. With these the loss came within 0.4 % of the optimum over all sos-convex quartics (a semidefinite program)
+on every set of pairs tried, and for most sets it agreed to all digits. The minimization is unconstrained and uses
+gradients, so fits can be batched; the semidefinite program cannot.
 
 Reference: Zhou et al. 2016, for the terms of the loss.
 """

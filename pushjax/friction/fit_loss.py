@@ -18,7 +18,8 @@ MAX_STEPS = 500  # of the optimizer, in each round
 # stays large for hundreds of steps that lower the loss by less than 1e-8.
 GRADIENT_TOLERANCE, LARGEST_DECREASE = 1e-9, 1e-10
 
-# Of an ellipsoid, in units of the mean wrench: so its limit is finite in every direction, at most 100 mean wrenches.
+# Least eigenvalue of an ellipsoid's A, for wrenches in units of their mean norm. With it, the limit in any direction is
+# at most 100 times the mean wrench.
 LEAST_EIGENVALUE = 1e-4
 
 # Exponents of (x, y, z) = (fx, fy, tau / length), in the order of the coefficients of an ellipsoid's H.
@@ -55,15 +56,13 @@ class Quadratic(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs in the basis of monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a.
+    """Pairs in the basis of the m monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a.
 
     Attributes:
         value: The monomials at each F_i, shape (pairs, m).
         gradient: Their gradients, shape (3, pairs, m).
         twist: Unit twists V_i, shape (3, pairs).
         share: Weights of the pairs, shape (pairs,). They sum to one.
-
-    The number of monomials is m.
     """
 
     value: Float[Array, "pairs m"]
@@ -136,8 +135,8 @@ def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimu
     """Minimize the loss over the factors of the terms, by BFGS.
 
     The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
-    needs a factorization, and it slows down where the optimum lies on the border of convexity. With NumPy nothing is
-    compiled, which takes longer than the minimization.
+    needs a factorization, and it slows down where the optimum lies on the border of convexity. NumPy saves the
+    compilation, which takes longer than the minimization.
     """
 
     def objective(parameters):

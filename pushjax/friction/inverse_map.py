@@ -59,6 +59,7 @@ def aligned_wrench(form: Form, twist: Vec3, wanted: Bool[Array, ""], tolerance: 
         c1, c2, c3, c4, power_slope = compute_once((c1, c2, c3, c4, step.dot(unit_twist)), squared)
 
         def merit(t: float) -> Scalar:
+            """Return (V . F)^4 / H, the fourth power of the merit; only surfaces of degree four are searched."""
             p = power + t * power_slope
             value = h + t * (c1 + t * (c2 + t * (c3 + t * c4)))
             return jnp.where((value > 0) & (p > 0), (p * p) * (p * p) / jnp.where(value > 0, value, 1.0), 0.0)

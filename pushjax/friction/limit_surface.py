@@ -128,6 +128,9 @@ class LimitSurface(eqx.Module):
 
         Returns:
             H, a scalar.
+
+        Raises:
+            ValueError: If the wrench has another shape, or is known and not finite.
         """
         return self.form().value(self._normalized_wrench(wrench))
 
@@ -139,6 +142,9 @@ class LimitSurface(eqx.Module):
 
         Returns:
             Twist (vx, vy, omega), shape (3,). Its norm has no meaning. Zero for a zero wrench.
+
+        Raises:
+            ValueError: If the wrench has another shape, or is known and not finite.
         """
         g = self.form().gradient(self._normalized_wrench(wrench))
         return jnp.stack([g.x, g.y, g.z / self.length])
@@ -151,6 +157,9 @@ class LimitSurface(eqx.Module):
 
         Returns:
             Hessian, shape (3, 3). It is positive semi-definite if the surface is convex.
+
+        Raises:
+            ValueError: If the wrench has another shape, or is known and not finite.
         """
         scale = jnp.stack([jnp.ones_like(self.length), jnp.ones_like(self.length), 1 / self.length])
         return self.form().hessian(self._normalized_wrench(wrench)).array() * (scale[:, None] * scale[None])
@@ -179,6 +188,9 @@ class LimitSurface(eqx.Module):
 
         Returns:
             The scaled wrench, shape (3,). A zero wrench stays zero.
+
+        Raises:
+            ValueError: If the wrench has another shape, or is known and not finite.
         """
         w = as_float(wrench, self.length.dtype, "wrench")
         check_shape("wrench", w, (3,))
@@ -210,6 +222,7 @@ class LimitSurface(eqx.Module):
 
         Raises:
             ValueError: If the file does not contain a surface of this class.
+            OSError: If the file cannot be read.
         """
         surface = load_json(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface_from_record)
         if not isinstance(surface, cls):

@@ -15,7 +15,7 @@ from pushjax._internal.autodiff import without_derivatives
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax.friction.quartic import MONOMIALS
 
-# With this many terms, a fit reaches the optimum over all convex quartics. `pushjax.friction.fit` says how closely.
+# With this many terms, a fit is close to the optimum over all convex quartics. `pushjax.friction.fit` says how close.
 TERMS = 5
 MAX_STEPS = 100  # of the Levenberg-Marquardt method
 _LOWER_INDICES = np.tril_indices(3)

@@ -155,9 +155,9 @@ class Support(eqx.Module):
         """Represent uniform pressure over a shape by one support point for each cell of a grid.
 
         The cells are nearly square. The load of a cell is in proportion to the area of its part inside the outline, and
-        the support point is the center of that part. The spacing is chosen such that the number of cells is as close to
-        `points` as possible. A rectangle gets exactly `points` if it can be divided into that many squares. For
-        example, a square with 64 points gets 8 by 8.
+        the support point is the center of that part. Of several spacings, the one whose number of cells is closest to
+        `points` is taken. A rectangle gets exactly `points` if it can be divided into that many squares. For example, a
+        square with 64 points gets 8 by 8.
 
         Args:
             shape: Shape of the slider's base. It must not be traced.

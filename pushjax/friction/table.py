@@ -116,6 +116,7 @@ class Table(eqx.Module):
 
     Raises:
         ValueError: If an array has the wrong shape or is not finite.
+        TypeError: If an array does not consist of real numbers.
 
     Reference: Extends Zhou et al. 2017, where the table is uniform.
     """
@@ -135,7 +136,7 @@ class Table(eqx.Module):
         given = {"anisotropy": anisotropy, "log_gradient": log_gradient, "log_hessian": log_hessian, "origin": origin}
         dtype = common_dtype(*given.values())
         for name, value in given.items():
-            array = as_float(value, dtype)
+            array = as_float(value, dtype, name)
             check_shape(name, array, (SIZES[name],))
             check_finite(name, array)
             setattr(self, name, array)

@@ -32,12 +32,13 @@ class Curve(Shape):
     Args:
         control: Control points, shape (controls, 2), m, at least four, in either orientation. The first point is not
             repeated at the end.
-        convex: Whether a finger touches the curve in one place only. None: determined from the control points; if they
-            are traced, convexity is not assumed.
+        convex: Whether the curve is convex, so that a finger touches it in one place only. None: determined from the
+            control points; if they are traced, convexity is not assumed.
 
     Raises:
-        ValueError: If there are fewer than four control points, or NaN or repeated points among them; if the curve
-            crosses itself, encloses no area or has a cusp; or if it is not convex although `convex` is True.
+        ValueError: If there are fewer than four control points; if one of them is not finite, or coincides with the
+            next one; if the curve crosses itself, encloses no area or has a cusp; or if it is not convex although
+            `convex` is True.
     """
 
     control: Float[Array, "controls 2"]
@@ -182,7 +183,11 @@ def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array
 
 
 def _checked_points(name: str, points: ArrayLike) -> Array:
-    """Return the argument `name` as an array; raise unless it holds at least four finite, distinct points."""
+    """Return the argument `name` as an array.
+
+    Raises:
+        ValueError: Unless it holds at least four finite points, each of which differs from the next.
+    """
     array = as_float(points, name=name)
     check_shape(name, array, (name, 2))
     if len(array) < 4:
@@ -207,8 +212,8 @@ _BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) 
 def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return points and first and second derivatives of a known curve, each of shape (parameters, 2).
 
-    This repeats `spline_segments` and `SplineSegment.evaluate` in NumPy, to compute in float64 whatever precision JAX
-    runs in.
+    The parameters, shape (parameters,), are counted in segments. This repeats `spline_segments` and
+    `SplineSegment.evaluate` in NumPy, to compute in float64 whatever precision JAX runs in.
     """
     index = np.floor(parameter).astype(int)
     t = (parameter - index)[:, None]
@@ -237,7 +242,11 @@ def _checked_signed_area(control: np.ndarray) -> float:
 
 
 def _is_convex(control: Array, claimed: bool | None) -> bool:
-    """Return whether the curve turns inward nowhere, up to roundoff; if traced, return `claimed`."""
+    """Return whether the curve turns inward at none of 32 points per segment, up to roundoff; if traced, `claimed`.
+
+    Raises:
+        ValueError: If it does, although `claimed` is True.
+    """
     known = concrete(control)
     if known is None:
         return bool(claimed)
@@ -256,7 +265,10 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     convex = bool(curvature.min() >= -tolerance)
     if claimed and not convex:
         near = int(np.argmin(curvature)) // 32
-        raise ValueError(f"convex is True, but the curve is not: it turns inward near control point {near}")
+        raise ValueError(
+            f"convex is True, but the curve is not: it turns inward near control point {near}, "
+            "counted counterclockwise from 0"
+        )
     return convex if claimed is None else bool(claimed)
 
 

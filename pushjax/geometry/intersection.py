@@ -111,13 +111,14 @@ def _pair_areas(a: _Edges, b: _Edges) -> Array:
     at_low = a.at_left(low) - b.at_left(low)
     at_high = a.at_right(high) - b.at_right(high)
     below = jnp.minimum(at_low, 0) + jnp.minimum(at_high, 0)
-    # |d| is written as d - 2 min(d, 0), whose derivative at d = 0 matches that of `below`: the quotient's has no jump.
+    # |d| is written as d - 2 min(d, 0). Its derivative at d = 0 matches that of `below`, so that of the quotient does
+    # not jump.
     share = _safe_divide(below, at_low + at_high - 2 * below)
     return -0.5 * a.sign * b.sign * width * below * share
 
 
 def _safe_divide(numerator: Array, denominator: Array) -> Array:
     """Return numerator / denominator, and zero where the denominator, a length, vanishes."""
-    # The square of a smaller length, by which a derivative divides, would overflow.
+    # Derivatives divide by the square of the denominator, second ones by its cube, which must not underflow.
     nonzero = denominator > jnp.cbrt(jnp.finfo(denominator.dtype).tiny)
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)

@@ -34,8 +34,9 @@ class Polygon(Shape):
     Args:
         vertices: Vertices, shape (vertices, 2), m, at least three, in either orientation. The first vertex is not
             repeated at the end.
-        convex: Whether a finger touches the polygon in one place only. None: determined from the vertices; if they are
-            traced, convexity is not assumed. False for a convex polygon costs time but does not change results.
+        convex: Whether the polygon is convex, so that a finger touches it in one place only. None: determined from the
+            vertices; if they are traced, convexity is not assumed. False for a convex polygon costs time but does not
+            change results.
 
     Raises:
         ValueError: If there are fewer than three vertices, or NaN or repeated vertices among them; if edges cross; if
@@ -136,16 +137,20 @@ class Polygon(Shape):
 
         Args:
             depth: Distance by which each edge moves inward, m; negative moves it outward. It must be small enough
-                that no edge vanishes.
+                that no edge vanishes. This is checked only in part: too deep an inset of a rectangle or a triangle is
+                a valid polygon again.
 
         Returns:
             The polygon between the moved edges.
+
+        Raises:
+            ValueError: If the moved edges cross, or if the polygon between them is not convex although this one is.
         """
         distance = as_float(depth, self.vertices.dtype, "depth")
         edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
         normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
         previous_normal = jnp.roll(normal, 1, axis=0)
-        # A corner's shift s satisfies n . s = -depth for the normals n of both of its edges.
+        # The shift of a corner for an outward distance of one: n . corner_shift = 1 for the normals n of both edges.
         corner_shift = (previous_normal + normal) / (1 + jnp.sum(previous_normal * normal, axis=1, keepdims=True))
         return Polygon(self.vertices - distance * corner_shift, convex=self.convex)
 
@@ -217,5 +222,8 @@ def _is_convex(vertices: Array, claimed: bool | None) -> bool:
     innermost = int(np.argmin(bulge))
     convex = bool(bulge[innermost] >= -16 * float(jnp.finfo(vertices.dtype).eps) * np.max(np.abs(points)))
     if claimed and not convex:
-        raise ValueError(f"convex is True, but the vertices are not: vertex {innermost} is a reflex corner")
+        raise ValueError(
+            f"convex is True, but the vertices are not: vertex {innermost}, counted counterclockwise from 0, "
+            "is a reflex corner"
+        )
     return convex if claimed is None else bool(claimed)

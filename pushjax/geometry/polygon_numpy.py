@@ -103,7 +103,7 @@ def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCur
 
     Args:
         vertices: Vertices, counterclockwise, (vertices, 2), m.
-        distance: The distance, m.
+        distance: The distance, m, positive.
         count: Number of points on the curve made of shifted edges and of arcs around convex corners. Parts of it that
             are nearer to another edge are left out, so there are fewer points where the polygon has reflex corners.
 

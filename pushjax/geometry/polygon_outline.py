@@ -60,7 +60,7 @@ class Edge(NamedTuple):
         return Vec2(self.along_y, -self.along_x)
 
     def foot(self, x: Vec2) -> tuple[Scalar, Scalar, Vec2]:
-        """Project a point on the edge.
+        """Project a point onto the edge.
 
         Args:
             x: Query point, m, body frame.
@@ -195,8 +195,9 @@ def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
     """Return the signed distance, closest point and normal for the query point `x`, from its nearest edge alone.
 
     If `x` projects onto the interior of the edge, the signed distance is linear in `x`, and its sign is right inside
-    and outside. If a vertex is the closest point, the sign is that of the component along the bisector: outside a
-    convex vertex, inside a reflex one. This sign stays right for vertices that are almost straight.
+    and outside. If a vertex is the closest point, the sign is that of the component along the bisector: positive at a
+    convex vertex, because `x` is then outside, and negative at a reflex one. This sign stays right for vertices that
+    are almost straight.
     """
     position, clipped, from_edge = compute_once(edge.foot(x), x.x)
     projects_inside = (position > 0) & (position < edge.length)

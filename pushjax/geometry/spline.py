@@ -1,4 +1,4 @@
-"""Outline of a closed cubic spline: closest points, second contacts, and support points.
+"""Outline of a closed cubic spline: closest points, second contacts, and points with a given normal.
 
 The query point is x, and p(u) is the outline's point at the parameter u. The function phi(u) = |x - p(u)|^2 / 2 and its
 derivative are evaluated at `SAMPLES` nodes per segment. Between two nodes, the cubic through their values and

@@ -5,10 +5,10 @@ normal n. So g(u) = cross(path, p + r n - x) = 0. The first contact is the root 
 the disk's center is at most r from the outline.
 
 The derivative is g' = cross(path, p') (1 + r kappa), where kappa is the curvature, negative in a hollow (a concave part
-of the outline). The derivative changes sign at two kinds of places only. The first are those
-where the outline is parallel to the path; a quadratic per segment gives them exactly. The second are those where the
-disk has the same curvature as the hollow it is in; they do not depend on the path. Between these places g is monotone.
-So the values of g at these places decide whether there is a root, and no contact is missed.
+of the outline). The derivative changes sign at two kinds of places only. At the first, the outline is parallel to the
+path; a quadratic per segment gives these places exactly. At the second, the disk has the same curvature as the hollow
+it is in. These places do not depend on the path, and are found with a grid of `HOLLOW_SAMPLES` intervals per segment.
+Between all these places g is monotone. So the values of g at them decide whether there is a root.
 """
 
 from itertools import pairwise
@@ -28,7 +28,8 @@ SWEEP_ITERATIONS = 10
 # How many of the places where the disk enters the outline on the line of the path are solved for, nearest first. More
 # than one is needed because their order is known only approximately beforehand.
 MAX_ENTRIES = 3
-# Intervals per segment; at their ends it is checked whether the disk fits into the curvature of the hollow.
+# Intervals per segment; at their ends it is checked whether the disk fits into the curvature of the hollow. A place
+# that is too tight only between two ends is not seen.
 HOLLOW_SAMPLES = 16
 
 
@@ -193,8 +194,9 @@ def _monotone_intervals(
 def _free_intervals(segments: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
     """Return the first and last interval of each segment that a disk can touch from outside.
 
-    These are the intervals in which the disk fits into the curvature. Each interval is a tuple of arrays of its start
-    and its end, as segment parameters. If a segment has no such interval, its ends are equal.
+    These are the intervals in which the disk fits into the curvature. A third one between these two is left out. Each
+    interval is a tuple of arrays of its start and its end, as segment parameters. If a segment has no such interval,
+    its ends are equal.
     """
     zero = jnp.zeros_like(segments.c0.x)
     if convex:

@@ -69,7 +69,7 @@ def animate(
 
     Raises:
         ValueError: If there is no push, if there are fewer than two frames, if a name in `measured` is that of no push,
-            or if a trajectory is of a hand with another number of contacts.
+            or if a push has another number of configurations than of poses.
     """
     by_name = dict(pushes) if isinstance(pushes, Mapping) else {"": pushes}
     measured_by_name = dict(measured or {})
@@ -172,7 +172,7 @@ class _Panel:
     Args:
         axes: Axes to draw into.
         track: The push as it is drawn.
-        largest: Largest force of all panels, N, which sets the scale of the arrows.
+        largest_force: Largest force of all panels, N, which sets the scale of the arrows.
     """
 
     def __init__(self, axes: Axes, track: DrawnPush, largest_force: float):

@@ -16,8 +16,8 @@ from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 from pushjax.simulation.hand import Hand
 
 QUANTILES = (0.025, 0.5, 0.975)
-MOST_LINES = 200
-CELL = 1.0  # mm
+MOST_LINES = 200  # largest number of paths that are drawn as lines
+CELL = 1.0  # mm, side of the cells in which paths are counted
 Density = tuple[tuple[np.ndarray, np.ndarray], np.ndarray]  # ((n, n) of x, (n, n) of y), m; density (n, n), 1/mm²
 
 

@@ -17,8 +17,9 @@ from pushjax.plot.parts import vertices
 from pushjax.simulation.hand import Hand, Pad
 from pushjax.simulation.trajectory import Trajectory
 
-TOUCH = 1e-3  # gap of a contact, in units of the slider's size, beside what the hand still moved in its last step
-BALANCE = 1e-3  # resultant, relative to the normal forces, with which forces count as balanced
+# Largest gap of a contact, in units of the slider's size. The motion of the hand in its last step is added to it.
+TOUCH = 1e-3
+BALANCE = 1e-3  # largest resultant of forces that count as balanced, relative to the normal forces
 SQUEEZE_LABEL = "forces that hold it, per unit of squeeze"
 STIFF = 1e4  # weight of the equations in the search for the most even forces
 
@@ -50,11 +51,11 @@ def squeeze_forces(shape: Shape, hand: Hand, grasp: Trajectory, friction: float)
         return None
     before, after = (_as_poses(hand.poses(grasp.configuration[k])) for k in (moved[-1], moved[-1] + 1))
     point, normal, motion = _contacts(shape, hand, np.asarray(grasp.pose[-1], float), before, after)
-    alpha = _balanced(point, normal, motion, friction)
-    if alpha is None:
+    edge_weights = _balanced(point, normal, motion, friction)
+    if edge_weights is None:
         return None
     tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-    left, right = alpha.T[..., None]
+    left, right = edge_weights.T[..., None]
     return SqueezeForces(point, (left + right) * normal + friction * (left - right) * tangent)
 
 

@@ -50,8 +50,8 @@ def panel_row(panels: int, width: float, height: float, shared: bool = False) ->
 
     Args:
         panels: Number of panels.
-        width: Width of each panel, in.
-        height: Height of each panel, in.
+        width: Width of each panel, inches.
+        height: Height of each panel, inches.
         shared: Whether the panels show the same range.
     """
     figure, axes = plt.subplots(

@@ -14,7 +14,7 @@ def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
         cells: Each with `surface`, `object`, `model` ("quartic" or "ellipsoid"), `mean_mm`, `ci95_bootstrap_mm` and
             `paper_mm` (or None). A cell with `mean_mm` None has the reason as `missing`, which is written in its place.
         title: Title of the picture.
-        width: Width of the figure, in.
+        width: Width of the figure, inches.
     """
     with plt.rc_context(STYLE):
         conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))

@@ -152,7 +152,10 @@ def _describe_step(status: int, modes: np.ndarray) -> str:
 
 
 def _plain_name(member: ContactMode | Status) -> str:
-    """Return the name of a mode or status in lower case, with spaces; a grasp may be flat or wedged, so it is held."""
+    """Return the name of a mode or status in lower case, with spaces.
+
+    GRASPED is "held by every finger", because the slider may be held flat or wedged.
+    """
     if member is Status.GRASPED:
         return "held by every finger"
     return member.name.lower().replace("_", " ")

@@ -103,9 +103,8 @@ def random_surface(
         raise ValueError(f"degree must be 2 or 4; got {degree}")
     factors = jax.random.normal(k_shape, (5, 3, 3))
     is_rank_one = jax.random.bernoulli(k_rank, 0.5, (5,))
-    kept = (
-        ~is_rank_one[:, None, None] | (jnp.arange(3) == 0)[None, None, :]
-    )  # a thin factor keeps its first column: rank one
+    # A factor of rank one keeps its first column only.
+    kept = ~is_rank_one[:, None, None] | (jnp.arange(3) == 0)[None, None, :]
     factors = jnp.where(kept, factors, 0.0)
     weights = jax.random.exponential(k_scale, (5,))
     c = squared_quadratics(jnp.sqrt(weights)[:, None, None] * factors @ jnp.swapaxes(factors, 1, 2))
@@ -256,9 +255,8 @@ def _random_points_and_normals(uniform: _Numbers, mu: Array, contacts: int | Arr
     middle = 0.04 * shared[None, :2] - 0.02
     axes = 0.02 + 0.06 * shared[None, 2:4]
     ahead = _unit_vector(2 * jnp.pi * shared[4:5])
-    axes_directions = jnp.concatenate(
-        [ahead, _perpendicular(ahead)]
-    )  # (a, b) @ turned: a along `ahead`, b orthogonal to it
+    # (a, b) @ axes_directions is a along `ahead` and b orthogonal to it.
+    axes_directions = jnp.concatenate([ahead, _perpendicular(ahead)])
 
     on_circle = _unit_vector(2 * jnp.pi * phase)
     on_ellipse = middle + (on_circle * axes) @ axes_directions
