@@ -50,11 +50,11 @@ def deviation(pose_a: ArrayLike, pose_b: ArrayLike, length: ArrayLike) -> Float[
 
     Reference: Zhou et al. 2017, section VI.A.
     """
-    check_finite("length", length)
-    check_positive("length", length)
     dtype = common_dtype(pose_a, pose_b, length)
     named = (("pose_a", pose_a), ("pose_b", pose_b), ("length", length))
     a, b, scale = (as_float(value, dtype, name) for name, value in named)
+    check_finite("length", scale)
+    check_positive("length", scale)
     for name, pose in (("pose_a", a), ("pose_b", b)):
         if pose.ndim == 0 or pose.shape[-1] != 3:
             raise ValueError(f"{name} has shape {pose.shape}; expected (..., 3)")

@@ -162,6 +162,9 @@ def _fetch(command: Data) -> None:
         progress.say("fetching 118 files of 34 MB, without those that are there already")
         folder = fetch_triangle(command.to, progress=progress)
     print(f"the logs are in {folder}")
+    elsewhere = os.environ.get("PUSHJAX_DATA")
+    if elsewhere and Path(elsewhere).resolve() != folder.resolve():
+        print(f"PUSHJAX_DATA names another folder, {elsewhere}: use these with --data {folder}")
 
 
 def data_folder(given: Path | None) -> Path:

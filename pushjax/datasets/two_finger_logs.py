@@ -75,14 +75,19 @@ def load_two_finger_logs(folder: str | PathLike[str]) -> TwoFingerLog:
     problems: list[LogError] = []
     actions: list[Action] = []
     for sensor in sensors:
-        planned = _read_actions(sensor.with_name(sensor.name.replace("_sensor", "_pushaction")))
-        for record, action in zip(read_records(sensor), planned, strict=False):
-            found = record if isinstance(record, LogError) else _convert_push(sensor, record, action)
-            if isinstance(found, LogError):
-                problems.append(found)
-            else:
-                rows.append(found)
-                actions.append(action)
+        planned = list(_read_actions(sensor.with_name(sensor.name.replace("_sensor", "_pushaction"))))
+        for record in read_records(sensor):
+            if isinstance(record, LogError):  # of a push, or of the whole file
+                if record.push is None or record.push < len(planned):
+                    problems.append(record)
+            elif record.index < len(planned):
+                action = planned[record.index]
+                found = _convert_push(sensor, record, action)
+                if isinstance(found, LogError):
+                    problems.append(found)
+                else:
+                    rows.append(found)
+                    actions.append(action)
     if not rows:
         raise nothing_usable(path, problems)
     order = np.argsort([row["time"] for row in rows])

@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._internal.checks import (
     ArrayLike,
     as_float,
+    check_count,
     check_finite,
     check_positive,
     check_shape,
@@ -155,12 +156,11 @@ def fit_limit_surface(  # pyright: ignore[reportInconsistentOverload]
     check_shape("wrench", wrenches, ("pairs", 3))
     pair_weights = checked_weights(weights, wrenches.shape[0], dtype)
     _check_arguments(wrenches, twists, characteristic_length, pair_weights, degree)
-    for name, value in (("value_weight", value_weight), ("ridge", ridge)):
+    factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
+    for name, value in zip(("value_weight", "ridge"), factors, strict=True):
         check_finite(name, value)
         check_positive(name, value)
-    if terms < 1:
-        raise ValueError(f"terms must be at least 1; got {terms}")
-    factors = as_float(value_weight, dtype, "value_weight"), as_float(ridge, dtype, "ridge")
+    check_count("terms", terms)
     arrays = [wrenches, twists, characteristic_length, pair_weights, *factors]
     fit = _fit_in_jax if traced(arrays) else _fit_in_numpy
     coefficients, fit_report = fit(*arrays, degree=degree, terms=terms if degree == 4 else 1)

@@ -251,7 +251,11 @@ class LimitSurface(eqx.Module):
 
 def _surface_from_record(record: dict[str, Any], dtype: Any) -> LimitSurface:
     """Return the limit surface that the record of a JSON file describes."""
-    kinds = {kind.__name__.lower(): kind for kind in LimitSurface.__subclasses__()}
+    # imported here because they import this module; a user who loads a surface may not have imported them
+    from pushjax.friction.ellipsoid import Ellipsoid
+    from pushjax.friction.quartic import Quartic
+
+    kinds = {kind.__name__.lower(): kind for kind in (Ellipsoid, Quartic)}
     if record["kind"] not in kinds:
         raise ValueError(f"{record['kind']!r} is no kind of surface; there are {', '.join(sorted(kinds))}")
     kind: Any = kinds[record["kind"]]
@@ -275,7 +279,9 @@ def angle_between(a: Vec3, b: Vec3, xp: Any = jnp) -> Scalar:
         b: The other.
         xp: numpy or jax.numpy.
     """
-    return xp.arctan2(norm(a.cross(b), xp), a.dot(b))
+    sine, cosine = norm(a.cross(b), xp), a.dot(b)
+    # arctan2(0, 0) is zero, but its derivative is NaN
+    return xp.arctan2(sine, xp.where((sine == 0) & (cosine == 0), 1.0, cosine))
 
 
 def angle_tolerance(angle: Scalar) -> float:

@@ -273,8 +273,7 @@ class Support(eqx.Module):
         Raises:
             ValueError: If `pairs` is less than one, or the length is not positive.
         """
-        if pairs < 1:
-            raise ValueError(f"pairs must be at least 1; got {pairs}")
+        check_count("pairs", pairs)
         characteristic_length = (
             in_numpy(_characteristic_length)(self.point, self.limit)
             if length is None

@@ -115,7 +115,18 @@ class WishartEllipsoid(SurfaceDistribution):
 
     @staticmethod
     def of(mean: Ellipsoid, dof: Array) -> "WishartEllipsoid":
-        return WishartEllipsoid(mean, Cholesky.of(tril(mean.A)).lower, dof)
+        """Return the distribution around a mean, with `dof` degrees of freedom.
+
+        Raises:
+            ValueError: If A is singular up to roundoff. If it is traced, all samples are NaN instead.
+        """
+        cholesky = Cholesky.of(tril(mean.A))
+        if concrete(cholesky.positive) is not None and not cholesky.positive:
+            raise ValueError(
+                "surface: A is singular up to roundoff, so no surfaces can be sampled around it; use float64"
+            )
+        factor = jax.tree.map(lambda entry: jnp.where(cholesky.positive, entry, jnp.nan), cholesky.lower)
+        return WishartEllipsoid(mean, factor, dof)
 
     def with_dof(self, dof: Array) -> "WishartEllipsoid":
         return eqx.tree_at(lambda s: s.dof, self, dof)

@@ -75,6 +75,11 @@ class Disk(Shape):
     def bounds(self) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
         return self.center - self.radius, self.center + self.radius
 
+    @property
+    def perimeter(self) -> Float[Array, ""]:
+        """Length of the outline, m."""
+        return 2 * jnp.pi * self.radius
+
     def boundary(self, points: int) -> Float[Array, "points 2"]:
         angle = 2 * jnp.pi * (jnp.arange(points, dtype=self.radius.dtype) + 0.5) / points
         return self.center[None] + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)

@@ -21,7 +21,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype, concrete
+from pushjax.geometry.shape import signed_area
 
 
 def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
@@ -39,7 +40,8 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
         The area, m^2. It is exactly zero if the boxes around the polygons do not overlap.
 
     Raises:
-        ValueError: If an array has another shape, or fewer than three vertices.
+        ValueError: If an array has another shape, or fewer than three vertices, or is not finite, or if the polygons
+            have different orientations. The last two are not checked for traced values.
         TypeError: If an array does not consist of real numbers.
     """
     dtype = common_dtype(first, second)
@@ -49,7 +51,11 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
         check_shape(name, array, ("vertices", 2))
         if array.shape[0] < 3:
             raise ValueError(f"{name}: a polygon needs at least three vertices; got {array.shape[0]}")
+        check_finite(name, array)
         polygons.append(array)
+    known = [concrete(polygon) for polygon in polygons]
+    if known[0] is not None and known[1] is not None and signed_area(known[0]) * signed_area(known[1]) < 0:
+        raise ValueError("first and second: one polygon runs counterclockwise and the other clockwise")
     # Vertices are relative to one of them, so that polygons far from the origin do not lose digits.
     a, b = (polygon - polygons[1][:1] for polygon in polygons)
     boxes_overlap = jnp.all((jnp.max(a, axis=0) > jnp.min(b, axis=0)) & (jnp.max(b, axis=0) > jnp.min(a, axis=0)))

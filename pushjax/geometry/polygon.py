@@ -137,22 +137,28 @@ class Polygon(Shape):
 
         Args:
             depth: Distance by which each edge moves inward, m; negative moves it outward. It must be small enough
-                that no edge vanishes. This is checked only in part: too deep an inset of a rectangle or a triangle is
-                a valid polygon again.
+                that no edge vanishes.
 
         Returns:
             The polygon between the moved edges.
 
         Raises:
-            ValueError: If the moved edges cross, or if the polygon between them is not convex although this one is.
+            ValueError: If `depth` is not a finite scalar, or so large that an edge vanishes or the moved edges cross.
+                Not checked for traced values.
         """
         distance = as_float(depth, self.vertices.dtype, "depth")
+        check_shape("depth", distance, ())
+        check_finite("depth", distance)
         edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
         normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
         previous_normal = jnp.roll(normal, 1, axis=0)
         # The shift of a corner for an outward distance of one: n . corner_shift = 1 for the normals n of both edges.
         corner_shift = (previous_normal + normal) / (1 + jnp.sum(previous_normal * normal, axis=1, keepdims=True))
-        return Polygon(self.vertices - distance * corner_shift, convex=self.convex)
+        vertices = self.vertices - distance * corner_shift
+        remaining = concrete(jnp.sum((jnp.roll(vertices, -1, axis=0) - vertices) * edge, axis=1))
+        if remaining is not None and not np.all(remaining > 0):
+            raise ValueError(f"depth: {float(distance):g} m is too much, edge {int(np.argmin(remaining))} vanishes")
+        return Polygon(vertices, convex=self.convex)
 
     def outline(self) -> PolygonOutline:
         vertices = self.vertices

@@ -231,7 +231,7 @@ def _frame_fractions(drawn: list[DrawnPush], frames: int) -> np.ndarray:
         moving_steps = np.flatnonzero(np.any(moving, axis=0))
         # includes the step whose status says why nothing moves any more
         stop_step = steps if moving_steps.size == 0 else min(moving_steps[-1] + 2, steps)
-        last_fraction = max(last_fraction, stop_step / steps)
+        last_fraction = max(last_fraction, stop_step / max(steps, 1))
     return _equally_spaced(1.0, frames) * last_fraction
 
 

@@ -119,9 +119,13 @@ def test_the_command_says_how_far_it_is(server, tmp_path, monkeypatch, capsys):
     """In a pipe too: a line before the first file, and one for each tenth of the bytes."""
     monkeypatch.setattr(download, "SOURCE", server.address)
     monkeypatch.setattr(download, "triangle_files", lambda: FILES)
+    monkeypatch.setenv("PUSHJAX_DATA", "elsewhere")
     cli.main(["data", "triangle", "--to", str(tmp_path)])
     printed = capsys.readouterr()
     first, *rest = printed.err.splitlines()
     assert first.startswith("pushjax: fetching 118 files of 34 MB")
     assert [line.split(": ")[-1] for line in rest] == ["99%", "100%"]  # 9000 of 9009 bytes, and all
-    assert printed.out == f"the logs are in {tmp_path}\n"
+    assert printed.out.splitlines() == [
+        f"the logs are in {tmp_path}",
+        f"PUSHJAX_DATA names another folder, elsewhere: use these with --data {tmp_path}",
+    ]

@@ -95,6 +95,22 @@ def test_missing_files_are_named(session, tmp_path):
         load_two_finger_logs(session)
 
 
+def test_pushes_keep_their_actions_after_a_damaged_header(session):
+    sensor, actions = files(session)
+    whole = load_two_finger_logs(session)
+    lines = sensor.read_text().splitlines()
+    sensor.write_text("\n".join(["x", *lines[1:], *lines[1:]]))
+    planned = actions.read_text().splitlines()
+    amount, closing = planned[5].split()
+    other = [*planned[1:5], f"{float(amount) - 1} {closing}"]
+    actions.write_text("\n".join(["2", *planned[1:6], *other]))
+    log = load_two_finger_logs(session)
+    assert len(log) == 2
+    assert len(log.problems) == 1
+    np.testing.assert_array_equal(log.hand_end[0], whole.hand_end[0])
+    assert np.any(log.hand_end[1] != whole.hand_end[0])
+
+
 def test_a_damaged_record_is_a_problem(session):
     sensor, _ = files(session)
     lines = sensor.read_text().splitlines()

@@ -257,6 +257,16 @@ def test_bad_input(quartic):
         FrictionModel(dof=5, friction=0.3).sample(jax.random.key(0), quartic)
 
 
+def test_a_mean_that_is_singular_up_to_roundoff():
+    almost_one = 1 - np.finfo(np.float32).eps
+    matrix = np.array([[1, almost_one, 0], [almost_one, 1, 0], [0, 0, 1]], np.float32)
+    model = FrictionModel(dof=20, friction=0.3)
+    with pytest.raises(ValueError, match="surface: A is singular up to roundoff"):
+        model.around(pj.Ellipsoid(matrix, np.float32(0.03)))
+    traced = jax.jit(lambda a: model.sample(jax.random.key(0), pj.Ellipsoid(a, np.float32(0.03)))[0].A)(matrix)
+    assert np.isnan(traced).all()
+
+
 def test_largest_share_of_itself(quartic):
     """All of a Gram matrix can be subtracted from itself, exactly; of the ball's, a positive multiple."""
     c = tuple(map(jnp.asarray, np.asarray(quartic.coefficients) / float(quartic.coefficients[0])))

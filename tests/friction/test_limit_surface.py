@@ -2,6 +2,8 @@
 
 import functools
 import json
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -304,7 +306,8 @@ def test_angle_between():
     for angle in (0.0, 1e-9, 0.3, 3.0):
         turned = Vec3(2 * jnp.cos(angle), jnp.zeros(()), 2 * jnp.sin(angle))
         assert float(angle_between(unit, turned)) == pytest.approx(angle, rel=1e-14)
-    assert np.isfinite(jax.grad(lambda x: angle_between(unit, Vec3(x, 0 * x, 0 * x)))(1.0))
+    for x in (1.0, 0.0):
+        assert np.isfinite(jax.grad(lambda x: angle_between(unit, Vec3(x, 0 * x, 0 * x)))(x))
 
 
 # --- files ---
@@ -320,6 +323,14 @@ def test_files_keep_every_bit(tmp_path, degree, dtype):
         for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(surface), strict=True):
             assert a.dtype == b.dtype == dtype
             assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+def test_files_are_read_by_a_process_that_has_not_used_the_class(tmp_path):
+    path = tmp_path / "surface.json"
+    Ellipsoid(np.eye(3), 0.1).save(path)
+    code = f"import pushjax as pj; print(type(pj.LimitSurface.load({str(path)!r})).__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "Ellipsoid"
 
 
 def test_wrong_files(tmp_path):

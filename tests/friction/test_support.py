@@ -262,7 +262,10 @@ BAD = {
     "uniform load": (lambda: Support.uniform(Disk(1), 4, load=-1), "load must be positive"),
     "twist": (lambda: Support(THREE, np.ones(3)).wrench(np.zeros(2)), "twist has shape"),
     "twist NaN": (lambda: Support(THREE, np.ones(3)).wrench([0, 0, np.nan]), "twist must be finite"),
-    "pairs": (lambda: Support.points(THREE).wrench_twist_pairs(jax.random.key(0), 0), "pairs must be at least 1"),
+    "pairs": (
+        lambda: Support.points(THREE).wrench_twist_pairs(jax.random.key(0), 0),
+        "pairs must be a whole number, at least 1",
+    ),
     "length": (lambda: Support.points(THREE).wrench_twist_pairs(jax.random.key(0), 5, 0.0), "length must be positive"),
     "lengths": (lambda: Support.points(THREE).wrench_twist_pairs(jax.random.key(0), 5, [1, 1]), "length has shape"),
     "traced": (lambda: jax.jit(lambda r: Support.uniform(Disk(r)).load)(1.0), "shape must be known"),

@@ -177,7 +177,12 @@ def test_clockwise_polygons_and_mirror_images():
 
 @pytest.mark.parametrize(
     ("first", "message"),
-    [(T[:2], "first: a polygon needs at least three vertices; got 2"), (T[:, 0], r"first has shape \(8,\)")],
+    [
+        (T[:2], "first: a polygon needs at least three vertices; got 2"),
+        (T[:, 0], r"first has shape \(8,\)"),
+        (T * np.nan, "first must be finite"),
+        (T[::-1], "one polygon runs counterclockwise and the other clockwise"),
+    ],
 )
 def test_invalid_arguments(first, message):
     with pytest.raises(ValueError, match=message):

@@ -806,3 +806,23 @@ def test_each_of():
             jax.grad(lambda s, way=way, kinds=kinds: sum(v for v, _ in way(s, kinds)))(0.7) for way in (once, apart)
         )
         assert next(slopes) == pytest.approx(float(next(slopes)), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [
+        (0.03, r"depth: 0.03 m is too much, edge \d vanishes"),  # an edge would have the length zero
+        (0.05, r"depth: 0.05 m is too much, edge \d vanishes"),  # all edges would be turned around: again a rectangle
+        (np.nan, "depth must be finite"),
+        ([0.01, 0.02], "depth has shape"),
+    ],
+)
+def test_too_deep_an_inset(depth, message):
+    with pytest.raises(ValueError, match=message):
+        Polygon.rectangle(0.06, 0.06).inset(depth)
+
+
+def test_disks_have_a_perimeter():
+    points = np.asarray(Disk(0.02, (0.01, 0.0)).boundary(10_000))
+    lengths = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+    assert float(Disk(0.02).perimeter) == pytest.approx(lengths.sum(), rel=1e-6)

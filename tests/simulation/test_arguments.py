@@ -81,6 +81,15 @@ def test_others_name_the_argument(call, message):
     assert str(caught.value).startswith(message)
 
 
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), np.zeros(3), jax.numpy.zeros(3)])
+def test_known_arguments_inside_jit(pose):
+    """Constants of a traced program are checked as elsewhere, or not at all, but are no error."""
+    jax.make_jaxpr(lambda x: x + pj.rollout(SLIDER, HAND, PATH, pose=pose, friction=0.3).pose[-1])(0.0)
+    jax.make_jaxpr(lambda key: pj.random_rollout(key, SLIDER, HAND, PATH, pose=pose, model=MODEL).push.pose)(
+        jax.random.key(0)
+    )
+
+
 @pytest.mark.parametrize(
     "call",
     [
