@@ -26,7 +26,11 @@ SINGULAR = {4: 1e-5, 8: 1e-11}
 
 
 class Frictionless(ContactSolver):
-    """Solver for contacts without friction, whose coefficients of friction are ignored, under an ellipsoid."""
+    """Solver for contacts without friction, whose coefficients of friction are ignored, under an ellipsoid.
+
+    Two contacts whose normals are opposite up to 3e-3 rad (float32) or 3e-6 rad (float64) count as exactly opposite.
+    They jam the slider, although it might escape from so narrow a wedge, hundreds of times as fast as the pushers.
+    """
 
     def solve(self, problem: ScaledProblem) -> ScalarSolution:
         """Solve a dimensionless contact problem.

@@ -9,6 +9,7 @@ Reference: Zhou et al. 2016; Zhou et al. 2017, section III.A.
 
 from abc import abstractmethod
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -22,6 +23,9 @@ from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3
 
+# Kinds of surfaces in files. Their modules are named like them, and are imported when needed, because a user who loads a
+# surface may not have imported them.
+KINDS = ("ellipsoid", "quartic")
 FORMAT, VERSION = "pushjax limit surface", 1
 
 
@@ -251,14 +255,9 @@ class LimitSurface(eqx.Module):
 
 def _surface_from_record(record: dict[str, Any], dtype: Any) -> LimitSurface:
     """Return the limit surface that the record of a JSON file describes."""
-    # imported here because they import this module; a user who loads a surface may not have imported them
-    from pushjax.friction.ellipsoid import Ellipsoid
-    from pushjax.friction.quartic import Quartic
-
-    kinds = {kind.__name__.lower(): kind for kind in (Ellipsoid, Quartic)}
-    if record["kind"] not in kinds:
-        raise ValueError(f"{record['kind']!r} is no kind of surface; there are {', '.join(sorted(kinds))}")
-    kind: Any = kinds[record["kind"]]
+    if record["kind"] not in KINDS:
+        raise ValueError(f"{record['kind']!r} is no kind of surface; there are {', '.join(KINDS)}")
+    kind: Any = getattr(import_module(f"pushjax.friction.{record['kind']}"), record["kind"].capitalize())
     return kind(**{field.name: jnp.asarray(record[field.name], dtype) for field in fields(kind)})
 
 

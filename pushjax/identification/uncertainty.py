@@ -1,5 +1,6 @@
 """Uncertainty of estimates without the assumption of a normal posterior: profiles and the bootstrap."""
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from pushjax.identification.result import Identified
 
 POINTS, REACH = 3, 2.7  # points of a profile on each side of the estimate, and its half-width in standard deviations
+# A profile ends where a friction is within 0.25 % of its range from an end of it: pushes that do not determine a
+# friction leave its z with a standard deviation of hundreds.
+MAX_FRICTION_Z = 6.0
+# A side of a profile is refined, by up to so many points, until the first point above the rise at which an interval of
+# 90 % ends is not above so many times that rise.
+REFINEMENTS, RISE_OF_90, STEEP = 6, ndtri(0.95) ** 2 / 2, 3.0
 TOLERANCE = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
 
 
@@ -62,7 +69,8 @@ def profile(
         reach: Distance from the estimate to the outermost values, in standard deviations.
 
     Returns:
-        The profile, with 2 * points + 1 values.
+        The profile, with 2 * points + 1 values, and more where it is steep. A side on which a friction is at an end of
+            its range has none.
 
     Raises:
         ValueError: If `label` is another label.
@@ -74,25 +82,68 @@ def profile(
     pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     covariance = found.covariance
     std = float(np.sqrt(np.asarray(covariance)[position, position]))
-    distance = reach * np.arange(-points, points + 1) / points
-    # From the center outwards, because each fit starts from the one before.
-    order = [*range(points, -1, -1), *range(points + 1, 2 * points + 1)]
-    loss, values = np.zeros(len(distance)), np.zeros(len(distance))
     # The direction in which all other entries would move if the posterior were normal.
     direction = covariance[position] / covariance[position, position] * std
-    z, last_distance = found.z, 0.0
-    for k in order:
-        if k in (points, points + 1):
-            z, last_distance = found.z, 0.0
-        z, last_distance = z + (distance[k] - last_distance) * direction, distance[k]
-        fixed = FixedEntries(jnp.arange(len(z)) == position, z)
-        schedule = Schedule.of(z.dtype, 1, TOLERANCE)
-        given = jnp.array([True, True, True])
-        fitted = compiled_fit(problem, pushes, z, _sigma_by_kind(found), given, fixed, schedule, robust=found.robust)
-        z, loss[k] = fitted.z, float(fitted.loss)
-        values[k] = _physical_value(found, fitted.z, label)
-    rise = (loss - loss.min()) / 2
-    return Profile(label, values, rise, distance**2 / 2)
+    fixed, schedule = jnp.arange(len(found.z)) == position, Schedule.of(found.z.dtype, 1, TOLERANCE)
+    sigma, given = _sigma_by_kind(found), jnp.array([True, True, True])
+
+    def refit(near: _ProfilePoint, distance: float) -> _ProfilePoint:
+        z = near.z + (distance - near.distance) * direction
+        entries = FixedEntries(fixed, z)
+        fitted = compiled_fit(problem, pushes, z, sigma, given, entries, schedule, robust=found.robust)
+        return _ProfilePoint(distance, fitted.z, float(fitted.loss))
+
+    estimate = refit(_ProfilePoint(0.0, found.z, 0.0), 0.0)
+    computed = [estimate]
+    for sign in (-1, 1):
+        end = float(found.z[position]) + sign * reach * std
+        if label.partition("[")[0] == "friction":
+            end = float(np.clip(end, -MAX_FRICTION_Z, MAX_FRICTION_Z))
+        extent = sign * (end - float(found.z[position])) / std
+        if extent > 0:
+            computed += _profile_side(refit, estimate, [sign * extent * k / points for k in range(1, points + 1)])
+    computed.sort(key=lambda point: point.distance)
+    distance, loss = np.array([point.distance for point in computed]), np.array([point.loss for point in computed])
+    values = np.array([_physical_value(found, point.z, label) for point in computed])
+    return Profile(label, values, (loss - loss.min()) / 2, distance**2 / 2)
+
+
+class _ProfilePoint(NamedTuple):
+    """A fit with one number held.
+
+    Attributes:
+        distance: Distance of that number from its estimate, in standard deviations.
+        z: All numbers after the fit.
+        loss: Loss of the fit.
+    """
+
+    distance: float
+    z: Array
+    loss: float
+
+
+def _profile_side(
+    refit: Callable[[_ProfilePoint, float], _ProfilePoint], estimate: _ProfilePoint, distances: Sequence[float]
+) -> list[_ProfilePoint]:
+    """Return the points of a profile on one side of the estimate.
+
+    Args:
+        refit: Fit with the number held at a distance, which starts from a point nearby.
+        estimate: The estimate.
+        distances: Distances, from the estimate outward. More are added where the profile is steep.
+    """
+    side = [estimate]
+    for distance in distances:
+        side.append(refit(side[-1], distance))
+    for _ in range(REFINEMENTS):
+        rise = np.array([(point.loss - estimate.loss) / 2 for point in side])
+        if not np.any(rise > RISE_OF_90):
+            break
+        above = int(np.argmax(rise > RISE_OF_90))
+        if above == 0 or rise[above] <= STEEP * RISE_OF_90:
+            break
+        side.insert(above, refit(side[above - 1], (side[above - 1].distance + side[above].distance) / 2))
+    return side[1:]
 
 
 def bootstrap(

@@ -65,7 +65,7 @@ def animate(
         seconds: Time that the animation plays, s.
 
     Returns:
-        The animation; `save` writes it to a file.
+        The animation; `pushjax.plot.save` writes it to a file.
 
     Raises:
         ValueError: If there is no push, if there are fewer than two frames, if a name in `measured` is that of no push,
@@ -88,7 +88,8 @@ def animate(
         panels = [_Panel(axes, track, largest_force) for axes, track in zip(all_axes, drawn, strict=True)]
         for axes, name in zip(all_axes, by_name, strict=True):
             draw_fixtures(axes, fixtures)
-            axes.set_title(name, pad=18)  # leaves room for the words below it
+            # A name leaves room for the words below it. Without one, a space keeps the room of the words themselves.
+            axes.set_title(name or " ", pad=18 if name else 4)
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
         _share_limits(figure, all_axes, drawn)
@@ -128,7 +129,7 @@ def animate_cloud(
         seconds: Time that the animation plays, s.
 
     Returns:
-        The animation; `save` writes it to a file.
+        The animation; `pushjax.plot.save` writes it to a file.
 
     Raises:
         ValueError: If there are fewer than two frames, or the path is of another length than the trajectories.

@@ -94,7 +94,10 @@ class Trajectory(eqx.Module):
 
     @property
     def failed(self) -> Bool[Array, "steps"]:
-        """Steps whose status is a failure (`Status.failed`), (steps,); there the slider stays where it was."""
+        """Steps whose status is a failure (`Status.failed`), (steps,).
+
+        There the slider stays where it was, or where the last part of the step that could be done left it.
+        """
         return jnp.isin(self.status, jnp.array([s for s in Status if s.failed], self.status.dtype))
 
     @property

@@ -280,15 +280,23 @@ def summary(record: dict[str, Any]) -> str:
         normal, exact = (f"{row[name][0]:.3g} to {row[name][1]:.3g}" for name in ("interval", "profile"))
         lines.append(f"{name:{width}}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
     lines += [
-        f"limit surface: {record['surface_determined']:.1f} of the {record['surface_numbers']} numbers that its prior "
-        "varies are determined",
+        f"{name}: these pushes only bound it; take the profile's interval, and not the estimate"
+        for name, row in zip(names, record["rows"], strict=True)
+        if row["determined"] < words.HARDLY_DETERMINED
+    ]
+    lines += [
+        f"limit surface: the pushes determine {record['surface_determined']:.1f} of the {record['surface_numbers']} "
+        "numbers that its prior varies",
         "",
         words.predicted(record),
         f"sigma: {record['sigma_mm']:.3g} mm; " + ("converged" if record["converged"] else "NOT converged"),
     ]
     if record["noise"] is not None:
         lines.append(f"noise: {words.noise(record['noise'])}")
-    lines.append("interval: normal; profile: all else at its best; determined: how much of the doubt before is gone.")
+    lines.append(
+        "interval: for a normal posterior; profile: with all other numbers refitted; determined: part of the prior "
+        "variance that the pushes remove"
+    )
     if record["failed_steps"]:
         lines.append(f"{record['failed_steps']} steps of the predicted pushes failed (see the JSON)")
     lines += [f"drew {path}" for path in record["pictures"]]

@@ -87,7 +87,7 @@ def _profiles(findings: Findings, out: Path) -> Path:
     for panel, each in zip(axes.flat, profiles, strict=False):
         name, scale = unit(each.label)
         # Signed distances of the values from the estimate, in standard deviations of z.
-        distance = np.sign(np.arange(len(each.normal)) - len(each.normal) // 2) * np.sqrt(2 * each.normal)
+        distance = np.sign(np.arange(len(each.normal)) - np.argmin(each.normal)) * np.sqrt(2 * each.normal)
         dense = np.linspace(distance[0], distance[-1], 200)
         value, rise = (PchipInterpolator(distance, y)(dense) for y in (scale * each.value, each.rise))
         panel.plot(value, rise, "-", color=plot.BLUE, label="all else at its best")

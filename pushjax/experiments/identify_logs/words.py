@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+HARDLY_DETERMINED = 0.1  # part of the prior variance that pushes remove, below which they only bound a number
 # What the unknowns are called in the report; the others keep the name that `pj.Unknowns` gives them.
 NAMES = {
     "friction": "coefficient of friction at the contact",
@@ -50,7 +51,7 @@ def predicted(record: dict[str, Any]) -> str:
     """Say how far predicted final poses are from the measured ones."""
     return (
         f"The final poses are predicted to {record['mean_mm']:.2f} mm in the mean, and to {record['worst_mm']:.2f} mm "
-        f"at worst. Before any push was used, it was {record['expected_mm']:.2f} mm in the mean. The objects moved "
+        f"at worst. Without learning from them, the mean error is {record['expected_mm']:.2f} mm. The objects moved "
         f"{record['no_motion_mm']:.1f} mm."
     )
 
@@ -75,5 +76,7 @@ def _unknown(row: dict[str, Any], level: str) -> tuple[str, str]:
     )
     unit = f" {row['unit']}" if row["unit"] else ""
     low, high = row["profile"]
-    share = f"the pushes take away {row['determined']:.0%} of the doubt"
+    share = f"the pushes remove {row['determined']:.0%} of the prior variance"
+    if row["determined"] < HARDLY_DETERMINED:
+        share += ", so they only bound this number"
     return name, f"{row['estimate']:.4g}{unit}; {level} interval {low:.3g} to {high:.3g}{unit}; {share}"

@@ -22,6 +22,7 @@ from pushjax.experiments.plan.fixtures import parse_fixtures
 from pushjax.experiments.plan.options import Options
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
+from pushjax.identification.pushes_of_recordings import MAX_SLIDER_SIZE
 from pushjax.planning import FinalPose, Goal, PushPlan, PushPlanStatus, PushSequence, finger_motion, plan_pushes
 from pushjax.planning.transits.between_pushes import FingerMotion
 from pushjax.planning.transits.roadmap import TransitStatus
@@ -53,6 +54,7 @@ def run(
     """
     options.check()
     shape, hand, fixtures = parse_shape(options.shape), pj.Hand.finger(options.radius), parse_fixtures(options)
+    _check_sizes(shape, options)
     _check_finger(shape, options)
     support = parse_support(options.support, shape)
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
@@ -81,6 +83,16 @@ def run(
         pictures.append(str(draw(slider, goal, fixtures, plan, options, out / "plan.png")))
     settings = {"seed": seed} | vars(options)
     return result_record("plan", settings, **_plan_entries(plan, goal, motion), files=files, pictures=pictures)
+
+
+def _check_sizes(shape: pj.Shape, options: Options) -> None:
+    """Raise ValueError if the block or the finger is so large that it is probably in another unit."""
+    low, high = (np.asarray(corner, float) for corner in shape.bounds)
+    for name, size in (("shape", float(np.max(high - low))), ("radius", 2 * options.radius)):
+        if size > MAX_SLIDER_SIZE:
+            raise ValueError(
+                f"--{name}: {size:g} m across; expected at most {MAX_SLIDER_SIZE:g} m: is it in millimeters?"
+            )
 
 
 def _check_finger(shape: pj.Shape, options: Options) -> None:
@@ -191,11 +203,13 @@ def summary(record: dict[str, Any]) -> str:
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
     else:
         lines = [
-            f"{len(record['path'])} pushes in {record['duration_s']:.0f} s: success in {record['success']:.1%} of "
-            f"{record['samples']} samples of friction"
-            + ("" if status == PushPlanStatus.FOUND else ", less than asked for"),
+            f"{len(record['path'])} pushes, which take the robot {record['duration_s']:.0f} s: success in "
+            f"{record['success']:.1%} of {record['samples']} samples of friction",
             f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
             f"{spread['theta_deg']:.1f} deg",
         ]
+        if status != PushPlanStatus.FOUND:
+            asked = f"less than the {record['settings']['success']:.0%} asked for"
+            lines.insert(1, f"  {asked}: try more --attempts, more --pushes, or a smaller range of --friction")
         lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]
     return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])
