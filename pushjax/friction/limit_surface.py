@@ -23,8 +23,8 @@ from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3
 
-# Kinds of surfaces in files. Their modules are named like them, and are imported when needed, because a user who loads a
-# surface may not have imported them.
+# Kinds of surfaces in files. Their modules are named like them. They are imported when needed, because a user who loads
+# a surface may not have imported them.
 KINDS = ("ellipsoid", "quartic")
 FORMAT, VERSION = "pushjax limit surface", 1
 

@@ -24,9 +24,11 @@ POINTS, REACH = 3, 2.7  # points of a profile on each side of the estimate, and 
 # A profile ends where a friction is within 0.25 % of its range from an end of it: pushes that do not determine a
 # friction leave its z with a standard deviation of hundreds.
 MAX_FRICTION_Z = 6.0
-# A side of a profile is refined, by up to so many points, until the first point above the rise at which an interval of
-# 90 % ends is not above so many times that rise.
-REFINEMENTS, RISE_OF_90, STEEP = 6, ndtri(0.95) ** 2 / 2, 3.0
+# The rise at which an interval of 90 % ends. A side of a profile that does not reach it goes on, up to so many times to
+# twice the distance. A side whose first point above it is above so many times that rise is refined, by up to so many
+# points.
+RISE_OF_90 = ndtri(0.95) ** 2 / 2
+EXTENSIONS, STEEP, REFINEMENTS = 8, 3.0, 6
 TOLERANCE = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
 
 
@@ -69,8 +71,8 @@ def profile(
         reach: Distance from the estimate to the outermost values, in standard deviations.
 
     Returns:
-        The profile, with 2 * points + 1 values, and more where it is steep. A side on which a friction is at an end of
-            its range has none.
+        The profile, with 2 * points + 1 values, and more where it is flat or steep. A side on which a friction is at an
+            end of its range has none.
 
     Raises:
         ValueError: If `label` is another label.
@@ -96,12 +98,13 @@ def profile(
     estimate = refit(_ProfilePoint(0.0, found.z, 0.0), 0.0)
     computed = [estimate]
     for sign in (-1, 1):
-        end = float(found.z[position]) + sign * reach * std
+        limit = np.inf
         if label.partition("[")[0] == "friction":
-            end = float(np.clip(end, -MAX_FRICTION_Z, MAX_FRICTION_Z))
-        extent = sign * (end - float(found.z[position])) / std
+            limit = (MAX_FRICTION_Z - sign * float(found.z[position])) / std
+        extent = min(reach, limit)
         if extent > 0:
-            computed += _profile_side(refit, estimate, [sign * extent * k / points for k in range(1, points + 1)])
+            distances = [sign * extent * k / points for k in range(1, points + 1)]
+            computed += _profile_side(refit, estimate, distances, limit)
     computed.sort(key=lambda point: point.distance)
     distance, loss = np.array([point.distance for point in computed]), np.array([point.loss for point in computed])
     values = np.array([_physical_value(found, point.z, label) for point in computed])
@@ -123,24 +126,34 @@ class _ProfilePoint(NamedTuple):
 
 
 def _profile_side(
-    refit: Callable[[_ProfilePoint, float], _ProfilePoint], estimate: _ProfilePoint, distances: Sequence[float]
+    refit: Callable[[_ProfilePoint, float], _ProfilePoint],
+    estimate: _ProfilePoint,
+    distances: Sequence[float],
+    limit: float,
 ) -> list[_ProfilePoint]:
     """Return the points of a profile on one side of the estimate.
 
     Args:
         refit: Fit with the number held at a distance, which starts from a point nearby.
         estimate: The estimate.
-        distances: Distances, from the estimate outward. More are added where the profile is steep.
+        distances: Distances, from the estimate outward. More are added where the profile is flat or steep.
+        limit: Largest distance.
     """
+
+    def rise(point: _ProfilePoint) -> float:
+        return (point.loss - estimate.loss) / 2
+
     side = [estimate]
     for distance in distances:
         side.append(refit(side[-1], distance))
-    for _ in range(REFINEMENTS):
-        rise = np.array([(point.loss - estimate.loss) / 2 for point in side])
-        if not np.any(rise > RISE_OF_90):
+    for _ in range(EXTENSIONS):
+        last = side[-1]
+        if rise(last) > RISE_OF_90 or abs(last.distance) >= limit:
             break
-        above = int(np.argmax(rise > RISE_OF_90))
-        if above == 0 or rise[above] <= STEEP * RISE_OF_90:
+        side.append(refit(last, float(np.sign(last.distance)) * min(2 * abs(last.distance), limit)))
+    for _ in range(REFINEMENTS):
+        above = next((k for k, point in enumerate(side) if rise(point) > RISE_OF_90), None)
+        if above is None or rise(side[above]) <= STEEP * RISE_OF_90:
             break
         side.insert(above, refit(side[above - 1], (side[above - 1].distance + side[above].distance) / 2))
     return side[1:]

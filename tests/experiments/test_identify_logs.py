@@ -22,7 +22,7 @@ from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identification.noise import _LogNoise, _score
 from pushjax.identification.predictive import PredictiveModel
 from pushjax.identification.pushes_of_recordings import screen
-from pushjax.identification.uncertainty import bootstrap, profile_interval
+from pushjax.identification.uncertainty import Profile, _profile_side, _ProfilePoint, bootstrap, profile_interval
 
 WIDTH, HEIGHT, RADIUS, STEPS, MU = 0.1, 0.06, 0.005, 12, 0.3
 COLUMNS = ("push", "hand_x", "hand_y", "object_x", "object_y", "object_theta", "force_x", "force_y")
@@ -364,6 +364,41 @@ def few(log, block):
 def found(few, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     return pj.identify(few, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None, inset=0.002), sigma=NOISE)
+
+
+@pytest.mark.parametrize("wall", [0.02, 0.5, 0.93, 15.0])
+def test_profile_side_finds_a_wall(wall):
+    """Flat up to the wall, then steep: the points close in on where the interval ends."""
+
+    def refit(near, distance):
+        return _ProfilePoint(distance, near.z, 2 * 100.0 * max(abs(distance) - wall, 0))
+
+    estimate = _ProfilePoint(0.0, jnp.zeros(1), 0.0)
+    side = [estimate, *_profile_side(refit, estimate, [-1 / 3, -2 / 3, -1.0], limit=20.0)]
+    distances, rises = np.array([[point.distance, point.loss / 2] for point in side]).T
+    assert np.all(np.diff(distances) < 0)
+    profile = Profile("friction", distances[::-1], rises[::-1], distances[::-1] ** 2 / 2)
+    assert profile_interval(profile)[0] == pytest.approx(-wall - 0.0135, abs=0.02 * max(wall, 1))
+
+
+@pytest.mark.slow
+def test_profile_of_a_friction_that_is_only_bounded():
+    """The finger never slides, so all frictions from some on explain the pushes alike, and the derivative is zero."""
+    disk, rng = pj.Disk(0.04), np.random.default_rng(0)
+    slider, hand = pj.Slider(disk, pj.Ellipsoid(np.diag([1.0, 1.0, 1.5]), 0.027)), pj.Hand.finger(RADIUS)
+    around, turn = 2 * np.pi * (np.arange(16) + 0.5) / 16, rng.uniform(-0.15, 0.15, 16)
+    begin = 0.0455 * np.stack([np.cos(around), np.sin(around)], axis=1)
+    along = -np.stack([np.cos(around + turn), np.sin(around + turn)], axis=1)
+    path = begin[:, None] + np.linspace(0, 0.03, STEPS + 1)[None, :, None] * along[:, None]
+    push = jax.jit(jax.vmap(lambda path: pj.rollout(slider, hand, path, pose=jnp.zeros(3), friction=0.2).pose[-1]))
+    end = np.asarray(push(path)) + rng.normal(size=(16, 3)) * [1e-4, 1e-4, 1e-4 / 0.027]
+    pushes = pj.Pushes(np.zeros((16, 3)), path, end)
+    found = pj.identify(pushes, slider, hand, pj.Unknowns((0.0, 1.0), surface_dof=None), sigma=1e-4)
+    friction = found.profile(pushes, slider, hand, "friction")
+    low, high = profile_interval(friction)
+    assert 0.02 < low < 0.06  # with 0.05 the finger slides, with 0.1 it never does
+    assert high == pytest.approx(1, abs=0.01)
+    assert friction.rise[0] > 10
 
 
 @pytest.mark.slow

@@ -188,6 +188,8 @@ def test_attempts_end_with_the_first_that_is_sure_enough():
         (["--goal", "0", "0", "0", "--tolerance", "0", "1"], "--tolerance must be positive; got 0 1"),
         (["--goal", "0", "0", "0", "--success", "2"], "--success must be a probability; got 2"),
         (["--goal", "0", "0", "0", "--shape", "cube:1"], "--shape: expected rectangle:"),
+        (["--goal", "0", "0", "0", "--shape", "rectangle:90x60"], "--shape: 90 m across; expected at most 2 m"),
+        (["--goal", "0", "0", "0", "--radius", "5"], "--radius: 10 m across; expected at most 2 m"),
         (["--goal", "0", "0", "0", "--finger", "0", "0"], "--finger overlaps the block at its start, by 35 mm"),
         (
             ["--goal", "30", "20", "0"],

@@ -280,9 +280,9 @@ def summary(record: dict[str, Any]) -> str:
         normal, exact = (f"{row[name][0]:.3g} to {row[name][1]:.3g}" for name in ("interval", "profile"))
         lines.append(f"{name:{width}}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
     lines += [
-        f"{name}: these pushes only bound it; take the profile's interval, and not the estimate"
+        f"{name}: the posterior is far from normal; take the profile's interval, and not the estimate"
         for name, row in zip(names, record["rows"], strict=True)
-        if row["determined"] < words.HARDLY_DETERMINED
+        if words.is_not_normal(row)
     ]
     lines += [
         f"limit surface: the pushes determine {record['surface_determined']:.1f} of the {record['surface_numbers']} "

@@ -4,7 +4,9 @@ from typing import Any
 
 import numpy as np
 
-HARDLY_DETERMINED = 0.1  # part of the prior variance that pushes remove, below which they only bound a number
+# The posterior of a number counts as normal if its profile's interval is at most so many times as wide as that of a
+# normal posterior, and the other way round.
+NOT_NORMAL = 2.0
 # What the unknowns are called in the report; the others keep the name that `pj.Unknowns` gives them.
 NAMES = {
     "friction": "coefficient of friction at the contact",
@@ -47,6 +49,15 @@ def figures(record: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
+def is_not_normal(row: dict[str, Any]) -> bool:
+    """Return whether the posterior of a number is so far from normal that only its profile's interval is right.
+
+    An example is the friction of a finger that never slides: the pushes only bound it from below.
+    """
+    normal, exact = (row[name][1] - row[name][0] for name in ("interval", "profile"))
+    return not normal / NOT_NORMAL <= exact <= normal * NOT_NORMAL
+
+
 def predicted(record: dict[str, Any]) -> str:
     """Say how far predicted final poses are from the measured ones."""
     return (
@@ -77,6 +88,6 @@ def _unknown(row: dict[str, Any], level: str) -> tuple[str, str]:
     unit = f" {row['unit']}" if row["unit"] else ""
     low, high = row["profile"]
     share = f"the pushes remove {row['determined']:.0%} of the prior variance"
-    if row["determined"] < HARDLY_DETERMINED:
-        share += ", so they only bound this number"
+    if is_not_normal(row):
+        share = "its posterior is far from normal, so the estimate says little"
     return name, f"{row['estimate']:.4g}{unit}; {level} interval {low:.3g} to {high:.3g}{unit}; {share}"

@@ -37,8 +37,10 @@ def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, opti
         errors = np.asarray(goal.offset(np.asarray(plan.outcomes.pose)), float)
         _draw_positions(panels[1], errors, options.tolerance[0])
         plot.histogram_panel(panels[2], np.degrees(errors[:, 2]), "error of the angle / °", bins=30)
-        for side in (-1, 1):
-            panels[2].axvline(side * np.degrees(options.tolerance[1]), color=plot.BLACK, lw=1, ls="--")
+        for side, label in ((-1, "tolerance"), (1, None)):
+            angle = side * np.degrees(options.tolerance[1])
+            panels[2].axvline(angle, color=plot.BLACK, lw=1, ls="--", label=label)
+        panels[2].legend(fontsize=7, loc="upper left")
         panels[0].set_title(f"{plan.status.name.replace('_', ' ').lower()}: {plan.success:.0%} succeed")
         panels[2].set_title("angle at the end")
         return plot.save(figure, path)
@@ -63,7 +65,14 @@ def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, option
         )
         axes.add_patch(Circle(tuple(points[0]), plot.MM * options.radius, color=plot.BLUE, fill=False, lw=0.9))
         axes.annotate(
-            str(number + 1), points[0], xytext=(7, 7), textcoords="offset points", color=plot.BLUE, weight="bold"
+            str(number + 1),
+            points[0],
+            xytext=(7, 7),
+            textcoords="offset points",
+            color=plot.BLUE,
+            weight="bold",
+            bbox={"boxstyle": "circle,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
+            zorder=6,
         )
     axes.set(xlabel="x / mm", ylabel="y / mm")
     axes.set_aspect("equal", adjustable="datalim")
@@ -72,8 +81,10 @@ def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, option
 
 def _draw_positions(axes: Axes, errors: np.ndarray, tolerance: float) -> None:
     points = plot.MM * errors[:, :2]
-    axes.plot(*points.T, ".", color=plot.RED, ms=3)
-    axes.add_patch(Circle((0, 0), plot.MM * tolerance, color=plot.BLACK, fill=False, ls="--", lw=1))
     reach = max(1.3 * plot.MM * tolerance, float(np.quantile(np.abs(points), 0.995)) * 1.05)
-    axes.set(xlabel="error of x / mm", ylabel="error of y / mm", xlim=(-reach, reach), ylim=(-reach, reach))
-    axes.set(aspect="equal", title="position at the end")
+    axes.plot(*points[np.all(np.abs(points) <= reach, axis=1)].T, ".", color=plot.RED, ms=3)
+    axes.add_patch(Circle((0, 0), plot.MM * tolerance, color=plot.BLACK, fill=False, ls="--", lw=1))
+    axes.update_datalim([(-reach, -reach), (reach, reach)])
+    axes.set(xlabel="error of x / mm", ylabel="error of y / mm")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title("position at the end")
