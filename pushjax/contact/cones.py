@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, as_float, check_shape, check_type, common_dtype
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.contact_plane import LimitCurve
 from pushjax.contact.problem import Contacts, contacts_in_scalars
@@ -58,6 +58,7 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
         Unit velocities of the contact point, (2, 2), body frame: the left edge, then the right edge.
 
     Raises:
+        TypeError: For a surface of another type.
         ValueError: If a shape is wrong, a number is not finite, the normal is not of unit length or the friction is
             negative.
 
@@ -70,6 +71,7 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
 
     Reference: Mason 1986; Zhou et al. 2017, section IV.A.
     """
+    check_type("surface", surface, LimitSurface)
     dtype = common_dtype(surface, point, normal, friction)
     return _motion_edges(surface, _checked_contacts(point, normal, friction, dtype))
 

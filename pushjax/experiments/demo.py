@@ -104,7 +104,7 @@ def summary(record: dict[str, Any]) -> str:
         x, y, theta = np.asarray(row["pose"], float)
         modes = ", ".join(f"{count} {name.lower()}" for name, count in row["modes"].items())
         lines.append(
-            f"  {row['model']:<10} fit {row['fit_angle_deg']:.1f} deg off   ends at x = {1e3 * x:.2f} mm, "
+            f"  {row['model']:<10} mean error of twists {row['fit_angle_deg']:.1f} deg   ends at x = {1e3 * x:.2f} mm, "
             f"y = {1e3 * y:.2f} mm, theta = {np.degrees(theta):.2f} deg   steps: {modes}"
         )
     lines.append(f"  the two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration)")

@@ -195,14 +195,14 @@ class Identified(eqx.Module):
     def profile(self, pushes: Pushes, slider: Slider, hand: Hand, label: str, **options: Any) -> uncertainty.Profile:
         """Compute how much worse all pushes are explained if one number is held at other values.
 
-        See `uncertainty.profile` for the arguments and options. `label` is one of `labels`.
+        See `pushjax.identification.uncertainty.profile` for the arguments and options. `label` is one of `labels`.
         """
         return uncertainty.profile(self, pushes, slider, hand, label, **options)
 
     def bootstrap(self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int) -> Parameters:
         """Identify from `n` sets of pushes that are drawn from the given ones with replacement.
 
-        See `uncertainty.bootstrap`.
+        See `pushjax.identification.uncertainty.bootstrap`.
 
         Returns:
             The estimates, with a leading axis (n,).

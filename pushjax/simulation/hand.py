@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_non_negative, check_shape
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_count,
+    check_finite,
+    check_non_negative,
+    check_shape,
+    check_type,
+)
 from pushjax.geometry.polygon import Polygon
 
 Kinematics = Callable[[Array], Array]
@@ -41,12 +49,14 @@ class Pad(eqx.Module):
         shape: The polygon, in the finger's own frame, m.
 
     Raises:
+        TypeError: For another shape than a polygon.
         ValueError: For a polygon that is not known to be convex.
     """
 
     shape: Polygon
 
     def __init__(self, shape: Polygon):
+        check_type("shape", shape, Polygon)
         if not shape.convex:
             raise ValueError("shape: a pad must be a convex polygon whose vertices are known")
         self.shape = shape
@@ -69,7 +79,8 @@ class Hand(eqx.Module):
         least: Smallest allowed value of the last coordinate, the opening, m; None for no limit.
 
     Raises:
-        ValueError: For a hand without fingers, or for kinematics that do not give one pose for each finger.
+        ValueError: For a hand without fingers, for a `dof` that is not a whole number of at least 1, or for kinematics
+            that do not give one pose for each finger.
     """
 
     fingers: tuple[Finger, ...]
@@ -80,6 +91,7 @@ class Hand(eqx.Module):
     def __init__(self, fingers: Sequence[Any], kinematics: Kinematics, dof: int, least: ArrayLike | None = None):
         if not fingers:
             raise ValueError("fingers: a hand needs at least one; got none")
+        check_count("dof", dof)
         self.fingers = tuple(_finger(finger) for finger in fingers)
         self.kinematics, self.dof = kinematics, dof
         self.least = None if least is None else as_float(least, name="least")

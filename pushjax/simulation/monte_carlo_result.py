@@ -102,7 +102,10 @@ class MonteCarlo:
                 }
                 for k, name in enumerate(COORDINATES)
             },
-            "friction": {"mean": float(self.friction.mean()), "std": float(self.friction.std())},
+            "friction": {
+                "mean": float(self.friction.mean()),
+                "std": float(self.friction.std(ddof=1)) if len(self) > 1 else 0.0,
+            },
             "repaired": {
                 "share": float(repaired.mean()),
                 "mean_shrinkage": float(self.shrinkage[repaired].mean()) if repaired.any() else 0.0,

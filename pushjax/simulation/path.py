@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype, concrete, in_numpy
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_count,
+    check_finite,
+    check_shape,
+    common_dtype,
+    concrete,
+    in_numpy,
+)
 
 
 def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
@@ -28,7 +37,7 @@ def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+
         >>> line((0.0, 0.0), (0.5, 0.0), steps=2).tolist()
         [[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]]
     """
-    _check_steps(steps)
+    check_count("steps", steps)
     dtype = common_dtype(start, end)
     a, b = as_float(start, dtype, "start"), as_float(end, dtype, "end")
     check_shape("start", a, ("dof",))
@@ -66,7 +75,7 @@ def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Fl
         >>> arc((0.1, 0.0, 0.0), (0.0, 0.0), np.pi / 2, steps=2).round(4).tolist()
         [[0.1, 0.0, 0.0], [0.0707, 0.0707, 0.7854], [0.0, 0.1, 1.5708]]
     """
-    _check_steps(steps)
+    check_count("steps", steps)
     dtype = common_dtype(start, center, angle)
     start_array, center_array = as_float(start, dtype, "start"), as_float(center, dtype, "center")
     angle_array = as_float(angle, dtype, "angle")
@@ -135,7 +144,7 @@ def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
     Raises:
         ValueError: For fewer than two points or one step, or for values that are not finite.
     """
-    _check_steps(steps)
+    check_count("steps", steps)
     points = checked_path(path, None)
     lengths = arc_length(points)
     return interpolate_arc_length(points, lengths, jnp.arange(steps + 1, dtype=points.dtype) / steps * lengths[-1])
@@ -158,14 +167,6 @@ def interpolate_arc_length(path: Array, arc: Float[Array, "points"], at: Float[A
         at: Lengths at which the result is wanted. Beyond an end of the path, the result is that end.
     """
     return jnp.stack([jnp.interp(at, arc, column) for column in path.T], axis=1)
-
-
-def _check_steps(steps: int) -> None:
-    """Raise ValueError unless `steps` is a whole number of at least 1."""
-    if not isinstance(steps, (int, np.integer)):
-        raise ValueError(f"steps must be a whole number; got {steps!r}")
-    if steps < 1:
-        raise ValueError(f"steps must be at least 1; got {steps}")
 
 
 def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:

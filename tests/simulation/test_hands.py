@@ -39,8 +39,8 @@ def test_line_is_batched_and_differentiable():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((0.0, 0.0), (1.0, 0.0), 0), "steps must be at least 1; got 0"),
-        (((0.0, 0.0), (1.0, 0.0), -3), "steps must be at least 1; got -3"),
+        (((0.0, 0.0), (1.0, 0.0), 0), "steps must be a whole number, at least 1; got 0"),
+        (((0.0, 0.0), (1.0, 0.0), -3), "steps must be a whole number, at least 1; got -3"),
         (((0.0, 0.0), (1.0, 0.0, 0.0), 5), "end has shape"),
         ((0.0, (1.0, 0.0), 5), "start has shape"),
         (([[0.0, 0.0]], (1.0, 0.0), 5), "start has shape"),
@@ -70,7 +70,7 @@ def test_through_meets_every_way_point():
     [
         ([[0.0, 0.0]], 3, "at least one step, two configurations"),
         ([[0.0, 0.0], [1.0, 0.0]], [2, 2], "one for each of 1 stretches; got 2"),
-        ([[0.0, 0.0], [1.0, 0.0]], 0, "steps must be at least 1; got 0"),
+        ([[0.0, 0.0], [1.0, 0.0]], 0, "steps must be a whole number, at least 1; got 0"),
         ([[0.0, 0.0], [np.nan, 0.0]], 1, "path must be finite"),
     ],
 )
@@ -123,7 +123,7 @@ def test_resample_has_finite_derivatives(recorded):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([[0.0, 0.0], [1.0, 0.0]], 0), "steps must be at least 1; got 0"),
+        (([[0.0, 0.0], [1.0, 0.0]], 0), "steps must be a whole number, at least 1; got 0"),
         (([[0.0, 0.0]], 5), "path needs at least one step, two configurations; got 1"),
         (([0.0, 0.0], 5), "path has shape"),
         (([[0.0, 0.0], [np.nan, 0.0], [1.0, 0.0]], 5), "path must be finite; 1 configuration.*first at index 1"),
