@@ -156,15 +156,16 @@ def _compute(command: Common) -> None:
 def _fetch(command: Data) -> None:
     """Fetch a set of recorded pushes."""
     from pushjax._internal.progress_bar import progress_bar
+    from pushjax.datasets.data_folder import ENVIRONMENT_VARIABLE
     from pushjax.datasets.download import fetch_triangle
 
     with progress_bar() as progress:
         progress.say("fetching 118 files of 34 MB, without those that are there already")
         folder = fetch_triangle(command.to, progress=progress)
     print(f"the logs are in {folder}")
-    elsewhere = os.environ.get("PUSHJAX_DATA")
+    elsewhere = os.environ.get(ENVIRONMENT_VARIABLE)
     if elsewhere and Path(elsewhere).resolve() != folder.resolve():
-        print(f"PUSHJAX_DATA names another folder, {elsewhere}: use these with --data {folder}")
+        print(f"{ENVIRONMENT_VARIABLE} names another folder, {elsewhere}: use these with --data {folder}")
 
 
 def data_folder(given: Path | None) -> Path:

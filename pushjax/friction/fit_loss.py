@@ -175,12 +175,14 @@ def leave_saddle(xp, loss: Quadratic, parameters: Array) -> tuple[Array, Float[A
         parameters: Lower triangle of L, (6,).
 
     Returns:
-        The lower triangle after the step, and the decrease of the loss: zero if there is no such direction.
+        The lower triangle after the step, and the decrease of the loss: zero if there is no such direction, and NaN
+        if the loss is not finite.
     """
     lower, p = forms_of(xp, parameters)
     sums = _sums(xp, 2, parameters.dtype)
     slope = (loss.gradient(coefficients_of_forms(xp, p, 2)) @ sums).reshape(3, 3)
-    eigenvalues, eigenvectors = xp.linalg.eigh(slope)
+    # NumPy's `eigh` raises an error for NaN, which wrenches give whose squares underflow
+    eigenvalues, eigenvectors = xp.linalg.eigh(xp.where(xp.isfinite(slope), slope, 0.0))
     v = eigenvectors[:, 0]
     change = sums @ xp.outer(v, v).ravel()
     step = xp.maximum(-eigenvalues[0], 0) / (2 * change @ loss.q @ change)

@@ -240,6 +240,8 @@ def test_float32_stays_float32_and_agrees():
 
 def test_bad_input_names_the_argument():
     wrench, twist, length = pairs_of("uniform", 30)
+    with pytest.raises(ValueError, match="A must be finite"):  # the squares of the wrenches underflow
+        pj.fit_limit_surface(1e-200 * wrench, twist, length, degree=2)
     with pytest.raises(ValueError, match=r"14 pairs.*at least 15"):
         pj.fit_limit_surface(wrench[:14], twist[:14], length)
     with pytest.raises(ValueError, match=r"5 pairs.*at least 6"):

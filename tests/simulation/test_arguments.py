@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.simulation.hand import Pad
 
 BLOCK = pj.Polygon.rectangle(0.09, 0.06)
 SURFACE = pj.Ellipsoid(np.eye(3), 0.03)
@@ -73,6 +74,9 @@ def test_monte_carlo_names_the_argument(changed, message):
         (lambda: pj.Support.uniform(BLOCK, points=64.5), "points must be a whole number, at least 1; got 64.5"),
         (lambda: pj.Polygon([(0, 0), (1, 0), (0,)]), "vertices: expected an array of numbers; got rows that differ"),
         (lambda: pj.Hand.finger("5 mm"), "radius: expected real numbers; got '5 mm'"),
+        (lambda: Pad("square"), "shape: expected a Polygon; got a str"),
+        (lambda: pj.Hand((0.005,), lambda q: q[None], 2.0), "dof must be a whole number, at least 1; got 2.0"),
+        (lambda: pj.motion_cone(None, (0.0, 0.0), (0.0, 1.0), 0.3), "surface: expected a LimitSurface; got a NoneType"),
     ],
 )
 def test_others_name_the_argument(call, message):

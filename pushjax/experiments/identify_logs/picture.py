@@ -9,8 +9,8 @@ from scipy.interpolate import PchipInterpolator
 
 from pushjax import plot
 from pushjax.experiments.identify_logs.findings import Findings, unit
+from pushjax.identification.uncertainty import RISE_OF_90
 
-RISE_OF_90 = 1.3528  # half the square of the 95 % quantile of the normal distribution
 SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
 
 
