@@ -183,7 +183,7 @@ def replayed(env: PushT, states: TaskState, actions: Array, params: Any) -> tupl
 
 def states_at(env: PushT, params: Any, rows: np.ndarray) -> TaskState:
     """Return the states whose observations are the given rows, (batch, 5)."""
-    return jax.vmap(lambda row: env.state_of(row, params, position_first=False))(jnp.asarray(rows))
+    return jax.vmap(lambda row: env.state_of(row, params))(jnp.asarray(rows))
 
 
 def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
@@ -192,9 +192,7 @@ def compared(env: PushT, episodes: Recorded) -> dict[str, Any]:
     padded = np.arange(-(-count // AT_ONCE) * AT_ONCE) % count
     ends, coverages = [], []
     for part in padded.reshape(-1, AT_ONCE):
-        states = jax.vmap(lambda row: env.state_of(row, params, position_first=False))(
-            jnp.asarray(episodes.start[part])
-        )
+        states = jax.vmap(lambda row: env.state_of(row, params))(jnp.asarray(episodes.start[part]))
         _, (_, _, _, _, _, info) = replayed(env, states, jnp.asarray(episodes.actions[:, part]), params)
         ends.append(np.asarray(info["final_observation"])[-1])
         coverages.append(np.asarray(info["coverage"])[-1])

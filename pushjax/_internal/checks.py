@@ -124,8 +124,10 @@ def check_count(name: str, value: Any) -> None:
 def check_type(name: str, value: Any, *kinds: type) -> None:
     """Raise TypeError unless `value` is an instance of one of `kinds`."""
     if not isinstance(value, kinds):
-        wanted = " or ".join(kind.__name__ for kind in kinds)
-        raise TypeError(f"{name}: expected a {wanted}; got a {type(value).__name__}")
+        *wanted, given = (kind.__name__ for kind in (*kinds, type(value)))
+        if given in wanted:  # that of another package
+            *wanted, given = (f"{kind.__module__}.{kind.__name__}" for kind in (*kinds, type(value)))
+        raise TypeError(f"{name}: expected a {' or '.join(wanted)}; got a {given}")
 
 
 def check_finite(name: str, value: Any) -> None:

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, check_type
+from pushjax._internal.checks import ArrayLike, as_float, check_positive, check_type
 from pushjax._internal.jit import eager_context
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.friction_model import FrictionModel
@@ -33,7 +33,7 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.environment import Environment, TaskParams, TaskState
-from pushjax.tasks.parts import placed, shared_params, with_noise
+from pushjax.tasks.parts import checked, placed, shared_params, with_noise
 from pushjax.tasks.render import render
 from pushjax.tasks.spaces import Box, Dict, Space
 
@@ -133,6 +133,8 @@ class PushT(Environment):
         physics: Physics = "pymunk",
         *,
         block: Polygon | None = None,
+        center: ArrayLike | None = None,
+        length: ArrayLike | None = None,
         goal: ArrayLike = GOAL,
         friction: ArrayLike | None = None,
         model: FrictionModel | None = None,
@@ -146,7 +148,12 @@ class PushT(Environment):
         Args:
             physics: "pymunk" for the motion of gym-pusht: an ellipsoid, and no friction at the agent. "table" for a
                 quartic that is fitted to even pressure, and friction at the agent.
-            block: The block, px. Its poses are those of its own frame. Default: the T.
+            block: The block, px. Its poses are those of the frame of its vertices. It has no holes. Default: the T.
+            center: Center of gravity of the block, in the frame of its vertices, (2,), px. Default: that of gym-pusht
+                for the T, the centroid of another block. For "table" it cannot be given.
+            length: The square root of inertia over mass about the center of gravity, px: how hard the block is to turn.
+                Default: that of gym-pusht for the T (54.8 px), the radius of gyration of another block of even
+                thickness, about `center`. For "table" it cannot be given.
             goal: Pose of the block at the goal, (3,), px and rad.
             friction: Coefficient of friction between agent and block. Default: none for "pymunk", 0.3 for "table".
             model: Distribution of friction, drawn at each reset for the whole episode. The mean of the limit surfaces
@@ -161,12 +168,15 @@ class PushT(Environment):
 
         Raises:
             ValueError: For another value of `physics`, a wrong shape, a value that is not finite, a negative noise or
-                friction, or a `model` that the limit surface does not allow (`FrictionModel.around`).
+                friction, a `length` that is not positive, `center` or `length` with "table", or a `model` that the
+                limit surface does not allow (`FrictionModel.around`).
             TypeError: If `block` is no `Polygon`, or `model` no `FrictionModel`.
         """
         if physics not in get_args(Physics):
             raise ValueError(f"physics must be one of {', '.join(get_args(Physics))}; got {physics!r}")
-        slider, origin, keypoints = _block(block, physics, self.METERS)
+        if physics == "table" and not (center is None and length is None):
+            raise ValueError("center and length are for physics 'pymunk'; a block of physics 'table' presses evenly")
+        slider, origin, keypoints = _block(block, center, length, physics, self.METERS)
         if friction is None and physics == "table":
             friction = TABLE_FRICTION
         noise = {"position_noise": position_noise, "angle_noise": angle_noise, "action_noise": action_noise}
@@ -267,29 +277,23 @@ class PushT(Environment):
         return render(block, goal, state.hand, action, size=size, seams=params.seams)
 
     def state_of(
-        self, observation: ArrayLike, params: PushTParams | None = None, *, position_first: bool = True
+        self, observation: ArrayLike, params: PushTParams | None = None, *, velocity: ArrayLike = (0.0, 0.0)
     ) -> TaskState:
-        """Return the state that belongs to an observation, with the agent at rest.
+        """Return the state that is observed as the given row.
 
         Args:
-            observation: Agent x and y, block x and y and angle, (5,), px and rad, as in "state" observations and in the
-                data sets of LeRobot.
+            observation: Agent x and y, block x and y and angle, (5,), px and rad, as in "state" observations.
             params: The parameters; None for `default_params`.
-            position_first: Whether the position is set before the angle, as gym-pusht does in a reset to a state. The
-                angle then turns the block about its center of gravity, which moves the origin of its frame. False for
-                the state whose observation is the row.
+            velocity: Velocity of the agent, (2,), px/s.
 
         Raises:
             ValueError: For a wrong shape; where it is not traced, also for values that are not finite.
         """
         params = self.default_params if params is None else params
-        row = as_float(observation, params.goal.dtype, "observation")
-        check_shape("observation", row, (5,))
-        check_finite("observation", row)
-        angle = 0 * row[4:] if position_first else row[4:]
-        center = placed(-params.origin[None], jnp.concatenate([row[2:4], angle]))[0]
-        pose = jnp.concatenate([center, row[4:]])
-        return TaskState(pose, row[:2], jnp.zeros_like(row[:2]), jnp.zeros((), jnp.int32))
+        row = checked("observation", as_float(observation, params.goal.dtype, "observation"), (5,), signed=True)
+        speed = checked("velocity", as_float(velocity, params.goal.dtype, "velocity"), (2,), signed=True)
+        center = placed(-params.origin[None], row[2:])[0]
+        return TaskState(jnp.concatenate([center, row[4:]]), row[:2], speed, jnp.zeros((), jnp.int32))
 
 
 @cache
@@ -299,30 +303,36 @@ def _default_params(dtype: Any) -> PushTParams:
         return PushT().params()
 
 
-def _block(block: Polygon | None, physics: Physics, meters: float) -> tuple[Slider, Array, Array]:
-    """Make the slider from a block (None: the T).
+def _block(
+    block: Polygon | None, center: ArrayLike | None, length: ArrayLike | None, physics: Physics, meters: float
+) -> tuple[Slider, Array, Array]:
+    """Make the slider from a block (None: the T); the other arguments are those of `PushT.params`.
 
     Returns:
         The slider, m; and in its frame, px, the origin of the block's own frame, (2,), and the observed points,
         (points, 2).
     """
     if block is None:
-        vertices, center, keypoints = np.array(T_VERTICES, float), np.array(T_CENTER), np.array(T_KEYPOINTS, float)
+        vertices, middle, keypoints = np.array(T_VERTICES, float), np.array(T_CENTER), np.array(T_KEYPOINTS, float)
     else:
         check_type("block", block, Polygon)
-        vertices, center = np.asarray(block.vertices, float), np.asarray(block.centroid, float)
+        vertices, middle = np.asarray(block.vertices, float), np.asarray(block.centroid, float)
         keypoints = vertices
-    shape = Polygon(as_float((vertices - center) * meters))
+    if center is not None:
+        middle = np.asarray(checked("center", center, (2,), signed=True), float)
+    shape = Polygon(as_float((vertices - middle) * meters))
     if physics == "table":
         slider = Slider.uniform(shape)
     else:
-        length = T_LENGTH * meters if block is None else _gyration_radius(shape)
-        slider = Slider(shape, Ellipsoid(as_float(np.eye(3)), as_float(length)))
-    return slider, as_float(-center), as_float(keypoints - center)
+        default = T_LENGTH if block is None else _gyration_radius(shape) / meters
+        reach = checked("length", default if length is None else length, ())
+        check_positive("length", reach)
+        slider = Slider(shape, Ellipsoid(as_float(np.eye(3)), reach * meters))
+    return slider, as_float(-middle), as_float(keypoints - middle)
 
 
 def _gyration_radius(shape: Polygon) -> float:
-    """Radius of gyration of a polygon about its centroid, the origin, m."""
+    """Radius of gyration of a polygon about the origin, m."""
     x, y = np.asarray(shape.vertices, float).T
     next_x, next_y = np.roll(x, -1), np.roll(y, -1)
     cross = x * next_y - next_x * y

@@ -82,12 +82,23 @@ def test_corners_are_those_of_gym_pusht():
 
 def test_state_of_a_row():
     row = np.array([100.0, 120.0, 200.0, 210.0, 2.5])
-    state = ENV.state_of(row, position_first=False)
-    assert np.allclose(ENV.observe(jax.random.key(0), state, None, ENV.default_params), row, atol=1e-3)
-    # gym-pusht's own documentation: its reset to this state gives this observation
-    state = ENV.state_of([0.0, 10.0, 20.0, 30.0, 1.0])
-    observed = ENV.observe(jax.random.key(0), state, None, ENV.default_params)
-    assert np.allclose(observed, [0.0, 10.0, 57.866196, 50.686398, 1.0], atol=1e-4)
+    for params in (ENV.default_params, ENV.params(block=BOX, center=(10.0, 20.0))):
+        state = ENV.state_of(row, params, velocity=(3.0, 4.0))
+        assert np.allclose(ENV.observe(jax.random.key(0), state, None, params), row, atol=1e-3)
+        assert np.array_equal(state.velocity, [3, 4])
+
+
+def test_block_with_a_center_and_a_length_of_its_own():
+    params = ENV.params(block=BOX, center=(10.0, 20.0), length=50.0)
+    assert float(params.slider.surface.length) == pytest.approx(0.05)
+    assert np.allclose(params.slider.shape.vertices, (np.array(BOX.vertices) - [10, 20]) * 1e-3)
+    assert np.allclose(params.origin, [-10, -20])
+    default = ENV.params(block=BOX)
+    assert float(default.slider.surface.length) == pytest.approx(np.hypot(0.08, 0.06) / 12**0.5)
+    assert np.allclose(default.origin, 0, atol=1e-5)
+    heavy = ENV.params(length=53.39)
+    assert np.array_equal(heavy.corners, ENV.default_params.corners)
+    assert float(heavy.slider.surface.length) == pytest.approx(0.05339)
 
 
 # Steps of a box: its programs are small, because a finger touches a convex block in one place
@@ -155,6 +166,10 @@ def test_derivatives_are_those_of_differences(box, box_steps):
         (lambda: ENV.params("mujoco"), "physics must be one of pymunk, table; got 'mujoco'"),
         (lambda: ENV.params(goal=(1.0, 2.0)), r"goal has shape \(2,\)"),
         (lambda: ENV.params(friction=-0.1), "friction must not be negative"),
+        (lambda: ENV.params(length=0.0), "length must be positive; got 0"),
+        (lambda: ENV.params(center=(1.0, 2.0, 3.0)), r"center has shape \(3,\)"),
+        (lambda: ENV.params("table", length=50.0), "center and length are for physics 'pymunk'"),
+        (lambda: ENV.state_of(np.zeros(5), velocity=[1.0]), r"velocity has shape \(1,\)"),
         (lambda: ENV.params(action_noise=np.nan), "action_noise must be finite"),
         (lambda: ENV.params(max_steps_in_episode=0), "max_steps_in_episode must be a whole number, at least 1"),
         (lambda: ENV.state_of([1.0, 2.0]), r"observation has shape \(2,\)"),
@@ -169,6 +184,9 @@ def test_bad_input(wrong, message):
 def test_wrong_types_and_actions():
     with pytest.raises(TypeError, match="block"):
         ENV.params(block=pj.Disk(20.0))
+    foreign = type("Polygon", (), {"__module__": "shapely.geometry"})()
+    with pytest.raises(TypeError, match=r"expected a pushjax\.geometry.*\.Polygon; got a shapely\.geometry\.Polygon"):
+        ENV.params(block=foreign)
     with pytest.raises(TypeError, match="has no field speed"):
         ENV.default_params.replace(speed=1)
     _, state = ENV.reset(jax.random.key(0))
