@@ -73,8 +73,7 @@ def control_step(
     """Push a slider along a short path, among walls.
 
     If the hand is one round finger, a slider that overlaps the finger or a wall deeply at the start is pushed out
-    (`separation`), and the status of all steps is then OVERLAPPING. There is an exception among walls, and for a
-    polygon that is not convex: if the push with one contact and without walls is valid, it counts.
+    (`separation`), and the status of all steps is then OVERLAPPING.
 
     Args:
         polygon: Outline of the slider.
@@ -101,7 +100,6 @@ def control_step(
     if walls or not polygon.convex:  # else there is no other contact
         valid = jax.lax.stop_gradient(_is_valid(with_one_contact, polygon, surface, walls, allowed))
         push = where_needed(~valid & ~deep, _with_all_contacts, push, *args, rounds=in_rounds)
-        deep &= ~valid
     return where_needed(deep, _separated, push, *args)
 
 

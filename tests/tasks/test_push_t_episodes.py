@@ -11,6 +11,7 @@ import pytest
 import pushjax as pj
 from benchmarks import pusht
 from pushjax.tasks import PushT, TaskState
+from pushjax.tasks.push_t import T_VERTICES
 
 BATCH, STEPS = pusht.AT_ONCE, 30
 ENV = PushT()
@@ -39,9 +40,7 @@ def test_steps_are_finite_and_episodes_follow_one_another():
 
 
 def test_reward_of_a_block_at_the_goal():
-    states = jax.vmap(lambda shift: ENV.state_of([50, 50, 256 + shift, 256, np.pi / 4], position_first=False))(
-        jnp.linspace(0.0, 40.0, BATCH)
-    )
+    states = jax.vmap(lambda shift: ENV.state_of([50, 50, 256 + shift, 256, np.pi / 4]))(jnp.linspace(0.0, 40.0, BATCH))
     actions = jnp.full((STEPS, BATCH, 2), 50.0, float)
     _, (_, _, reward, terminated, _, info) = pusht.replayed(ENV, states, actions, PARAMS)
     coverage = np.asarray(info["coverage"][0])
@@ -54,9 +53,7 @@ def test_reward_of_a_block_at_the_goal():
 def test_a_block_at_a_wall_holds_the_agent_back():
     """The bar of the T lies on the left wall, and the agent pushes the stem toward the wall."""
     row = [200.0, 256.0, 7.0, 256.0, -np.pi / 2]
-    states = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), ENV.state_of(row, position_first=False)
-    )
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (BATCH, *leaf.shape)), ENV.state_of(row))
     actions = jnp.broadcast_to(jnp.array([20.0, 256.0]), (STEPS, BATCH, 2))
     after, (*_, info) = pusht.replayed(ENV, states, actions, PARAMS)
     assert np.allclose(after.pose[-1], states.pose, atol=0.5)
@@ -121,3 +118,32 @@ def test_parity_with_gym_pusht():
     assert found["free"]["within"] >= 0.9  # 1.5 px and 1 degree
     assert found["free"]["coverage"][1] < 0.02
     assert found["walls"]["within"] >= 0.7  # 3 px; few episodes meet a wall
+
+
+def test_a_deep_overlap_at_the_start_opens_as_in_pymunk():
+    """The agent starts 5 to 12 px inside the T, and leaves: the T is not thrown out, and does not stay."""
+    pytest.importorskip("gym_pusht")
+    shapely = pytest.importorskip("shapely")
+    gym, rng, rows, actions, ends = pusht.make_gym(), np.random.default_rng(0), [], [], []
+    gym.reset(seed=0)
+    while len(rows) < BATCH:
+        row = rng.uniform([150, 150, 200, 200, 0], [362, 362, 312, 312, 2 * np.pi])
+        c, s = np.cos(row[4]), np.sin(row[4])
+        block = shapely.Polygon(np.array(T_VERTICES) @ [[c, s], [-s, c]] + row[2:4])
+        nearest = np.array(shapely.shortest_line(block, shapely.Point(row[:2])).coords)[0]
+        away = row[:2] - nearest
+        if not 3 < np.linalg.norm(away) < 10:  # the agent's radius is 15
+            continue
+        rows.append(row)
+        actions.append(row[:2] + rng.uniform(5, 60) * away / np.linalg.norm(away))
+        gym.agent.position, gym.agent.velocity = tuple(row[:2]), (0, 0)
+        gym.block.angle = row[4]
+        gym.block.position, gym.block.velocity, gym.block.angular_velocity = tuple(row[2:4]), (0, 0), 0
+        ends.append(gym.step(actions[-1])[0])
+    states = pusht.states_at(ENV, PARAMS, np.array(rows))
+    shared = jnp.broadcast_to(jnp.asarray(np.array(actions)), (STEPS, BATCH, 2))
+    _, (*_, info) = pusht.replayed(ENV, states, shared, PARAMS)
+    found = np.asarray(info["final_observation"])[0]
+    moved, off = (np.linalg.norm((np.array(ends) - each)[:, 2:4], axis=1) for each in (rows, found))
+    assert np.median(moved) > 1
+    assert (off < 0.5).mean() > 0.9, np.sort(off)
