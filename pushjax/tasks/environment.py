@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt8, UInt32
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape
 from pushjax._internal.compaction import where_needed
@@ -87,6 +87,7 @@ class TaskState(_Replaceable):
         time: Number of control steps since the reset.
         surface: The limit surface that was drawn for this episode; None for that of the parameters.
         friction: The coefficient of friction that was drawn; None for that of the parameters.
+        next_start: Raw key of the start of the next episode, (2,); None to take that of the step that ends this one.
     """
 
     pose: Float[Array, "3"]
@@ -95,6 +96,7 @@ class TaskState(_Replaceable):
     time: Int[Array, ""]
     surface: LimitSurface | None = None
     friction: Float[Array, ""] | None = None
+    next_start: UInt32[Array, "2"] | None = None
 
 
 # Observation, state, reward, whether the episode terminated, whether it was truncated, and `info`.
@@ -203,7 +205,8 @@ class Environment(ABC):
         """Start an episode.
 
         Args:
-            key: PRNG key of the start, the drawn friction and the observation's noise.
+            key: PRNG key of the start, the drawn friction and the observation's noise, and of the starts that follow
+                by `step`: they do not depend on the actions, nor on when episodes end.
             params: The parameters; None for `default_params`.
 
         Returns:
@@ -215,7 +218,7 @@ class Environment(ABC):
         """Take one control step, and start a new episode if it ended this one.
 
         Args:
-            key: PRNG key of everything random in the step and in a new start.
+            key: PRNG key of everything random in the step. A new start is random by the key of the `reset`.
             state: The state.
             action: The action, as in `action_space`. One that is not finite counts as one that leaves the hand in its
                 place.
@@ -233,9 +236,10 @@ class Environment(ABC):
 
     def reset_env(self, key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
         """Start an episode. `reset` is the compiled form of this method."""
-        start_key, friction_key, observation_key = jax.random.split(key, 3)
+        start_key, friction_key, observation_key, next_key = jax.random.split(key, 4)
         pose, hand = self.draw_start(start_key, params)
-        state = TaskState(pose, hand, jnp.zeros_like(hand), jnp.zeros((), jnp.int32))
+        next_start = jax.random.bits(next_key, (2,), jnp.uint32)
+        state = TaskState(pose, hand, jnp.zeros_like(hand), jnp.zeros((), jnp.int32), next_start=next_start)
         if params.model is not None:
             surface_key, contact_key = jax.random.split(friction_key)
             surface = params.surfaces.sample(surface_key).surface
@@ -315,11 +319,16 @@ def _step(env: Environment, key: PRNGKeyArray, state: TaskState, action: Any, pa
     observation, state, reward, terminated, info = env.step_env(key, state, action, params)
     truncated = env.is_truncated(state, params)
 
-    def new_episode(key: PRNGKeyArray, params: Any) -> tuple[Any, TaskState]:
-        return env.reset_env(jax.random.fold_in(key, 1), params)
+    def new_episode(key: PRNGKeyArray, next_start: Array | None, params: Any) -> tuple[Any, TaskState]:
+        if next_start is None:
+            first, new = env.reset_env(jax.random.fold_in(key, 1), params)
+            return first, new.replace(next_start=None)
+        return env.reset_env(jax.random.wrap_key_data(next_start, impl="threefry2x32"), params)
 
     info |= {"terminated": terminated, "truncated": truncated, "final_observation": observation}
-    next_episode = where_needed(terminated | truncated, new_episode, (observation, state), key, params)
+    next_episode = where_needed(
+        terminated | truncated, new_episode, (observation, state), key, state.next_start, params
+    )
     return *next_episode, reward, terminated, truncated, info
 
 

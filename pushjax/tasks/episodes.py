@@ -1,4 +1,7 @@
-"""Compiled starts, steps and automatic resets of episodes, each with its own PRNG key, for `pushjax.tasks.gym`."""
+"""Compiled starts, steps and automatic resets of episodes, each with its own PRNG key, for `pushjax.tasks.gym`.
+
+The key changes only at a start. So the start of an episode does not depend on how long those before it took.
+"""
 
 from typing import Any
 
@@ -16,7 +19,7 @@ from pushjax.tasks.environment import Environment, TaskState
 @quick_jit
 def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, ...]:
     """Start an episode, at `task.state_of(row)` if a row is given. Return the next key, observation, state and info."""
-    key, start_key, noise_key = jax.random.split(key, 3)
+    key, start_key, noise_key, _ = jax.random.split(key, 4)  # the last is that of the steps
     observation, state = task.reset_env(start_key, params)
     if row is not None:
         at_row = task.state_of(row, params)
@@ -29,8 +32,8 @@ def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, .
 
 @quick_jit
 def step(task: Environment, key: Array, state: TaskState, action: Any, params: Any) -> tuple[Any, ...]:
-    """Take a step. Return the next key, observation, state, reward, terminated, truncated and info."""
-    key, step_key = jax.random.split(key)
+    """Take a step. Return the key, observation, state, reward, terminated, truncated and info."""
+    step_key = jax.random.fold_in(jax.random.split(key, 4)[3], state.time)
     observation, state, reward, terminated, info = task.step_env(step_key, state, action, params)
     return key, observation, state, reward, terminated, task.is_truncated(state, params), info
 

@@ -7,7 +7,10 @@ Batches are computed by one compiled step. They start, step and end as those of 
 environments, with the same random numbers.
 """
 
+import os
 from collections.abc import Sequence
+from numbers import Integral
+from operator import index
 from typing import Any, ClassVar
 
 import jax
@@ -29,14 +32,8 @@ except ImportError as error:
     raise ImportError(f"pushjax.tasks.gym needs Gymnasium 1.1 or later: pip install '.[gym]' ({error})") from None
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}
-# Tasks that are registered, and the control steps after which `gymnasium.make` truncates their episodes.
-MAX_EPISODE_STEPS = {
-    "PushT": 300,
-    "PushBox": 100,
-    "PushAlongWall": 100,
-    "PushTwoFingers": 100,
-    "Squeeze": 100,
-}
+TASKS = "PushT", "PushBox", "PushAlongWall", "PushTwoFingers", "Squeeze"  # that are registered
+_processes: list[int] = []  # in which an environment was made; a fork inherits the numbers
 
 
 class TaskEnv(gymnasium.Env):
@@ -45,8 +42,8 @@ class TaskEnv(gymnasium.Env):
     `info` has the `measures` of the task, among them the "coverage" of the goal and "is_success"; and "status", the
     number of steps of the simulator with each `Status`. After a reset the last is zero.
 
-    An environment that `gymnasium.make` returns is truncated after the `max_episode_steps` given there, which is 300 by
-    default for "PushT" and 100 for the others. Otherwise `max_steps_in_episode` of the parameters counts.
+    An episode is truncated after the `max_episode_steps` given to `gymnasium.make`, or else after
+    `max_steps_in_episode` of the parameters.
 
     Args:
         task: The task, or the name of one in `pushjax.tasks`.
@@ -76,6 +73,7 @@ class TaskEnv(gymnasium.Env):
         self.render_mode, self.render_size = _checked_rendering(render_mode, render_size)
         self.observation_space = _space(self.task.observation_space(self.params))
         self.action_space = _space(self.task.action_space(self.params))
+        self._max_episode_steps = int(self.params.max_steps_in_episode)  # read where no `TimeLimit` has it
         self._key: Any = None
         self._state: TaskState | None = None
         self._action: Any = None
@@ -92,7 +90,10 @@ class TaskEnv(gymnasium.Env):
 
         Raises:
             ValueError: If "reset_to_state" has another shape, is not finite, or the task has no `state_of`.
+            RuntimeError: In a process that was forked after JAX had run.
         """
+        _check_process()
+        seed = None if seed is None else index(seed)
         super().reset(seed=seed)
         if seed is not None or self._key is None:
             self._key = _keys([int(self.np_random.integers(2**32)) if seed is None else seed])[0]
@@ -119,7 +120,8 @@ class TaskEnv(gymnasium.Env):
         self._action = _actions(action, self.action_space)
         result = episodes.step(self.task, self._key, self._state, self._action, self.params)
         self._key, observation, self._state, reward, terminated, truncated, info = result
-        truncated = bool(truncated) and self.spec is None  # with a spec the wrapper `TimeLimit` truncates
+        # with a limit of `gymnasium.make` the wrapper `TimeLimit` truncates
+        truncated = bool(truncated) and (self.spec is None or self.spec.max_episode_steps is None)
         return _numpy(observation), float(reward), bool(terminated), truncated, _single_info(info)
 
     def render(self) -> np.ndarray | None:
@@ -205,6 +207,8 @@ class TaskVectorEnv(VectorEnv):
             ValueError: If an option or the seeds have another shape, a value is not finite, or the task has no
                 `state_of`.
         """
+        _check_process()
+        seed = int(seed) if isinstance(seed, Integral) else seed
         super().reset(seed=seed if isinstance(seed, int) else None)
         mask = _reset_mask(options, self.num_envs)
         if self._states is None and not mask.all():
@@ -274,19 +278,29 @@ class TaskVectorEnv(VectorEnv):
         if len(seeds) != self.num_envs:
             raise ValueError(f"seed: expected one for each of {self.num_envs} environments; got {len(seeds)}")
         given = np.array([one is not None for one in seeds])
-        return np.where(given[:, None], _keys([one or 0 for one in seeds]), keys)
+        return np.where(given[:, None], _keys([0 if one is None else index(one) for one in seeds]), keys)
 
 
 def _task(task: str | Environment, options: dict[str, Any]) -> Environment:
     """Return the task that the arguments describe."""
+    _processes.append(os.getpid())
     if not isinstance(task, str):
         check_type("task", task, Environment)
         if options:
             raise TypeError(f"{', '.join(options)}: options go with the name of a task; got the task itself")
         return task
-    if task not in MAX_EPISODE_STEPS:
-        raise ValueError(f"task must be one of {', '.join(MAX_EPISODE_STEPS)}; got {task!r}")
+    if task not in TASKS:
+        raise ValueError(f"task must be one of {', '.join(TASKS)}; got {task!r}")
     return getattr(tasks, task)(**options)
+
+
+def _check_process() -> None:
+    """Raise an error in a forked process, where JAX would wait forever. Gymnasium passes it on from a `reset`."""
+    if _processes and os.getpid() != _processes[0]:
+        raise RuntimeError(
+            "JAX cannot be used in a process that was forked after it had run: use gymnasium.make_vec without "
+            "vectorization_mode, which computes all environments in one step, or AsyncVectorEnv with context='spawn'"
+        )
 
 
 def _checked_rendering(mode: str | None, size: int) -> tuple[str | None, int]:
@@ -377,11 +391,10 @@ def _final(observations: Any, info: dict[str, Array], ended: np.ndarray) -> dict
     return {"final_obs": final, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}
 
 
-for _name, _steps in MAX_EPISODE_STEPS.items():
+for _name in TASKS:
     gymnasium.register(
         f"pushjax/{_name}-v0",
         entry_point="pushjax.tasks.gym:TaskEnv",
         vector_entry_point="pushjax.tasks.gym:TaskVectorEnv",
-        max_episode_steps=_steps,
         kwargs={"task": _name},
     )

@@ -1,6 +1,8 @@
 """The Gymnasium versions of the tasks, compared with Gymnasium's own vector of single environments."""
 
 import pickle
+import subprocess
+import sys
 import warnings
 from dataclasses import dataclass
 
@@ -120,6 +122,69 @@ def test_vector_is_a_vector_of_single_environments(mode, rng):
     assert_equal(ours.reset(seed=seeds), theirs.reset(seed=seeds))
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_starts_do_not_depend_on_the_actions(mode):
+    """The third episode starts alike however long those before took, also with a seed of NumPy."""
+    starts = []
+    for actions, seed in ((0.0, 3), (0.2, np.int64(3))):
+        env = TaskVectorEnv(Walk(), NUM_ENVS, autoreset_mode=mode)
+        env.reset(seed=seed)
+        episodes, found, ended = np.zeros(NUM_ENVS, int), np.full(NUM_ENVS, np.nan), np.zeros(NUM_ENVS, bool)
+        for _ in range(20):
+            observations, _, terminated, truncated, _ = env.step(np.full((NUM_ENVS, 2), actions))
+            ended_now = terminated | truncated
+            fresh = ended_now if mode == AutoresetMode.SAME_STEP else ended
+            episodes, ended = episodes + fresh, ended_now
+            found = np.where(fresh & (episodes == 2), observations["x"][:, 0], found)
+        starts.append(found)
+    assert np.isfinite(starts[0]).all()
+    np.testing.assert_array_equal(*starts)
+
+
+def test_starts_of_the_functional_interface_do_not_depend_on_the_actions():
+    env, starts = Walk(), []
+    for action, seed in ((0.0, 0), (0.2, 1)):
+        _, state = env.reset(jax.random.key(7))
+        found = [state.pose]
+        for key in jax.random.split(jax.random.key(seed), 20):
+            _, state, _, terminated, truncated, _ = env.step(key, state, jnp.full(2, action))
+            found += [state.pose] if terminated | truncated else []
+        starts.append(np.array(found[:3]))
+    assert starts[0].shape == (3, 3)
+    np.testing.assert_array_equal(*starts)
+    assert len(np.unique(starts[0])) == 9
+
+
+def test_seeds_of_numpy():
+    env, many = TaskEnv(Walk()), TaskVectorEnv(Walk(), NUM_ENVS)
+    assert_equal(env.reset(seed=np.int32(3)), env.reset(seed=3))
+    assert_equal(many.reset(seed=list(np.arange(NUM_ENVS))), many.reset(seed=0))
+
+
+FORKED = """
+import gymnasium, pushjax.tasks.gym
+made = gymnasium.make_vec("pushjax/PushBox-v0", num_envs=2, vectorization_mode="async", vector_kwargs={kwargs})
+try:
+    print("observed", made.reset(seed=0)[0].shape)
+except RuntimeError as error:
+    print("refused:", error)
+made.close(terminate=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "printed"),
+    [("dict(context='fork')", "refused: JAX cannot be"), ("dict(context='spawn')", "observed (2, 6)")],
+)
+def test_environments_in_processes(kwargs, printed, tmp_path):
+    """A forked process says that JAX does not work there, and does not wait forever."""
+    (tmp_path / "script.py").write_text(
+        "if __name__ == '__main__':" + FORKED.format(kwargs=kwargs).replace("\n", "\n    ")
+    )
+    done = subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, text=True, timeout=300)
+    assert printed in done.stdout, done.stdout + done.stderr
+
+
 def test_final_observation_is_that_before_the_reset():
     env = TaskVectorEnv(Walk(), NUM_ENVS, autoreset_mode="SameStep")
     env.reset(seed=0)
@@ -199,7 +264,7 @@ def test_gymnasiums_checks(push_t):
 
 
 def test_time_limit_is_that_of_make(push_t):
-    assert push_t.spec.max_episode_steps == 300
+    assert push_t.get_wrapper_attr("_max_episode_steps") == 300
     short = gymnasium.make("pushjax/PushT-v0", max_episode_steps=2, **QUICK)
     short.reset(seed=0)
     assert [short.step(np.array([20.0, 20.0]))[3] for _ in range(2)] == [False, True]
@@ -208,13 +273,22 @@ def test_time_limit_is_that_of_make(push_t):
     assert gymnasium.make_vec("pushjax/PushT-v0", num_envs=2).params.max_steps_in_episode == 300
 
 
+@pytest.mark.parametrize("steps", [2, 400])
+def test_time_limit_may_be_that_of_the_parameters(steps):
+    params = PushT(**QUICK).params(max_steps_in_episode=steps)
+    single = gymnasium.make("pushjax/PushT-v0", params=params, **QUICK)
+    single.reset(seed=0)
+    single.unwrapped._state = single.unwrapped._state.replace(time=np.int32(steps - 2))
+    assert [single.step(np.array([20.0, 20.0]))[3] for _ in range(2)] == [False, True]
+    many = gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, params=params, **QUICK)
+    assert many.params.max_steps_in_episode == steps
+
+
 def test_push_t_in_a_vector(push_t):
     """One wrapper on a single environment, the same one on a vector; the second environment starts at the goal."""
     goal = [400.0, 100.0, 256.0, 256.0, np.pi / 4]
-    params = push_t.unwrapped.params
     row = np.array([[100.0, 100.0, 250.0, 300.0, 1.0], [0.0] * 5])
-    at_goal = push_t.unwrapped.task.block_pose(push_t.unwrapped.task.state_of(np.array(goal), params), params)
-    row[1] = [400.0, 100.0, *(2 * np.array(goal[2:4]) - np.asarray(at_goal)[:2]), np.pi / 4]
+    row[1] = goal
     many = RecordVectorStatistics(gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, **QUICK))
     single = RecordEpisodeStatistics(push_t)
     first, _ = many.reset(seed=0, options={"reset_to_state": row})
