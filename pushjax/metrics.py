@@ -249,6 +249,13 @@ def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:
     return float(np.abs(a - b).sum() / 2)
 
 
+def mean_pose(poses: Float[Array, "n 3"]) -> Float[Array, "3"]:
+    """Return the mean of poses, m and rad: of angles the mean direction, within half a turn of the first angle."""
+    turns = poses[:, 2] - poses[0, 2]
+    angle = poses[0, 2] + jnp.arctan2(jnp.mean(jnp.sin(turns)), jnp.mean(jnp.cos(turns)))
+    return jnp.concatenate([jnp.mean(poses[:, :2], axis=0), angle[None]])
+
+
 class _Kernel:
     """Gaussian kernels centered at the samples, each repeated one full turn away on either side.
 
@@ -284,12 +291,10 @@ def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array,
     Angles are unwrapped to within half a turn of the samples' mean direction. Positions are relative to their mean,
     because float32 has no digits to lose.
     """
-    theta = samples[:, 2]
-    mean_angle = jnp.arctan2(jnp.mean(jnp.sin(theta)), jnp.mean(jnp.cos(theta)))
-    mean_pose = jnp.concatenate([jnp.mean(samples[:, :2], axis=0), mean_angle[None]])
+    center = mean_pose(samples)
 
     def relative_points(poses: Array) -> Array:
-        relative = poses - jnp.broadcast_to(mean_pose, poses.shape)
+        relative = poses - jnp.broadcast_to(center, poses.shape)
         angle = relative[..., 2] - 2 * jnp.pi * jax.lax.stop_gradient(jnp.round(relative[..., 2] / (2 * jnp.pi)))
         return jnp.concatenate([relative[..., :2], (length * angle)[..., None]], axis=-1)
 

@@ -7,6 +7,7 @@ import pytest
 import scipy.stats
 
 import pushjax as pj
+from pushjax.metrics import mean_pose
 
 LENGTH = 0.03
 
@@ -128,6 +129,15 @@ def test_derivatives(samples):
             assert slope[i, k] == pytest.approx((above - below) / (2 * h), rel=1e-3, abs=1e-7)
     # at equal poses the distance has a kink
     assert np.all(np.isfinite(jax.grad(lambda x: pj.energy_score(x, x[0], LENGTH))(jnp.zeros((4, 3)))))
+
+
+def test_the_mean_pose_is_the_same_in_any_frame(samples):
+    """Poses around half a turn have their mean there, and whole turns change nothing but the branch."""
+    mean = np.asarray(mean_pose(samples))
+    half = np.asarray(mean_pose(jnp.asarray(samples + [0, 0, np.pi])))
+    assert np.allclose(half - mean, [0, 0, np.pi], atol=1e-5)
+    wrapped = np.array([[1.0, 2.0, 3.1], [3.0, 4.0, -3.1]])
+    assert np.allclose(mean_pose(jnp.asarray(wrapped)), [2.0, 3.0, np.pi], atol=1e-6)
 
 
 def test_total_variation():

@@ -180,6 +180,16 @@ def test_a_belief_over_the_start(slider, easy, plan):
     assert done.success(easy) < plan.success - 0.1
 
 
+def test_a_belief_around_half_a_turn(slider, easy):
+    """Pushes are laid out from the mean direction: the belief and the goal of an easy plan, turned by half a turn."""
+    start = np.array([[0, 0, np.pi - 0.05], [0, 0, 0.05 - np.pi]])
+    turned = easy.pose * np.array([-1, -1, 1]) + np.array([0, 0, np.pi])
+    goal = Goal(turned, length=slider.surface.length, **TOLERANCES)
+    plan = plan_pushes(KEY, slider, HAND, start, goal, **SETTINGS)
+    assert np.cos(plan.pose[0, 2]) == pytest.approx(-1, abs=1e-6)
+    assert plan.success > 0.9
+
+
 def test_pushes_that_move_nothing_are_left_out(slider, easy):
     """At the goal already, the best push is one that misses the block: the plan has none."""
     here = Goal((0, 0, 0), length=slider.surface.length, **TOLERANCES)

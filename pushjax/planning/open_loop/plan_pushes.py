@@ -28,6 +28,7 @@ from pushjax._internal.checks import ArrayLike, as_float, check_count, check_fin
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
+from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
 from pushjax.planning.goal import Goal
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE, Obstacles
@@ -182,7 +183,7 @@ def _search(
 ) -> tuple[Candidates, np.ndarray]:
     """Return the best candidates, and the least cost after each iteration under sampled friction."""
     keys = iter(jax.random.split(key, 1 + len(warm_up) + len(search)))
-    mean_start = jnp.mean(problem.start, axis=0, keepdims=True)
+    mean_start = mean_pose(problem.start)[None]
     nominal = eqx.tree_at(lambda p: (p.draws, p.start), problem, (problem.mean, mean_start))
     found = Candidates(problem.pushes.sample(next(keys), candidates), np.full(candidates, np.inf))
     history = [np.zeros(0)]
@@ -274,7 +275,7 @@ def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarra
     check_shape("finger", given, (2,))
     check_finite("finger", given)
     center, radius = np.asarray(given, float), problem.hand.radius[0]
-    in_body = to_body(np.mean(np.asarray(problem.start, float), axis=0), center)
+    in_body = to_body(np.asarray(mean_pose(problem.start), float), center)
     from_slider = float(signed_distances(outline_vertices(problem.slider.shape), in_body) - radius)
     if from_slider < 0:
         raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-from_slider:.3g} m")

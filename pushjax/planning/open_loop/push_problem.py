@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, check_shape, common_dtype
 from pushjax._internal.jit import jit, quick_jit
 from pushjax.friction.friction_model import FrictionModel
+from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, Risk
 from pushjax.planning.friction_samples import draw_friction, mean_friction
 from pushjax.planning.goal import Goal
@@ -99,7 +100,7 @@ class PushProblem(eqx.Module):
             after = self.rollout(draw, path, pose).pose[-1]
             return after, (path, after)
 
-        start = jnp.mean(self.start, axis=0)
+        start = mean_pose(self.start)
         paths, poses = jax.lax.scan(push, start, parameters.reshape(self.pushes.count, -1))[1]
         return paths, jnp.concatenate([start[None], poses])
 
@@ -179,7 +180,7 @@ def samples_of(paths: np.ndarray, problem: PushProblem) -> Sample:
 
 def _without_samples(problem: PushProblem) -> PushProblem:
     """Return the problem with what does not depend on the number of samples: the same for all stages of a search."""
-    return replace(problem, draws=None, start=jnp.mean(problem.start, axis=0, keepdims=True))
+    return replace(problem, draws=None, start=mean_pose(problem.start)[None])
 
 
 def _in_batches(count: int, size: int) -> list[np.ndarray]:
