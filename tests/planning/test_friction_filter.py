@@ -141,6 +141,21 @@ def test_a_motion_that_nothing_explains_leaves_the_belief(made):
     assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves((kept, kept.mean(), kept.effective())))
 
 
+def test_a_failed_simulation_does_not_remove_a_sample(made):
+    """A sample whose simulation fails once, and which explains all that is seen later, has most of the weight."""
+    paths = jnp.asarray(some_pushes(np.random.default_rng(2), 8))
+    belief = made.init(jax.random.key(0))
+    surface, mu = jax.tree.map(lambda leaf: leaf[3], (belief.surface, belief.friction))
+    failed = belief._replace(friction=belief.friction.at[3].set(jnp.nan))
+    for k, path in enumerate(paths):
+        after = pj.rollout(pj.Slider(SLIDER.shape, surface), HAND, path, pose=np.zeros(3), friction=mu).pose[-1]
+        belief = made.update(failed if k == 0 else belief, np.zeros(3), path, after)
+        belief = belief._replace(friction=belief.friction.at[3].set(mu))
+        assert belief.status == BeliefStatus.UPDATED
+        assert np.isfinite(belief.evidence).all()
+    assert float(belief.weight[3]) > 1 / 128
+
+
 def test_a_hand_that_touches_nothing_teaches_nothing(made):
     path = 0.2 + jnp.zeros((STEPS + 1, 2))
     belief = made.init(jax.random.key(0))

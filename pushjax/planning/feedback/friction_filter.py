@@ -196,9 +196,9 @@ def _update(
 ) -> FrictionBelief:
     finite = jnp.all(jnp.isfinite(before)) & jnp.all(jnp.isfinite(after)) & jnp.all(jnp.isfinite(path))
     squared = jnp.where(finite, _squared_errors(settings, belief, before, path, after), jnp.inf)
-    simulated = jnp.isfinite(squared)
-    likelihood = -(STUDENT_DOF + 3) / 2 * jnp.log1p(jnp.where(simulated, squared, 0.0) / STUDENT_DOF)
-    evidence = belief.evidence + jnp.where(simulated, likelihood, -jnp.inf)
+    # a simulation that failed counts as a motion that is not explained: it must not remove the sample for good
+    judged = jnp.where(jnp.isfinite(squared), squared, LOST**2)
+    evidence = belief.evidence - (STUDENT_DOF + 3) / 2 * jnp.log1p(judged / STUDENT_DOF)
     possible = jnp.any(squared < LOST**2) & jnp.any(jnp.isfinite(evidence))
     evidence = jnp.where(possible, evidence, belief.evidence)
     weight = jnp.where(possible, _tempered(jnp.where(possible, evidence, 0.0), settings.effective), belief.weight)
