@@ -111,7 +111,7 @@ def _controller(
         learning = {"friction_filter": settings, "prior": settings.init(key)}
     planning = planner(slider, pushes)
     planning.prepare()
-    made = PushController(planning, setting.finger_control(), friction=mean, feedback=feedback, **learning)
+    made = PushController(planning, setting.finger_control(), feedback=feedback, **learning)
     made.prepare()
     return made
 
@@ -123,7 +123,7 @@ def _knowing(nominal: PushController, state: Any) -> PushController:
     true = PushLibrary.simulate(slider, HAND, pushes.starts, pushes.directions, friction=friction)
     planning = planner(slider, true, value=nominal.planner.value)
     planning.prepare()
-    return PushController(planning, setting.finger_control(), friction=friction, feedback=nominal.feedback)
+    return PushController(planning, setting.finger_control(), feedback=nominal.feedback)
 
 
 def _play(key: Any, state: Any, step: Any, params: Any, made: PushController) -> Episode:

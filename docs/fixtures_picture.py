@@ -42,7 +42,7 @@ def episode(slider: pj.Slider, pushes: planning.PushLibrary, known: tuple) -> Ep
     """Play one episode among the fixtures, with a planner that knows some of them."""
     table = planning.Workspace.rectangle((0.0, 0.0), (SIDE, SIDE), known)
     planner = planning.PushPlanner(slider, RADIUS, pushes, GOAL, table, planning.Pace(0.05, 0.02, 0.02))
-    made = planning.PushController(planner, planning.PositionControl(), friction=FRICTION)
+    made = planning.PushController(planner, planning.PositionControl())
     memory, hand, pose, finger = made.initial_memory(), pj.Hand.finger(RADIUS), START, FINGER
     found = Episode([START], [], [])
     while len(found.paths) < STEPS and planner.measure(compose(inverse(GOAL), pose)) < planner.measure.enough:

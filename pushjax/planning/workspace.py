@@ -5,8 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pushjax._internal.checks import check_finite
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.obstacles import Obstacles
 from pushjax.simulation.fixtures import Fixture, Wall
+
+ROUNDING = 1e-7  # m, by which a slider at the goal may be out of the workspace
 
 
 class Workspace(NamedTuple):
@@ -53,6 +57,19 @@ class Workspace(NamedTuple):
     def allows_finger(self, points: np.ndarray) -> np.ndarray:
         """Return whether points (..., 2), world, m, are within the finger's limits; obstacles are not considered."""
         return np.all((points >= self.finger_low) & (points <= self.finger_high), axis=-1)
+
+    def check_goal(self, goal: np.ndarray, vertices: np.ndarray) -> None:
+        """Raise ValueError unless a slider with these vertices is within its limits at a goal, (3,)."""
+        if goal.shape != (3,):
+            raise ValueError(f"goal has shape {goal.shape}; expected (3,)")
+        check_finite("goal", goal)
+        corners = to_world(goal, vertices)
+        outside = np.maximum(self.slider_low - corners, corners - self.slider_high).max()
+        if outside > ROUNDING:
+            raise ValueError(
+                f"goal must be a pose at which the slider is within the workspace; got {goal.tolist()}, at which it "
+                f"reaches {1e3 * outside:.3g} mm out of it"
+            )
 
 
 class Extent:

@@ -191,7 +191,7 @@ def test_a_box_gets_around_fixtures(slider):
     ):
         table = Workspace.rectangle((0.0, 0.0), (0.5, 0.5), known)
         planner = PushPlanner(slider, RADIUS, pushes, GOAL, table, PACE)
-        made = PushController(planner, PositionControl(), friction=FRICTION)
+        made = PushController(planner, PositionControl())
         found = episodes[name] = [play(made, *start, there) for start in starts(slider, 20)]
         reached = [each.steps for each in found if each.success]
         print(

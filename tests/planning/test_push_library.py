@@ -1,13 +1,21 @@
 """Libraries of pushes: their outcomes, their composition, their files, and the cost to go."""
 
+import os
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.experiments.pusht_mpc import player
 from pushjax.geometry import se2, se2_numpy
+from pushjax.planning.feedback.controller import PushController
 from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.feedback.finger_control import PositionControl
+from pushjax.planning.feedback.friction_filter import FrictionFilter
 from pushjax.planning.feedback.push_library import PushLibrary, digest, fan, pose_features
+from pushjax.planning.feedback.push_planner import PushPlanner
 from pushjax.planning.pace import Pace
 from pushjax.planning.workspace import Extent, Workspace
 
@@ -115,6 +123,98 @@ def test_files(slider, library, tmp_path):
         PushLibrary.load(tmp_path / "text.npz")
 
 
+def test_files_have_exactly_the_name_that_was_given(library, tmp_path):
+    library.save(str(tmp_path / "x"))
+    assert os.listdir(tmp_path) == ["x"]
+    assert PushLibrary.load(str(tmp_path / "x")).digest == library.digest
+
+
+def test_a_file_is_written_as_a_whole_or_not_at_all(library, tmp_path, monkeypatch):
+    library.save(tmp_path / "x")
+    before = (tmp_path / "x").read_bytes()
+
+    def interrupted(file, **arrays):
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        library.save(tmp_path / "x")
+    assert os.listdir(tmp_path) == ["x"]
+    assert (tmp_path / "x").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format_version": 1}, "its format is 1; this program reads"),
+        ({"outcomes": np.zeros(3)}, r"outcomes has shape \(3,\)"),
+        ({"valid": np.ones((2, 2), bool)}, r"valid has shape \(2, 2\)"),
+        ({"starts": np.full((300, 2), np.nan)}, "starts must be finite numbers"),
+        ({"friction": "much"}, "friction must be finite numbers"),
+    ],
+)
+def test_content_of_files_is_checked(library, tmp_path, changes, message):
+    library.save(tmp_path / "x.npz")
+    with np.load(tmp_path / "x.npz") as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(tmp_path / "x.npz", **(arrays | changes))
+    with pytest.raises(ValueError, match=f"does not hold a library of pushes: {message}"):
+        PushLibrary.load(tmp_path / "x.npz")
+
+
+def test_damaged_files_of_the_cache_are_built_again(slider, tmp_path, monkeypatch):
+    monkeypatch.setattr(player, "fan", lambda slider, radius: fan(slider, radius, 12, 1))
+    built, loaded = player.library(slider, tmp_path)
+    assert not loaded
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:100])
+    again, loaded = player.library(slider, tmp_path)
+    assert not loaded
+    assert player.library(slider, tmp_path)[1]
+    np.testing.assert_array_equal(again.outcomes, built.outcomes)
+
+
+def test_a_planner_takes_the_library_of_its_slider_and_finger(slider, library):
+    table, pace = Workspace.rectangle((0, 0), (0.5, 0.5)), Pace(0.05, 0.02, 0.02)
+    planner = PushPlanner(slider, RADIUS, library, GOAL, table, pace)
+    assert PushController(planner, PositionControl()).friction == FRICTION
+    thin = pj.Slider(pj.Polygon.rectangle(0.1, 0.05), slider.surface)
+    for other in (thin, pj.Slider(slider.shape, pj.Ellipsoid(np.eye(3), 0.04))):
+        with pytest.raises(ValueError, match="library was made for another slider"):
+            PushPlanner(other, RADIUS, library, GOAL, table, pace)
+    with pytest.raises(ValueError, match=r"a finger with a radius of 0\.01 m; got 0\.015"):
+        PushPlanner(slider, 0.015, library, GOAL, table, pace)
+    learning = FrictionFilter(slider, pj.Hand.finger(0.02), pj.FrictionModel(20, (0.1, 0.5)), samples=8)
+    with pytest.raises(ValueError, match=r"a finger with a radius of 0\.01 m; got 0\.02"):
+        PushController(planner, PositionControl(), friction_filter=learning, prior=learning.init(jax.random.key(0)))
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        ((0.04, 0.3, 0.0), "goal must be a pose at which the slider is within the workspace.* 10 mm out of it"),
+        ((0.2, 0.3), r"goal has shape \(2,\)"),
+        ((0.2, np.nan, 0.0), "goal must be finite"),
+    ],
+)
+def test_goals_out_of_the_workspace(slider, library, goal, message):
+    table, pace = Workspace.rectangle((0, 0), (0.5, 0.5)), Pace(0.05, 0.02, 0.02)
+    with pytest.raises(ValueError, match=message):
+        PushPlanner(slider, RADIUS, library, np.array(goal), table, pace)
+
+
+def test_a_hash_tells_costs_apart(slider, library):
+    def digest_of(goal=GOAL, side=0.5, push=0.02, fixtures=()):
+        table = Workspace.rectangle((0, 0), (side, side), fixtures)
+        return PushPlanner(slider, RADIUS, library, goal, table, Pace(0.05, push, 0.02)).value_digest()
+
+    wall = pj.Wall(jnp.zeros(2), jnp.array([1.0, 0.0]))
+    others = digest_of(GOAL + 0.01), digest_of(side=0.6), digest_of(push=0.03), digest_of(fixtures=(wall,))
+    assert digest_of() == digest_of()
+    assert len({digest_of(), *others}) == 5
+
+
 def test_random_friction(slider, library):
     """Outcomes under drawn friction scatter, less with a better known surface; without noise they do not."""
     few = slice(0, 120, 12)
@@ -209,6 +309,9 @@ def test_files_of_costs(costs, tmp_path):
     value.save(tmp_path / "cost.npz")
     read = CostToGo.load(tmp_path / "cost.npz")
     assert all(np.array_equal(a, b) for a, b in zip(read, value, strict=True))
+    value._replace(spacing=np.zeros(2)).save(tmp_path / "cost")
+    with pytest.raises(ValueError, match=r"does not hold a cost to go: spacing has shape \(2,\)"):
+        CostToGo.load(tmp_path / "cost")
     (tmp_path / "text.npz").write_text("none")
     with pytest.raises(ValueError, match="does not hold a cost to go"):
         CostToGo.load(tmp_path / "text.npz")

@@ -38,7 +38,7 @@ def block(vertices):
 def made_controller(slider, contacts, angles, friction=0.0):
     pushes = PushLibrary.build(slider, RADIUS, friction=friction, contacts=contacts, angles=angles)
     planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
-    return PushController(planner, PositionControl(), friction=friction)
+    return PushController(planner, PositionControl())
 
 
 class Outcome(NamedTuple):
@@ -93,7 +93,7 @@ def adapting(rectangle):
     planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
     learning = FrictionFilter(slider, rectangle.hand, model, samples=12, effective=2.0)
     prior = learning.init(key)
-    return PushController(planner, PositionControl(), friction=0.3, friction_filter=learning, prior=prior)
+    return PushController(planner, PositionControl(), friction_filter=learning, prior=prior)
 
 
 @pytest.mark.slow

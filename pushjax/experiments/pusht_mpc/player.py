@@ -1,8 +1,8 @@
 """The planner for `gym-pusht`, built once and kept in the user's cache folder, and episodes that it plays."""
 
-import hashlib
 import os
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,7 @@ def library(slider: pj.Slider, folder: Path, **friction: Any) -> tuple[PushLibra
     starts, directions = fan(slider, setting.FINGER_RADIUS)
     wanted = digest(slider, hand, starts, directions, **friction)
     path = folder / f"pushes-{wanted[:16]}.npz"
-    if path.exists():
+    with suppress(FileNotFoundError, ValueError):  # there is none, or it is damaged
         return PushLibrary.load(path, wanted), True
     built = PushLibrary.simulate(slider, hand, starts, directions, **friction)
     folder.mkdir(parents=True, exist_ok=True)
@@ -126,19 +126,19 @@ def controller(
     pushes, loaded = library(slider, folder, friction=friction_in_model)
     times: dict[str, Any] = {"library": time.perf_counter() - began, "library_from_file": loaded}
     began = time.perf_counter()
-    name = hashlib.sha256(f"{pushes.digest} {setting.pace()} {setting.goal()}".encode()).hexdigest()[:16]
-    file = folder / f"cost-{name}.npz"
-    # As in `PushPlanner`: None to compute it, False to do without.
-    value: CostToGo | bool | None = (CostToGo.load(file) if file.exists() else None) if cost_to_go else False
-    planning = planner(slider, pushes, look_ahead=lookahead, value=value)
-    if value is None and planning.value is not None:
-        planning.value.save(file)
+    planning = planner(slider, pushes, look_ahead=lookahead, value=None if cost_to_go else False)
+    if cost_to_go:
+        file = folder / f"cost-{planning.value_digest()[:16]}.npz"
+        try:
+            planning.value = CostToGo.load(file)
+        except (FileNotFoundError, ValueError):  # there is none, or it is damaged
+            value = planning.value
+            assert value is not None
+            value.save(file)
     planning.prepare()
     times["tables"] = time.perf_counter() - began
     began = time.perf_counter()
-    push_controller = PushController(
-        planning, setting.finger_control(), friction=friction_in_model, feedback=feedback, noise=observation_noise
-    )
+    push_controller = PushController(planning, setting.finger_control(), feedback=feedback, noise=observation_noise)
     push_controller.prepare()
     return push_controller, times | {"feedback": time.perf_counter() - began}
 

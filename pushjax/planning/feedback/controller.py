@@ -101,15 +101,16 @@ class PushController:
     Args:
         planner: Chooses the pushes.
         control: Model of the finger.
-        friction: Coefficient of contact friction, as the library of the planner has it.
         feedback: Whether the end of a push is corrected while it runs.
         noise: Standard deviation of the positions that are seen, m.
-        friction_filter: How a belief about friction is updated by what is seen. None: `friction` is known.
+        friction_filter: How a belief about friction is updated by what is seen. None: friction is that of the planner's
+            library.
         prior: Belief before anything is seen. If the planner's library has as many samples, they must be the same: both
             come from `draw_friction` with one key.
 
     Raises:
-        ValueError: If one of `friction_filter` and `prior` is given without the other.
+        ValueError: If one of `friction_filter` and `prior` is given without the other, or if the filter is for another
+            slider or finger than the planner's library.
     """
 
     def __init__(
@@ -117,7 +118,6 @@ class PushController:
         planner: PushPlanner,
         control: FingerControl,
         *,
-        friction: float = 0.0,
         feedback: bool = True,
         noise: float = 0.0,
         friction_filter: FrictionFilter | None = None,
@@ -126,7 +126,10 @@ class PushController:
         if (friction_filter is None) != (prior is None):
             raise ValueError("friction_filter and prior must be given together")
         self.friction_filter, self.prior = friction_filter, prior
-        self.planner, self.control, self.friction, self.feedback = planner, control, friction, feedback
+        if friction_filter is not None:
+            planner.sampled.check_made_for(friction_filter.slider, float(friction_filter.hand.radius[0]))
+        self.planner, self.control, self.feedback = planner, control, feedback
+        self.friction = planner.sampled.friction
         self.hand = Hand.finger(planner.radius)
         self.length = planner.library.length
         grid = np.stack(np.meshgrid(ALONG, ACROSS, indexing="ij"), axis=-1).reshape(-1, 2)

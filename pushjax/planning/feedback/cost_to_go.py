@@ -5,19 +5,22 @@ move the slider by the same displacements wherever it is. So for each angle, a p
 stands for all pushes into that cell, and one sweep of the iteration takes minima of shifted grids.
 """
 
+import hashlib
 from pathlib import Path
-from typing import NamedTuple
-from zipfile import BadZipFile
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.planning.feedback.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.feedback.free_space import FreeSpace
 from pushjax.planning.feedback.pose_grid import POSITIONS, PoseGrid, grid_spacing
 from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
 
+FORMAT = 1  # of the file, and of what is computed here: raise it when either changes
 NEVER = 1e3  # control steps; cost of poses from which the goal is not reached
 ANGLES = 36  # angles of the grid in a full turn
 SWEEPS = 12  # largest number of sweeps over the grid
@@ -31,7 +34,7 @@ class CostToGo(PoseGrid):
 
     def save(self, path: str | Path) -> None:
         """Write the grid to a file in NumPy's format "npz"."""
-        np.savez_compressed(path, **self._asdict())
+        save_arrays(path, FORMAT, self._asdict())
 
     @staticmethod
     def load(path: str | Path) -> "CostToGo":
@@ -40,14 +43,10 @@ class CostToGo(PoseGrid):
         Raises:
             ValueError: If the file does not hold a cost to go.
         """
-        try:
-            with np.load(path) as file:
-                origin, spacing, values = (file[name] for name in CostToGo._fields)
-        except (KeyError, ValueError, EOFError, OSError, BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
-            raise ValueError(f"{path} does not hold a cost to go: {error}") from error
-        return CostToGo(origin, float(spacing), values)
+        found = load_arrays(path, "a cost to go", FORMAT, CostToGo._fields)
+        shapes = {"origin": (2,), "spacing": (), "values": ("positions", "positions", "angles")}
+        check_arrays(path, "a cost to go", found, shapes)
+        return CostToGo(found["origin"], float(found["spacing"]), found["values"])
 
 
 def cost_to_go(
@@ -109,6 +108,18 @@ def cost_to_go(
     if space is not None:
         values = np.where(met, _least_around(np.where(met, NEVER, values)) + between, values)
     return CostToGo(np.asarray(low, np.float32), spacing, values)
+
+
+def digest_of_costs(
+    library: PushLibrary, goal: np.ndarray, workspace: Workspace, *, space: FreeSpace | None = None, **given: Any
+) -> str:
+    """Return the hash of what `cost_to_go` depends on; the arguments are the same."""
+    settings = FORMAT, POSITIONS, ANGLES, SWEEPS, CHANGE, LAST_PUSHES, NEAR_CENTER
+    kept = None if space is None else (space.clearance, space.slider_clearance)
+    content = hashlib.sha256(f"{library.digest} {settings} {kept} {sorted(given)}".encode())
+    for leaf in jax.tree.leaves((goal, workspace, given)):
+        content.update(f"{np.shape(leaf)}".encode() + np.asarray(leaf, np.float64).tobytes())
+    return content.hexdigest()
 
 
 class _Moves(NamedTuple):

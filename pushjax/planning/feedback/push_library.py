@@ -15,7 +15,7 @@ import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,6 +27,7 @@ from pushjax._internal.checks import check_count, check_type
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.planning.feedback.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.push_batch import simulate_pushes
 from pushjax.simulation.hand import Hand
@@ -37,6 +38,20 @@ GAP = 0.04  # between finger and slider where a push starts
 STEP = 0.0275  # of the simulation, and between neighboring lengths of a push
 TRAVEL = 2.3  # longest push
 LEAST_MOTION = 0.005  # a push that moves the slider less than this is not valid
+
+FORMAT = 2  # of the file, and of what is computed here: raise it when either changes
+SHAPES = {
+    "starts": ("pushes", "dof"),
+    "directions": ("pushes", 2),
+    "travel": ("lengths",),
+    "outcomes": ("samples", "pushes", "lengths", 3),
+    "valid": ("pushes", "lengths"),
+    "length": (),
+    "center": (2,),
+    "slider": ("numbers",),
+    "radius": (),
+    "friction": (),
+}
 
 
 @dataclass(frozen=True)
@@ -52,6 +67,9 @@ class PushLibrary:
         valid: Whether the push moves the slider and nothing failed or jammed in any sample, (pushes, lengths).
         length: Characteristic length of the slider's limit surface, m.
         center: Centroid of the slider, (2,), body frame, m.
+        slider: Numbers of the slider, its outline and its limit surface, (numbers,).
+        radius: Radius of the hand's first finger, m.
+        friction: Coefficient of contact friction; the mean one if it is random.
         digest: Hash of everything that the outcomes depend on.
     """
 
@@ -62,6 +80,9 @@ class PushLibrary:
     valid: np.ndarray
     length: float
     center: np.ndarray
+    slider: np.ndarray
+    radius: float
+    friction: float
     digest: str
 
     @staticmethod
@@ -143,13 +164,13 @@ class PushLibrary:
         paths = np.repeat(np.asarray(starts, np.float64)[:, None], steps + 1, axis=1)
         paths[..., :2] += travel[:, None] * directions[:, None]
         if model is None:
-            surfaces, mus = [slider.surface], [friction]
+            surfaces, mus, mean = [slider.surface], [friction], friction
         else:
             if key is None:
                 raise ValueError("key: draws from a FrictionModel need a PRNG key; got None")
             draws = draw_friction(key, slider.surface, model, samples)
             surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k, 0], draws.surface) for k in range(samples)]
-            mus = np.asarray(draws.friction[:, 0]).tolist()
+            mus, mean = np.asarray(draws.friction[:, 0]).tolist(), np.mean(np.asarray(model.friction))
         outcomes, valid = [], np.ones((pushes, steps + 1), bool)
         for surface, mu in zip(surfaces, mus, strict=True):
             poses, valid_steps = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
@@ -164,12 +185,15 @@ class PushLibrary:
             valid=valid,
             length=length,
             center=np.asarray(slider.shape.centroid, np.float64),
+            slider=_numbers(slider),
+            radius=float(hand.radius[0]),
+            friction=float(mean),
             digest=digest(slider, hand, starts, directions, friction, model, samples, key),
         )
 
     def save(self, path: str | Path) -> None:
         """Write the library to a file in NumPy's format "npz"."""
-        np.savez_compressed(path, **{name: getattr(self, name) for name in self.__dataclass_fields__})
+        save_arrays(path, FORMAT, {name: getattr(self, name) for name in self.__dataclass_fields__})
 
     @staticmethod
     def load(path: str | Path, digest: str | None = None) -> "PushLibrary":
@@ -182,21 +206,25 @@ class PushLibrary:
         Raises:
             ValueError: If the file holds no library, or one of another slider, hand or set of pushes.
         """
-        try:
-            with np.load(path) as file:
-                fields = {name: file[name] for name in PushLibrary.__dataclass_fields__}
-        except (KeyError, ValueError, EOFError, OSError, BadZipFile) as error:
-            if isinstance(error, FileNotFoundError):
-                raise
-            raise ValueError(f"{path} does not hold a library of pushes: {error}") from error
-        fields |= {"length": float(fields["length"]), "digest": str(fields["digest"])}
-        library = PushLibrary(**fields)
+        content = "a library of pushes"
+        fields: dict[str, Any] = load_arrays(path, content, FORMAT, PushLibrary.__dataclass_fields__)
+        check_arrays(path, content, fields, SHAPES)
+        fields |= {name: float(fields[name]) for name in ("length", "radius", "friction")}
+        library = PushLibrary(**fields | {"valid": fields["valid"].astype(bool), "digest": str(fields["digest"])})
         if digest is not None and library.digest != digest:
             raise ValueError(
                 f"{path} holds a library of another slider, hand, friction or set of pushes; build it again "
                 f"(its digest is {library.digest[:12]}, expected {digest[:12]})"
             )
         return library
+
+    def check_made_for(self, slider: Slider, radius: float) -> None:
+        """Raise ValueError if this is the library of another slider or finger."""
+        numbers = _numbers(slider)
+        if numbers.shape != self.slider.shape or not np.allclose(numbers, self.slider, rtol=1e-5, atol=1e-7):
+            raise ValueError("library was made for another slider: its outline or limit surface differ from `slider`'s")
+        if not np.isclose(radius, self.radius, rtol=1e-5):
+            raise ValueError(f"library was made for a finger with a radius of {self.radius:.6g} m; got {radius!r}")
 
     @cached_property
     def entries(self) -> np.ndarray:
@@ -330,12 +358,19 @@ def fan(
     return np.repeat(curve.points, angles, axis=0), directions
 
 
+def _numbers(slider: Slider) -> np.ndarray:
+    """Return all numbers of a slider, (numbers,)."""
+    return np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in jax.tree.leaves(slider)])
+
+
 def digest(slider, hand, starts, directions, friction=0.0, model=None, samples=1, key=None) -> str:
     """Return the hash of what the outcomes of `PushLibrary.simulate` depend on; the arguments are the same."""
     parts = (slider, hand, model, np.asarray(starts), np.asarray(directions), np.asarray(friction))
     # types and static fields, without the addresses of functions, which differ from process to process
     structure = re.sub("0x[0-9a-f]+", "", str(jax.tree.structure(parts)))
-    content = hashlib.sha256(f"{pushjax.__version__} {GAP} {STEP} {TRAVEL} {samples} {structure}".encode())
+    content = hashlib.sha256(
+        f"{pushjax.__version__} {FORMAT} {GAP} {LEAST_MOTION} {STEP} {TRAVEL} {samples} {structure}".encode()
+    )
     for leaf in jax.tree.leaves(parts):
         content.update(np.round(np.asarray(leaf, np.float64), 9).tobytes())
     if key is not None:

@@ -10,13 +10,14 @@ Farther away: the push with that least sum.
 
 from copy import copy
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go, digest_of_costs
 from pushjax.planning.feedback.coverage_table import CoverageTable, Measure
 from pushjax.planning.feedback.free_space import GRID_STRIDE, FreeSpace
 from pushjax.planning.feedback.planned_push import PlannedPush, PlanStatus, PushChoice
@@ -54,7 +55,7 @@ class PushPlanner:
         slider: The slider.
         radius: Radius of the finger, m.
         library: Pushes of that slider and finger.
-        goal: The goal, (3,), world, m and rad.
+        goal: The goal, (3,), world, m and rad. The slider must be within the workspace there.
         workspace: Limits of finger and slider, and the fixtures that they stay out of. Pushes in which either comes
             nearer to a fixture than a clearance are not chosen.
         pace: Speeds of the finger.
@@ -66,7 +67,8 @@ class PushPlanner:
             is planned from where they end.
 
     Raises:
-        ValueError: For a goal at which the slider overlaps a fixture.
+        ValueError: For a library of another slider or finger, and for a goal at which the slider overlaps a fixture or
+            reaches out of the workspace.
     """
 
     def __init__(
@@ -83,9 +85,11 @@ class PushPlanner:
         value: CostToGo | bool | None = None,
         retry: float = RETRY,
     ):
+        library.check_made_for(slider, radius)
         self.slider, self.radius, self.sampled, self.retry = slider, radius, library, retry
         self.goal, self.workspace, self.pace = np.asarray(goal, float), workspace, pace
         self.vertices, length = outline_vertices(slider.shape), library.length
+        workspace.check_goal(self.goal, self.vertices)
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
         self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
         self._weigh(None)
@@ -141,20 +145,25 @@ class PushPlanner:
             return self._value
         if self._value is False:
             return None
+        return cost_to_go(self.library, self.goal, self.workspace, **self._costs())
+
+    def _costs(self) -> dict[str, Any]:
+        """Return the other arguments of `cost_to_go`."""
         low, high = self._positions(self.library.length)
-        return cost_to_go(
-            self.library,
-            self.goal,
-            self.workspace,
-            self.push_time,
-            usable=self.usable,
-            tolerance=self.measure.reach,
-            between=BETWEEN,
-            low=low,
-            high=high,
-            vertices=self.vertices,
-            space=self.space,
-        )
+        return {
+            "push_time": self.push_time,
+            "usable": self.usable,
+            "tolerance": self.measure.reach,
+            "between": BETWEEN,
+            "low": low,
+            "high": high,
+            "vertices": self.vertices,
+            "space": self.space,
+        }
+
+    def value_digest(self) -> str:
+        """Return a hash of what the cost to go depends on, by which it may be kept in a file."""
+        return digest_of_costs(self.library, self.goal, self.workspace, **self._costs())
 
     def _positions(self, length: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the lowest and the highest position of the slider's origin for which tables are made."""
