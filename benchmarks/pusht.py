@@ -250,9 +250,12 @@ def _gym_speed(whole: bool, kind: str, seconds: float = 3.0) -> float:
         if whole:
             env.step(action)
         else:
-            for _ in range(10):
-                force = env.k_p * (action - env.agent.position) - env.k_v * np.array(env.agent.velocity)
-                env.agent.velocity += force * env.dt
+            a, b = action.tolist()
+            for _ in range(10):  # with plain floats, twice as fast as gym-pusht's own arrays
+                (x, y), (u, v) = env.agent.position, env.agent.velocity
+                u += (env.k_p * (a - x) - env.k_v * u) * env.dt
+                v += (env.k_p * (b - y) - env.k_v * v) * env.dt
+                env.agent.velocity = u, v
                 env.space.step(env.dt)
         done += 1
     return done / (time.process_time() - start)
