@@ -134,7 +134,7 @@ def test_derivatives(samples):
 def test_the_mean_pose_is_the_same_in_any_frame(samples):
     """Poses around half a turn have their mean there, and whole turns change nothing but the branch."""
     mean = np.asarray(mean_pose(samples))
-    half = np.asarray(mean_pose(jnp.asarray(samples + [0, 0, np.pi])))
+    half = np.asarray(mean_pose(jnp.asarray(samples + np.array([0, 0, np.pi]))))
     assert np.allclose(half - mean, [0, 0, np.pi], atol=1e-5)
     wrapped = np.array([[1.0, 2.0, 3.1], [3.0, 4.0, -3.1]])
     assert np.allclose(mean_pose(jnp.asarray(wrapped)), [2.0, 3.0, np.pi], atol=1e-6)

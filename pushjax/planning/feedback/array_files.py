@@ -1,7 +1,6 @@
 """Files of arrays in NumPy's format "npz", written as a whole or not at all."""
 
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,15 +12,13 @@ import numpy as np
 def save_arrays(path: str | Path, version: int, arrays: dict[str, Any]) -> None:
     """Write arrays by name, with the version of their format, to exactly this path."""
     target = Path(path).expanduser()
-    with tempfile.NamedTemporaryFile(dir=target.parent, prefix=f".{target.name}-", delete=False) as file:
-        try:
+    partial = target.with_name(f".{target.name}-{os.getpid()}")
+    try:
+        with partial.open("wb") as file:
             np.savez_compressed(file, format_version=version, **arrays)
-            file.close()
-            os.replace(file.name, target)
-        except BaseException:
-            file.close()
-            Path(file.name).unlink(missing_ok=True)
-            raise
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def load_arrays(path: str | Path, content: str, version: int, names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -33,7 +30,7 @@ def load_arrays(path: str | Path, content: str, version: int, names: Iterable[st
             raise ValueError(f"its format is {written}; this program reads {version}")
     except FileNotFoundError:
         raise
-    except (KeyError, ValueError, EOFError, OSError, BadZipFile) as error:
+    except (KeyError, ValueError, TypeError, EOFError, OSError, BadZipFile) as error:
         raise ValueError(f"{path} does not hold {content}: {error}") from error
     return found
 
