@@ -126,6 +126,17 @@ def cos_sin(angle: Scalar) -> Vec2:
     return Vec2(jnp.cos(angle), jnp.sin(angle))
 
 
+def sinc(angle: Scalar) -> Scalar:
+    """Return sin(angle) / angle for an angle of at most a quarter of a turn, rad; smooth at zero.
+
+    It is the Taylor series, to an error of 2e-16.
+    """
+    square, result = angle * angle, jnp.ones_like(angle)
+    for k in range(20, 0, -2):
+        result = 1 - square / (k * (k + 1)) * result
+    return result
+
+
 def wrap_to_pi(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """Return an angle, rad, reduced by whole turns to at most half a turn. Its derivative is one everywhere."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))

@@ -1,7 +1,8 @@
-"""Selection of a finger's contacts from its contact candidates, and the same contacts later in the step.
+"""Selection of a finger's or a fixture's contacts from the candidates, and the same contacts later in the step.
 
-A pad has more candidates than are needed to constrain it. The nearest of them is selected, and one or two others that
-constrain a different motion.
+A pad or a wall has more candidates than are needed to constrain it. The nearest of them is selected, and one or two
+others that constrain most of the motions that are left free. So whatever lies flat rests on the two ends of what it
+touches, however many vertices lie in between.
 """
 
 from typing import Any
@@ -14,72 +15,64 @@ from pushjax._internal.xla import compute_once, decide
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import Outline
-from pushjax.simulation.candidate import Candidate, Candidates, take
-from pushjax.simulation.detection import edges, is_nonconvex_polygon
+from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, Candidates, take
+from pushjax.simulation.detection import DisplacementAt, edges, is_nonconvex_polygon, num_contacts
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Finger, Pad
 
 # Two candidates nearer to each other than this, in units of the limit surface's length, count as one. The first is for
 # a polygon. The second is for a smooth outline, where a corner of a pad and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
-# In units of the same length. A candidate that is farther than the nearest by more than this does not exist
-# (`OUT_OF_REACH`).
-EXISTING = 1e3
+# A candidate counts as nearer by this fraction of its distance from the middle of all candidates. So of candidates that
+# are equally near up to roundoff, the outermost is selected.
+SAME_DISTANCE = 1e-5
 
 
 def select_contacts(
-    candidates: Candidates, length: Scalar, outline: Outline, path: Vec2
+    candidates: Candidates, finger: Finger | Wall, length: Scalar, outline: Outline, displacement_at: DisplacementAt
 ) -> tuple[Int[Array, ""] | int, ...]:
     """Select which candidates are contacts, the likeliest first. The selection is not differentiated.
 
-    Of the candidates of a pad, it selects the nearest, and the nearest of those that are at a different place. On a
-    polygon that is not convex, distances are compared after the displacement `path`, and a third candidate is selected.
-    A tuple of candidates (of a round finger, or on a disk) is selected as a whole.
+    Distances are compared after the displacement of the finger, with the slider at rest. A tuple of candidates (of a
+    round finger, or of a pad on a disk) is selected as a whole.
 
     Args:
         candidates: All candidates, as from `contact_candidates`.
+        finger: The finger, or a wall.
         length: Characteristic length of the limit surface, m.
         outline: The slider's outline.
-        path: Displacement of the finger in the rest of the step, slider's frame, m.
+        displacement_at: Displacement of the finger's material at points of the slider, in the rest of the step.
 
     Returns:
         Indices of the selected candidates. If there is no second or third one, the first index is repeated.
     """
     if not isinstance(candidates, Candidate):
         return tuple(range(len(candidates)))
-    candidates, path = jax.lax.stop_gradient((candidates, path))
-    if is_nonconvex_polygon(outline):
-        candidates = candidates._replace(distance=candidates.distance - candidates.normal.dot(path))
-        return _select_three(candidates, length)
-    distance = candidates.distance
-    first = jnp.argmin(distance)
-    nearest = take(candidates, first)
-    offset = candidates.point - nearest.point
-    separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
-    is_other = offset.dot(offset) > (separation * length) ** 2
-    is_other = decide(is_other & (distance < nearest.distance + EXISTING * length), length)
-    second = jnp.where(jnp.any(is_other), jnp.argmin(jnp.where(is_other, distance, jnp.inf)), first)
-    return first.astype(jnp.int32), second.astype(jnp.int32)
-
-
-def _select_three(candidates: Candidate, length: Scalar) -> tuple[Int[Array, ""], ...]:
-    """Return the indices of the nearest candidate, and of two that constrain most of the motions that it leaves free.
-
-    A pad that lies flat across two arms then rests on its outermost candidates. A pad in an inner corner then rests on
-    both edges. Neither rests on two candidates side by side.
-    """
-    chosen = [jnp.argmin(candidates.distance).astype(jnp.int32)]
-    nearest = take(candidates, chosen[0])
-    eligible = candidates.distance < nearest.distance + EXISTING * length
-    travel = jnp.zeros_like(candidates.distance)
-    previous = nearest
-    for _ in range(2):
-        differs, distance = _distances_in_other_directions(candidates, previous, length)
-        eligible, travel = compute_once((eligible & differs, jnp.maximum(travel, distance)), length)
+    displacement = displacement_at(candidates.point)
+    candidates, length, displacement = jax.lax.stop_gradient((candidates, length, displacement))
+    eligible = candidates.distance < OUT_OF_REACH / 2
+    candidates = candidates._replace(distance=candidates.distance - candidates.normal.dot(displacement))
+    offset = candidates.point - _mean(candidates.point, eligible)
+    distance = jnp.where(eligible, candidates.distance, OUT_OF_REACH)
+    outermost = distance - SAME_DISTANCE * jnp.sqrt(offset.dot(offset))
+    chosen, travel = [jnp.argmin(outermost).astype(jnp.int32)], jnp.zeros_like(distance)
+    for _ in range(num_contacts(finger, outline) - 1):
+        previous = take(candidates, chosen[-1])
+        differs, other = _distances_in_other_directions(candidates, previous, length)
+        if not is_nonconvex_polygon(outline):  # in an inner corner, both contacts are at one place
+            offset = candidates.point - previous.point
+            separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
+            differs &= offset.dot(offset) > (separation * length) ** 2
+        eligible, travel = compute_once((eligible & differs, jnp.maximum(travel, other)), length)
         best = jnp.argmin(jnp.where(eligible, travel, jnp.inf))
         chosen.append(jnp.where(jnp.any(eligible), best, chosen[0]).astype(jnp.int32))
-        previous = take(candidates, chosen[-1])
     return tuple(chosen)
+
+
+def _mean(points: Vec2, mask: Bool[Array, " candidates"]) -> Vec2:
+    """Mean of the points that a mask marks."""
+    count = jnp.maximum(jnp.sum(mask), 1)
+    return Vec2(*(jnp.sum(jnp.where(mask, entry, 0.0)) / count for entry in points))
 
 
 def _distances_in_other_directions(

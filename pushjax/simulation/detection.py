@@ -1,19 +1,20 @@
 """Contact detection: contact points, normals and gaps between fingers and slider during a step.
 
-The fraction of a step in which the hand moves freely is computed exactly, for straight relative paths of any length. So
-a finger can neither tunnel through the slider nor meet the extension of an edge past its corner. From there on, every
+The fraction of a step in which the hand moves freely (`impact`) is not longer than it is, however long the step. So a
+finger can neither tunnel through the slider nor meet the extension of an edge past its corner. From there on, every
 place where a finger and the slider may touch is a contact candidate with its own gap, closed or open. The contact
 problem finds which of them are closed within the step.
 
 A round finger has one candidate, or two on an outline that is not convex. A pad has one on a disk. Otherwise it has
 many, of which `contact_selection` selects two or three. Against a polygon, each corner of the pad and of the slider is
-compared with the outline of the other. If the polygon is convex, the two nearest at different places are selected. (An
-edge that lies flat on an edge rests on the two ends of their common part.) If it is not convex, three are: the nearest,
-and the two that constrain most of the motions that the nearest leaves free. Against a smooth outline, two of the
-candidates that `pad_on_curve` finds are selected. The selection is new in each step and stays the same within the step.
+compared with the outline of the other; against a smooth outline, `pad_on_curve` finds the candidates. The nearest is
+selected, and the one that constrains most of the motions that it leaves free; of a polygon that is not convex, another.
+(An edge that lies flat on an edge rests on the two ends of their common part.) The selection is new in each step and
+stays the same within the step.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ from jaxtyping import Array, Bool
 from pushjax._internal.xla import compute_once, decide, structure_and_shapes, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
+from pushjax.geometry.ellipse import EllipseOutline
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline, roundoff
 from pushjax.simulation import pad_on_curve
@@ -48,14 +50,16 @@ END_TOLERANCE = {4: 2e-5, 8: 1e-6}
 # into one edge of that corner still projects onto the other.
 REFLEX_EXTENSION = 0.05
 
+# Called with points of the slider; all in the slider's frame, m.
+DisplacementAt = Callable[[Vec2], Vec2]
+
 
 def contact_candidates(
     finger: Finger | Wall,
     outline: Outline,
     finger_pose: FingerPose,
-    path: Vec2,
+    displacement_at: DisplacementAt,
     length: Scalar,
-    supports: EdgeSupport | None = None,
 ) -> Candidates:
     """Return the contact candidates of a finger: every place where it and the slider may touch.
 
@@ -63,10 +67,9 @@ def contact_candidates(
         finger: The finger, or a wall.
         outline: The slider's outline.
         finger_pose: Pose of the finger in the slider's frame.
-        path: Displacement of the finger in the slider's frame, m. It decides which edge is touched where a corner lies
-            on a corner.
+        displacement_at: Displacement of the finger's material at points of the slider. It decides which edge is touched
+            where a corner lies on a corner.
         length: Characteristic length of the limit surface, m.
-        supports: Result of `edge_supports`, if it is known already.
     """
     if isinstance(finger, Wall):
         return wall_candidates(outline, finger_pose)
@@ -81,17 +84,18 @@ def contact_candidates(
         normal = closest.normal.rotate(angle)
         return (Candidate(closest.distance - outline.radius, outline.center - normal.scale(outline.radius), normal),)
     if not isinstance(outline, PolygonOutline):
-        if supports is None:
-            supports = edge_supports(finger, outline, finger_pose)
-        return _smooth_candidates(pad, outline, finger_pose.center, angle, length, supports)
+        return _smooth_candidates(
+            pad, outline, finger_pose.center, angle, length, _edge_supports(pad, outline, finger_pose)
+        )
+    pad_corners = corners(pad).turned(angle, finger_pose.center)
     pad_on_slider, pad_on_next_edge = _vertex_edge_candidates(
-        outline, corners(pad).turned(angle, finger_pose.center), path, length
+        outline, pad_corners, displacement_at(pad_corners.point), length
     )
     inverse_angle, slider_corners = Vec2(angle.x, -angle.y), corners(outline)
     closest, _ = _vertex_edge_candidates(
         pad,
         slider_corners.turned(inverse_angle, (-finger_pose.center).unrotate(angle)),
-        (-path).unrotate(angle),
+        (-displacement_at(slider_corners.point)).unrotate(angle),
         length,
     )
     slider_on_pad = Candidate(closest.distance, slider_corners.point, -closest.normal.rotate(angle))
@@ -119,13 +123,13 @@ class Corner(NamedTuple):
 
 
 def _vertex_edge_candidates(
-    outline: Outline, corner: Corner, path: Vec2, length: Scalar
+    outline: Outline, corner: Corner, displacement: Vec2, length: Scalar
 ) -> tuple[Candidate, Candidate]:
     """For each corner, return the nearest edge of a polygon that it can touch, and the next nearest.
 
     A corner can touch an edge if it projects onto the edge and points toward it. If there is no such edge, the distance
-    is `OUT_OF_REACH`. If a corner lies on the common vertex of two edges, the edge that it is pressed against along
-    `path` comes first.
+    is `OUT_OF_REACH`. If a corner lies on the common vertex of two edges, the edge that it is pressed against by its
+    `displacement` comes first.
 
     The closest point of the outline would be wrong here. A corner that is slightly inside, next to a vertex of the
     polygon, may be closest to the wrong edge. A corner that is past the end of an edge touches nothing, although it is
@@ -162,7 +166,7 @@ def _vertex_edge_candidates(
             jnp.where(touches, height, OUT_OF_REACH), corner.point - edge.normal.scale(height), -edge.normal
         )
         gap = jnp.maximum(jnp.abs(candidate.distance), tolerance)
-        pressing = jnp.broadcast_to(-edge.normal.dot(path), gap.shape)
+        pressing = jnp.broadcast_to(-edge.normal.dot(displacement), gap.shape)
         entry = candidate, gap, pressing, past
         if two_nearest is None:
             nothing = candidate._replace(distance=jnp.full_like(gap, OUT_OF_REACH))
@@ -193,26 +197,18 @@ def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
     return inside
 
 
-def edge_supports(finger: Finger, outline: Outline, finger_pose: FingerPose) -> EdgeSupport | None:
-    """Return the points of a smooth outline that face a pad's edges; None for round fingers, polygons and disks.
-
-    Several functions need the result, so it can be computed once and passed to them.
-    """
-    if isinstance(finger, RoundFinger) or isinstance(outline, PolygonOutline | DiskOutline):
-        return None
-    return pad_on_curve.edge_support_points(
-        edges(finger.shape.outline()), outline, finger_pose.center, _pad_angle(finger_pose)
-    )
+def _edge_supports(pad: PolygonOutline, outline: Outline, finger_pose: FingerPose) -> EdgeSupport:
+    """The points of a smooth outline that face a pad's edges."""
+    return pad_on_curve.edge_support_points(edges(pad), outline, finger_pose.center, _pad_angle(finger_pose))
 
 
 def _smooth_candidates(
-    pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, supports: EdgeSupport | None
+    pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, supports: EdgeSupport
 ) -> Candidate:
     """Return the candidates of a pad and a smooth outline.
 
     They are the closest point of the outline for each corner of the pad, and then the points that face the pad's edges.
     """
-    assert supports is not None
     too_deep, corner = -2 * MAX_PENETRATION * length, corners(pad).turned(angle, center)
     closest = jax.vmap(outline.closest)(corner.point)
     faces = (corner.onward.dot(closest.normal) >= -TILT_TOLERANCE) & (
@@ -249,11 +245,16 @@ def _num_contacts(structure: Any, shapes: tuple[jax.ShapeDtypeStruct, ...]) -> i
     def candidates_of(finger: Finger, outline: Outline) -> Candidates:
         zero = jnp.zeros(())
         still = Vec2(zero, zero)
-        return contact_candidates(finger, outline, FingerPose(still, still), still, zero)
+        return contact_candidates(finger, outline, FingerPose(still, still), lambda point: still, zero)
 
     finger, outline = jax.tree.unflatten(structure, shapes)
     candidates = jax.eval_shape(candidates_of, finger, outline)
     return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
+
+
+def is_convex(outline: Outline) -> bool:
+    """Whether an outline is known to be convex."""
+    return outline.convex if isinstance(outline, PolygonOutline) else isinstance(outline, DiskOutline | EllipseOutline)
 
 
 def is_nonconvex_polygon(outline: Outline) -> bool:
@@ -261,24 +262,8 @@ def is_nonconvex_polygon(outline: Outline) -> bool:
     return isinstance(outline, PolygonOutline) and not outline.convex
 
 
-def time_of_impact(finger: Finger, outline: Outline, finger_pose: FingerPose, path: Vec2, length: Scalar) -> Scalar:
-    """Return the fraction of `path` after which a finger first touches the slider, or one if it never does.
-
-    The finger moves along `path` without turning, in the frame of a slider at rest.
-    """
-    supports = edge_supports(finger, outline, finger_pose)
-    presses, candidates = jnp.zeros((), bool), contact_candidates(finger, outline, finger_pose, path, length, supports)
-    for candidate in (candidates,) if isinstance(candidates, Candidate) else candidates:
-        # in contact and pressing: the push begins at once
-        presses |= jnp.any((candidate.distance <= 0) & (candidate.normal.dot(path) > candidate.distance))
-    # Otherwise the first hit along the path counts, also for a finger that touches but moves away.
-    hit = _sweep(finger, outline, finger_pose, path, supports)
-    presses, hits = compute_once((presses, hit <= 1), finger_pose.center.x)
-    return jnp.where(presses, 0.0, jnp.where(hits, hit, 1.0))
-
-
 def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: FingerPose) -> Scalar:
-    """Penetration depth of a finger or a wall in the slider, m; where they are apart, minus their distance.
+    """Penetration depth of a finger or a wall in the slider, m; where they are apart, minus their exact distance.
 
     For a pad it is the depth of the deepest corner of either body in the other. Where edges cross and no corner is
     inside, it is at least half of how deep an edge of the slider is in the pad. For a pad and a smooth outline it is
@@ -293,9 +278,7 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
         return outline.radius - pad.closest((outline.center - finger_pose.center).unrotate(angle)).distance
     pad_corners = finger_pose.center + corners(pad).point.rotate(angle)
     if not isinstance(outline, PolygonOutline):
-        supports = edge_supports(finger, outline, finger_pose)
-        assert supports is not None
-        return pad_on_curve.penetration_depth(pad, supports, outline, pad_corners)
+        return pad_on_curve.penetration_depth(pad, _edge_supports(pad, outline, finger_pose), outline, pad_corners)
     slider_corners = (corners(outline).point - finger_pose.center).unrotate(angle)
     slider_in_pad = pad.closest(slider_corners).distance
     pad_in_slider = outline.closest(pad_corners).distance
@@ -319,25 +302,6 @@ def _chord_depth(pad: PolygonOutline, slider_corners: Vec2) -> Scalar:
     middle = (enter + leave) / 2
     depth = functools.reduce(jnp.minimum, [first + middle * (last - first) for first, last in depths])
     return jnp.max(jnp.where(enter < leave, depth, -jnp.inf))
-
-
-def _sweep(
-    finger: Finger, outline: Outline, finger_pose: FingerPose, path: Vec2, supports: EdgeSupport | None
-) -> Scalar:
-    """Fraction of `path` at which the finger first hits the outline; inf if it does not."""
-    if isinstance(finger, RoundFinger):
-        return outline.sweep(finger_pose.center, path, finger.radius)
-    pad, angle, zero = finger.shape.outline(), _pad_angle(finger_pose), jnp.zeros_like(path.x)
-    slider_path = (-path).unrotate(angle)
-    if isinstance(outline, DiskOutline):
-        return pad.sweep((outline.center - finger_pose.center).unrotate(angle), slider_path, outline.radius)
-    pad_corners = finger_pose.center + corners(pad).point.rotate(angle)
-    if not isinstance(outline, PolygonOutline):
-        assert supports is not None
-        return pad_on_curve.sweep(pad, supports, outline, pad_corners, path, slider_path)
-    pad_corner_hits = outline.sweep(pad_corners, path, zero)
-    slider_corner_hits = pad.sweep((corners(outline).point - finger_pose.center).unrotate(angle), slider_path, zero)
-    return jnp.minimum(jnp.min(pad_corner_hits), jnp.min(slider_corner_hits))
 
 
 def edges(outline: Outline) -> tuple[Edge, ...]:

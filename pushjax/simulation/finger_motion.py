@@ -8,21 +8,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from pushjax._internal.xla import compute_once, map_items
-from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, wrap_to_pi
+from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, sinc, wrap_to_pi
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import FingerPose
-from pushjax.simulation.detection import penetration_depth
+from pushjax.simulation.detection import corners, penetration_depth
 from pushjax.simulation.fixtures import Fixtures, Wall
-from pushjax.simulation.hand import Finger, Hand, Pad
+from pushjax.simulation.hand import Finger, Hand, Pad, RoundFinger
 
 # A jam is a grasp if every finger is nearer to the slider than this, in units of the limit surface's length, or than
-# four times the largest displacement of a finger in the step. The margin is needed because a jam is detected before the
-# last gap is closed, and because the slider swings faster than the fingers close.
+# four times the largest displacement of a finger in the part of the step that jams. The margin is needed because a jam
+# is detected before the last gap is closed, and because the slider swings faster than the fingers close.
 GRASP_GAP = 1e-4
 # After a step a finger may be this deep in the slider, as a fraction of the largest displacement of the fingers in the
 # step, if it was not deeper before: the midpoint rule leaves that much at a corner. The floor is in units of the length
 # and allows for roundoff.
 DEPTH_PER_DISPLACEMENT, DEPTH_FLOOR = 0.1, 1e-5
+# Keyed by the bytes of a float; in units of the length. A finger that is nearer or less deep than this just touches.
+TOUCHING = {4: 3e-6, 8: 1e-10}
 
 
 class BodyFrame(NamedTuple):
@@ -55,7 +57,10 @@ class BodyFrame(NamedTuple):
                 the world.
         """
         displacement = (twist.xy + contact.perp().scale(twist.z)).rotate(frame_angle)
-        theta = self.pose.z + twist.z
+        # Displacements are chords. So is the turn: 2 asin(z / 2) is the angle whose chord it is.
+        square = twist.z * twist.z
+        series = 1 + 9 / 80 * square * (1 + 25 / 168 * square * (1 + 49 / 288 * square))
+        theta = self.pose.z + twist.z * (1 + square / 24 * series)
         angle = compute_once(cos_sin(theta), self.pose.x)
         lever_change = contact.rotate(angle) - contact.rotate(self.angle)
         x, y = self.pose.x + displacement.x - lever_change.x, self.pose.y + displacement.y - lever_change.y
@@ -64,6 +69,9 @@ class BodyFrame(NamedTuple):
 
 class FingerMotion(NamedTuple):
     """Motion of one finger over a step, and its friction. A fixture is a finger that stays where it is.
+
+    A finger that turns goes around a fixed point, as a rigid body would: so the motion within a step does not depend on
+    which point of the finger is its center.
 
     Attributes:
         finger: The finger, or a wall.
@@ -83,7 +91,7 @@ class FingerMotion(NamedTuple):
 
     def pose_in_slider(self, slider: BodyFrame, fraction: Scalar) -> FingerPose:
         """Return the pose of the finger in the slider's frame when `fraction` of the step is done."""
-        center = slider.local(self.center + self.path.scale(fraction))
+        center = slider.local(self.center + self._chord(jnp.zeros_like(fraction), fraction))
         if isinstance(self.finger, Wall):
             return FingerPose(center, Vec2.of(self.finger.normal).unrotate(slider.angle))
         if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
@@ -99,8 +107,46 @@ class FingerMotion(NamedTuple):
         angle, turning = self.angle, self.turning
         if angle is not None and turning is not None:
             angle, turning = angle + begin * turning, size * turning
-        center = self.center + self.path.scale(begin)
-        return FingerMotion(self.finger, self.friction, center, self.path.scale(size), angle, turning)
+        center = self.center + self._chord(jnp.zeros_like(begin), begin)
+        return FingerMotion(self.finger, self.friction, center, self._chord(begin, size), angle, turning)
+
+    def _chord(self, begin: Scalar, size: Scalar) -> Vec2:
+        """Displacement of the center in the part of the step that starts at `begin` and has the size `size`, world."""
+        if self.turning is None:
+            return self.path.scale(size)
+        half = self.turning / 2
+        direction = cos_sin((2 * begin + size - 1) * half)
+        return self.path.rotate(direction).scale(size * sinc(size * half) / sinc(half))
+
+    def moves(self) -> Bool[Array, ""]:
+        """Whether the finger does not stay as it is; True also for a motion that is NaN."""
+        moves = (self.path.x != 0) | (self.path.y != 0)
+        return moves if self.turning is None else moves | (self.turning != 0)
+
+    def largest_displacement(self) -> Scalar:
+        """Largest displacement of a point of the finger over the step, m; for a round finger, a bound of it."""
+        center = jnp.sqrt(self.path.dot(self.path))
+        if self.turning is None or isinstance(self.finger, Wall):
+            return center
+        if isinstance(self.finger, RoundFinger):
+            return center + jnp.abs(2 * jnp.sin(self.turning / 2)) * self.finger.radius
+        chords = self._corner_chords(self.finger)
+        return jnp.sqrt(jnp.max(chords.dot(chords)))
+
+    def arc_length(self) -> Scalar:
+        """Largest length of the way of a point of the finger over the step, m, without the turn of a round finger."""
+        if self.turning is None:
+            return jnp.sqrt(self.path.dot(self.path))
+        chords = self._corner_chords(self.finger) if isinstance(self.finger, Pad) else self.path
+        return jnp.sqrt(jnp.max(chords.dot(chords))) / sinc(self.turning / 2)
+
+    def _corner_chords(self, pad: Pad) -> Vec2:
+        """Displacement of each corner of a pad over the step, world, m."""
+        assert self.angle is not None
+        assert self.turning is not None
+        corner = corners(pad.shape.outline()).point
+        turned = corner.rotate(cos_sin(self.angle + self.turning)) - corner.rotate(cos_sin(self.angle))
+        return Vec2(self.path.x + turned.x, self.path.y + turned.y)
 
     def material_displacement(
         self, slider: BodyFrame, point: Vec2, center: Vec2, remaining: Scalar, in_predictor: Bool[Array, ""]
@@ -116,7 +162,7 @@ class FingerMotion(NamedTuple):
                 A turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
                 toward each other on what they hold, and cause a jam.
         """
-        translation = self.path.scale(remaining).unrotate(slider.angle)
+        translation = self._chord(1 - remaining, remaining).unrotate(slider.angle)
         if self.turning is None:
             return translation
         translation = translation.unrotate(cos_sin(jnp.where(in_predictor, remaining * self.turning / 2, 0.0)))
@@ -184,16 +230,26 @@ def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: V
 
 
 def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:
-    """Largest displacement of a finger's center in the step, m, without its turn. Not differentiated."""
-    paths = jax.lax.stop_gradient([motion.path for motion in motions])
-    return jnp.sqrt(functools.reduce(jnp.maximum, [path.dot(path) for path in paths]))
+    """Largest displacement of a point of a finger in the step, m. Not differentiated."""
+    motions = jax.lax.stop_gradient(motions)
+    return functools.reduce(jnp.maximum, [motion.largest_displacement() for motion in motions])
 
 
-def holding_distance(motions: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
-    """Distance within which a finger holds a jammed slider, m."""
-    return jnp.maximum(GRASP_GAP * length, 4 * max_displacement(motions))
+def holding_distance(displacement: Scalar, length: Scalar) -> Scalar:
+    """Distance within which a finger holds a slider that jams, m.
+
+    Args:
+        displacement: Largest displacement of a finger in the part of the step that jams, m.
+        length: Length of the limit surface, m.
+    """
+    return jnp.maximum(GRASP_GAP * length, 4 * displacement)
 
 
-def allowed_penetration(motions: tuple[FingerMotion, ...], length: Scalar) -> Scalar:
-    """Largest depth of a finger in the slider after a step, m, unless it was deeper before."""
-    return jnp.maximum(DEPTH_FLOOR * length, DEPTH_PER_DISPLACEMENT * max_displacement(motions))
+def allowed_penetration(displacement: Scalar, length: Scalar) -> Scalar:
+    """Largest depth of a finger in the slider after a step, m, unless it was deeper before.
+
+    Args:
+        displacement: Largest displacement of a finger in the step, m.
+        length: Length of the limit surface, m.
+    """
+    return jnp.maximum(DEPTH_FLOOR * length, DEPTH_PER_DISPLACEMENT * displacement)

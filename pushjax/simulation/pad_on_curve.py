@@ -1,4 +1,4 @@
-"""Contact detection for a pad against a smooth outline: contact candidates, first contact and penetration depth.
+"""Contact detection for a pad against a smooth outline: contact candidates and penetration depth.
 
 An edge of the pad touches where the outward normal of the outline is opposite to the normal of the edge. These support
 points (`Outline.facing`) depend on the direction only. A corner of the pad touches at the point of the outline nearest
@@ -60,25 +60,6 @@ def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2,
     # All edges at once: unrolled edge by edge, the program for a jaw took much longer to trace and to compile.
     stacked = jax.tree.map(lambda *entries: jnp.stack(entries), *edges)
     return jax.tree.map(jnp.ravel, jax.vmap(supports_of_edge)(stacked))
-
-
-def sweep(
-    pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2, path: Vec2, outline_path: Vec2
-) -> Scalar:
-    """Return the fraction of `path` after which a pad and an outline first touch; inf if they do not.
-
-    Args:
-        pad: Outline of the pad.
-        supports: Support points of the pad's edges at the start.
-        outline: The smooth outline.
-        corners: Corners of the pad, in the outline's frame, m.
-        path: Displacement of the pad, in the outline's frame, m.
-        outline_path: Displacement of the outline, in the pad's frame, m.
-    """
-    zero = jnp.zeros_like(path.x)
-    corner_hit = jnp.min(jax.vmap(lambda corner: outline.sweep(corner, path, zero))(corners))
-    edge_hits = pad.sweep(supports.local, outline_path, zero)
-    return jnp.minimum(corner_hit, jnp.min(jnp.where(supports.valid, edge_hits, jnp.inf)))
 
 
 def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:

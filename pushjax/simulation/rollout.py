@@ -9,6 +9,7 @@ If no motion satisfies every contact, the hand has jammed, and it stops there fo
 from collections.abc import Callable, Sequence
 from functools import partial
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,9 +18,11 @@ from jaxtyping import Array
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
 from pushjax._internal.jit import outside_trace, quick_jit
+from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, to_scalars
 from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.status import Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.table import Table, TransformedForm
@@ -35,9 +38,10 @@ from pushjax.simulation.arguments import (
 )
 from pushjax.simulation.detection import num_contacts
 from pushjax.simulation.finger_motion import (
+    allowed_penetration,
     finger_motions,
     fixture_motions,
-    holding_distance,
+    max_displacement,
     max_penetration,
     unstack_finger_poses,
 )
@@ -45,7 +49,7 @@ from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import ScalarStep, step_in_scalars
-from pushjax.simulation.substeps import DividedPush, hand_stops, simulate_in_substeps
+from pushjax.simulation.substeps import DividedPush, hand_stops, resting, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 
 MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 512, ...
@@ -302,22 +306,30 @@ def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
 def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
     """Return the records of all steps of a hand with one contact: a round finger on a convex outline, a pad on a disk.
 
-    Such steps are not divided: their overlap is recorded but not checked. Arguments as in `simulate_in_substeps`.
+    Such a step is not divided. If it is too long, it is NOT_CONVERGED. Arguments as in `simulate_in_substeps`.
     """
 
-    def body(pose: Vec3, step: Array):
+    def body(before: tuple[Vec3, Array], step: Array):
+        pose, depth = before
         form, mu = push.friction_at(step, pose)
         motions = push.motions_at(step, mu)
-        # also the overlap after the previous step; it costs little, since contact detection starts with the same query
-        depth = max_penetration(push.outline, motions, pose, 0.0)
-        record, _ = step_in_scalars(
-            form, push.outline, motions, push.solver, pose, depth, holding_distance(motions, form.length)
+        # one contact holds nothing
+        record, _ = step_in_scalars(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
+        allowed = jnp.maximum(depth, allowed_penetration(max_displacement(motions), form.length))
+        depth = max_penetration(push.outline, motions, record.pose, 1.0)
+        is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
+        is_too_long = decide(is_solved & (depth > allowed), pose.x)
+        depth_at_rest = jax.lax.cond(
+            eqxi.unvmap_any(is_too_long), lambda: max_penetration(push.outline, motions, pose, 1.0), lambda: depth
         )
-        return record.pose, record._replace(overlap=depth)
+        pose, depth = tree_where(is_too_long, (pose, depth_at_rest), (record.pose, depth))
+        return (pose, depth), (record._replace(pose=pose, overlap=depth), is_too_long)
 
     body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
-    last_pose, records = jax.lax.scan(body, start, jnp.arange(push.steps))
-    last = jnp.asarray(push.steps - 1)
-    motions = push.motions_at(last, push.friction_at(last, last_pose)[1])
-    final_depth = max_penetration(push.outline, motions, last_pose, 1.0)
-    return records._replace(overlap=jnp.concatenate([records.overlap[1:], final_depth[None]]))
+    first = jnp.zeros((), jnp.int32)
+    motions = push.motions_at(first, push.friction_at(first, start)[1])
+    depth = max_penetration(push.outline, motions, start, 0.0)
+    _, (records, is_too_long) = jax.lax.scan(body, (start, depth), jnp.arange(push.steps))
+    failed = resting(records, records.pose)._replace(overlap=records.overlap)
+    failed = failed._replace(status=jnp.full_like(records.status, Status.NOT_CONVERGED))
+    return jax.vmap(tree_where)(is_too_long, failed, records)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from pushjax._math.vec import Scalar, Vec3
+from pushjax._math.vec import Scalar, Vec2, Vec3
 
 MAX_RATIO = 4.0  # a slider may move by this multiple of the largest displacement of a finger
 ALWAYS_ALLOWED = 0.1  # it may always move by this fraction of the limit surface's length
@@ -33,19 +33,29 @@ class SpeedJudgment(NamedTuple):
 
 
 def judge_speed(
-    before: Vec3, after: Vec3, displacement: Scalar, length: Scalar, is_smallest: Bool[Array, ""]
+    twist: Vec3,
+    force: tuple[Vec2, ...],
+    contact_point: Float[Array, "contacts 2"],
+    displacement: Scalar,
+    length: Scalar,
+    is_smallest: Bool[Array, ""],
 ) -> SpeedJudgment:
-    """Judge how far a slider moved in a part of a step.
+    """Judge how far a slider moved in a part of a step: where forces act on it, and how far it turned.
 
     Args:
-        before: Pose of the slider at the start, world.
-        after: Its pose at the end.
+        twist: Twist of the slider over the part.
+        force: Force of each contact, N.
+        contact_point: Point of each contact, m.
         displacement: Largest displacement of a finger in this part, m.
         length: Length of the limit surface, m. It makes angles distances.
         is_smallest: Whether the part cannot be divided any more.
     """
-    change = jax.tree.map(jax.lax.stop_gradient, after - before)
-    motion = jnp.sqrt(change.xy.dot(change.xy)) + length * jnp.abs(change.z)
+    twist, force, length = jax.lax.stop_gradient((twist, force, length))
+    weight = jnp.stack([contact_force.x for contact_force in force])
+    total = jnp.sum(weight)
+    middle = Vec2.of(weight @ contact_point / jnp.where(total > 0, total, 1.0))
+    at_middle = twist.xy + middle.perp().scale(twist.z)
+    motion = jnp.sqrt(at_middle.dot(at_middle)) + length * jnp.abs(twist.z)
 
     def is_allowed(multiple: int, fraction: Scalar | float) -> Bool[Array, ""]:
         return multiple * motion <= jnp.maximum(multiple * MAX_RATIO * displacement, fraction * length)

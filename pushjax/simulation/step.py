@@ -2,8 +2,7 @@
 
 A step has three phases. They are computed in the slider's body frame, to which the motion of the hand is rotated.
 
-1. free motion: the hand travels until a finger meets the slider (exactly, see `detection`), and the rest of the step
-   pushes;
+1. free motion: the hand travels until a finger meets the slider (see `impact`), and the rest of the step pushes;
 2. predictor: solve the contacts as they are then, and move the slider by half of that motion;
 3. corrector: solve the contacts as they are halfway, with the angle halfway, and move the slider by that motion.
 
@@ -25,6 +24,7 @@ angles of the outline's corners. Whether the result is valid is judged afterward
 slider (`max_penetration`), which is computed from the whole outline. `substeps` divides a step that is too long.
 """
 
+import functools
 from functools import partial
 from typing import NamedTuple
 
@@ -43,15 +43,16 @@ from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import OUT_OF_REACH, Candidate
 from pushjax.simulation.contact_selection import select_contacts, selected_candidates, track_contacts
-from pushjax.simulation.detection import MAX_PENETRATION, contact_candidates, num_contacts, time_of_impact
-from pushjax.simulation.finger_motion import DEPTH_FLOOR, BodyFrame, FingerMotion
+from pushjax.simulation.detection import MAX_PENETRATION, contact_candidates, num_contacts
+from pushjax.simulation.finger_motion import DEPTH_FLOOR, TOUCHING, BodyFrame, FingerMotion
 from pushjax.simulation.fixtures import Wall
-from pushjax.simulation.wall_contact import select_on_wall
+from pushjax.simulation.impact import time_of_impact
 from pushjax.simulation.working_set import Urgency, WorkingSet, num_solved_together, violations
 
-# rad. If a step, or a part of one, turns the slider farther than this, its result is rejected: contacts are detected at
-# the start of the step, and nothing checks what the slider passes on the way.
-MAX_ROTATION_PER_STEP = 0.5
+# If a step, or a part of one, turns the slider farther than this, rad, or if a finger slips on it farther than this, in
+# units of the limit surface's length, the result is rejected: contacts are detected at the start of the step, and
+# nothing checks what the slider passes on the way.
+MAX_ROTATION_PER_STEP, MAX_SLIP_PER_STEP = 0.5, 0.5
 
 
 class ScalarStep(NamedTuple):
@@ -90,7 +91,7 @@ class Stage(NamedTuple):
         status: `Status` so far.
         at_start: For each finger, its contacts as they were at the start of the step.
         chosen: For each finger, the index of each of its contacts among its candidates.
-        holds: Whether every finger is near enough to hold a jammed slider, and no fixture is.
+        holds: Whether there are several fingers, every one is near enough to hold a jammed slider, and no fixture is.
         urgency: Urgency by which contacts are selected (see `working_set`); None without fixtures, and if all contacts
             are solved together.
     """
@@ -179,15 +180,14 @@ class PushingPart(NamedTuple):
         """
         x = self.start.pose.x
         finger_pose = compute_once(finger_motion.pose_in_slider(frame, self.begin + self.rest * fraction), x)
-        path = finger_motion.path.unrotate(frame.angle)
+
+        def displacement_at(point: Vec2) -> Vec2:
+            return finger_motion.material_displacement(frame, point, finger_pose.center, self.rest, in_predictor)
+
         candidates = compute_once(
-            contact_candidates(finger_motion.finger, self.outline, finger_pose, path, self.length), x
+            contact_candidates(finger_motion.finger, self.outline, finger_pose, displacement_at, self.length), x
         )
-        if isinstance(finger_motion.finger, Wall):
-            assert isinstance(candidates, Candidate)
-            selected = select_on_wall(candidates, self.length, self.outline)
-        else:
-            selected = select_contacts(candidates, self.length, self.outline, path.scale(self.rest))
+        selected = select_contacts(candidates, finger_motion.finger, self.length, self.outline, displacement_at)
         tracked = track_contacts(candidates, chosen, at_start, finger_motion.finger, self.outline)
         indices = tuple(jnp.where(in_predictor, new, old) for new, old in zip(selected, tracked, strict=True))
         contacts, originals, is_near = [], [], jnp.zeros((), bool)
@@ -196,10 +196,8 @@ class PushingPart(NamedTuple):
             # a corner that has passed the end of an edge by now keeps its contact from the start of the step
             candidate = tree_where(decide(candidate.distance > OUT_OF_REACH / 2, x), original, candidate)
             # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
-            gap = _gap_of_fixture(original.distance, self.length) if is_fixture else original.distance
-            displacement = finger_motion.material_displacement(
-                frame, candidate.point, finger_pose.center, self.rest, in_predictor
-            )
+            gap = _gap(original.distance, (DEPTH_FLOOR if is_fixture else TOUCHING[x.dtype.itemsize]) * self.length)
+            displacement = displacement_at(candidate.point)
             contacts.append(
                 compute_once(Contact(candidate.point, candidate.normal, displacement, finger_motion.friction, gap), x)
             )
@@ -259,7 +257,7 @@ def step_in_scalars(
             if items:
                 found += map_items(lambda item, contacts_of=contacts_of: contacts_of(*item), items)
         by_finger, chosen, at_start, near = zip(*found, strict=True)
-        contacts, holds = sum(by_finger, ()), jnp.ones((), bool)
+        contacts, holds = sum(by_finger, ()), jnp.asarray(len(motions) > 1)
         for k, is_near in enumerate(near):
             holds &= is_near if k < len(motions) else ~is_near
         used_urgency = carry.urgency
@@ -271,55 +269,71 @@ def step_in_scalars(
         solution = working.spread(solution, len(contacts))
         urgency_after = None if urgency is None else violations(contacts, solution.twist, solution.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
-        status = jnp.where(carry.status == Status.MOVING, solution.status, jnp.maximum(carry.status, solution.status))
+        status = jnp.where(carry.status <= Status.FREE, solution.status, jnp.maximum(carry.status, solution.status))
         straight_point = _force_weighted_point(contacts, solution.force)
         next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency)
-        return next_stage, (solution, _points_and_normals(contacts), urgency_after)
+        on_bodies = sum(
+            (c for c, m in zip(by_finger, motions + fixtures, strict=True) if not isinstance(m.finger, Wall)), ()
+        )
+        slip = _largest_slip(on_bodies, solution.twist)
+        return next_stage, (solution, _points_and_normals(contacts), urgency_after, slip)
 
     before = Stage.before(start, counts, urgency if fixtures else None)
     carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
-    solution, points_and_normals, urgency_after = jax.tree.map(lambda leaf: leaf[-1], outputs)
+    solution, points_and_normals, urgency_after, slip = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
-    status = _status(carry, overlap_before, form.length)
+    moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
+    status = _status(carry, moves, slip, overlap_before, form.length)
     return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after
 
 
-def _status(last_stage: Stage, depth: Scalar, length: Scalar) -> Int[Array, ""]:
+def _status(last_stage: Stage, moves: Bool[Array, ""], slip: Scalar, depth: Scalar, length: Scalar) -> Int[Array, ""]:
     """Status of a step.
 
     Args:
         last_stage: What the corrector left.
+        moves: Whether the hand moves.
+        slip: Largest slip of the slider on a finger or a fixture, m.
         depth: Depth of the deepest finger at the start of the step, m.
         length: Characteristic length of the limit surface, m.
     """
     status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
-    too_far = (status == Status.MOVING) & (jnp.abs(last_stage.twist.z) > MAX_ROTATION_PER_STEP)
-    status = jnp.where(too_far, Status.NOT_CONVERGED, status)
+    too_far = (jnp.abs(last_stage.twist.z) > MAX_ROTATION_PER_STEP) | (slip > MAX_SLIP_PER_STEP * length)
+    is_solved = status == Status.MOVING
+    if sum(len(entries) for entries in last_stage.at_start) > 1:  # what leaves its only contact meets nothing else
+        is_solved |= status == Status.FREE
+    status = jnp.where(is_solved & too_far, Status.NOT_CONVERGED, status)
+    # a hand that rests changes nothing, and proves nothing
+    status = jnp.where(moves | (status == Status.INVALID), status, Status.FREE)
     overlapping = (depth > MAX_PENETRATION * length) & (status != Status.INVALID)
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
+
+
+def _largest_slip(contacts: tuple[Contact, ...], twist: Vec3) -> Scalar:
+    """Largest displacement of the slider relative to a finger or a fixture at a contact, m. Not differentiated."""
+    contacts, twist = jax.lax.stop_gradient((contacts, twist))
+    squares = []
+    for contact in contacts:
+        slip = twist.xy + contact.point.perp().scale(twist.z) - contact.displacement
+        squares.append(slip.dot(slip))
+    return jnp.sqrt(functools.reduce(jnp.maximum, squares))
 
 
 def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
     """Fraction of the step after which a finger first touches a slider at rest, or one if none does."""
     begin = jnp.ones_like(start.pose.x)
 
-    def impact_of(finger_motion: FingerMotion) -> Scalar:
-        assert not isinstance(finger_motion.finger, Wall)
-        finger_pose = finger_motion.pose_in_slider(start, jnp.zeros_like(start.pose.x))
-        finger_pose, path = compute_once((finger_pose, finger_motion.path.unrotate(start.angle)), start.pose.x)
-        return time_of_impact(finger_motion.finger, outline, finger_pose, path, length)
-
-    for impact in map_items(impact_of, motions):
+    for impact in map_items(lambda motion: time_of_impact(motion, outline, start, length), motions):
         begin = jnp.minimum(begin, impact)
     return compute_once(begin, start.pose.x)
 
 
-def _gap_of_fixture(distance: Scalar, length: Scalar) -> Scalar:
-    """Gap of a fixture, m: zero where the slider rests against it within roundoff.
+def _gap(distance: Scalar, roundoff: Scalar) -> Scalar:
+    """Gap of a contact, m: zero where a body touches within roundoff.
 
-    Otherwise the roundoff would move the slider, and its status would be MOVING though nothing pushes.
+    Otherwise the roundoff would move a slider on which nothing pushes, and would jam what a turning hand holds.
     """
-    rests = (distance < 0) & (distance > -DEPTH_FLOOR * length)
+    rests = (distance < 0) & (distance > -roundoff)
     return distance + jax.lax.stop_gradient(jnp.where(rests, -distance, 0.0))
 
 

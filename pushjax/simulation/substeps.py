@@ -17,6 +17,10 @@ that has ended. Trials that are undone do not contribute to derivatives, which a
 A jam is proved to first order only: within a long step the slider may turn out of it. So a whole step that jams is
 divided, too, and its first part has the size `JAM_PART`. If a part of that size jams, the hand stops where that part
 began. If all parts move, so does the step.
+
+If a body that holds the slider has no friction, the slider turns ever faster, without bound, while the last gap closes:
+no step ends exactly where nothing moves any more. So if the smallest part fails, it is tried once more with `BRACING`
+added to every friction. If it jams then, so does the push.
 """
 
 from collections.abc import Callable
@@ -53,6 +57,9 @@ JAM_PART = 1 / 16  # of a step that jams as a whole: size of the part that has t
 # NOT_CONVERGED, and the slider stays where the last accepted part left it. A grasp of a slider with many corners takes
 # 1.1 trials per step.
 TRIALS_PER_STEP, EXTRA_TRIALS = 4, 64
+# Added to all coefficients of friction where the smallest part fails. What jams with it could only move some ten times
+# as fast as the hand without it.
+BRACING = 0.1
 MAX_SWAPS = 3  # changes of the working set before a part is divided
 # A contact that is not in the contact problem may be violated by this fraction of the allowed penetration.
 MISSED_FRACTION = 0.01
@@ -70,6 +77,7 @@ class PushState(NamedTuple):
         halved: Whether the part has its size because a part of twice that size failed.
         whole_step_jams: Whether the step as a whole jams.
         urgency: Urgency of each contact; None if all are solved together.
+        braced: Whether the smallest part has failed, and is tried with more friction.
         swaps: How often the working set of this part has changed.
         overlap: Current depth of the deepest finger, m.
         stop_status: Status that stopped the hand, or zero.
@@ -87,6 +95,7 @@ class PushState(NamedTuple):
     halved: Bool[Array, ""]
     whole_step_jams: Bool[Array, ""]
     urgency: Urgency | None
+    braced: Bool[Array, ""]
     swaps: Int[Array, ""]
     overlap: Scalar
     stop_status: Int[Array, ""]
@@ -136,7 +145,7 @@ class DividedPush(NamedTuple):
         status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
         urgency, idle = initial_urgency(counts, pose.x), _idle_record(pose, sum(counts))
-        return PushState(pose, pose, first, zero, one, no, no, urgency, status, overlap, status, status, no, idle)
+        return PushState(pose, pose, first, zero, one, no, no, urgency, no, status, overlap, status, status, no, idle)
 
     def trial(self, state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
         """Try the next part of a step.
@@ -146,8 +155,15 @@ class DividedPush(NamedTuple):
         """
         form, mu = self.friction_at(state.step, state.origin)
         motions = self.motions_at(state.step, mu)
-        reach, tolerance = holding_distance(motions, form.length), allowed_penetration(motions, form.length)
+        displacement = max_displacement(motions)
+        reach = holding_distance(state.part * displacement, form.length)
+        tolerance = allowed_penetration(displacement, form.length)
         part = tuple(motion.part(state.done, state.part) for motion in motions)
+        bracing = jnp.where(state.braced, BRACING, 0.0)
+        part, fixtures = (
+            tuple(motion._replace(friction=motion.friction + bracing) for motion in bodies)
+            for bodies in (part, self.fixtures)
+        )
         record, urgency_after = step_in_scalars(
             form,
             self.outline,
@@ -158,11 +174,13 @@ class DividedPush(NamedTuple):
             reach,
             state.urgency,
             state.step < self.end,
-            self.fixtures,
+            fixtures,
             state.swaps == 0,
         )
-        displacement, is_smallest = state.part * max_displacement(motions), state.part < 2 * SMALLEST_PART
-        speed = judge_speed(state.pose, record.pose, displacement, form.length, is_smallest)
+        is_smallest = state.part < 2 * SMALLEST_PART
+        speed = judge_speed(
+            record.twist, record.force, record.contact_point, state.part * displacement, form.length, is_smallest
+        )
         next_state, end_of_step = _next_state(
             state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.end
         )
@@ -238,6 +256,7 @@ class Decision(NamedTuple):
     Attributes:
         accepted: The part is done.
         joins: A contact that the result violates joins the contact problem, and the same part is tried again.
+        braces: The smallest part is tried again with more friction.
         stops: The hand stops where the part began.
         abandons: The step is given up. The next trial is of the whole step, to find the overlap of a slider that stays.
         fails: The step ends with the status `reason`.
@@ -246,6 +265,7 @@ class Decision(NamedTuple):
 
     accepted: Bool[Array, ""]
     joins: Bool[Array, ""]
+    braces: Bool[Array, ""]
     stops: Bool[Array, ""]
     abandons: Bool[Array, ""]
     fails: Bool[Array, ""]
@@ -286,16 +306,20 @@ def _decide(
     if urgency_after is not None:
         worst = jnp.max(jnp.where(urgency_after < LOADED, urgency_after, -jnp.inf))
         joins = is_solved & ~fails & (state.swaps < MAX_SWAPS) & (worst > MISSED_FRACTION * state.part * tolerance)
-    accepted, stops, joins = compute_once((is_solved & clear & ~fails & ~joins, stops, joins), state.pose.x)
-    hopeless = (state.part / 2 < SMALLEST_PART) | state.failed | (record.status >= Status.OVERLAPPING)
-    abandons = hopeless & ~accepted & ~stops & ~fails & ~joins
+    accepted = is_solved & clear & ~fails & ~joins & ~state.braced
+    accepted, stops, joins = compute_once((accepted, stops, joins), state.pose.x)
+    is_bad = record.status >= Status.OVERLAPPING
+    is_smallest = state.part / 2 < SMALLEST_PART
+    hopeless = (is_smallest | state.failed | is_bad) & ~accepted & ~stops & ~fails & ~joins
+    braces = hopeless & is_smallest & ~is_bad & ~state.braced & (len(record.force) > 1)
+    abandons = hopeless & ~braces
     # If nothing moved and the trial took the hand to the end of the step, its overlap is known and no further trial is
     # needed.
     ends_at_once = abandons & ~is_solved & (state.part == 1)
     reason = jnp.where(is_solved, Status.NOT_CONVERGED, record.status)
     reason = jnp.where(fails, state.abandon_status, reason).astype(jnp.int8)
     return Decision(
-        accepted, joins, stops, abandons & ~ends_at_once, decide(fails | ends_at_once, state.pose.x), reason
+        accepted, joins, braces, stops, abandons & ~ends_at_once, decide(fails | ends_at_once, state.pose.x), reason
     )
 
 
@@ -333,7 +357,7 @@ def _next_state(
     accepted_parts = accepted_parts._replace(status=jnp.where(moves, record.status, state.accepted_parts.status))
     done = state.done + state.part
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
-    failed_record = _resting(record, state.origin)._replace(status=decision.reason, overlap=depth)
+    failed_record = resting(record, state.origin)._replace(status=decision.reason, overlap=depth)
     stopped_record = state.accepted_parts._replace(pose=state.pose, status=record.status, overlap=state.overlap)
     end_record = tree_where(stops, stopped_record, tree_where(accepted, accepted_parts, failed_record))
 
@@ -341,7 +365,8 @@ def _next_state(
     continues = decide(accepted & ~ends, pose.x)
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
-    smaller = jnp.where(decision.joins, state.part, jnp.where(jams, JAM_PART, state.part / 2))
+    again = decision.joins | decision.braces
+    smaller = jnp.where(again, state.part, jnp.where(jams, JAM_PART, state.part / 2))
     larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
     next_state = PushState(
         pose=tree_where(ends, end_record.pose, tree_where(continues, pose, state.pose)),
@@ -349,16 +374,17 @@ def _next_state(
         step=jnp.where(ends, jnp.where(stops, steps, state.step + 1), state.step),
         done=jnp.where(restarts, 0.0, jnp.where(accepted, done, state.done)),
         part=jnp.where(restarts, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
-        halved=jnp.where(decision.joins, state.halved, ~(restarts | accepted | jams)),
+        halved=jnp.where(again, state.halved, ~(restarts | accepted | jams)),
         whole_step_jams=(state.whole_step_jams | jams) & ~(ends | restarts),
         urgency=state.urgency,
+        braced=decision.braces | (state.braced & decision.joins),
         swaps=jnp.where(decision.joins, state.swaps + 1, 0).astype(jnp.int8),
         overlap=jnp.where(ends, end_record.overlap, jnp.where(accepted, depth, state.overlap)),
         stop_status=jnp.where(stops, record.status, state.stop_status).astype(jnp.int8),
         abandon_status=jnp.where(decision.abandons, decision.reason, 0).astype(jnp.int8),
         failed=jnp.where(ends, fails, state.failed),
         accepted_parts=tree_where(
-            ends, _resting(record, end_record.pose), tree_where(continues, accepted_parts, state.accepted_parts)
+            ends, resting(record, end_record.pose), tree_where(continues, accepted_parts, state.accepted_parts)
         ),
     )
     next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
@@ -370,7 +396,7 @@ def hand_stops(status: Array) -> Bool[Array, "..."]:
     return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
-def _resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
+def resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
     """Record of a slider that stays at `pose` while nothing pushes."""
     blank = jax.tree.map(jnp.zeros_like, record)
     return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))

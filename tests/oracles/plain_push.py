@@ -83,8 +83,11 @@ def _unrotate(v: list, turn: tuple) -> list:
 
 
 def _moved(pose: list, turn: tuple, point: Any, motion: Any, seen: tuple) -> tuple[list, tuple]:
-    """Move the contact point in a straight line and rotate the slider about it (`simulation.step.BodyFrame.moved`)."""
-    angle = pose[2] + motion[2]
+    """Move the contact point in a straight line and rotate the slider about it.
+
+    The motion is that of the points, along chords, so the angle is the one whose chord is `motion[2]`.
+    """
+    angle = pose[2] + 2 * math.asin(motion[2] / 2)
     after = _turn(angle)
     straight = _rotate([motion[0] - motion[2] * point[1], motion[1] + motion[2] * point[0]], seen)
     swing = [a - b for a, b in zip(_rotate(point, after), _rotate(point, turn), strict=True)]

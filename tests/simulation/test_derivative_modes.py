@@ -183,14 +183,14 @@ def test_derivatives_of_grasps(hand, opening):
     np.testing.assert_allclose(slope[:, 0], central, rtol=0, atol=HAND_DIFFERENCE * max(1, np.abs(central).max()))
     assert np.abs(slope[:, 0, 4:]).max() > 0.1
     if len(hand.fingers) == 2 and opening[0] == 0.06 and hand.least > 0:
-        _turns_too_far(forward, base[0])
+        _turns_flat(forward, base[0])
 
 
-def _turns_too_far(forward, like):
-    """Frictionless round fingers on parallel faces: NOT_CONVERGED, and the hand moves on into the slider."""
+def _turns_flat(forward, like):
+    """Frictionless round fingers on parallel faces: the slider turns ever faster until it is held."""
     row = like * np.array([0, 1, 0, 1, 0, 0, 0, 1]) + np.array([0, 0, 0, 0.1, 0, 0, 0, -0.02])
     _, slope, kind = forward(jnp.asarray(np.tile(row, (6 * INPUTS, 1))), jnp.asarray(np.tile(np.eye(INPUTS), (6, 1))))
-    assert {pj.Status.MOVING, pj.Status.NOT_CONVERGED, pj.Status.OVERLAPPING} <= set(np.asarray(kind[0]).tolist())
+    assert set(np.asarray(kind[0]).tolist()) <= {pj.Status.FREE, pj.Status.MOVING, pj.Status.GRASPED}
     assert np.all(np.isfinite(slope))
 
 

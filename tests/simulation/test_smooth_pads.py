@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax._math.vec import Vec2
+from pushjax._math.vec import Vec2, Vec3
 from pushjax.experiments.grasps.sliders import butterfly
 from pushjax.simulation.candidate import OUT_OF_REACH, FingerPose
-from pushjax.simulation.detection import contact_candidates, penetration_depth, time_of_impact
+from pushjax.simulation.detection import contact_candidates, penetration_depth
+from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
 from pushjax.simulation.hand import Pad
+from pushjax.simulation.impact import time_of_impact
 
 SEMI = np.array([0.02, 0.014])
 LENGTH = 0.015
@@ -84,13 +86,20 @@ def placed(x, y, turn) -> FingerPose:
 def test_meets_where_brute_force_does(name, rng):
     shape, finger = shapes()[name], pad()
     outline, points, bounds = shape.outline(), dense(shape, 4000), [np.asarray(b) for b in finger.shape.bounds]
-    met = jax.jit(lambda at, path: time_of_impact(finger, outline, at, path, jnp.asarray(LENGTH)))
+    resting, zero = BodyFrame.at(Vec3(*jnp.zeros(3))), jnp.zeros(())
+
+    def met_at(center, angle, path):
+        return time_of_impact(
+            FingerMotion(finger, zero, center, path, angle, zero), outline, resting, jnp.asarray(LENGTH)
+        )
+
+    met = jax.jit(met_at)
     deep = jax.jit(lambda at: penetration_depth(finger, outline, at))
     hits = 0
     for _ in range(25):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
         at, path = placed(aside, 0.04, turn), Vec2(jnp.asarray(rng.uniform(-0.01, 0.01)), jnp.asarray(-0.05))
-        start = float(met(at, path))
+        start = float(met(at.center, jnp.asarray(turn), path))
         shares, begin, way = np.linspace(0, 1, 101), np.array([aside, 0.04]), np.array([float(path.x), float(path.y)])
         depth = np.array([inside(points, bounds, begin + share * way, turn) for share in shares])
         first = shares[np.argmax(depth > 0)] if (depth > 0).any() else 1.0
@@ -108,7 +117,7 @@ def test_places_are_at_their_distance(name):
     """With a pad over the outline, contacts lie on it, at their stated distance from the pad along the normal."""
     shape, finger = shapes()[name], pad()
     still = Vec2(jnp.zeros(()), jnp.zeros(()))
-    seen = jax.jit(lambda at: contact_candidates(finger, shape.outline(), at, still, jnp.asarray(LENGTH)))
+    seen = jax.jit(lambda at: contact_candidates(finger, shape.outline(), at, lambda point: still, jnp.asarray(LENGTH)))
     deep = jax.jit(lambda at: penetration_depth(finger, shape.outline(), at))
     for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
         at = placed(aside, 0.025, turn)
