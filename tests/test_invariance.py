@@ -7,6 +7,8 @@ close and change places are all one program, and so are scenes that differ in th
 import dataclasses
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 import pushjax as pj
 
 STEPS = 12
+SMALL_PART = 5e-4  # where steps are divided in other parts
 EXACT = 1e-9  # m and rad: what roundoff becomes in twelve steps
 SPLIT_M, SPLIT_RAD = 1.5e-3, 0.06  # where the sizes of steps differ
 EXAMPLES = settings(max_examples=6, deadline=None, derandomize=True)
@@ -317,3 +320,141 @@ def test_rows_split(kind, seed):
     few, many = late.push(), late.but(path=split(late.path, 10)).push()
     np.testing.assert_allclose(many.pose[-1, :2], few.pose[-1, :2], atol=SPLIT_M)
     np.testing.assert_allclose(many.pose[-1, 2], few.pose[-1, 2], atol=SPLIT_RAD)
+
+
+# --- one body or one hand in several forms ---
+
+
+def test_vertices_on_straight_sides_and_a_convex_polygon_declared_not_convex():
+    """A pad pushes a rectangle flat, tilted and aside: more vertices on sides, or `convex=False`, change nothing."""
+    rng = np.random.default_rng(0)
+    ends, steps = SIDE[[1, 2, 3, 0]], np.linspace(0, 0.03, STEPS + 1)
+    for tilt, turn, aside in ((0, 0, 0), (0.02, 0, 0), (0, 0.1, 0), (0, 0, 0.5), (-0.02, -0.1, 0.3)):
+        path = np.stack([aside * steps, steps - 0.0053, turn * steps / 0.03], axis=1)[:, None]
+        scene = Scene(points=SIDE, length=0.023, fingers=(4 * PAD * [1, 0.25],), path=path, friction=np.array([0.3]))
+        scene = scene.but(pose=np.array([0.03, 0.0172 + 0.03 * abs(np.sin(tilt)), tilt]))
+        wanted = of(scene.push())
+        split_sides = np.concatenate(
+            [
+                np.linspace(a, b, 4)[:3] + rng.uniform(-0.2, 0.2, (3, 1)) * [[0], [1], [1]] * (b - a) / 3
+                for a, b in zip(SIDE, ends, strict=True)
+            ]
+        )
+        same(of(scene.but(points=split_sides).push()), wanted)
+        same(of(scene.but(shape=lambda v: pj.Polygon(v, convex=False)).push()), wanted)
+
+
+def test_disk_ellipse_and_curve():
+    """A disk, an ellipse with equal axes, and a curve through 64 points of the circle (which is off by 0.2 um).
+
+    Where the slider comes over the end of a pad within a step, its turn is exact to a hundredth of that step.
+    """
+    angle = np.pi / 32 * np.arange(64)
+    circle = 0.02 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    shapes = {
+        "disk": lambda v: pj.Disk(0.02),
+        "ellipse": lambda v: pj.Ellipse(0.02, 0.02),
+        "curve": pj.Curve.through,
+    }
+    for fingers, atol in (((0.006,), 1e-5), ((PAD,), 2e-3)):
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            scene = Scene(points=circle, A=surface(rng), length=0.0142, fingers=fingers)
+            scene = scene.but(path=approach(rng, 0.05, 0.04)[:, None], friction=np.array([0.4]))
+            disk, ellipse, curve = (of(scene.but(shape=shape).push()) for shape in shapes.values())
+            same(ellipse, disk)
+            np.testing.assert_allclose(curve[0], disk[0], atol=atol)
+
+
+def test_wall_as_a_half_plane_a_box_and_two_boxes():
+    """A slider that is pushed onto a wall and along it does not catch on the seam of two boxes.
+
+    The step in which it jams may be divided in other parts, so the angle there is exact to a sixteenth of that step.
+    """
+    half = np.array([[-0.3, -0.1], [0.3, -0.1], [0.3, 0], [-0.3, 0]])
+    left, right = np.minimum(half, [0.004, 0]), np.maximum(half, [0.004, -1])
+    walls = {
+        "wall": (("wall", None, np.zeros(3), 0.2),),
+        "box": (("box", half, np.zeros(3), 0.2),),
+        "boxes": (("box", left, np.zeros(3), 0.2), ("box", right, np.zeros(3), 0.2)),
+    }
+    cases = {
+        "onto": ((0.005, 0.07), (0.005, 0.035), (0, 0.026, 0.15)),
+        "along": ((-0.045, 0.012), (0.035, 0.012), (0, 0.0202, 0.0)),
+        "tip": ((-0.05, 0.035), (0.02, 0.025), (0, 0.03, 0.2)),
+        "press": ((-0.01, 0.07), (0.03, 0.038), (0, 0.024, 0.05)),
+    }
+    for start, end, pose in cases.values():
+        path = np.concatenate([pj.line(start, end, STEPS), np.zeros((STEPS + 1, 1))], axis=1)[:, None]
+        scene = Scene(length=0.021, path=path, pose=np.array(pose))
+        wall, *boxes = (scene.but(fixtures=fixtures).push() for fixtures in walls.values())
+        for box in boxes:
+            np.testing.assert_allclose(box.pose[-1], wall.pose[-1], atol=SMALL_PART)
+            assert box.status[-1] == wall.status[-1]
+
+
+def test_idle_finger_far_away():
+    """A second finger that never touches changes nothing, except that steps of hands with two contacts are divided."""
+    for seed in range(6):
+        scene, _ = drawn(("rectangle", "finger"), seed)
+        far = scene.path + np.array([3.0, 1.0, 0.0])
+        two = scene.but(fingers=(0.006, 0.009), friction=np.array([scene.friction[0], 0.9]))
+        wanted = of(scene.push())
+        same(of(two.but(path=np.concatenate([scene.path, far], axis=1)).push()), wanted, SMALL_PART)
+        swapped = two.but(fingers=(0.009, 0.006), friction=two.friction[::-1])
+        same(of(swapped.but(path=np.concatenate([far, scene.path], axis=1)).push()), wanted, SMALL_PART)
+
+
+# --- how it is computed ---
+
+
+@pytest.mark.parametrize("kind", [("rectangle", "finger"), ("T", "finger")], ids="-".join)
+def test_eager_jit_vmap_scan_closed_over_or_given(kind):
+    scene, _ = drawn(kind, 3)
+    slider, hand, mu = scene.slider(), scene.hand(), jnp.asarray(scene.friction)
+    rows, pose = jnp.asarray(scene.path.reshape(STEPS + 1, -1)), jnp.asarray(scene.pose)
+    wanted = of(scene.push())
+
+    def push(slider, rows, pose):
+        found = pj.rollout(slider, hand, rows, pose=pose, friction=mu)
+        return found.pose, found.status
+
+    same(jax.tree.map(np.asarray, jax.jit(push)(slider, rows, pose)), wanted)
+    batch = jnp.stack([rows + 0.001, rows])
+    closed = jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda rows: push(slider, rows, pose)))(batch))
+    same((closed[0][1], closed[1][1]), wanted)
+    nonsense = batch.at[0].set(jnp.nan)
+    among = jax.tree.map(np.asarray, jax.jit(jax.vmap(push, in_axes=(None, 0, None)))(slider, nonsense, pose))
+    same((among[0][1], among[1][1]), wanted)
+    assert set(among[1][0].tolist()) == {pj.Status.INVALID}
+
+    def one_step(pose, ends):
+        done = pj.step(slider, hand, *ends, pose=pose, friction=mu)
+        return done.pose, (done.pose, done.status)
+
+    _, (poses, statuses) = jax.jit(lambda pose: jax.lax.scan(one_step, pose, (rows[:-1], rows[1:])))(pose)
+    same((np.concatenate([pose[None], poses]), np.asarray(statuses)), wanted)
+
+
+@pytest.mark.parametrize("kind", [("rectangle", "finger"), ("rectangle", "pad"), ("T", "finger")], ids="-".join)
+def test_float32_beside_float64(kind):
+    """In float32 a push of 45 mm ends within 20 um and 0.5 mrad of float64: seven digits, some lost in each step."""
+    for seed in range(4):
+        scene, _ = drawn(kind, seed)
+
+        def narrow(x):
+            return np.asarray(x, np.float32)
+
+        single = scene.but(
+            points=narrow(scene.points),
+            A=narrow(scene.A),
+            length=np.float32(scene.length),
+            fingers=tuple(narrow(f) for f in scene.fingers),
+            path=narrow(scene.path),
+            pose=narrow(scene.pose),
+            friction=narrow(scene.friction),
+        )
+        narrow_push, wide = single.push(), scene.push()
+        assert narrow_push.pose.dtype == np.float32
+        np.testing.assert_allclose(narrow_push.pose[-1, :2], wide.pose[-1, :2], atol=2e-5)
+        np.testing.assert_allclose(narrow_push.pose[-1, 2], wide.pose[-1, 2], atol=5e-4)

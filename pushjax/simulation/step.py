@@ -52,7 +52,7 @@ from pushjax.simulation.working_set import Urgency, WorkingSet, num_solved_toget
 # If a step, or a part of one, turns the slider farther than this, rad, or if a finger slips on it farther than this, in
 # units of the limit surface's length, the result is rejected: contacts are detected at the start of the step, and
 # nothing checks what the slider passes on the way.
-MAX_ROTATION_PER_STEP, MAX_SLIP_PER_STEP = 0.5, 0.5
+MAX_ROTATION_PER_STEP, MAX_SLIP_PER_STEP = 0.5, 1.0
 
 
 class ScalarStep(NamedTuple):
@@ -273,50 +273,53 @@ def step_in_scalars(
         straight_point = _force_weighted_point(contacts, solution.force)
         next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency)
         on_bodies = sum(
-            (c for c, m in zip(by_finger, motions + fixtures, strict=True) if not isinstance(m.finger, Wall)), ()
+            (found for found, m in zip(by_finger, motions + fixtures, strict=True) if not isinstance(m.finger, Wall)),
+            (),
         )
-        slip = _largest_slip(on_bodies, solution.twist)
-        return next_stage, (solution, _points_and_normals(contacts), urgency_after, slip)
+        is_long = _turns_or_slips_too_far(on_bodies, solution, form.length)
+        return next_stage, (solution, _points_and_normals(contacts), urgency_after, is_long)
 
     before = Stage.before(start, counts, urgency if fixtures else None)
     carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
-    solution, points_and_normals, urgency_after, slip = jax.tree.map(lambda leaf: leaf[-1], outputs)
+    is_long = jnp.any(outputs[-1])
+    solution, points_and_normals, urgency_after, _ = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
     moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
-    status = _status(carry, moves, slip, overlap_before, form.length)
+    status = _status(carry, moves, is_long, overlap_before, form.length)
     return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after
 
 
-def _status(last_stage: Stage, moves: Bool[Array, ""], slip: Scalar, depth: Scalar, length: Scalar) -> Int[Array, ""]:
+def _status(
+    last_stage: Stage, moves: Bool[Array, ""], is_long: Bool[Array, ""], depth: Scalar, length: Scalar
+) -> Int[Array, ""]:
     """Status of a step.
 
     Args:
         last_stage: What the corrector left.
         moves: Whether the hand moves.
-        slip: Largest slip of the slider on a finger or a fixture, m.
+        is_long: Whether the slider turns or slips too far for one step.
         depth: Depth of the deepest finger at the start of the step, m.
         length: Characteristic length of the limit surface, m.
     """
     status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
-    too_far = (jnp.abs(last_stage.twist.z) > MAX_ROTATION_PER_STEP) | (slip > MAX_SLIP_PER_STEP * length)
-    is_solved = status == Status.MOVING
-    if sum(len(entries) for entries in last_stage.at_start) > 1:  # what leaves its only contact meets nothing else
-        is_solved |= status == Status.FREE
-    status = jnp.where(is_solved & too_far, Status.NOT_CONVERGED, status)
+    status = jnp.where((status <= Status.FREE) & is_long, Status.NOT_CONVERGED, status)
     # a hand that rests changes nothing, and proves nothing
     status = jnp.where(moves | (status == Status.INVALID), status, Status.FREE)
     overlapping = (depth > MAX_PENETRATION * length) & (status != Status.INVALID)
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
 
 
-def _largest_slip(contacts: tuple[Contact, ...], twist: Vec3) -> Scalar:
-    """Largest displacement of the slider relative to a finger or a fixture at a contact, m. Not differentiated."""
-    contacts, twist = jax.lax.stop_gradient((contacts, twist))
+def _turns_or_slips_too_far(contacts: tuple[Contact, ...], solution: ScalarSolution, length: Scalar) -> Bool[Array, ""]:
+    """Whether a motion turns the slider, or slips at a contact with a finger or a fixture, too far for one step."""
+    contacts, twist, length = jax.lax.stop_gradient((contacts, solution.twist, length))
     squares = []
     for contact in contacts:
         slip = twist.xy + contact.point.perp().scale(twist.z) - contact.displacement
         squares.append(slip.dot(slip))
-    return jnp.sqrt(functools.reduce(jnp.maximum, squares))
+    slips = functools.reduce(jnp.maximum, squares) > (MAX_SLIP_PER_STEP * length) ** 2
+    # what leaves its only contact meets nothing else
+    solved = (solution.status == Status.MOVING) | ((solution.status == Status.FREE) & (len(contacts) > 1))
+    return solved & (slips | (jnp.abs(twist.z) > MAX_ROTATION_PER_STEP))
 
 
 def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
