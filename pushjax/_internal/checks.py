@@ -39,7 +39,7 @@ def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array
         name: Name of the argument, for messages.
 
     Raises:
-        TypeError: If the value does not consist of real numbers.
+        TypeError: If the value does not consist of real numbers, or has fewer than 32 bits.
         ValueError: If the rows of a nested sequence differ in length.
     """
     array = value
@@ -51,6 +51,8 @@ def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array
             raise ValueError(f"{name}: expected an array of numbers; got rows that differ: {error}") from None
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.bool_, jnp.integer, jnp.floating)):
         raise TypeError(f"{name}: expected real numbers; got {value!r}")
+    if jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.itemsize < 4:
+        raise TypeError(f"{name}: expected float32 or float64; got {array.dtype}, which is too coarse for contacts")
     if dtype is None:
         is_floating = jnp.issubdtype(array.dtype, jnp.floating)
         dtype = jax.dtypes.canonicalize_dtype(array.dtype) if is_floating else jnp.result_type(float)

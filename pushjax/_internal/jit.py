@@ -7,6 +7,7 @@ part of a user's program is compiled for a short run time.
 import functools
 import gc
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ParamSpec, TypeVar
 
@@ -21,10 +22,6 @@ except ImportError:  # JAX up to 0.9
 P = ParamSpec("P")
 R = TypeVar("R")
 
-OBJECTS_OF_A_TRACE = 50_000  # a call that has created at least this many Python objects has traced something
-FROZEN_AT_IMPORT = gc.get_freeze_count()  # objects that the interpreter itself has frozen
-
-
 # JAX 0.11 and later no longer have XLA's fusion emitters, and raise an error for an option that they do not know.
 HAS_FUSION_EMITTERS = jax.__version_info__ < (0, 11)
 # A program that is called by itself runs once or a few times, on one example, for milliseconds, so the user waits only
@@ -32,7 +29,8 @@ HAS_FUSION_EMITTERS = jax.__version_info__ < (0, 11)
 QUICK_OPTIONS: dict[str, str | bool | int] = {"xla_backend_optimization_level": 1}
 if HAS_FUSION_EMITTERS:
     QUICK_OPTIONS["xla_cpu_use_fusion_emitters"] = False
-NO_TRACE = get_opaque_trace_state()  # this module is imported outside of any trace
+with ThreadPoolExecutor(1) as thread:  # this module may be imported within a trace, but a new thread has none
+    NO_TRACE = thread.submit(get_opaque_trace_state).result()
 
 
 def outside_trace() -> bool:
@@ -81,10 +79,7 @@ def without_gc(function: Callable[P, R]) -> Callable[P, R]:
     millions of objects, nearly all of which stay. The collector would scan them at every few hundred new objects and
     find nothing; it took up to half of the time of tracing.
 
-    So the collector is disabled during the call, in all threads. After the call the new objects are promoted to the
-    oldest generation, where they would be had the collector run; otherwise it would scan all of them three more times.
-    A call that traces nothing leaves the generations as they are, so that garbage is found as soon as without this
-    wrapper.
+    So the collector is disabled during the call, in all threads.
     """
 
     @functools.wraps(function, updated=())
@@ -95,20 +90,6 @@ def without_gc(function: Callable[P, R]) -> Callable[P, R]:
             gc.disable()
             return function(*args, **kwargs)
         finally:
-            try:
-                _promote_new_objects()
-            finally:
-                gc.enable()
+            gc.enable()
 
     return call
-
-
-def _promote_new_objects() -> None:
-    """Promote all objects to the oldest generation if there are many new ones."""
-    # `unfreeze` below would also release objects that the user has frozen, so then nothing is promoted
-    if gc.get_count()[0] < OBJECTS_OF_A_TRACE or gc.get_freeze_count() > FROZEN_AT_IMPORT:
-        return
-    try:
-        gc.freeze()
-    finally:
-        gc.unfreeze()  # moves all frozen objects to the oldest generation

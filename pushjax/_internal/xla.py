@@ -40,7 +40,8 @@ def compute_once(values, runtime_scalar: Scalar):
     Raises:
         TypeError: If a value is neither floating nor boolean.
     """
-    one = jax.lax.stop_gradient(runtime_scalar) * 0 + 1
+    # the barrier keeps a scalar that is a constant of the program from being simplified away with its divisions
+    one = jax.lax.optimization_barrier(jax.lax.stop_gradient(runtime_scalar)) * 0 + 1
 
     def divided_by_one(value):
         if jnp.issubdtype(value.dtype, jnp.floating):

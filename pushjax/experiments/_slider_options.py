@@ -35,6 +35,8 @@ def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj
     if kind == "ellipse":
         return pj.Ellipse(*sizes)
     if kind == "regular":
+        if not (sizes[0] >= 3 and sizes[0].is_integer()):
+            raise ValueError(f"{option}: a regular polygon needs a whole number of at least three sides; got {text!r}")
         return pj.Polygon.regular(int(sizes[0]), sizes[1])
     return pj.Polygon.rectangle(*sizes)
 
@@ -73,9 +75,9 @@ def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSur
 
 
 def _vertices(path: Path, option: str) -> np.ndarray:
-    """Read a file with one vertex x, y (m) per line; a heading is allowed."""
+    """Read a file with one vertex x, y (m) per line; a heading, a first row without any number, is allowed."""
     try:
-        rows = [row for row in csv.reader(path.read_text().splitlines()) if row]
+        rows = [row for row in csv.reader(path.expanduser().read_text("utf-8-sig").splitlines()) if row]
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{option}: {path}: expected {SHAPES}; {error}") from error
     numbers = []
@@ -83,7 +85,7 @@ def _vertices(path: Path, option: str) -> np.ndarray:
         try:
             numbers.append([float(cell) for cell in row])
         except ValueError as error:
-            if k > 0:
+            if k > 0 or any(cell.strip(" +-.")[:1].isdigit() for cell in row):
                 raise ValueError(f"{option}: {path}, line {k + 1}: expected two numbers, x and y; got {row}") from error
     if any(len(row) != 2 for row in numbers) or len(numbers) < 3:
         raise ValueError(f"{option}: {path}: expected at least three vertices, two numbers each; got {len(numbers)}")

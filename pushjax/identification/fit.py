@@ -22,7 +22,7 @@ GAP_SCALE = 3.0  # sigma: beyond this residual of a gap, the finger counts as ha
 
 
 # Numbers that a push counts as having measured. All its poses together weigh as much as one, and so do its directions.
-NUMBERS_PER_KIND = PerKind(poses=3, directions=3, gap=1)
+NUMBERS_PER_KIND = PerKind(poses=3, directions=2, gap=1)  # a direction is a unit vector
 
 
 class Fit(NamedTuple):

@@ -363,8 +363,9 @@ def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset
     """Return the true path of the hand, from the logged one.
 
     The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
-    lag_distance, shifted by `hand_offset`. Beyond an end of the logged path it goes straight on. Its direction there is
-    that of a fifth of the path, because local directions of a recording are mostly roundoff.
+    lag_distance, shifted by `hand_offset`. Arc lengths are those of x and y. Beyond an end of the logged path it goes
+    straight on. Its direction there is that of a fifth of the path, because local directions of a recording are mostly
+    roundoff.
 
     Args:
         path: (steps + 1, dof) logged path.
@@ -378,7 +379,9 @@ def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset
     arc = arc_length(path[:, :2])
     length = arc[-1]
     true_arc = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
-    corrected = interpolate_arc_length(path, arc, jnp.clip(true_arc, 0, length))
+    # the change is added, because a hand that only closes or turns has no arc length to interpolate at
+    at_logged, at_true = (interpolate_arc_length(path, arc, s) for s in (arc, jnp.clip(true_arc, 0, length)))
+    corrected = path + (at_true - at_logged)
     rows = max(len(path) // DIRECTION_PARTS, 1)
     beyond, before = jnp.maximum(true_arc - length, 0), jnp.minimum(true_arc, 0)
     corrected = corrected + beyond[:, None] * _change_per_length(path, arc, -1 - rows, -1)[None]

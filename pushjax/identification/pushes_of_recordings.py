@@ -31,6 +31,8 @@ MAX_DISTANCE = 30.0
 MAX_TURN = 2 * np.pi  # rad, largest rotation of a slider in a push
 TRAVEL_MARGIN = 0.01  # m, margin for a slider that moves farther than its hand, and for errors of the tracker
 
+TURN_LENGTH = 0.05  # m/rad, what a turn of the hand counts as a distance
+
 
 def screen(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
     """Keep pushes that are physically possible; list the others in `problems` with the reason.
@@ -165,8 +167,9 @@ def has_wrenches(recordings: Recordings) -> bool:
 
 
 def _hand_travel(push: Recording) -> Floats:
-    """Return the distance (m,) that the hand has moved at each sample, in the configuration's own units."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(push.hand, axis=0), axis=1))])
+    """Return the distance (m,) that the hand has moved at each sample, with turns as distances, m."""
+    lengths = np.where(np.arange(push.hand.shape[1]) == 2, TURN_LENGTH, 1.0)  # the third coordinate is an angle
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(push.hand, axis=0) * lengths, axis=1))])
 
 
 def _interpolated_columns(values: Floats, arc: Floats, query: Floats) -> Floats:

@@ -3,8 +3,8 @@
 Quasi-static motion does not depend on time, so a step is a displacement of the hand; `pushjax.simulation.step` has the
 scheme of a step. The only state is the pose of the pushed slider.
 
-If no motion satisfies every contact, the hand has jammed, and it stops there for good. A step in which the hand does not
-move changes nothing.
+If no motion satisfies every contact, the hand has jammed, and it stops there for good. A step in which the hand stays
+changes nothing.
 """
 
 from collections.abc import Callable, Sequence

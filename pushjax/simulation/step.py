@@ -272,11 +272,7 @@ def step_in_scalars(
         status = jnp.where(carry.status <= Status.FREE, solution.status, jnp.maximum(carry.status, solution.status))
         straight_point = _force_weighted_point(contacts, solution.force)
         next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency)
-        on_bodies = sum(
-            (found for found, m in zip(by_finger, motions + fixtures, strict=True) if not isinstance(m.finger, Wall)),
-            (),
-        )
-        is_long = _turns_or_slips_too_far(on_bodies, solution, form.length)
+        is_long = _turns_or_slips_too_far(motions + fixtures, by_finger, solution, form.length)
         return next_stage, (solution, _points_and_normals(contacts), urgency_after, is_long)
 
     before = Stage.before(start, counts, urgency if fixtures else None)
@@ -309,16 +305,22 @@ def _status(
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
 
 
-def _turns_or_slips_too_far(contacts: tuple[Contact, ...], solution: ScalarSolution, length: Scalar) -> Bool[Array, ""]:
+def _turns_or_slips_too_far(
+    motions: tuple[FingerMotion, ...],
+    by_finger: tuple[tuple[Contact, ...], ...],
+    solution: ScalarSolution,
+    length: Scalar,
+) -> Bool[Array, ""]:
     """Whether a motion turns the slider, or slips at a contact with a finger or a fixture, too far for one step."""
-    contacts, twist, length = jax.lax.stop_gradient((contacts, solution.twist, length))
+    by_finger, twist, length = jax.lax.stop_gradient((by_finger, solution.twist, length))
     squares = []
-    for contact in contacts:
-        slip = twist.xy + contact.point.perp().scale(twist.z) - contact.displacement
-        squares.append(slip.dot(slip))
+    for motion, contacts in zip(motions, by_finger, strict=True):
+        for contact in () if isinstance(motion.finger, Wall) else contacts:  # a wall has no end to slip past
+            slip = twist.xy + contact.point.perp().scale(twist.z) - contact.displacement
+            squares.append(slip.dot(slip))
     slips = functools.reduce(jnp.maximum, squares) > (MAX_SLIP_PER_STEP * length) ** 2
     # what leaves its only contact meets nothing else
-    solved = (solution.status == Status.MOVING) | ((solution.status == Status.FREE) & (len(contacts) > 1))
+    solved = (solution.status == Status.MOVING) | ((solution.status == Status.FREE) & (len(solution.force) > 1))
     return solved & (slips | (jnp.abs(twist.z) > MAX_ROTATION_PER_STEP))
 
 

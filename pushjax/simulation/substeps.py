@@ -233,16 +233,7 @@ def _records_of_steps(
     last: PushState,
     idle_record: ScalarStep,
 ) -> ScalarStep:
-    """For each step, the record of the round that ended it, or what the last round left if no round ended it.
-
-    Args:
-        records: Record of each round.
-        ended: Whether each round ended its step.
-        step: Index of the step of each round.
-        steps: Number of steps.
-        last: State after the last round.
-        idle_record: Record of a step in which nothing pushes.
-    """
+    """For each step, the record of the round that ended it, or what the last round left if no round ended it."""
     rounds = len(ended)
     round_of_step = jnp.full(steps, rounds).at[jnp.where(ended, step, steps)].set(jnp.arange(rounds), mode="drop")
     status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
