@@ -364,8 +364,7 @@ def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset
 
     The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
     lag_distance, shifted by `hand_offset`. Arc lengths are those of x and y. Beyond an end of the logged path it goes
-    straight on. Its direction there is that of a fifth of the path, because local directions of a recording are mostly
-    roundoff.
+    straight on, in the direction of a fifth of the path: local directions of a recording are mostly roundoff.
 
     Args:
         path: (steps + 1, dof) logged path.

@@ -159,11 +159,9 @@ class DividedPush(NamedTuple):
         reach = holding_distance(state.part * displacement, form.length)
         tolerance = allowed_penetration(displacement, form.length)
         part = tuple(motion.part(state.done, state.part) for motion in motions)
-        bracing = jnp.where(state.braced, BRACING, 0.0)
-        part, fixtures = (
-            tuple(motion._replace(friction=motion.friction + bracing) for motion in bodies)
-            for bodies in (part, self.fixtures)
-        )
+        extra = jnp.where(state.braced, BRACING, 0.0)
+        bodies = tuple(motion._replace(friction=motion.friction + extra) for motion in part + self.fixtures)
+        part, fixtures = bodies[: len(part)], bodies[len(part) :]
         record, urgency_after = step_in_scalars(
             form,
             self.outline,
@@ -299,8 +297,7 @@ def _decide(
         joins = is_solved & ~fails & (state.swaps < MAX_SWAPS) & (worst > MISSED_FRACTION * state.part * tolerance)
     accepted = is_solved & clear & ~fails & ~joins & ~state.braced
     accepted, stops, joins = compute_once((accepted, stops, joins), state.pose.x)
-    is_bad = record.status >= Status.OVERLAPPING
-    is_smallest = state.part / 2 < SMALLEST_PART
+    is_bad, is_smallest = record.status >= Status.OVERLAPPING, state.part / 2 < SMALLEST_PART
     hopeless = (is_smallest | state.failed | is_bad) & ~accepted & ~stops & ~fails & ~joins
     braces = hopeless & is_smallest & ~is_bad & ~state.braced & (len(record.force) > 1)
     abandons = hopeless & ~braces
