@@ -24,7 +24,8 @@ from pushjax.simulation.hand import Finger, Pad
 # a polygon. The second is for a smooth outline, where a corner of a pad and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
 # A candidate counts as nearer by this fraction of its distance from the middle of all candidates. So of candidates that
-# are equally near up to roundoff, the outermost is selected.
+# are equally near up to roundoff, the outermost is selected. Not so on a polygon that is not convex, where two more are
+# selected, and where a pad in an inner corner has to rest on that corner.
 SAME_DISTANCE = 1e-5
 
 
@@ -54,7 +55,7 @@ def select_contacts(
     candidates = candidates._replace(distance=candidates.distance - candidates.normal.dot(displacement))
     offset = candidates.point - _mean(candidates.point, eligible)
     distance = jnp.where(eligible, candidates.distance, OUT_OF_REACH)
-    outermost = distance - SAME_DISTANCE * jnp.sqrt(offset.dot(offset))
+    outermost = distance - (0.0 if is_nonconvex_polygon(outline) else SAME_DISTANCE) * jnp.sqrt(offset.dot(offset))
     chosen, travel = [jnp.argmin(outermost).astype(jnp.int32)], jnp.zeros_like(distance)
     for _ in range(num_contacts(finger, outline) - 1):
         previous = take(candidates, chosen[-1])

@@ -120,7 +120,8 @@ def test_an_inner_corner_touches_no_pad():
     outline = pj.Polygon(L).outline()
     lower = FingerPose(Vec2(jnp.asarray(0.02), jnp.asarray(0.016)), cos_sin(jnp.asarray(-0.11)))
     pad = JAW.fingers[0]
-    touches = contact_candidates(pad, outline, lower, Vec2(jnp.zeros(()), jnp.zeros(())), jnp.asarray(0.04))
+    still = Vec2(jnp.zeros(()), jnp.zeros(()))
+    touches = contact_candidates(pad, outline, lower, lambda point: still, jnp.asarray(0.04))
     inner = 4 + 3  # after the four corners of the pad, the fourth of the outline
     np.testing.assert_allclose([touches.point.x[inner], touches.point.y[inner]], (-0.01, 0.01))
     assert touches.distance[inner] > OUT_OF_REACH / 2
@@ -240,7 +241,7 @@ SLIDER = pj.Slider(pj.Polygon.rectangle(0.09, 0.06), surface(0.03))
 TWO = pj.Hand.two_fingers(0.008)
 TURNING = pj.line((0, 0, 0, 0.105), (0, 0, 0, 0.0772), 4)
 START = (0.012, 0.002, 0.6)
-CLOSED = 0.0765  # opening at which a rectangle from there is held before the step ends
+CLOSED = 0.0761  # opening at which a rectangle from there is held before the step ends
 
 
 def turned(x) -> pj.Trajectory:
@@ -264,7 +265,9 @@ def test_a_step_that_is_too_long_is_divided():
     fine = whole_step(push, path, 0.2)
     assert fine.status[-1] == pj.Status.GRASPED
     off = pj.deviation(push.pose[-1], fine.pose[-1], 0.03)
-    assert float(off) < 1e-4, "the parts are as exact as steps of their size"
+    # the hand stops at most a sixteenth of the step of 8 mm before the jam, and the slider may turn past it by as much
+    assert abs(float(push.configuration[-1, 3] - fine.configuration[-1, 3])) < 5e-4
+    assert float(off) < 3e-4
     assert float(jnp.max(push.overlap)) < 1e-4
     # the twist is that of the whole step: the rotation of the slider in it
     np.testing.assert_allclose(push.twist[-1, 2], push.pose[-1, 2] - push.pose[-2, 2], rtol=1e-12)
