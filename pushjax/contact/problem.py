@@ -270,7 +270,7 @@ def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
         H in scalars, and the coefficients of friction.
     """
     form = surface.form()
-    usable = jnp.isfinite(sum(jax.tree.leaves(form))) & (form.length > 0)
+    usable = surface.is_valid()
     return jax.tree.map(lambda entry: jnp.where(usable, entry, 1.0), form), jnp.where(usable, friction, jnp.nan)
 
 

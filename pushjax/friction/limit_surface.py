@@ -26,6 +26,9 @@ from pushjax._math.vec import Scalar, Vec3
 # Kinds of surfaces in files. Their modules are named like them. They are imported when needed, because a user who loads
 # a surface may not have imported them.
 KINDS = ("ellipsoid", "quartic")
+MAX_LENGTH = 1e8  # of a traced surface, m; its fourth power is still a number, and so is that of the inverse
+# Keyed by the bytes of a float: largest factor of H, whose square is still a number; and roundoff of least minors.
+MAX_SCALE, CONVEX_ROUNDOFF = {4: 1e16, 8: 1e120}, {4: 1e-5, 8: 1e-13}
 FORMAT, VERSION = "pushjax limit surface", 1
 
 
@@ -96,6 +99,22 @@ class LimitSurface(eqx.Module):
     @abstractmethod
     def form(self) -> Form:
         """Return H as a `Form`, for computations below the public interface."""
+
+    def is_valid(self) -> Bool[Array, ""]:
+        """Whether numbers that were traced when the surface was made can be computed with.
+
+        An ellipsoid must be convex. A quartic must be so at three wrenches, because more takes too long.
+        """
+        form = jax.lax.stop_gradient(self.form())
+        hessians = [form.hessian(Vec3(*axis)) for axis in jnp.eye(3, dtype=self.length.dtype)]
+        sizes = jnp.stack([matrix.trace() for matrix in hessians])
+        largest, roundoff = MAX_SCALE[sizes.dtype.itemsize], CONVEX_ROUNDOFF[sizes.dtype.itemsize]
+        valid = jnp.isfinite(sum(jax.tree.leaves(form))) & jnp.all((sizes >= 1 / largest) & (sizes <= largest))
+        for matrix in hessians:
+            valid &= matrix.least_minor() >= -roundoff
+        diagonal = jnp.stack([hessians[0].xx, hessians[1].yy, hessians[2].zz])
+        valid &= jnp.min(diagonal) > jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
+        return valid & (self.length >= 1 / MAX_LENGTH) & (self.length <= MAX_LENGTH)
 
     @abstractmethod
     def is_convex(self) -> bool:

@@ -41,6 +41,7 @@ from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.polygon_numpy import signed_distances
 from pushjax.geometry.shape import Shape
 
+MAX_CELLS = 4_000_000  # of all grids that are tried
 SAMPLES = 8  # samples of each cell along x and along y, to estimate how much of it lies inside
 AT_ONCE = 4096  # points whose distances are computed together, because points times edges may be many
 
@@ -168,7 +169,8 @@ class Support(eqx.Module):
             The support.
 
         Raises:
-            ValueError: If `points` is less than one, the shape is traced, or the load is not positive.
+            ValueError: If `points` is less than one, the shape is traced or covers less than about a ten-thousandth of
+                the box around it, or the load is not positive.
         """
         check_count("points", points)
         low, high = (concrete(corner) for corner in shape.bounds)
@@ -179,14 +181,28 @@ class Support(eqx.Module):
         # spacings around the value from the area, the nearest first.
         around = np.linspace(-0.1, 0.4, 26)
         spacings = np.sqrt(float(shape.area) / points) * (1 + around[np.argsort(np.abs(around), kind="stable")])
-        grids = [_cells(low, high, spacing) for spacing in spacings]
-        max_samples = max(len(samples) for samples, _ in grids)  # pad all to one length, to compile once
+        if np.sum(np.prod(high - low) / spacings**2) > MAX_CELLS:
+            raise ValueError(
+                "shape covers too little of the box around it to lay a grid over it, a share of "
+                f"{float(shape.area) / float(np.prod(high - low)):.2g}; give `Support.points`, or turn its frame"
+            )
+        boxes = [_cells(low, high, spacing) for spacing in spacings]
+        distance = _distances(shape, np.concatenate([middles for middles, _ in boxes]).astype(dtype))
+        at_middles = np.split(distance, np.cumsum([len(middles) for middles, _ in boxes])[:-1])
+        # cells that are outside as a whole have no part in the support
+        grids = [
+            (middles[distance <= 0.51 * np.hypot(*cell)], cell)
+            for (middles, cell), distance in zip(boxes, at_middles, strict=True)
+        ]
+        most = max(len(middles) for middles, _ in grids)  # pad all to one length, to compile once
         # samples nearer to the outline than this count half, because roundoff would decide whether they are inside
         tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())
         best: tuple[np.ndarray, np.ndarray] | None = None
-        for samples, middles in grids:
-            padded = np.concatenate([samples, np.broadcast_to(low, (max_samples - len(samples), 2))])
-            inside = _inside(shape, padded.astype(dtype), tolerance)[: len(samples)]
+        for middles, cell in grids:
+            samples = _samples(middles, cell)
+            padded = np.concatenate([samples, np.broadcast_to(low, ((most - len(middles)) * SAMPLES**2, 2))])
+            depth = _distances(shape, padded.astype(dtype))[: len(samples)]
+            inside = np.where(depth < -tolerance, 1.0, np.where(depth <= tolerance, 0.5, 0.0))
             found = _covered_parts(samples, middles, inside)
             if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
                 best = found
@@ -314,16 +330,19 @@ def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarra
     """Divide a box into cells whose sides are as close to `spacing` as the box allows.
 
     Returns:
-        A tuple of the sample points, shape (cells * SAMPLES^2, 2), and the centers of the cells, shape
-        (cells, 2), both in m.
+        A tuple of the centers of the cells, shape (cells, 2), and the sides of a cell, shape (2,), both in m.
     """
     count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
     cell = (high - low) / count
     x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
-    middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), cell
+
+
+def _samples(middles: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Return the sample points of cells, shape (cells * SAMPLES^2, 2), m."""
     offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     offsets = np.stack(np.meshgrid(offset * cell[0], offset * cell[1], indexing="ij"), axis=-1).reshape(-1, 2)
-    return (middles[:, None] + offsets[None]).reshape(-1, 2), middles
+    return (middles[:, None] + offsets[None]).reshape(-1, 2)
 
 
 def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -338,24 +357,22 @@ def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray)
     return mean[fraction > 0], fraction[fraction > 0]
 
 
-def _inside(shape: Shape, points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return 1 for a point inside, 0 outside, and one half where the outline is within the tolerance, m.
+def _distances(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Return signed distances from the outline, m, that are exact near it, and too small far outside.
 
-    With NumPy, where this is simple. Distances have to be exact near the outline only.
+    With NumPy, where this is simple.
     """
     if isinstance(shape, Polygon):
         vertices, parts = np.asarray(shape.vertices, np.float64), range(0, len(points), AT_ONCE)
-        distance = np.concatenate([signed_distances(vertices, points[k : k + AT_ONCE]) for k in parts])
-    elif isinstance(shape, Disk):
-        distance = np.linalg.norm(points - np.asarray(shape.center), axis=1) - np.asarray(shape.radius)
-    elif isinstance(shape, Ellipse):
+        return np.concatenate([signed_distances(vertices, points[k : k + AT_ONCE]) for k in parts])
+    if isinstance(shape, Disk):
+        return np.linalg.norm(points - np.asarray(shape.center), axis=1) - np.asarray(shape.radius)
+    if isinstance(shape, Ellipse):
         semi = np.asarray([shape.semi_x, shape.semi_y])
         scaled = (points - np.asarray(shape.center)) / semi
         slope = np.maximum(np.linalg.norm(2 * scaled / semi, axis=1), 1e-30)  # zero at the center
-        distance = (np.sum(scaled**2, axis=1) - 1) / slope
-    else:
-        distance = np.asarray(_signed_distances(shape, on_device(points)))
-    return np.where(distance < -tolerance, 1.0, np.where(distance <= tolerance, 0.5, 0.0))
+        return (np.sum(scaled**2, axis=1) - 1) / slope
+    return np.asarray(_signed_distances(shape, on_device(points)))
 
 
 @quick_jit

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
 from pushjax._math.linalg import Symmetric3
@@ -17,6 +17,8 @@ from pushjax.friction.limit_surface import Form
 
 # Number of entries of each attribute of `Table`.
 SIZES = {"anisotropy": 2, "log_gradient": 2, "log_hessian": 3, "origin": 2}
+# Numbers that are larger have no valid steps: their exponential and their fourth power cannot be computed with.
+MAX_ANISOTROPY, MAX_NUMBER = 20.0, 1e9
 NEAR_ZERO = 1e-3  # squared norm r^2 of the anisotropy below which series give cosh(r) and sinh(r) / r, without 0 / 0
 
 
@@ -140,6 +142,11 @@ class Table(eqx.Module):
             check_shape(name, array, (SIZES[name],))
             check_finite(name, array)
             setattr(self, name, array)
+
+    def is_valid(self) -> Bool[Array, ""]:
+        """Whether numbers that were traced when the table was made can be computed with."""
+        others = jnp.concatenate([self.log_gradient, self.log_hessian, self.origin])
+        return jnp.all(jnp.abs(self.anisotropy) <= MAX_ANISOTROPY) & jnp.all(jnp.abs(others) <= MAX_NUMBER)
 
     def wrench_transform(self, pose: Vec3, length: Scalar) -> WrenchTransform:
         """Return the map T of the wrenches of a slider, in its body frame.

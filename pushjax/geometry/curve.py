@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete, in_numpy
 from pushjax._internal.jit import quick_jit
@@ -98,6 +98,9 @@ class Curve(Shape):
         if not 4 <= controls <= len(known) // 2:
             raise ValueError(f"controls must be from 4 to half the number of points, {len(known) // 2}; got {controls}")
         return Curve(jnp.asarray(_fit_control_points(known.astype(np.float64), controls), array.dtype), convex=convex)
+
+    def is_valid(self) -> Bool[Array, ""]:
+        return jax.lax.stop_gradient(self.area) > 0
 
     @property
     @quick_jit

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import tree_where
@@ -62,6 +62,9 @@ class Disk(Shape):
         for name, value in (("radius", self.radius), ("center", self.center)):
             check_finite(name, value)
         check_positive("radius", self.radius)
+
+    def is_valid(self) -> Bool[Array, ""]:
+        return jax.lax.stop_gradient(self.radius) > 0
 
     @property
     def area(self) -> Float[Array, ""]:

@@ -20,7 +20,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import decide, tree_where
@@ -264,6 +264,10 @@ class Ellipse(Shape):
             check_positive(name, value)
         check_shape("center", self.center, (2,))
         check_finite("center", self.center)
+
+    def is_valid(self) -> Bool[Array, ""]:
+        semi = jax.lax.stop_gradient(jnp.stack([self.semi_x, self.semi_y]))
+        return jnp.min(semi) > jnp.finfo(semi.dtype).eps * jnp.max(semi)
 
     @property
     def area(self) -> Float[Array, ""]:

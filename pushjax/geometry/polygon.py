@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import (
     ArrayLike,
@@ -18,7 +18,7 @@ from pushjax._internal.checks import (
     on_device,
 )
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
-from pushjax.geometry.shape import Shape, check_simple_polygon, signed_area
+from pushjax.geometry.shape import Shape, check_simple_polygon, is_outline, signed_area
 
 # Up to this many edges, the search over the edges is unrolled, so that XLA vectorizes a batch across its examples. For
 # more edges, arrays over the edges keep the compiled program small.
@@ -104,6 +104,9 @@ class Polygon(Shape):
         check_positive("circumradius", radius)
         angle = 2 * jnp.pi * jnp.arange(sides, dtype=radius.dtype) / sides
         return Polygon(radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1), convex=True)
+
+    def is_valid(self) -> Bool[Array, ""]:
+        return is_outline(self.vertices, self.convex)
 
     @property
     def area(self) -> Float[Array, ""]:

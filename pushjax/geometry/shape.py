@@ -1,16 +1,19 @@
 """Base classes of shapes and of their outlines, and helpers that several shapes share."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
 from pushjax._math.vec import Scalar, Vec2
+
+PAIRS_AT_ONCE = 2**20  # pairs of edges that are compared together
 
 
 class ClosestPoint(NamedTuple):
@@ -117,6 +120,10 @@ class Shape(eqx.Module):
     @abstractmethod
     def outline(self) -> Outline:
         """Return the boundary, prepared for distance queries."""
+
+    def is_valid(self) -> Bool[Array, ""]:
+        """Whether numbers that were traced when the shape was made describe a shape."""
+        return jnp.ones((), bool)
 
     @property
     @abstractmethod
@@ -261,6 +268,28 @@ def equally_spaced(
     return start + offset, arc_at_node[-1]
 
 
+def is_outline(vertices: Float[Array, "vertices 2"], convex: bool) -> Bool[Array, ""]:
+    """Whether a closed polyline runs once around an area, counterclockwise, and is convex if that is claimed.
+
+    Whether edges that are not neighbors cross is not checked, unless it is convex.
+
+    Args:
+        vertices: Vertices, m.
+        convex: Whether it is said to be convex.
+    """
+    vertices = jax.lax.stop_gradient(vertices)
+    before = vertices - jnp.roll(vertices, 1, axis=0)
+    after = jnp.roll(before, -1, axis=0)
+    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    size = jnp.max(jnp.abs(vertices - vertices[:1]))
+    turn = jnp.sum(jnp.arctan2(cross, jnp.sum(before * after, axis=1)))
+    relative = vertices - vertices[:1]
+    end = jnp.roll(relative, -1, axis=0)
+    area = jnp.sum(relative[:, 0] * end[:, 1] - relative[:, 1] * end[:, 0]) / 2
+    valid = jnp.all(jnp.sum(before**2, axis=1) > 0) & (area > roundoff(size * size)) & (jnp.abs(turn - 2 * jnp.pi) < 1)
+    return valid & jnp.all(cross >= -roundoff(size * jnp.hypot(after[:, 0], after[:, 1]))) if convex else valid
+
+
 def signed_area(v: np.ndarray) -> float:
     """Compute the signed area of a closed polyline, m^2, positive if it runs counterclockwise.
 
@@ -285,19 +314,21 @@ def check_simple_polygon(name: str, v: np.ndarray) -> None:
     Raises:
         ValueError: If two vertices coincide, the polyline encloses no area, or it crosses or touches itself.
     """
-    n, size = len(v), float(np.max(np.ptp(v, axis=0)))
-    gap = np.linalg.norm(v[:, None] - v[None], axis=-1) + size * np.eye(n)
-    if size == 0 or gap.min() <= 1e-9 * size:
-        i, j = np.unravel_index(np.argmin(gap), gap.shape)
+    size = float(np.max(np.ptp(v, axis=0)))
+    near = 1e-9 * size
+    pairs = np.zeros((0, 2), int) if size == 0 else np.concatenate(list(_edges_that_may_meet(v, near)))
+    gap = np.linalg.norm(v[pairs[:, 0]] - v[pairs[:, 1]], axis=1)
+    if size == 0 or gap.min() <= near:
+        i, j = (0, 1) if size == 0 else pairs[np.argmin(gap)]
         raise ValueError(
             f"{name}: {int(min(i, j))} and {int(max(i, j))} are the same point; each corner is given once, and the "
             "first is not repeated at the end"
         )
-    if np.linalg.svd(v - v.mean(axis=0), compute_uv=False)[1] <= 1e-12 * size:
+    if np.linalg.svd(v - v.mean(axis=0), full_matrices=False, compute_uv=False)[1] <= 1e-12 * size:
         raise ValueError(f"{name} lie on one line and enclose no area")
-    crossed = find_self_intersection(v, 1e-9 * size)
+    crossed = find_self_intersection(v, near)
     if crossed is not None:
-        first, second = (f"the edge from vertex {k} to vertex {(k + 1) % n}" for k in crossed)
+        first, second = (f"the edge from vertex {k} to vertex {(k + 1) % len(v)}" for k in crossed)
         raise ValueError(f"{name}: the outline crosses or touches itself: {first}, and {second}, counted from 0")
 
 
@@ -311,23 +342,40 @@ def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] |
     Returns:
         The indices of the two edges, or None if there are no such edges.
     """
-    n = len(v)
-    a, b = v, np.roll(v, -1, axis=0)
+    n, end = len(v), np.roll(v, -1, axis=0)
 
     def orientation(p, q, r):
         """Return twice the signed area of the triangle (p, q, r): its sign tells on which side of p q lies r."""
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
 
-    p, q, r, s = a[:, None], b[:, None], a[None], b[None]
-    crossing = (orientation(p, q, r) * orientation(p, q, s) < 0) & (orientation(r, s, p) * orientation(r, s, q) < 0)
-    on_edge = _is_near_segment(p, q, r, tolerance)  # a vertex on an edge; its own edges are excluded below
-    index = np.arange(n)
-    is_own_vertex = (index[None] == index[:, None]) | (index[None] == (index[:, None] + 1) % n)
-    touching = crossing | (on_edge & ~is_own_vertex)
-    if not touching.any():
-        return None
-    i, j = np.argwhere(touching)[0]
-    return int(i), int(j)
+    for pairs in _edges_that_may_meet(v, tolerance):
+        i, j = pairs.T
+        p, q, r, s = v[i], end[i], v[j], end[j]
+        touching = (orientation(p, q, r) * orientation(p, q, s) < 0) & (orientation(r, s, p) * orientation(r, s, q) < 0)
+        for k, other in ((i, j), (j, i)):  # a vertex on an edge that is not its own
+            on_edge = _is_near_segment(v[k], end[k], v[other], tolerance)
+            touching |= on_edge & (other != (k + 1) % n)
+        if touching.any():
+            first, second = pairs[np.argmax(touching)]
+            return int(first), int(second)
+    return None
+
+
+def _edges_that_may_meet(v: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+    """Yield the pairs of edges of a closed polyline that overlap along x, or along y if fewer do, as rows (i, j)."""
+    end, n = np.roll(v, -1, axis=0), len(v)
+    low, high = np.minimum(v, end), np.maximum(v, end) + tolerance
+    orders = np.argsort(low, axis=0, kind="stable")
+    lasts = [np.searchsorted(low[orders[:, k], k], high[orders[:, k], k], side="right") for k in range(2)]
+    axis = int(np.argmin([last.sum() for last in lasts]))
+    order, partners = orders[:, axis], lasts[axis] - np.arange(n) - 1
+    ends = np.cumsum(partners)
+    for first in range(0, n, PAIRS_AT_ONCE // n + 1):  # as many edges as have no more pairs than fit
+        rows = np.arange(first, min(first + PAIRS_AT_ONCE // n + 1, n))
+        count = partners[rows]
+        i = np.repeat(rows, count)
+        j = i + 1 + np.arange(len(i)) - np.repeat(ends[rows] - count - (ends[rows[0]] - count[0]), count)
+        yield np.sort(np.stack([order[i], order[j]], axis=1), axis=1)
 
 
 def _is_near_segment(p: np.ndarray, q: np.ndarray, r: np.ndarray, tolerance: float) -> np.ndarray:

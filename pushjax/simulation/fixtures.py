@@ -9,6 +9,7 @@ not hold the slider.
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -61,10 +62,11 @@ class Wall(eqx.Module):
         known = concrete(direction)
         if known is not None and not np.any(known):
             raise ValueError("normal must not be zero; it is the direction from the wall into the free space")
-        squared = jnp.sum(direction**2)
-        has_length = squared > 0
-        # a traced normal of length zero becomes NaN, which makes every step INVALID, but its derivative is zero
-        self.normal = jnp.where(has_length, direction / jnp.sqrt(jnp.where(has_length, squared, 1.0)), jnp.nan)
+        # a traced normal without a direction becomes NaN, which makes every step INVALID, but its derivative is zero
+        squared = jax.lax.stop_gradient(jnp.sum(direction**2))
+        usable = (squared > 0) & jnp.isfinite(squared)
+        safe = jnp.where(usable, direction, 1.0)
+        self.normal = jnp.where(usable, safe / jnp.sqrt(jnp.sum(safe**2)), jnp.nan)
         self.friction = _checked_friction(friction, dtype)
 
 

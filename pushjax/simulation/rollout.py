@@ -38,6 +38,7 @@ from pushjax.simulation.arguments import (
     warn_about_units,
 )
 from pushjax.simulation.detection import num_contacts
+from pushjax.simulation.domain import MAX_FRICTION, are_valid, replace_invalid, valid_path, within
 from pushjax.simulation.finger_motion import (
     allowed_penetration,
     finger_motions,
@@ -210,7 +211,7 @@ FrictionAt = Callable[[Array, Vec3], tuple[Form, Array]]
 def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
     """Return the friction on a table, given the friction that would hold if the table were uniform.
 
-    If the table has a value that is not finite, the coefficients of friction are NaN, so every step is INVALID.
+    If the table has a value that is not valid, the coefficients of friction are NaN, so every step is INVALID.
 
     Args:
         table: The table; None for a uniform one.
@@ -218,11 +219,12 @@ def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionA
     """
     if table is None:
         return friction_at
-    is_finite = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(table)))
+    valid = table.is_valid()
+    known = jax.tree.map(lambda leaf: jnp.where(valid, leaf, 0.0), table)
 
     def friction_at_table(step: Array, pose: Vec3) -> tuple[Form, Array]:
         form, mu = friction_at(step, pose)
-        return TransformedForm(form, table.wrench_transform(pose, form.length)), jnp.where(is_finite, mu, jnp.nan)
+        return TransformedForm(form, known.wrench_transform(pose, form.length)), jnp.where(valid, mu, jnp.nan)
 
     return friction_at_table
 
@@ -250,23 +252,24 @@ def simulate(
         fixtures: Walls and bodies that the slider may touch.
         num_steps: Number of steps to simulate; None for all. The rest of the result has no meaning.
     """
-    push, start, steps = divided_push(shape, hand, path, solver, friction_at, fixtures), Vec3.of(pose), len(path) - 1
-    push = push._replace(num_steps=num_steps)
+    push, first_pose = divided_push(shape, hand, path, pose, solver, friction_at, fixtures)
+    push, start, steps = push._replace(num_steps=num_steps), Vec3.of(first_pose), len(path) - 1
     if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
         records = _simulate_one_contact(push, start)
         fraction = jnp.zeros_like(start.x)
     else:
         records, fraction = simulate_in_substeps(push, start)
-    results = to_arrays(records, push.friction_at(jnp.zeros((), jnp.int32), start)[0].length)
+    length = push.friction_at(jnp.zeros((), jnp.int32), start)[0].length
+    results = to_arrays(records, length)
     stop_step = first_true(hand_stops(results.status))
     last_done = jnp.where(stop_step >= 0, stop_step, steps)
     index = jnp.arange(steps + 1)
     # if the step of the jam was divided, the hand did the first part of it
     last_displacement = jax.lax.stop_gradient(fraction) * (path[jnp.minimum(last_done + 1, steps)] - path[last_done])
-    configuration = (
-        path[jnp.minimum(index, last_done)] + jnp.where(index > last_done, 1.0, 0.0)[:, None] * last_displacement[None]
-    )
-    poses = jnp.concatenate([pose[None], results.pose])
+    configuration = path[jnp.minimum(index, last_done)]
+    configuration += jnp.where((index > last_done)[:, None], last_displacement[None], 0.0)
+    poses = jnp.concatenate([first_pose[None], results.pose])
+    poses = jnp.where(within(pose, length), poses, pose)
     other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
     return Trajectory(pose=poses, configuration=configuration, **other_fields)
 
@@ -275,33 +278,45 @@ def divided_push(
     shape: Shape,
     hand: Hand,
     path: Array,
+    pose: Array,
     solver: ContactSolver | StickingSolver | None,
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
-) -> DividedPush:
-    """Prepare a push whose steps can be divided into parts (`substeps`). Arguments as in `simulate`."""
-    poses = hand.poses(path)
-    if fixtures:
-        friction_at = _friction_among(fixtures, friction_at)
+) -> tuple[DividedPush, Array]:
+    """Prepare a push whose steps can be divided into parts (`substeps`). Arguments as in `simulate`.
+
+    Returns:
+        The push, and the pose at the start, (3,). Both have numbers that can be computed with (`domain`).
+    """
+    length = friction_at(jnp.zeros((), jnp.int32), Vec3.of(jnp.zeros_like(pose)))[0].length
+    shape_valid, hand_valid, fixtures_valid, pose_valid = (
+        are_valid((shape,), length),
+        are_valid(hand.fingers, length),
+        are_valid(fixtures, length),
+        within(pose, length),
+    )
+    poses, row_valid = valid_path(hand, path, length)
+    row_valid &= shape_valid & hand_valid & fixtures_valid & pose_valid
+    shape, hand, fixtures = (
+        replace_invalid(bodies, valid, length)
+        for bodies, valid in ((shape, shape_valid), (hand, hand_valid), (fixtures, fixtures_valid))
+    )
+
+    def rows_at(step: Array, rows: Array) -> tuple[Array, Array]:
+        return tuple(jax.lax.dynamic_index_in_dim(rows, step + k, keepdims=False) for k in (0, 1))
 
     def motions_at(step: Array, mu: Array):
-        before, after = (jax.lax.dynamic_index_in_dim(poses, step + k, keepdims=False) for k in (0, 1))
+        (before, after), (valid_before, valid_after) = rows_at(step, poses), rows_at(step, row_valid)
+        before, after = jnp.where(valid_before, before, after), jnp.where(valid_after, after, before)
         return finger_motions(hand, mu, unstack_finger_poses(before), unstack_finger_poses(after))
-
-    return DividedPush(shape.outline(), len(path) - 1, motions_at, solver, friction_at, fixture_motions(fixtures))
-
-
-def _friction_among(fixtures: Fixtures, friction_at: FrictionAt) -> FrictionAt:
-    """Return the same friction, which is NaN if a fixture is not valid, so that every step is INVALID."""
-    is_valid = jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(fixtures)))
-    for fixture in fixtures:
-        is_valid &= fixture.friction >= 0
 
     def friction_if_valid(step: Array, pose: Vec3) -> tuple[Form, Array]:
         form, mu = friction_at(step, pose)
-        return form, jnp.where(is_valid, mu, jnp.nan)
+        valid_before, valid_after = rows_at(step, row_valid)
+        return form, jnp.where(valid_before & valid_after & (mu <= MAX_FRICTION), mu, jnp.nan)
 
-    return friction_if_valid
+    push = DividedPush(shape.outline(), len(path) - 1, motions_at, solver, friction_if_valid, fixture_motions(fixtures))
+    return push, jnp.where(pose_valid, pose, 0.0)
 
 
 def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:

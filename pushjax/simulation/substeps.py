@@ -159,7 +159,8 @@ class DividedPush(NamedTuple):
         reach = holding_distance(state.part * displacement, form.length)
         tolerance = allowed_penetration(displacement, form.length)
         part = tuple(motion.part(state.done, state.part) for motion in motions)
-        extra = jnp.where(state.braced, BRACING, 0.0)
+        # not every contact is solved, so friction that is not valid must be that of all bodies
+        extra = jnp.where(jnp.all(mu >= 0), jnp.where(state.braced, BRACING, 0.0), jnp.nan)
         bodies = tuple(motion._replace(friction=motion.friction + extra) for motion in part + self.fixtures)
         part, fixtures = bodies[: len(part)], bodies[len(part) :]
         record, urgency_after = step_in_scalars(

@@ -174,24 +174,24 @@ class _Progress(NamedTuple):
     status: Int[Array, "steps"]
 
 
-def _divided(polygon, surface, friction, hand, walls, path, pose) -> DividedPush:
-    """The push with all contacts."""
+def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[DividedPush, Array]:
+    """The push with all contacts, and the pose at its start."""
     solver, friction_at = _contact_model(polygon, surface, friction, hand, path)
-    return divided_push(polygon, hand, path, solver, friction_at, walls)
+    return divided_push(polygon, hand, path, pose, solver, friction_at, walls)
 
 
 @jax.jit
 def _begin(*args) -> _Progress:
     """Return the state before the first trial."""
-    push = _divided(*args)
+    push, start = _divided(*args)
     trials = jnp.full((), push.max_trials, jnp.int32)
-    return _Progress(push.first_state(Vec3.of(args[-1])), trials, jnp.full(push.steps, -1, jnp.int8))
+    return _Progress(push.first_state(Vec3.of(start)), trials, jnp.full(push.steps, -1, jnp.int8))
 
 
 @jax.jit
 def _advance(progress: _Progress, *args) -> _Progress:
     """Try the next part of a step, and note the status of the step if that ended it."""
-    state, (record, ended, step) = _divided(*args).trial(progress.push)
+    state, (record, ended, step) = _divided(*args)[0].trial(progress.push)
     status = progress.status.at[jnp.where(ended, step, len(progress.status))].set(record.status, mode="drop")
     return _Progress(state, progress.trials_left - 1, status)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pushjax import Disk, Ellipse, Polygon, Support
-from pushjax.friction.support import _inside
+from pushjax.friction.support import _distances
 
 ROUNDINGS = 200  # sums over some hundred points
 DTYPES = [np.float32, np.float64]
@@ -326,7 +326,21 @@ def test_what_is_inside_agrees_with_the_distance(shape):
     outline = np.asarray(shape.boundary(40))
     points = np.concatenate([np.random.default_rng(0).uniform(-0.08, 0.1, (500, 2)), outline, [shape.centroid]])
     distance = np.asarray(jax.jit(jax.vmap(shape.signed_distance))(points))
-    seen = _inside(shape, points, 1e-9)
-    np.testing.assert_array_equal(seen, np.where(distance < -1e-9, 1, np.where(distance <= 1e-9, 0.5, 0)))
-    assert (seen[500:540] == 0.5).all()
-    assert 0 < (seen == 1).sum() < 500
+    found = _distances(shape, points)
+    np.testing.assert_array_equal(found < -1e-9, distance < -1e-9)
+    np.testing.assert_array_equal(found > 1e-9, distance > 1e-9)
+    assert (np.abs(found[500:540]) <= 1e-9).all()
+    assert 0 < (found < 0).sum() < 500
+    # beyond the outline they may be too small, never too large: no cell is left out that has a part inside
+    assert np.all(found <= np.maximum(distance, 1e-9) * (1 + 1e-6))
+
+
+def test_a_thin_strip_askew_takes_memory_in_proportion_to_its_length():
+    width = np.array([1e-4, 1e-6])[:, None, None]
+    along, across = np.array([0.8, 0.6]) * 0.15, np.array([-0.6, 0.8]) / 2
+    strips = np.array([-1, 1, 1, -1])[:, None] * along + np.array([-1, -1, 1, 1])[:, None] * across * width
+    support = Support.uniform(Polygon(strips[0]))
+    np.testing.assert_allclose(support.center, 0, atol=1e-6)
+    np.testing.assert_allclose(support.radius_of_gyration, 0.3 / np.sqrt(12), rtol=0.01)
+    with pytest.raises(ValueError, match="shape covers too little of the box around it"):
+        Support.uniform(Polygon(strips[1]))

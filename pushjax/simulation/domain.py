@@ -1,0 +1,99 @@
+"""What a rollout computes with in place of numbers that are NaN, infinite or out of their domain.
+
+Such numbers can be refused only where they are not traced. Elsewhere they must reach no arithmetic: the derivative of
+what follows would be NaN, for this example and for all others that share an argument with it. So they are replaced, and
+the friction of the steps that they belong to is NaN, which makes the status of these steps INVALID.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from pushjax._math.vec import Scalar
+from pushjax.geometry.shape import Shape
+from pushjax.simulation.fixtures import Fixture, Wall
+from pushjax.simulation.hand import Hand, Pad, RoundFinger
+
+MAX_FRICTION = 1e9  # its fourth power is still a number
+ROUNDOFF = 1e-5  # by how much a traced path may close the hand farther than it may be closed, in units of the length
+
+
+def replace_invalid(tree: Any, valid: Bool[Array, ""], length: Scalar) -> Any:
+    """Return bodies with other numbers where they are not valid: regular outlines, and ones for all the rest.
+
+    Args:
+        tree: Shapes, a hand or fixtures.
+        valid: Whether their numbers are in their domain.
+        length: Characteristic length of the limit surface, m; the size of the bodies that replace them.
+    """
+
+    def replace(leaf: Array) -> Array:
+        angle = 2 * jnp.pi * jnp.arange(len(leaf), dtype=leaf.dtype) / len(leaf) if leaf.ndim == 2 else None
+        other = jnp.ones_like(leaf) if angle is None else jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        return jnp.where(valid, leaf, jax.lax.stop_gradient(length) * other)
+
+    return jax.tree.map(replace, tree)
+
+
+def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], length: Scalar) -> Bool[Array, ""]:
+    """Whether the numbers of all bodies are in their domain.
+
+    Args:
+        bodies: The bodies.
+        length: Characteristic length of the limit surface, m.
+    """
+    valid = jnp.ones((), bool)
+    for body in jax.lax.stop_gradient(tuple(bodies)):
+        shape = body if isinstance(body, Shape) else getattr(body, "shape", None)
+        if shape is not None:
+            lengths = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(shape)])
+            valid &= within(lengths, length) & shape.is_valid()
+            valid &= jnp.max(jnp.abs(lengths)) >= jnp.finfo(length.dtype).eps * length
+        if isinstance(body, RoundFinger):
+            valid &= within(body.radius[None], length) & (body.radius >= 0)
+        if isinstance(body, Wall):
+            valid &= within(body.point, length) & (jnp.sum(body.normal**2) > 0)
+        if isinstance(body, Fixture):
+            valid &= within(body.pose, length)
+        if isinstance(body, Wall | Fixture):
+            valid &= (body.friction >= 0) & (body.friction <= MAX_FRICTION)
+    return valid
+
+
+def within(pose: Float[Array, "*rows coordinates"], length: Scalar) -> Bool[Array, "*rows"]:
+    """Whether lengths and angles are no larger than a float resolves them to a tenth of their unit.
+
+    Args:
+        pose: Lengths, m; or poses, whose third coordinate is an angle, rad.
+        length: Characteristic length of the limit surface, m; the unit of lengths.
+    """
+    pose, unit = jax.lax.stop_gradient((pose, jnp.broadcast_to(length, pose.shape[-1:])))
+    if pose.shape[-1] == 3:
+        unit = unit.at[2].set(1.0)
+    largest = min(0.1 / float(jnp.finfo(pose.dtype).eps), 1e9)
+    return jnp.all(jnp.abs(pose) <= largest * unit.reshape(*(1,) * (pose.ndim - 1), -1), axis=-1)
+
+
+def valid_path(hand: Hand, path: Float[Array, "steps+1 dof"], length: Scalar) -> tuple[Array, Bool[Array, "steps+1"]]:
+    """Poses of the fingers along a path, and which rows of it are valid. The others are replaced by the first of these.
+
+    Args:
+        hand: The hand.
+        path: Configurations, (steps + 1, dof).
+        length: Characteristic length of the limit surface, m.
+    """
+    valid = jnp.all(jnp.isfinite(path), axis=1)
+    if hand.least is not None:
+        valid &= path[:, -1] >= hand.least - ROUNDOFF * length
+
+    def replaced(rows: Array) -> Array:
+        mask = valid.reshape(-1, *(1,) * (rows.ndim - 1))
+        first = jax.lax.stop_gradient(rows[jnp.argmax(valid)])
+        return jnp.where(mask, rows, jnp.where(jnp.any(valid), first, 0.0))
+
+    poses = hand.poses(replaced(path))
+    valid &= jnp.all(within(poses, length), axis=1)
+    return replaced(poses), valid

@@ -1,0 +1,100 @@
+"""One member of a batch with numbers that cannot be computed with: the others, and derivatives, are as without it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pushjax as pj
+
+STEPS, SIDE = 6, np.array([[-0.03, -0.02], [0.03, -0.02], [0.03, 0.02], [-0.03, 0.02]])
+BAD = {"NaN": np.nan, "infinite": np.inf, "huge": -1e30, "negative": -1.0, "zero": 0.0}
+# The numbers that are in their domain wherever they stand, so that the push need not be INVALID.
+ALLOWED = {
+    "huge": {"wall"},  # a normal of any length is a direction
+    "negative": {"pose", "path", "vertices", "wall"},
+    "zero": {"pose", "path", "vertices", "wall", "friction", "radius"},
+}
+GOOD = {
+    "pose": np.array([0.0, 0.001, 0.05]),
+    "A": np.diag([1.0, 1.2, 0.9]),
+    "length": np.array(0.03),
+    "friction": np.array(0.3),
+    "vertices": SIDE,
+    "radius": np.array(0.005),
+    "path": np.array(pj.line((-0.036, 0.004), (-0.024, 0.008), STEPS)),
+    "wall": np.array([0.1, 0.0, -1.0, 0.0, 0.2]),
+}
+
+
+def push(given) -> pj.Trajectory:
+    slider = pj.Slider(pj.Polygon(given["vertices"], convex=True), pj.Ellipsoid(given["A"], length=given["length"]))
+    walls = (pj.Wall(given["wall"][:2], given["wall"][2:4], given["wall"][4]),) if "wall" in given else ()
+    hand = pj.Hand.finger(given["radius"])
+    return pj.rollout(slider, hand, given["path"], pose=given["pose"], friction=given["friction"], fixtures=walls)
+
+
+def loss(batch, shift):
+    """Sum over a batch, of which all members share `shift`; and what the pushes gave."""
+
+    def of_one(given):
+        found = push(jax.tree.map(jnp.add, given, shift))
+        end = jnp.where(jnp.isfinite(found.pose[-1]), found.pose[-1], 0.0)
+        return jnp.sum(end * jnp.array([1.0, 2.0, 0.3])) + jnp.sum(found.twist), (found.pose, found.status)
+
+    values, found = jax.vmap(of_one)(batch)
+    return jnp.sum(values), found
+
+
+def broken():
+    """Members of a batch that are wrong in one place each, and whether they must be INVALID."""
+    for name, good in GOOD.items():
+        for kind, number in BAD.items():
+            for index in np.ndindex(good.shape) if good.size <= 5 else [(1, 1)]:
+                wrong = good.copy()
+                wrong[index] = number
+                yield f"{name}{list(index)} {kind}", {**GOOD, name: wrong}, name not in ALLOWED.get(kind, ())
+    for name, vertices in {"clockwise": SIDE[::-1], "collapsed": SIDE * [1, 0], "twice": SIDE[[0, 0, 2, 3]]}.items():
+        yield f"vertices {name}", {**GOOD, "vertices": vertices}, True
+
+
+@pytest.mark.parametrize("walls", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["plain", "wall"])
+def test_a_bad_member_of_a_batch_changes_nothing_for_the_others(walls):
+    def stacked(members):
+        return {k: jnp.asarray(np.stack([m[k] for m in members])) for k in GOOD if walls or k != "wall"}
+
+    program = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
+    none = {k: jnp.zeros(v.shape) for k, v in GOOD.items() if walls or k != "wall"}
+    (_, (poses, status)), (slope, _) = program(stacked([GOOD, GOOD]), none)
+    assert (status[0] == pj.Status.MOVING).all()
+    assert np.all(slope["pose"][0] != 0)
+    for name, member, must_be_invalid in broken():
+        if name.startswith("wall") and not walls:
+            continue
+        (_, found), (own, shared) = program(stacked([GOOD, member]), none)
+        for new, old in ((found[0], poses), (found[1], status), *((own[k], slope[k]) for k in own)):
+            np.testing.assert_array_equal(new[0], old[0], err_msg=name)
+        for k in own:
+            assert np.isfinite(own[k]).all(), (name, k)
+            np.testing.assert_allclose(shared[k], slope[k][0] + own[k][1], rtol=1e-5, atol=1e-7, err_msg=name)
+        invalid = np.asarray(found[1][1]) == pj.Status.INVALID
+        if must_be_invalid:
+            rows = np.isin(np.arange(STEPS), [0, 1]) if name.startswith("path") else np.ones(STEPS, bool)
+            assert invalid[rows].all(), (name, found[1][1])
+
+
+def test_forward_mode_and_debug_nans():
+    """A member with NaN in its path has a finite derivative in forward mode, too, with `jax_debug_nans` on."""
+    path = GOOD["path"].copy()
+    path[3] = np.nan
+    given = {k: jnp.asarray(v) for k, v in GOOD.items() if k != "wall"}
+
+    def end(given):
+        return push(given).pose[-1]
+
+    with jax.debug_nans(True):
+        for derivative in (jax.jacfwd, jax.jacrev):
+            slope = jax.jit(derivative(end))({**given, "path": path})
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+            assert not np.asarray(slope["path"][:, 3]).any()
+            assert np.asarray(slope["path"][:, 5]).any()
