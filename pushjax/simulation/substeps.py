@@ -395,7 +395,6 @@ def _idle_record(pose: Vec3, contacts: int) -> ScalarStep:
     """Record of a step in which nothing pushes."""
     zero = jnp.zeros_like(pose.x)
     still, no_points = Vec3(zero, zero, zero), jnp.zeros((contacts, 2), zero.dtype)
-    mode = jnp.full((), ContactMode.SEPARATED, jnp.int8)
-    status = jnp.full((), Status.FREE, jnp.int8)
+    mode, status = (jnp.full((), value, jnp.int8) for value in (ContactMode.SEPARATED, Status.FREE))
     forces, modes = (Vec2(zero, zero),) * contacts, (mode,) * contacts
     return ScalarStep(pose, still, still, forces, no_points, no_points, modes, status, zero)
