@@ -1,6 +1,7 @@
 """The on-disk cache of compiled programs, shared by successive processes."""
 
 import hashlib
+import logging
 import platform
 from pathlib import Path
 
@@ -17,7 +18,8 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     This enables JAX's own cache, for all programs of the process and not only for those of this library. A later
     process loads a program if it is the same program with the same shapes and dtypes, compiled by the same version of
     JAX with the same flags. The folder is limited to 2 GiB. If JAX already uses a folder and no other one is given,
-    nothing is changed, and the limit is the one that JAX has there.
+    nothing is changed, and the limit is the one that JAX has there. Unless `jax_logging_level` is set, XLA then logs
+    fatal errors only: its loader warns of every program that it loads, without reason.
 
     Args:
         folder: Folder of the cache. Default: the folder that JAX already uses (`JAX_COMPILATION_CACHE_DIR`, or
@@ -34,7 +36,21 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # small programs too: there are hundreds
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
     compilation_cache.reset_cache()  # JAX chose its cache at the first program; this makes it choose again
+    if not jax.config.jax_logging_level:  # pyright: ignore[reportAttributeAccessIssue]
+        _silence_loader()
     return path
+
+
+def _silence_loader() -> None:
+    """Keep XLA's loader from logging a line about SIGILL for every program that it loads from the cache.
+
+    It logs that two tuning flags of AVX-512 processors are unsupported, and then loads and runs the program
+    (jax-ml/jax#38445). The levels of Python's loggers stay as they are.
+    """
+    loggers = [(logger, logger.level) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
+    jax.config.update("jax_logging_level", "CRITICAL")
+    for logger, level in loggers:
+        logger.setLevel(level)
 
 
 def _default_folder() -> Path:
@@ -42,10 +58,10 @@ def _default_folder() -> Path:
 
     Machines that share a home folder may not be able to run each other's compiled programs.
     """
-    return platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / _processor()
+    return platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / processor()
 
 
-def _processor() -> str:
+def processor() -> str:
     """Return a name for this kind of processor and its instruction set."""
     cpuinfo = Path("/proc/cpuinfo")
     features = platform.processor()

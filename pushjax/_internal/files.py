@@ -22,7 +22,7 @@ def save_json(path: str | Path, format_name: str, version: int, dtype: Any, reco
         record: Content that `json` can write (see `to_list`).
     """
     with_header = {"format": format_name, "version": version, "dtype": str(dtype)} | record
-    Path(path).write_text(json.dumps(with_header, indent=1) + "\n")
+    Path(path).expanduser().write_text(json.dumps(with_header, indent=1) + "\n")
 
 
 def to_list(value: Any) -> Any:
@@ -52,7 +52,7 @@ def load_json(
         ValueError: If the file does not hold such a record.
     """
     try:
-        record = json.loads(Path(path).read_text())
+        record = json.loads(Path(path).expanduser().read_text())
         if record["format"] != format_name:
             raise ValueError("its format is another")
         if record["version"] != version:

@@ -1,6 +1,7 @@
 """Records of a command's results, with its settings, the versions and the machine, and their JSON files."""
 
 import json
+import math
 import os
 import platform
 import time
@@ -10,6 +11,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+from pushjax._internal.warn import warn
 
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "matplotlib")
 
@@ -54,16 +57,33 @@ def _processor() -> str:
 def write_json(record: dict[str, Any], path: Path) -> None:
     """Write a record as JSON, with NumPy and JAX arrays and numbers as lists and Python numbers.
 
+    JSON has no NaN and no infinity. Where a number is one of them, null is written, and a warning names the field.
+
     Args:
         record: The record.
         path: The file. Its folder is created.
 
     Raises:
-        ValueError: If a number is NaN or infinite.
         TypeError: If a value cannot be written to JSON.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(record, indent=2, default=to_builtin, allow_nan=False) + "\n")
+    plain, missing = json.loads(json.dumps(record, default=to_builtin)), []
+    path.write_text(json.dumps(_with_null(plain, "", missing), indent=2, allow_nan=False) + "\n")
+    if missing:
+        others = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
+        warn(f"{path}: {missing[0]}{others} is not a finite number; it is null there")
+
+
+def _with_null(value: Any, name: str, missing: list[str]) -> Any:
+    """Replace numbers that are not finite by None, and append their names to `missing`."""
+    if isinstance(value, dict):
+        return {key: _with_null(entry, f"{name}.{key}" if name else key, missing) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_with_null(entry, f"{name}[{k}]", missing) for k, entry in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        missing.append(name)
+        return None
+    return value
 
 
 def to_builtin(value: Any) -> Any:

@@ -3,8 +3,8 @@
 JAX is imported only once a command runs, so that `--help` and wrong options are answered at once.
 """
 
-import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -70,7 +70,10 @@ def parsed(arguments: Sequence[str]) -> Any:
     """Return the command that the arguments say, one of the classes in `Command`."""
     return tyro.cli(
         Command,  # pyright: ignore[reportArgumentType]
-        args=arguments,
+        # a shell leaves the home folder in `--out=~/pushes` as it is
+        args=[
+            re.sub(r"^(--[\w-]+=)?~(?=/|$)", lambda begin: (begin[1] or "") + str(Path.home()), a) for a in arguments
+        ],
         prog="pushjax",
         description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
         "`pushjax --version` prints the version.",
@@ -157,10 +160,12 @@ def _fetch(command: Data) -> None:
     """Fetch a set of recorded pushes."""
     from pushjax._internal.progress_bar import progress_bar
     from pushjax.datasets.data_folder import ENVIRONMENT_VARIABLE
-    from pushjax.datasets.download import fetch_triangle
+    from pushjax.datasets.download import fetch_triangle, triangle_files
 
+    files = triangle_files()
+    size = sum(file.bytes for file in files) / 1e6
     with progress_bar() as progress:
-        progress.say("fetching 118 files of 34 MB, without those that are there already")
+        progress.say(f"fetching {len(files)} files of {size:.0f} MB, without those that are there already")
         folder = fetch_triangle(command.to, progress=progress)
     print(f"the logs are in {folder}")
     elsewhere = os.environ.get(ENVIRONMENT_VARIABLE)
@@ -193,7 +198,7 @@ def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> 
     from pushjax.cli.page import write_page
 
     json = command.json or command.out / f"{record['experiment']}.json"
-    write_json(record, json)  # first, because it refuses what JSON cannot hold
+    write_json(record, json)
     if not isinstance(command, Demo):
         print(f"wrote {write_page(record, text, command.out / (record['experiment'] + '.html'), figures)}")
     print(f"wrote {json}")
@@ -213,12 +218,6 @@ def _keep_compiled(cache: bool) -> None:
         jax.config.update("jax_enable_compilation_cache", False)
         return
     folder = enable_compilation_cache()
-    # XLA's loader logs that two tuning flags of AVX-512 processors are unsupported, a line for every program, although
-    # it then loads and runs the program (jax-ml/jax#38445). The levels of Python's loggers are restored.
-    loggers = [(logger, logger.level) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
-    jax.config.update("jax_logging_level", "CRITICAL")
-    for logger, level in loggers:
-        logger.setLevel(level)
     show, told = warnings.showwarning, []
 
     def show_once(message, *where, **more):

@@ -42,6 +42,8 @@ class Frictionless(ContactSolver):
             The motion, which can be differentiated. Its margin is always infinite. A contact that touches without
             force has the mode SEPARATED.
         """
+        if problem.form.degree != 2:
+            raise ValueError(f"solver: Frictionless needs an ellipsoid; the surface has degree {problem.form.degree}")
         count, scalar = problem.count, problem.runtime_scalar
         zero = jnp.zeros_like(scalar)
         motions = tuple(problem.form.gradient(n) for n in problem.normal)  # by a unit force at each contact

@@ -26,6 +26,6 @@ def find_data(name: str | None = None) -> Path | None:
         The path, or None if it does not exist.
     """
     given = os.environ.get(ENVIRONMENT_VARIABLE)
-    folder = Path(given) if given else default_folder()
+    folder = Path(given).expanduser() if given else default_folder()
     found = folder if name is None else folder / name
     return found if found.exists() else None

@@ -55,7 +55,7 @@ def fetch_triangle(to: str | PathLike[str] | None = None, *, progress: ProgressC
     Raises:
         OSError: As in `fetch`.
     """
-    folder = default_folder() if to is None else Path(to)
+    folder = default_folder() if to is None else Path(to).expanduser()
     fetch(triangle_files(), SOURCE, folder, progress=progress)
     return folder
 

@@ -40,7 +40,7 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
     Raises:
         LogError: If the file is of no known kind, or if no push of it is usable.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     return _select_loader(file)(file)
 
 

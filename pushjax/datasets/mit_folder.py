@@ -50,7 +50,7 @@ def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> li
     Raises:
         LogError: If the folder is missing, or if it has no file of that object on that surface.
     """
-    return _find_files(Path(folder), surface, shape)[0]
+    return _find_files(Path(folder).expanduser(), surface, shape)[0]
 
 
 def load_mit_folder(
@@ -95,7 +95,7 @@ def load_mit_folder(
         raise ValueError(f"train_share must be between 0 and 1; got {train_share}")
     if abs(speed - fast_speed) < SAME_SPEED:
         raise ValueError(f"speed and fast_speed must differ; got {speed} and {fast_speed}")
-    found, misnamed = _find_files(Path(folder), surface, shape)
+    found, misnamed = _find_files(Path(folder).expanduser(), surface, shape)
     constant_speed = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
     by_speed, unusable = _read_pushes(constant_speed, (speed, fast_speed), progress)
     problems = [*misnamed, *unusable]

@@ -111,7 +111,7 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
         LogError: If the file is missing or is not an archive, if an array is missing or has the wrong shape, if a
             number is not finite or is too large, or if a push of `middle` is not in `whole`.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     names = [*_TRAINING_ARRAYS, *_OBJECT_ARRAYS]
     with_fast = "v20_index" in archive_names(file, "straight pushes")
     groups = {name: prefix for name, prefix in GROUP_PREFIXES.items() if name != "fast" or with_fast}

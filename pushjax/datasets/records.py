@@ -21,8 +21,11 @@ import numpy as np
 from pushjax.datasets.push_log import Floats, LogError
 
 POSE_COLUMNS, COUNT_COLUMNS, FORCE_COLUMNS, ROBOT_COLUMNS = 7, 1, 3, 8
+MAX_BYTES = 1 << 28  # of a log's text; the published ones have a few MB
 # A push has about 670 force samples and 220 robot samples. Even a very long push stays far below this.
 MAX_SAMPLES = 1_000_000
+# The norms of logged quaternions deviate from one by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
+QUATERNION_TOLERANCE = 0.01
 # No logged quantity (s, mm, N) comes near this value. Squares of larger numbers might overflow later.
 LARGEST_NUMBER = 1e12
 _GZIP_MAGIC = b"\x1f\x8b"
@@ -126,12 +129,15 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
         raise LogError(path, f"expected a push log, but cannot read the file: {reason}") from error
     if text.startswith(_GZIP_MAGIC):
         try:
-            text = gzip.decompress(text)
+            with gzip.open(path) as stream:
+                text = stream.read(MAX_BYTES + 1)
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             damage = f"; the gzip stream is damaged: {error}"
             text = _decompress_readable_part(text)
             # The stream may be cut inside a number, and the rest still looks like a number: drop the last line.
             text = text[: text.rfind(b"\n") + 1]
+    if len(text) > MAX_BYTES:
+        raise LogError(path, f"expected a push log, found more than {MAX_BYTES >> 20} MB of text")
     lines = text.decode("ascii", errors="replace").rstrip().splitlines()
     if not lines:
         raise LogError(path, f"expected the number of pushes in the first line, found an empty file{damage}")
@@ -147,6 +153,8 @@ def _decompress_readable_part(zipped: bytes) -> bytes:
     text = bytearray()
     try:
         for position in range(len(zipped)):
+            if len(text) > MAX_BYTES:
+                break
             text += stream.decompress(zipped[position : position + 1])
     except zlib.error:
         pass
@@ -291,3 +299,17 @@ def _find_next_record(lines: list[str], start: int, fault_at: int) -> int:
             # A damaged line just before an intact start (score 3) also scores 2: skip it.
             return candidate + 1 if _matching_start_lines(lines, candidate + 1) == 3 else candidate
     return len(lines)
+
+
+def check_quaternions(quaternions: Floats, line: int, what: str) -> None:
+    """Check that the quaternions, the first of which is on `line`, have unit norm.
+
+    Raises:
+        ParseError: For the first that has not.
+    """
+    norm = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
+    if len(bad):
+        raise ParseError(
+            f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0])
+        )

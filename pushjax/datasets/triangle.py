@@ -26,10 +26,8 @@ from pushjax.datasets.push_log import (
     rotation,
     wrap_angle,
 )
-from pushjax.datasets.records import ParseError, Record, read_records
+from pushjax.datasets.records import ParseError, Record, check_quaternions, read_records
 
-# The norms of logged quaternions deviate from one by 7e-7 (motion capture, six digits) and 7e-4 (robot, three digits).
-QUATERNION_TOLERANCE = 0.01
 # Broken trials have one to three samples per push. Complete ones have some 670 force and 220 robot samples.
 MIN_SAMPLES = 4
 # A finger that moves less than this (m) has no clear direction, because its path is logged with a resolution of 0.1 mm.
@@ -71,7 +69,7 @@ def load_triangle_log(
 
     Reference: Layout and processing are as in the toolbox of Zhou et al. 2017. The rule for jumps is our own.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     name, points = _select_support(file, arrangement, support_points)
     normal_force = triangle_setup.support_force(points)
     pushes: list[Push] = []
@@ -144,26 +142,12 @@ def _check_record(record: Record) -> None:
     ):
         if len(samples) < MIN_SAMPLES:
             raise ParseError(f"expected at least {MIN_SAMPLES} {what} samples, found {len(samples)}", line)
-    _check_quaternions(record.poses[:, 3:], record.line, "object pose")
-    _check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
+    check_quaternions(record.poses[:, 3:], record.line, "object pose")
+    check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
     _check_clock(record.force[:, 0], record.force_line, "force")
     _check_clock(record.robot[:, 0], record.robot_line, "robot")
     if record.robot[0, 0] > record.force[-1, 0] or record.robot[-1, 0] < record.force[0, 0]:
         raise ParseError("expected robot samples from the time of the force samples, found none", record.robot_line)
-
-
-def _check_quaternions(quaternions: Floats, line: int, what: str) -> None:
-    """Check that the quaternions, the first of which is on `line`, have unit norm.
-
-    Raises:
-        ParseError: For the first that has not.
-    """
-    norm = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
-    if len(bad):
-        raise ParseError(
-            f"expected a unit quaternion ({what}), found one of norm {norm[bad[0]]:.3g}", line + int(bad[0])
-        )
 
 
 def _check_clock(time: Floats, line: int, what: str) -> None:

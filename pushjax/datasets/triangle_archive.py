@@ -50,7 +50,7 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
         LogError: If the file is missing or no such archive, if an array is missing or has the wrong size, or if no row
             is usable.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     wanted = [
         *_PUSH_ARRAYS,
         *_FILE_ARRAYS,

@@ -162,7 +162,7 @@ def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
         LogError: If the file is missing or no such archive, if an array is missing or has the wrong size, or if no row
             is usable.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     data = read_archive(file, [*_PUSH_ARRAYS, *_FILE_ARRAYS, *_SUPPORT_ARRAYS], "two-finger pushes")
     count = _checked_count(file, data)
     numbers = {name: np.array(data[name], np.float64) for name in (*_PUSH_ARRAYS, *_FILE_ARRAYS, *_SUPPORT_ARRAYS[:2])}

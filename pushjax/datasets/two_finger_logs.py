@@ -19,7 +19,7 @@ import numpy as np
 from pushjax.datasets import triangle_setup
 from pushjax.datasets.mit_shapes import nearest_on_outline
 from pushjax.datasets.push_log import Floats, LogError, nothing_usable, rotation, wrap_angle
-from pushjax.datasets.records import Record, read_records
+from pushjax.datasets.records import ParseError, Record, check_quaternions, read_records
 from pushjax.datasets.triangle import body_pose
 from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
 
@@ -66,7 +66,7 @@ def load_two_finger_logs(folder: str | PathLike[str]) -> TwoFingerLog:
     Raises:
         LogError: If there are no such files, if a file of actions is damaged, or if no push is usable.
     """
-    path = Path(folder)
+    path = Path(folder).expanduser()
     sensors = sorted(path.glob("exp_*_sensor*.txt"))
     if not sensors:
         raise LogError(path, "expected logs exp_…_sensor….txt, found none")
@@ -120,7 +120,7 @@ def _read_actions(path: Path) -> Iterator[Action]:
         LogError: If the file is missing or damaged.
     """
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text("utf-8", errors="replace").splitlines()
     except OSError as error:
         raise LogError(path, f"expected planned pushes, but cannot read the file: {error.strerror or error}") from error
     size = 1 + len(NUMBERS_PER_LINE)
@@ -129,6 +129,8 @@ def _read_actions(path: Path) -> Iterator[Action]:
         try:
             values = [np.array(line.split(), float) for line in lines[index + 1 : index + size]]
             valid = all(len(v) == n and np.isfinite(v).all() for v, n in zip(values, NUMBERS_PER_LINE, strict=True))
+            # the approach and, unless the push turns, the target are directions
+            valid &= values[2][:2].any() and ("Rotation" in kind or values[1][:2].any())
         except ValueError:
             valid = False
         if not kind or not valid:
@@ -160,6 +162,12 @@ def _nominal_numbers(action: Action) -> Floats:
 
 def _convert_push(path: Path, record: Record, action: Action) -> dict | LogError:
     """Return one row of the arrays of `TwoFingerLog`, by name, or the error that says why the push is not usable."""
+    if not len(record.force):
+        return LogError(path, "expected force samples, found none", push=record.index)
+    try:
+        check_quaternions(record.poses[:, 3:], record.line, "object pose")
+    except ParseError as fault:
+        return LogError(path, str(fault), push=record.index, line=fault.line)
     start, end = (body_pose(row) for row in record.poses)
     object_turn = float(wrap_angle(end[2] - start[2]))
     end[2] = start[2] + object_turn

@@ -26,7 +26,7 @@ def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj
     """
     kind, colon, rest = text.partition(":")
     if kind not in ("rectangle", "disk", "ellipse", "regular"):
-        if colon and not Path(text).exists():
+        if colon and not Path(text).expanduser().exists():
             raise ValueError(f"{option}: expected {SHAPES}; got {text!r}")
         return pj.Polygon(_vertices(Path(text), option))
     sizes = parse_numbers(option, text, rest, "x", 1 if kind == "disk" else 2, SHAPES)

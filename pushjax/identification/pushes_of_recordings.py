@@ -34,16 +34,18 @@ TRAVEL_MARGIN = 0.01  # m, margin for a slider that moves farther than its hand,
 TURN_LENGTH = 0.05  # m/rad, what a turn of the hand counts as a distance
 
 
-def screen(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
+def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> Recordings:
     """Keep pushes that are physically possible; list the others in `problems` with the reason.
 
     Args:
         recordings: Recorded pushes.
         shape: Outline of the slider.
         hand: The hand that pushed.
+        parts: Number of parts of each push that are asked for (see `push_arrays`). If the slider was tracked often
+            enough for them in at least half of the pushes, the others are not kept.
 
     Returns:
-        The recordings without the impossible pushes. `problems` names each of these with its index and the reason.
+        The recordings without the other pushes. `problems` names each of these with its index and the reason.
 
     Raises:
         ValueError: If the outline seems to be in another unit.
@@ -61,6 +63,12 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand) -> Recordings:
             kept.append(push)
         else:
             problems.append(LogError(recordings.source, reason, push=push.index))
+    sparse = [push for push in kept if not _is_observed_often_enough(push, parts)]
+    if 2 * len(sparse) <= len(kept):
+        for push in sparse:
+            reason = f"the object was seen {push.seen[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
+            problems.append(LogError(recordings.source, reason, push=push.index))
+        kept = [push for push in kept if _is_observed_often_enough(push, parts)]
     if not kept:
         raise nothing_usable(recordings.source, problems)
     return replace(recordings, pushes=tuple(kept), problems=(*recordings.problems, *problems))
@@ -158,7 +166,11 @@ def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | N
 
 def observed_often_enough(recordings: Recordings, parts: int) -> bool:
     """Return whether the slider was tracked often enough during every push to give a pose after each part."""
-    return all(push.seen[1:-1].sum() >= parts - 1 for push in recordings.pushes)
+    return all(_is_observed_often_enough(push, parts) for push in recordings.pushes)
+
+
+def _is_observed_often_enough(push: Recording, parts: int) -> bool:
+    return bool(push.seen[1:-1].sum() >= parts - 1)
 
 
 def has_wrenches(recordings: Recordings) -> bool:
@@ -209,6 +221,7 @@ def _wrench_motion_pairs(
         np.cumsum([len(t) for t in fingertips])[:-1],
     )
     wrench, twist = np.zeros_like(poses[:, 1:]), np.zeros_like(poses[:, 1:])
+    lever = float(np.min(shape.bounds[1] - shape.bounds[0])) / 2  # that of the outline's nearest point, about
     for k, (push, pose, contact) in enumerate(zip(pushes, all_poses, contacts, strict=True)):
         force = np.asarray(push.force)
         measured = np.isfinite(force[:, 0]) & np.isfinite(force[:, 1])
@@ -218,7 +231,8 @@ def _wrench_motion_pairs(
         for part, (before, after) in enumerate(zip(poses[k, :-1], poses[k, 1:], strict=True)):
             in_part = usable & (part_of_sample[k] == part)
             translation = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
-            if in_part.any() and np.hypot(*translation) >= MIN_DISPLACEMENT:
+            turn = abs(after[2] - before[2]) * lever
+            if in_part.any() and max(np.hypot(*translation), turn) >= MIN_DISPLACEMENT:
                 forces, arms = body_force[in_part], contact[in_part]
                 wrench[k, part] = *forces.mean(axis=0), (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).mean()
                 twist[k, part] = *translation, after[2] - before[2]

@@ -176,11 +176,17 @@ def bootstrap(
 
     Returns:
         The estimates, with a leading axis (n,), and their z, (n, size).
+
+    Raises:
+        ValueError: If all pushes of a condition have the weight zero.
     """
     pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     weights = np.asarray(pushes.weight)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     has_weight = weights > 0
+    empty = np.flatnonzero(~has_weight.any(axis=1))
+    if empty.size:
+        raise ValueError(f"pushes: condition {empty[0]} has no push with a weight, so none can be drawn from it")
     counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in has_weight] for _ in range(n)])
     z = _refitted(
         problem, pushes, found.z, _sigma_by_kind(found), jnp.asarray(counts * weights, found.z.dtype), found.robust

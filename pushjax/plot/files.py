@@ -27,7 +27,7 @@ def save(picture: Figure | Animation, path: Path | str) -> Path:
         ValueError: If the suffix is none of these.
         RuntimeError: If there is no `ffmpeg` for an .mp4.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(picture, Animation):
         picture.write(path)

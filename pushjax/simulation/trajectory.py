@@ -24,16 +24,14 @@ class Step(eqx.Module):
     outline that is not convex. A pad has two contacts in general, one on a disk, and three on a polygon that is not
     convex. A wall has two contacts, or one on a disk. The contacts of one finger may change places from step to step.
 
-    The contact point moves in a straight line, and the rest of the slider turns about it. So the pose after the step
-    agrees with the exponential of the twist to second order only. For a step that was divided
-    (`pushjax.simulation.substeps`), the twist is the sum over its parts, and wrench, force, contacts and mode are those
-    halfway through the last part in which the slider moved.
+    The contact point moves in a straight line, and the rest of the slider turns about it. The twist is that of chords:
+    the slider turns by 2 asin(twist[2] / 2). So the pose after the step agrees with the exponential of the twist to
+    second order only. For a step that was divided (`pushjax.simulation.substeps`), the twist is the sum over its parts,
+    and wrench, force, contacts and mode are those halfway through the last part in which the slider moved.
 
     MOVING, FREE, JAMMED and GRASPED promise a bound on the overlap after the step. The bound is the overlap before the
     step or, if that is more, a tenth of the largest displacement of the fingers in the step, but at least 1e-5 of the
-    surface's length. The exception is a hand with one contact and no fixtures: one round finger on a convex outline, or
-    one pad on a disk. Its overlap is recorded, but is not checked, and the step is not tried again. In all
-    measurements, which were made with a round finger, it was below the bound.
+    surface's length.
 
     Attributes:
         pose: Pose of the slider after the step, (3,), world, m and rad.

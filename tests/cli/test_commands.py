@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax._internal.record import write_json
 from pushjax.cli import commands
 from pushjax.cli import main as cli
 from pushjax.experiments.table2 import conditions as table2
@@ -28,6 +29,26 @@ def read(path):
     record = json.loads(path.read_text())
     assert {"experiment", "versions", "machine", "settings"} <= record.keys()
     return record
+
+
+def test_a_number_that_json_lacks_is_null_and_named(tmp_path):
+    """A long run ends with its record, whatever one of its numbers is."""
+    rows = [{"error_mm": np.array([0.5, np.nan])}, {"error_mm": [1.5, np.inf]}]
+    with pytest.warns(
+        UserWarning, match=r"rows\[0\].error_mm\[1\], and 1 more is not a finite number; it is null there"
+    ):
+        write_json({"rows": rows}, tmp_path / "new" / "record.json")
+    assert json.loads((tmp_path / "new" / "record.json").read_text()) == {
+        "rows": [{"error_mm": [0.5, None]}, {"error_mm": [1.5, None]}]
+    }
+
+
+def test_the_home_folder_in_any_option(monkeypatch, tmp_path):
+    """A shell expands ~ at the beginning of a word only."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    command = cli.parsed(["demo", "--out=~/pushes", "--json", "~/demo.json"])
+    assert (command.out, command.json) == (tmp_path / "pushes", tmp_path / "demo.json")
 
 
 def test_demo(tmp_path, capsys):

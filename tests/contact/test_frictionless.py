@@ -50,3 +50,10 @@ def test_conditions_hold_and_jams_have_no_motion(count):
         limits = [(-1e3 * unit[k], 1e3 * unit[k])] * 3
         found = linprog(np.zeros(3), -rows[k] / [1, 1, length], -needed[k] - 1e-2 * unit[k], bounds=limits)
         assert found.status == 2, "a motion exists"
+
+
+def test_only_for_ellipsoids():
+    contacts = random_contacts_problem(jax.random.key(0), contacts=2).contacts
+    quartic = pj.Quartic([1.0, *[0.0] * 14], 0.03)
+    with pytest.raises(ValueError, match="Frictionless needs an ellipsoid; the surface has degree 4"):
+        pj.solve_contacts(quartic, contacts, solver=Frictionless())

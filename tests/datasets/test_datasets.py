@@ -618,6 +618,20 @@ def test_gzip_checksum(tmp_path: Path, records: Records) -> None:
     assert len(log.pushes) == 4
 
 
+def test_an_archive_that_unpacks_without_end(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    path.write_bytes(gzip.compress(bytes(300 << 20), 9))
+    with pytest.raises(LogError, match="found more than 256 MB of text"):
+        load_triangle_log(path)
+
+
+def test_the_home_folder_in_a_path(tmp_path: Path, records: Records, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "log.txt", records)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    assert indices(load_triangle_log("~/log.txt")) == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

@@ -77,6 +77,8 @@ def test_a_straight_push_follows_its_action(session):
         (lambda lines: [*lines[:3], "1 2 x", *lines[4:]], "line 2: expected the type of a push"),
         (lambda lines: [*lines[:5], "500 0.5"], "expected usable pushes|from the outline at the end"),
         (lambda lines: lines[:4], "expected"),
+        (lambda lines: [*lines[:4], "0 0 0", *lines[5:]], "line 2: expected the type of a push"),
+        (lambda lines: [*lines[:3], "1 \0 2", *lines[4:]], "line 2: expected the type of a push"),
     ],
 )
 def test_damaged_actions_are_named(session, damage, message):
@@ -117,4 +119,14 @@ def test_a_damaged_record_is_a_problem(session):
     lines[1] = " ".join(lines[1].split()[:5])
     sensor.write_text("\n".join(lines))
     with pytest.raises(LogError):
+        load_two_finger_logs(session)
+
+
+def test_a_pose_that_is_none_is_a_problem(session):
+    sensor, _ = files(session)
+    lines = sensor.read_text().splitlines()
+    pose = next(k for k, line in enumerate(lines) if len(line.split()) == 7)
+    lines[pose] = " ".join([*lines[pose].split()[:3], "0 0 0 0"])
+    sensor.write_text("\n".join(lines))
+    with pytest.raises(LogError, match="unit quaternion"):
         load_two_finger_logs(session)

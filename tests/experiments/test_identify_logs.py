@@ -16,7 +16,8 @@ from scipy.stats import multivariate_t
 
 import pushjax as pj
 from pushjax.cli import main as cli
-from pushjax.datasets import LogError, load_recordings
+from pushjax.datasets import LogError, Recordings, load_recordings
+from pushjax.datasets.recordings import Recording
 from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
 from pushjax.identification.noise import _LogNoise, _score
@@ -317,6 +318,30 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
     alone = pj.Pushes.of(recordings, STEPS)
     assert alone.poses_between.shape == (16, 0, 3)
     assert alone.wrench.shape == (16, 0, 3)
+
+
+def test_a_push_that_was_seen_too_rarely_is_left_out(log, block):
+    """One such push does not take the poses on the way, and the forces, from all others."""
+    whole = load_recordings(log)
+    rare = replace(whole.pushes[3], seen=np.isin(np.arange(STEPS + 1), (0, 5, STEPS)))
+    recordings = replace(whole, pushes=(*whole.pushes[:3], rare, *whole.pushes[4:]))
+    screened = screen(recordings, block, pj.Hand.finger(RADIUS), parts=3)
+    assert "the object was seen 1 times on the way; 3 parts need 2" in [p.message for p in screened.problems]
+    assert pj.Pushes.of(screened, STEPS, parts=3, shape=block).wrench.shape == (15, 2 + 1, 3)
+    unseen = replace(recordings, pushes=tuple(replace(p, seen=rare.seen) for p in whole.pushes))
+    assert len(screen(unseen, block, pj.Hand.finger(RADIUS), parts=3).pushes) == 16  # their final poses are used
+
+
+def test_a_part_that_only_turns_tells_about_the_torque(block):
+    """A couple turns the slider about its origin: the part has a wrench and a twist without translation."""
+    angle = np.linspace(0, 0.1, STEPS + 1)
+    pose = np.stack([0 * angle, 0 * angle, angle], axis=1)
+    hand = 0.04 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    tangent = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+    push = Recording(0, hand, pose, np.ones(STEPS + 1, bool), tangent, None)
+    pushes = pj.Pushes.of(Recordings((push,), (), "made"), STEPS, parts=3, shape=block)
+    assert np.all(np.asarray(pushes.has_pair))
+    np.testing.assert_allclose(pushes.twist[0], np.tile([0, 0, 0.1 / 3], (3, 1)), atol=1e-6)
 
 
 def test_logs_that_tell_less_than_others(log, block):

@@ -376,6 +376,8 @@ def test_contact_at_end_tells_where_things_are(square, real, expected, hand, tmp
     assert profile.rise[1] < profile.rise[0]
     drawn = found.bootstrap(jax.random.key(0), pushes, mean, hand, 4)
     assert np.all(np.linalg.norm(np.asarray(drawn.hand_offset) - hand_offset, axis=1) < 5e-4)
+    with pytest.raises(ValueError, match="condition 0 has no push with a weight"):
+        found.bootstrap(jax.random.key(0), pushes.weighted(0 * pushes.weight), mean, hand, 4)
     two = pj.Hand.two_fingers(RADIUS)
     wide = pj.Pushes(starts, jnp.zeros((*paths.shape[:2], two.dof)), starts)
     with pytest.raises(ValueError, match="contact_at_end is for a single round finger; the hand has 2 fingers"):

@@ -130,7 +130,7 @@ def find(
         if columns != hand.dof:
             raise ValueError(f"{one.source}: the hand has {columns} numbers; a hand {options.hand} has {hand.dof}")
     _check_forces(recordings, options)
-    recordings, unusable = _for_each(recordings, lambda one: screen(one, shape, hand))
+    recordings, unusable = _for_each(recordings, lambda one: screen(one, shape, hand, options.parts))
     problems = (*unreadable, *unusable, *(problem for one in recordings for problem in one.problems))
     for problem in problems:
         note(f"left out: {problem}")
