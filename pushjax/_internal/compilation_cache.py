@@ -36,7 +36,7 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # small programs too: there are hundreds
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
     compilation_cache.reset_cache()  # JAX chose its cache at the first program; this makes it choose again
-    if not jax.config.jax_logging_level:  # pyright: ignore[reportAttributeAccessIssue]
+    if jax.config.jax_logging_level in (None, "NOTSET"):  # pyright: ignore[reportAttributeAccessIssue]
         _silence_loader()
     return path
 
@@ -45,12 +45,13 @@ def _silence_loader() -> None:
     """Keep XLA's loader from logging a line about SIGILL for every program that it loads from the cache.
 
     It logs that two tuning flags of AVX-512 processors are unsupported, and then loads and runs the program
-    (jax-ml/jax#38445). The levels of Python's loggers stay as they are.
+    (jax-ml/jax#38445). The levels and handlers of Python's loggers stay as they are.
     """
-    loggers = [(logger, logger.level) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
+    loggers = [(logger, logger.level, [*logger.handlers]) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
     jax.config.update("jax_logging_level", "CRITICAL")
-    for logger, level in loggers:
+    for logger, level, handlers in loggers:
         logger.setLevel(level)
+        logger.handlers[:] = handlers
 
 
 def _default_folder() -> Path:

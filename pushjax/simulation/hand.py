@@ -72,9 +72,9 @@ class Hand(eqx.Module):
         fingers: The fingers: numbers (radii of disks, m), `Polygon`s (convex pads, in the finger's own frame, m),
             `RoundFinger`s or `Pad`s.
         kinematics: Function from a configuration (dof,) to the poses (fingers, 3) of the fingers, world, m and rad. For
-            a hand that never turns and has no pads, it may give their centers (fingers, 2) instead. It is traced. From
-            centers, every finger moves in a straight line in each step; two that turn while they hold something would
-            close on it.
+            a hand that never turns and has no pads, it may give their centers (fingers, 2) instead. It is traced. A
+            new function, such as a lambda that is made in a loop, compiles every program anew. From centers, every
+            finger moves in a straight line in each step; two that turn while they hold something would close on it.
         dof: Number of coordinates of a configuration.
         least: Smallest allowed value of the last coordinate, the opening, m; None for no limit.
 

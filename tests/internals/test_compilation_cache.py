@@ -15,10 +15,14 @@ from pushjax.cli import main as cli
 PROGRAM = """
 import jax, jax.numpy as jnp, sys
 import pushjax as pj
+import logging
+loggers = [logging.getLogger(name) for name in ("jax", "jaxlib")]
+before = [(logger.level, [*logger.handlers]) for logger in loggers]
 hits = []
 jax.monitoring.register_event_listener(lambda name, **_: hits.append(name.endswith("/cache_hits")))
 float(jax.jit(lambda x: x + 1)(1.0))  # a program of before
 print(pj.enable_compilation_cache(*sys.argv[1:]))
+assert before == [(logger.level, logger.handlers) for logger in loggers]
 float(jax.jit(lambda x: jnp.sort(x) @ x)(jnp.arange(100.0)))
 print(sum(hits))
 """
@@ -26,6 +30,7 @@ print(sum(hits))
 
 def process(*arguments: str, **environment: str) -> list[str]:
     unset = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")
+    unset += ("TF_CPP_MIN_LOG_LEVEL", "JAX_LOGGING_LEVEL")  # XLA logs as it does by default
     inherited = {name: value for name, value in os.environ.items() if name not in unset}
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, *arguments],
