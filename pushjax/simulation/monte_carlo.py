@@ -132,11 +132,7 @@ def monte_carlo(
         check_start_among_fixtures(slider, fixed, start)
         setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table, fixed)
         run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
-        saved = (
-            None
-            if checkpoint is None
-            else _checkpoint(Path(checkpoint).expanduser(), run, setup, slider, path_array, start)
-        )
+        saved = None if checkpoint is None else _checkpoint(Path(checkpoint), run, setup, slider, path_array, start)
         results = run.compute_all(saved, report)
     _warn_about_repairs(results.shrinkage)
     return MonteCarlo(np.broadcast_to(run.start, (n, 3)), *results, time.perf_counter() - start_time)
@@ -151,11 +147,12 @@ def _checkpoint(folder: Path, run: "_Run", setup: Setup, slider: Slider, path: A
     identity |= {"model": digest(model), "solver": digest(solver) if solver else "default"}
     identity |= {"table": digest(setup.table) if setup.table else "uniform", "fixtures": digest(setup.fixtures)}
     identity |= {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
-    identity |= {"platform": run.devices.local[0].platform, "device": run.devices.local[0].device_kind}
+    device = run.devices.local[0]
+    identity |= {"platform": device.platform, "device": device.device_kind}
     # other instructions or flags of the compiler give other bits; another number of devices does not
     flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag)
-    identity |= {"processor": processor(), "xla_flags": flags}
-    return run.in_all_processes(lambda: Checkpoint(folder, identity, writes=run.devices.writes))
+    identity |= {"processor": processor() if device.platform == "cpu" else "", "xla_flags": flags}
+    return run.in_all_processes(lambda: Checkpoint(folder.expanduser(), identity, writes=run.devices.writes))
 
 
 def _warn_about_repairs(shrinkage: np.ndarray) -> None:
