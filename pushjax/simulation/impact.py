@@ -88,20 +88,20 @@ def _advanced(motion: FingerMotion, outline: Outline, start: BodyFrame, length: 
         return gap, jnp.maximum(approach, 0.0), largest_speed * turning
 
     def is_apart(state):
-        fraction, (gap, *_), rounds = state
-        return (gap > touches) & (fraction < 1) & (rounds < MAX_ROUNDS)
+        _, apart, rounds = state
+        return apart & (rounds < MAX_ROUNDS)
 
     def advance(state):
-        fraction, (gap, speed, acceleration), rounds = state
+        fraction, _, rounds = state
+        gap, speed, acceleration = bounds_at(fraction)
         # gap = speed t + acceleration t^2 / 2
         closing = speed + jnp.sqrt(speed**2 + 2 * acceleration * gap)
-        fraction = jnp.minimum(
-            fraction + jnp.where(closing > 0, 2 * gap / jnp.where(closing > 0, closing, 1.0), 1.0), 1
-        )
-        return fraction, bounds_at(fraction), rounds + 1
+        free = jnp.where(closing > 0, 2 * gap / jnp.where(closing > 0, closing, 1.0), 1.0)
+        after = jnp.where(gap > touches, jnp.minimum(fraction + free, 1.0), fraction)
+        return after, (gap > touches) & (after < 1), rounds + 1
 
-    zero = jnp.zeros_like(x)
-    fraction, _, _ = jax.lax.while_loop(is_apart, advance, (zero, bounds_at(zero), jnp.zeros((), jnp.int32)))
+    state = jnp.zeros_like(x), jnp.ones((), bool), jnp.zeros((), jnp.int32)
+    fraction, _, _ = jax.lax.while_loop(is_apart, advance, state)
     # the implicit function theorem: where the gap closes, the instant depends on everything that the gap depends on
     gap, rate = jax.jvp(lambda f: gap_after(motion, outline, start, f), (fraction,), (jnp.ones_like(fraction),))
     rate = jax.lax.stop_gradient(rate)
