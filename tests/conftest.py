@@ -6,7 +6,6 @@ The compiled programs are cached between runs and between pytest's workers if JA
 import gc
 import os
 import sys
-import time
 from pathlib import Path
 
 from compiling import set_quick
@@ -33,6 +32,7 @@ gc.set_threshold(100_000, 50, 100)
 LONG = (
     "docs",
     "overlaps",
+    "invariance",
     "table1",
     "random_contacts",
     "commands",
@@ -96,18 +96,6 @@ SLOW_CASES = {
 }
 
 
-START = time.monotonic()
-
-
-def pytest_addoption(parser):
-    parser.addoption(
-        "--slow-within",
-        type=float,
-        metavar="SECONDS",
-        help="start no slow test later than this after the start",
-    )
-
-
 def pytest_collection_modifyitems(items):
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
 
@@ -119,7 +107,7 @@ def pytest_collection_modifyitems(items):
 
 
 class Marks:
-    """Marks tests as long and slow, and skips slow ones after their time. As a plugin, it sees the notebooks too."""
+    """Marks tests as long and slow. As a plugin, it sees the notebooks too."""
 
     def pytest_itemcollected(self, item):
         test, _, case = item.name.partition("[")
@@ -127,11 +115,6 @@ class Marks:
             item.add_marker("long")
         if item.path.stem == SLOW_NOTEBOOK or any(part in f"[{case}" for part in SLOW_CASES.get(test, ())):
             item.add_marker("slow")
-
-    def pytest_runtest_setup(self, item):
-        limit = item.config.getoption("--slow-within")
-        if limit is not None and item.get_closest_marker("slow") and time.monotonic() - START > limit:
-            pytest.skip("a slow test, and the time for these is over")
 
 
 def pytest_configure(config):
