@@ -91,12 +91,12 @@ def _distances_in_other_directions(
 
 
 def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tuple[Candidate, ...]:
-    """Return the selected candidates; one that is selected a second time is moved 1 m away, which is out of reach."""
+    """Return the selected candidates; one that is selected a second time is moved out of reach."""
     if not isinstance(candidates, Candidate):
         return candidates
     first, *others = (take(candidates, index) for index in chosen)
     repeated = [index == chosen[0] for index in chosen[1:]]
-    offsets = [jnp.where(same, 1.0, 0.0).astype(first.distance.dtype) for same in repeated]
+    offsets = [jnp.where(same, OUT_OF_REACH, 0.0).astype(first.distance.dtype) for same in repeated]
     return first, *(
         other._replace(distance=other.distance + offset) for other, offset in zip(others, offsets, strict=True)
     )
