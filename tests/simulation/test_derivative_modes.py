@@ -190,7 +190,7 @@ def _turns_flat(forward, like):
     """Frictionless round fingers on parallel faces: the slider turns ever faster until it is held."""
     row = like * np.array([0, 1, 0, 1, 0, 0, 0, 1]) + np.array([0, 0, 0, 0.1, 0, 0, 0, -0.02])
     _, slope, kind = forward(jnp.asarray(np.tile(row, (6 * INPUTS, 1))), jnp.asarray(np.tile(np.eye(INPUTS), (6, 1))))
-    assert set(np.asarray(kind[0]).tolist()) <= {pj.Status.FREE, pj.Status.MOVING, pj.Status.GRASPED}
+    assert set(np.asarray(kind[0, :CLOSING]).tolist()) == {pj.Status.FREE, pj.Status.MOVING, pj.Status.GRASPED}
     assert np.all(np.isfinite(slope))
 
 
