@@ -1,9 +1,9 @@
 """Small vectors as pytrees of scalars.
 
-`vmap` over code with arrays of shape (3,) leaves an inner axis of length three in every operation, which the compiler
-cannot vectorize. The same arithmetic on separate scalars becomes arithmetic on whole batches, which is five to ten
-times faster on a CPU. So all code below the public interface uses `Vec2` and `Vec3`, and converts from and to arrays at
-the interface (`of`, `array`).
+`vmap` puts the batch first, so arrays of shape (3,) keep an inner axis of length three in every operation, which the
+compiler cannot vectorize. Separate scalars become arrays over the batch. (So are arrays with the batch last, which are
+as fast with JAX 0.10 and compile faster, but have to be written for a batch.) All code below the public interface uses
+`Vec2` and `Vec3`, and converts from and to arrays at the interface (`of`, `array`).
 """
 
 from collections.abc import Iterable

@@ -20,8 +20,8 @@ from pushjax._internal.checks import (
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Shape, check_simple_polygon, is_outline, signed_area
 
-# Up to this many edges, the search over the edges is unrolled, so that XLA vectorizes a batch across its examples. For
-# more edges, arrays over the edges keep the compiled program small.
+# Up to this many edges, the search over the edges is unrolled. For more edges, arrays over the edges keep the compiled
+# program small. With JAX 0.10, both are about as fast.
 UNROLLED_EDGES = 12
 
 
