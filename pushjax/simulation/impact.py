@@ -105,7 +105,8 @@ def _advanced(motion: FingerMotion, outline: Outline, start: BodyFrame, length: 
     # the implicit function theorem: where the gap closes, the instant depends on everything that the gap depends on
     gap, rate = jax.jvp(lambda f: gap_after(motion, outline, start, f), (fraction,), (jnp.ones_like(fraction),))
     rate = jax.lax.stop_gradient(rate)
-    closes = (fraction > 0) & (fraction < 1) & (gap <= touches) & (-rate > LEAST_APPROACH * largest_speed)
+    is_near = gap <= TOUCHING[4] * jax.lax.stop_gradient(length)  # near enough for the step of Newton's method
+    closes = (fraction > 0) & (fraction < 1) & is_near & (-rate > LEAST_APPROACH * largest_speed)
     is_regular = decide(closes, x)
     refined = fraction - gap / jnp.where(is_regular, rate, 1.0)
     return jnp.where(is_regular, jnp.clip(refined, 0.0, 1.0), fraction)
