@@ -184,7 +184,8 @@ class PolygonOutline(Outline):
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         if isinstance(self.edges, Edge):
-            return jnp.min(self._sweep_edge(self.edges, x, path, radius))
+            # computed once, because the derivative of a minimum compares it with each value
+            return jnp.min(compute_once(self._sweep_edge(self.edges, x, path, radius), x.x))
         fraction = self._sweep_edge(self.edges[0], x, path, radius)
         for edge in self.edges[1:]:
             fraction = jnp.minimum(fraction, self._sweep_edge(edge, x, path, radius))

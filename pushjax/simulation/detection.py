@@ -280,8 +280,10 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
     if not isinstance(outline, PolygonOutline):
         return pad_on_curve.penetration_depth(pad, _edge_supports(pad, outline, finger_pose), outline, pad_corners)
     slider_corners = (corners(outline).point - finger_pose.center).unrotate(angle)
-    slider_in_pad = pad.closest(slider_corners).distance
-    pad_in_slider = outline.closest(pad_corners).distance
+    # computed once, because the derivative of a maximum compares it with each value
+    slider_in_pad, pad_in_slider = compute_once(
+        (pad.closest(slider_corners).distance, outline.closest(pad_corners).distance), finger_pose.center.x
+    )
     return jnp.maximum(jnp.maximum(jnp.max(-pad_in_slider), jnp.max(-slider_in_pad)), _chord_depth(pad, slider_corners))
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline
@@ -64,6 +65,9 @@ def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2,
 
 def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
     """Depth of the deepest corner in the outline, or of the deepest support point in the pad, m; negative if apart."""
-    corner_depth = jnp.max(-jax.vmap(lambda corner: outline.closest(corner).distance)(corners))
-    support_depths = -pad.closest(supports.local).distance
-    return jnp.maximum(corner_depth, jnp.max(jnp.where(supports.valid, support_depths, -jnp.inf)))
+    # The derivative of a maximum compares it with each value. Were these computed anew there, none might be equal.
+    corner_distance, support_distance = compute_once(
+        (jax.vmap(outline.closest)(corners).distance, pad.closest(supports.local).distance), corners.x[0]
+    )
+    support_depth = jnp.max(jnp.where(supports.valid, -support_distance, -jnp.inf))
+    return jnp.maximum(jnp.max(-corner_distance), support_depth)
