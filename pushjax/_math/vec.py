@@ -1,9 +1,9 @@
 """Small vectors as pytrees of scalars.
 
 `vmap` puts the batch first, so arrays of shape (3,) keep an inner axis of length three in every operation, which the
-compiler cannot vectorize. Separate scalars become arrays over the batch. (So are arrays with the batch last, which are
-as fast with JAX 0.10 and compile faster, but have to be written for a batch.) All code below the public interface uses
-`Vec2` and `Vec3`, and converts from and to arrays at the interface (`of`, `array`).
+compiler cannot vectorize. Separate scalars become arrays over the batch, which it can. (With JAX 0.10, arrays with the
+batch last are as fast and compile faster, but such code has to be written for a batch.) All code below the public
+interface uses `Vec2` and `Vec3`, and converts from and to arrays at the interface (`of`, `array`).
 """
 
 from collections.abc import Iterable
