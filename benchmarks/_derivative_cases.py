@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.simulation.substeps import SMALLEST_PART
 
 RADIUS, LENGTH = 0.005, 0.035
 # Half-width of the central differences, that of the finer ones, and the error above which these are used too.
@@ -164,7 +165,10 @@ def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray
         first, last = x[5:9] * unit, x[9:13] * unit
         path = first[None] + jnp.arange(steps + 1)[:, None] / steps * (last - first)[None]
         run = pj.rollout(slider, hand, path, pose=x[2:5] * unit[:3], friction=x[:2])
-        return scaled(run), jnp.concatenate([run.status, run.mode.ravel()])
+        travel = last - first
+        done = (run.configuration - first) @ travel / (travel @ travel)
+        stops = jnp.round(done[-1:] * steps / SMALLEST_PART).astype(jnp.int32)
+        return scaled(run), jnp.concatenate([run.status, run.mode.ravel(), stops])
 
     n = len(given[0])
     numbers = [given[0], given[1] / unit[:3], given[2] / unit, given[3] / unit, surfaces(mean, n)]

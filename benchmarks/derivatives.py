@@ -6,8 +6,8 @@
   differences, in float64, with lengths in units of the surface's. Differences of two widths, H and H / 4, are
   extrapolated, so that neither the truncation error (1e-20 times the fifth derivative) nor roundoff (1e-10) matters. A
   push is compared where the modes, the status and, for one finger, the touched edge or vertex are the same in every
-  step on both sides, because elsewhere there may be no derivative. Where the error is still large, it is computed once
-  more with differences of width FINE.
+  step on both sides, and a hand that jams stops in the same part of a step, because elsewhere there may be no
+  derivative. Where the error is still large, it is computed once more with differences of width FINE.
 - `grasps`: the same for random grasps.
 - `random`: derivatives of E[f] by `dof` and by the range of friction through `random_rollout`, against differences of
   means.
