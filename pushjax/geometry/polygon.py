@@ -1,7 +1,6 @@
 """Polygons, convex or not."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -19,10 +18,6 @@ from pushjax._internal.checks import (
 )
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Shape, check_simple_polygon, is_outline, signed_area
-
-# Up to this many edges, the search over the edges is unrolled. For more edges, arrays over the edges keep the compiled
-# program small. With JAX 0.10, both are about as fast.
-UNROLLED_EDGES = 12
 
 
 class Polygon(Shape):
@@ -164,25 +159,7 @@ class Polygon(Shape):
         return Polygon(vertices, convex=self.convex)
 
     def outline(self) -> PolygonOutline:
-        vertices = self.vertices
-        edge = jnp.roll(vertices, -1, axis=0) - vertices
-        length = jnp.sqrt(jnp.sum(edge**2, axis=1))
-        along = edge / length[:, None]
-        normal = jnp.stack([along[:, 1], -along[:, 0]], axis=1)
-        bisector = normal + jnp.roll(normal, 1, axis=0)  # at the start of each edge
-        bisector = bisector / jnp.sqrt(jnp.sum(bisector**2, axis=1, keepdims=True))
-        previous = jnp.roll(along, 1, axis=0)
-        turn = previous[:, 0] * along[:, 1] - previous[:, 1] * along[:, 0]
-        start_fields = (bisector[:, 0], bisector[:, 1]), turn
-        (a_x, a_y), turn_a = start_fields
-        (b_x, b_y), turn_b = jax.tree.map(lambda field: jnp.roll(field, -1), start_fields)
-        edges = Edge(
-            vertices[:, 0], vertices[:, 1], along[:, 0], along[:, 1], length, a_x, a_y, b_x, b_y, turn_a, turn_b
-        )
-        if len(vertices) > UNROLLED_EDGES:
-            return PolygonOutline(edges, self.convex)
-        unrolled = tuple(jax.tree.map(lambda field, i=i: field[i], edges) for i in range(len(vertices)))
-        return PolygonOutline(unrolled, self.convex)
+        return PolygonOutline(Edge.of(self.vertices), self.convex)
 
 
 @in_numpy

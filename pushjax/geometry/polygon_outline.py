@@ -8,56 +8,54 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._internal.xla import compute_once, largest, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersection, roundoff
 
 
 class Edge(NamedTuple):
-    """One edge of a polygon, or an array of edges, in the body frame. Suffix a is its start, suffix b its end.
+    """One edge of a polygon, or all of them as arrays (edges,), in the body frame.
 
     Attributes:
-        start_x: x of the start, m.
-        start_y: y of the start, m.
-        along_x: x of the unit direction.
-        along_y: y of the unit direction.
+        start: Start of the edge, m.
+        along: Unit direction from start to end.
         length: Length, m.
-        bisector_a_x: x of the unit bisector of the two outward normals that meet at the start.
-        bisector_a_y: y of that bisector.
-        bisector_b_x: x of the unit bisector of the two outward normals that meet at the end.
-        bisector_b_y: y of that bisector.
+        bisector_a: Unit bisector of the two outward normals that meet at the start.
+        bisector_b: The same at the end.
         turn_a: Sine of the angle by which the outline turns at the start; negative at a reflex vertex.
-        turn_b: Sine of the angle by which the outline turns at the end; negative at a reflex vertex.
+        turn_b: The same at the end.
+        previous: Unit direction of the edge before this one.
     """
 
-    start_x: Scalar
-    start_y: Scalar
-    along_x: Scalar
-    along_y: Scalar
+    start: Vec2
+    along: Vec2
     length: Scalar
-    bisector_a_x: Scalar
-    bisector_a_y: Scalar
-    bisector_b_x: Scalar
-    bisector_b_y: Scalar
+    bisector_a: Vec2
+    bisector_b: Vec2
     turn_a: Scalar
     turn_b: Scalar
+    previous: Vec2
 
-    @property
-    def start(self) -> Vec2:
-        """Start of the edge, m."""
-        return Vec2(self.start_x, self.start_y)
-
-    @property
-    def along(self) -> Vec2:
-        """Unit direction from start to end."""
-        return Vec2(self.along_x, self.along_y)
+    @staticmethod
+    def of(vertices: Float[Array, "edges 2"]) -> "Edge":
+        """All edges of a polygon that runs counterclockwise."""
+        x, y = vertices[:, 0], vertices[:, 1]
+        step_x, step_y = jnp.roll(x, -1) - x, jnp.roll(y, -1) - y
+        length = jnp.sqrt(step_x**2 + step_y**2)
+        along = Vec2(step_x / length, step_y / length)
+        previous = Vec2(*(jnp.roll(entry, 1) for entry in along))
+        bisector = Vec2(along.y + previous.y, -along.x - previous.x)
+        bisector = bisector.scale(1 / jnp.sqrt(bisector.dot(bisector)))
+        turn = previous.cross(along)
+        bisector_b, turn_b = jax.tree.map(lambda entry: jnp.roll(entry, -1), (bisector, turn))
+        return Edge(Vec2(x, y), along, length, bisector, bisector_b, turn, turn_b, previous)
 
     @property
     def normal(self) -> Vec2:
         """Outward unit normal; it lies to the right of the edge, because the outline runs counterclockwise."""
-        return Vec2(self.along_y, -self.along_x)
+        return Vec2(self.along.y, -self.along.x)
 
     def foot(self, x: Vec2) -> tuple[Scalar, Scalar, Vec2]:
         """Project a point onto the edge.
@@ -75,121 +73,66 @@ class Edge(NamedTuple):
         return s, clipped, rel - self.along.scale(clipped)
 
 
-# One boolean per edge: a list for unrolled edges, an array for an `Edge` of arrays.
-EdgeMask = list[Bool[Array, ""]] | Bool[Array, "edges"]
-
-
 class PolygonOutline(Outline):
     """Outline of a polygon that runs counterclockwise.
 
     Attributes:
-        edges: The edges: a tuple (few edges, unrolled search), or one `Edge` of arrays (many edges).
+        edges: The edges, as arrays.
         convex: Whether the polygon is known to be convex, so that a finger touches it in one place only.
     """
 
-    edges: tuple[Edge, ...] | Edge
+    edges: Edge
     convex: bool = eqx.field(static=True, default=False)
 
-    def _nearest_edge(self, x: Vec2) -> tuple[Edge, EdgeMask]:
-        """Return the edge nearest to `x`, and for each edge whether it is that one."""
-        if isinstance(self.edges, Edge):
-            *_, from_edge = self.edges.foot(x)
-            nearest = jnp.argmin(from_edge.dot(from_edge))
-            return jax.tree.map(lambda field: field[nearest], self.edges), jnp.arange(from_edge.x.size) == nearest
-        best, best_squared, is_nearest = self.edges[0], None, []
-        for edge in self.edges:
-            *_, from_edge = edge.foot(x)
-            squared = compute_once(from_edge.dot(from_edge), x.x)
-            if best_squared is None:
-                best_squared = squared
-                is_nearest = [jnp.ones_like(squared, bool)]
-                continue
-            nearer = decide(squared < best_squared, x.x)
-            best = tree_where(nearer, edge, best)
-            best_squared = jnp.where(nearer, squared, best_squared)
-            is_nearest = [was & ~nearer for was in is_nearest] + [nearer]
-        return best, is_nearest
+    def _nearest_edge(self, x: Vec2) -> Int[Array, ""]:
+        """Return the index of the edge nearest to `x`."""
+        *_, from_edge = self.edges.foot(x)
+        return jnp.argmin(from_edge.dot(from_edge))
 
     def closest(self, x: Vec2) -> ClosestPoint:
-        return _closest_on_edge(self._nearest_edge(x)[0], x)
+        return _closest_on_edge(_at(self.edges, self._nearest_edge(x)), x)
 
     def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
         if self.convex:
             return (self.closest(x),)
-        edge, is_nearest = self._nearest_edge(x)
-        first = _closest_on_edge(edge, x)
-        other, on_edge, found = self._second_edge(x, is_nearest, first.distance)
+        nearest = self._nearest_edge(x)
+        first = _closest_on_edge(_at(self.edges, nearest), x)
+        on_edge, on_vertex, squared = _test_second_contacts(self.edges, x, nearest, first.distance)
+        second = jnp.argmin(jnp.where(on_edge | on_vertex, squared, jnp.inf))
+        other, on_edge, found = _at((self.edges, on_edge, on_edge | on_vertex), second)
         # For an edge, also past its end, the distance is that to the edge's line. For a vertex, distance and normal are
         # those of any closest vertex.
         at_vertex = _closest_on_edge(other, x)
         _, clipped, _ = other.foot(x)
         height = other.normal.dot(x - other.start)
-        perimeter = jnp.sum(self.edges.length) if isinstance(self.edges, Edge) else sum(e.length for e in self.edges)
-        distance = jnp.where(found, jnp.where(on_edge, height, at_vertex.distance), first.distance + perimeter)
+        out_of_reach = first.distance + jnp.sum(self.edges.length)
+        distance = jnp.where(found, jnp.where(on_edge, height, at_vertex.distance), out_of_reach)
         point = tree_where(found, other.start + other.along.scale(clipped), first.point)
         normal = tree_where(found, tree_where(on_edge, other.normal, at_vertex.normal), first.normal)
         return first, ClosestPoint(distance, point, normal)
 
-    def _second_edge(
-        self, x: Vec2, is_nearest: EdgeMask, nearest_distance: Scalar
-    ) -> tuple[Edge, Bool[Array, ""], Bool[Array, ""]]:
-        """Find the second contact.
-
-        Args:
-            x: Query point, m, body frame.
-            is_nearest: For each edge, whether it is the nearest one.
-            nearest_distance: Signed distance to the nearest edge, m.
-
-        Returns:
-            A tuple of the edge of the second contact, whether the contact is with the edge itself (else with its start
-            vertex), and whether there is a second contact.
-        """
-        if isinstance(self.edges, Edge):
-            is_nearest = jnp.asarray(is_nearest)
-            previous = jax.tree.map(lambda field: jnp.roll(field, 1), self.edges)
-            neighbors = (jnp.roll(is_nearest, 1), is_nearest, jnp.roll(is_nearest, -1))
-            on_edge, on_vertex, squared = _test_second_contact(self.edges, previous, x, neighbors, nearest_distance)
-            chosen = jnp.argmin(jnp.where(on_edge | on_vertex, squared, jnp.inf))
-            return jax.tree.map(lambda field: field[chosen], (self.edges, on_edge, on_edge | on_vertex))
-        count = len(self.edges)
-        best, best_squared = self.edges[0], jnp.full_like(nearest_distance, jnp.inf)
-        found_on_edge, found = jnp.zeros_like(nearest_distance, bool), jnp.zeros_like(nearest_distance, bool)
-        for k, edge in enumerate(self.edges):
-            neighbors = (is_nearest[k - 1], is_nearest[k], is_nearest[(k + 1) % count])
-            on_edge, on_vertex, squared = _test_second_contact(edge, self.edges[k - 1], x, neighbors, nearest_distance)
-            on_edge, nearer = compute_once((on_edge, (on_edge | on_vertex) & (squared < best_squared)), x.x)
-            best = tree_where(nearer, edge, best)
-            found_on_edge, best_squared = (
-                jnp.where(nearer, on_edge, found_on_edge),
-                jnp.where(nearer, squared, best_squared),
-            )
-            found = found | nearer
-        return best, found_on_edge, found
-
-    def _sweep_edge(self, edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        """Return the fraction of `path` of first contact with `edge` or its start vertex, or inf."""
-        rel = x - edge.start
-        approach = -edge.normal.dot(path)
-        gap = edge.normal.dot(rel) - radius
-        fraction = gap / jnp.where(approach > 0, approach, 1.0)
-        contact_position = rel.dot(edge.along) + fraction * path.dot(edge.along)
-        # The tolerance is for two cases that would be missed by roundoff: a disk that starts in contact, and a point
-        # that aims at a vertex.
-        tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + radius + edge.length)
-        on_edge = (contact_position >= -tolerance) & (contact_position <= edge.length + tolerance)
-        hits = (approach > 0) & (gap >= -tolerance) & (fraction <= 1) & on_edge
-        return jnp.minimum(
-            jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf), ray_circle_intersection(rel, path, radius)
-        )
-
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        if isinstance(self.edges, Edge):
-            # computed once, because the derivative of a minimum compares it with each value
-            return jnp.min(compute_once(self._sweep_edge(self.edges, x, path, radius), x.x))
-        fraction = self._sweep_edge(self.edges[0], x, path, radius)
-        for edge in self.edges[1:]:
-            fraction = jnp.minimum(fraction, self._sweep_edge(edge, x, path, radius))
-        return fraction
+        return -largest(-_first_touches(self.edges, x, path, radius))
+
+
+def _at(tree, index: Int[Array, ""]):
+    """The entry with this index of every array."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _first_touches(edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Float[Array, " edges"]:
+    """Return the fraction of `path` of first contact with each edge or its start vertex, or inf."""
+    rel = x - edge.start
+    approach = -edge.normal.dot(path)
+    gap = edge.normal.dot(rel) - radius
+    fraction = gap / jnp.where(approach > 0, approach, 1.0)
+    contact_position = rel.dot(edge.along) + fraction * path.dot(edge.along)
+    # The tolerance is for two cases that would be missed by roundoff: a disk that starts in contact, and a point that
+    # aims at a vertex.
+    tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + radius + edge.length)
+    on_edge = (contact_position >= -tolerance) & (contact_position <= edge.length + tolerance)
+    hits = (approach > 0) & (gap >= -tolerance) & (fraction <= 1) & on_edge
+    return jnp.minimum(jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf), ray_circle_intersection(rel, path, radius))
 
 
 def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
@@ -202,9 +145,7 @@ def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
     """
     position, clipped, from_edge = compute_once(edge.foot(x), x.x)
     projects_inside = (position > 0) & (position < edge.length)
-    bisector = tree_where(
-        position <= 0, Vec2(edge.bisector_a_x, edge.bisector_a_y), Vec2(edge.bisector_b_x, edge.bisector_b_y)
-    )
+    bisector = tree_where(position <= 0, edge.bisector_a, edge.bisector_b)
     squared = from_edge.dot(from_edge)
     on_vertex = squared <= jnp.finfo(squared.dtype).tiny
     length = jnp.sqrt(jnp.where(on_vertex, 1.0, squared))
@@ -217,8 +158,10 @@ def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
     return ClosestPoint(distance, edge.start + edge.along.scale(clipped), normal)
 
 
-def _test_second_contact(edge: Edge, previous: Edge, x: Vec2, is_nearest: tuple, nearest_distance: Scalar):
-    """Test whether an edge, or its start vertex, is another local minimum of the distance from `x`.
+def _test_second_contacts(
+    edge: Edge, x: Vec2, nearest: Int[Array, ""], nearest_distance: Scalar
+) -> tuple[Bool[Array, " edges"], Bool[Array, " edges"], Float[Array, " edges"]]:
+    """Test for each edge whether it, or its start vertex, is another local minimum of the distance from `x`.
 
     An edge is a second contact if `x` projects onto it and lies on its outer side. An edge that `x` faces only through
     the material is no contact.
@@ -229,11 +172,9 @@ def _test_second_contact(edge: Edge, previous: Edge, x: Vec2, is_nearest: tuple,
     still stopped by the other.
 
     Args:
-        edge: The edge to test.
-        previous: The edge before it.
+        edge: The edges to test.
         x: Query point, m, body frame.
-        is_nearest: Three booleans: whether the nearest edge is the edge before `edge`, `edge` itself, or the edge after
-            it.
+        nearest: Index of the nearest edge.
         nearest_distance: Signed distance to the nearest edge, m.
 
     Returns:
@@ -245,10 +186,13 @@ def _test_second_contact(edge: Edge, previous: Edge, x: Vec2, is_nearest: tuple,
     tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + edge.length)
     turn_tolerance = roundoff(jnp.ones_like(nearest_distance))
     reflex_a, reflex_b = edge.turn_a < -turn_tolerance, edge.turn_b < -turn_tolerance
-    previous_is_nearest, this_is_nearest, next_is_nearest = is_nearest
+    count = edge.length.size
+    index = jnp.arange(count)
+    is_nearest, next_is_nearest = index == nearest, (index + 1) % count == nearest
+    previous_is_nearest = index == (nearest + 1) % count
     shares_point = (previous_is_nearest & ~reflex_a) | (next_is_nearest & ~reflex_b)
     is_wedged = ((previous_is_nearest & reflex_a) | (next_is_nearest & reflex_b)) & (nearest_distance <= tolerance)
     is_faced = (position >= -tolerance) & (position <= edge.length + tolerance) & (edge.normal.dot(rel) >= -tolerance)
-    on_edge = ~this_is_nearest & ~shares_point & (is_faced | is_wedged)
-    in_vertex_sector = (position <= 0) & (rel.dot(previous.along) >= 0) & ~reflex_a
-    return on_edge, in_vertex_sector & ~this_is_nearest & ~previous_is_nearest & ~on_edge, from_edge.dot(from_edge)
+    on_edge = ~is_nearest & ~shares_point & (is_faced | is_wedged)
+    in_vertex_sector = (position <= 0) & (rel.dot(edge.previous) >= 0) & ~reflex_a
+    return on_edge, in_vertex_sector & ~is_nearest & ~previous_is_nearest & ~on_edge, from_edge.dot(from_edge)

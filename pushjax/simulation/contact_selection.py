@@ -16,7 +16,7 @@ from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, Candidates, take
-from pushjax.simulation.detection import DisplacementAt, edges, is_nonconvex_polygon, num_contacts
+from pushjax.simulation.detection import DisplacementAt, is_nonconvex_polygon, num_contacts
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Finger, Pad
 
@@ -122,7 +122,7 @@ def track_contacts(
     """
     if not isinstance(finger, Pad) or not isinstance(candidates, Candidate) or not is_nonconvex_polygon(outline):
         return chosen
-    pad_corners = len(edges(finger.shape.outline()))
+    pad_corners = len(finger.shape.vertices)
     # Index offset from a corner of the pad with its nearest edge to the same corner with its next nearest edge.
     twin_offset = candidates.distance.size - pad_corners
     indices = []

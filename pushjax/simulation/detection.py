@@ -19,9 +19,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import compute_once, decide, structure_and_shapes, tree_where
+from pushjax._internal.xla import largest, structure_and_shapes
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.ellipse import EllipseOutline
@@ -87,11 +87,11 @@ def contact_candidates(
         return _smooth_candidates(
             pad, outline, finger_pose.center, angle, length, _edge_supports(pad, outline, finger_pose)
         )
-    pad_corners = corners(pad).turned(angle, finger_pose.center)
+    pad_corners = Corner.of(pad).turned(angle, finger_pose.center)
     pad_on_slider, pad_on_next_edge = _vertex_edge_candidates(
         outline, pad_corners, displacement_at(pad_corners.point), length
     )
-    inverse_angle, slider_corners = Vec2(angle.x, -angle.y), corners(outline)
+    inverse_angle, slider_corners = Vec2(angle.x, -angle.y), Corner.of(outline)
     closest, _ = _vertex_edge_candidates(
         pad,
         slider_corners.turned(inverse_angle, (-finger_pose.center).unrotate(angle)),
@@ -117,13 +117,24 @@ class Corner(NamedTuple):
     onward: Vec2
     back: Vec2
 
+    @staticmethod
+    def of(polygon: Outline) -> "Corner":
+        """The corners of a polygon.
+
+        Raises:
+            TypeError: If the outline is not that of a polygon.
+        """
+        if not isinstance(polygon, PolygonOutline):
+            raise TypeError(f"not a polygon's outline: {type(polygon).__name__}")
+        return Corner(polygon.edges.start, polygon.edges.along, -polygon.edges.previous)
+
     def turned(self, angle: Vec2, shift: Vec2) -> "Corner":
         """The corners rotated by `angle`, a unit vector, and then translated by `shift`."""
         return Corner(shift + self.point.rotate(angle), self.onward.rotate(angle), self.back.rotate(angle))
 
 
 def _vertex_edge_candidates(
-    outline: Outline, corner: Corner, displacement: Vec2, length: Scalar
+    outline: PolygonOutline, corner: Corner, displacement: Vec2, length: Scalar
 ) -> tuple[Candidate, Candidate]:
     """For each corner, return the nearest edge of a polygon that it can touch, and the next nearest.
 
@@ -135,24 +146,22 @@ def _vertex_edge_candidates(
     polygon, may be closest to the wrong edge. A corner that is past the end of an edge touches nothing, although it is
     near.
     """
-    two_nearest: tuple[tuple[Candidate, Scalar, Scalar, Array], tuple[Candidate, Scalar, Scalar, Array]] | None = None
-    # a reflex corner cannot touch a straight edge
-    is_convex_corner = corner.onward.cross(corner.back) >= -roundoff(jnp.ones_like(corner.point.x))
-    sides = edges(outline)
-    inside = compute_once(_inside(sides, corner.point), corner.point.x)
-    for k, edge in enumerate(sides):
+    edge = outline.edges
+    own_displacement = jax.tree.map(lambda entry: jnp.broadcast_to(entry, corner.point.x.shape), displacement)
+
+    def two_nearest(corner: Corner, displacement: Vec2) -> tuple[Candidate, Candidate]:
+        # a reflex corner cannot touch a straight edge
+        is_convex_corner = corner.onward.cross(corner.back) >= -roundoff(jnp.ones_like(corner.point.x))
         relative = corner.point - edge.start
         along, height = relative.dot(edge.along), edge.normal.dot(relative)
         tolerance = END_TOLERANCE[edge.length.dtype.itemsize] * edge.length
-        begin, end = -tolerance, edge.length + tolerance
-        past = jnp.zeros(along.shape, bool)
-        if is_nonconvex_polygon(outline):
+        begin, end, past = -tolerance, edge.length + tolerance, jnp.zeros(along.shape, bool)
+        if not outline.convex:
             # An edge is extended past an inner corner: a point that is past the edge's end there is inside the slider,
             # behind this edge and the next.
-            before, after = sides[k - 1].along, sides[(k + 1) % len(sides)].along
             past = (along < begin) | (along > end)
-            begin -= jnp.where(before.cross(edge.along) < 0, REFLEX_EXTENSION * length, 0.0)
-            end += jnp.where(edge.along.cross(after) < 0, REFLEX_EXTENSION * length, 0.0)
+            begin -= jnp.where(edge.turn_a < 0, REFLEX_EXTENSION * length, 0.0)
+            end += jnp.where(edge.turn_b < 0, REFLEX_EXTENSION * length, 0.0)
         faces = (
             (corner.onward.dot(edge.normal) >= -TILT_TOLERANCE)
             & (corner.back.dot(edge.normal) >= -TILT_TOLERANCE)
@@ -160,46 +169,34 @@ def _vertex_edge_candidates(
         )
         # A point that is behind an edge but not inside the polygon is on the far side of another edge. A point that is
         # deeper than twice the limit counts as on the far side, too.
-        behind = (height >= -tolerance) | (inside & (height > -2 * MAX_PENETRATION * length))
+        behind = (height >= -tolerance) | (_is_inside(edge, corner.point) & (height > -2 * MAX_PENETRATION * length))
         touches = faces & (along >= begin) & (along <= end) & behind
-        candidate = Candidate(
-            jnp.where(touches, height, OUT_OF_REACH), corner.point - edge.normal.scale(height), -edge.normal
-        )
-        gap = jnp.maximum(jnp.abs(candidate.distance), tolerance)
-        pressing = jnp.broadcast_to(-edge.normal.dot(displacement), gap.shape)
-        entry = candidate, gap, pressing, past
-        if two_nearest is None:
-            nothing = candidate._replace(distance=jnp.full_like(gap, OUT_OF_REACH))
-            two_nearest = entry, (nothing, jnp.full_like(gap, OUT_OF_REACH), pressing, past)
-            continue
-        first, second = two_nearest
-        nearer = (gap < first[1]) | ((gap == tolerance) & (first[1] <= tolerance) & (pressing > first[2]))
-        nearer, second_nearer = compute_once((nearer, gap < second[1]), corner.point.x)
-        two_nearest = (
-            tree_where(nearer, entry, first),
-            tree_where(nearer, first, tree_where(second_nearer, entry, second)),
-        )
-    assert two_nearest is not None
-    (nearest, *_, past), (second_nearest, *_, second_past) = two_nearest
-    # next to a convex corner, a point inside is pushed out by the nearest edge alone
-    outside = second_nearest.distance >= -END_TOLERANCE[length.dtype.itemsize] * length
-    keeps_second = decide(outside | past | second_past, corner.point.x)
-    return nearest, second_nearest._replace(distance=jnp.where(keeps_second, second_nearest.distance, OUT_OF_REACH))
+        gap = jnp.maximum(jnp.where(touches, jnp.abs(height), OUT_OF_REACH), tolerance)
+        lies_on = touches & (gap <= tolerance)
+        most_pressed = jnp.argmax(jnp.where(lies_on, -edge.normal.dot(displacement), -jnp.inf))
+        first = jnp.where(jnp.any(lies_on), most_pressed, jnp.argmin(gap))
+        second = jnp.argmin(jnp.where(jnp.arange(gap.size) == first, jnp.inf, gap))
+        distance = jnp.where(touches, height, OUT_OF_REACH)
+        candidates = Candidate(distance, corner.point - edge.normal.scale(height), -edge.normal)
+        nearest, other = (jax.tree.map(lambda leaf, k=k: leaf[k], candidates) for k in (first, second))
+        # next to a convex corner, a point inside is pushed out by the nearest edge alone
+        outside = other.distance >= -END_TOLERANCE[length.dtype.itemsize] * length
+        keeps_other = outside | past[first] | past[second]
+        return nearest, other._replace(distance=jnp.where(keeps_other, other.distance, OUT_OF_REACH))
+
+    return jax.vmap(two_nearest)(corner, own_displacement)
 
 
-def _inside(sides: tuple[Edge, ...], point: Vec2) -> Bool[Array, " points"]:
-    """Whether points lie inside a polygon: a ray along x crosses its outline an odd number of times."""
-    inside = jnp.zeros(point.x.shape, bool)
-    for k, edge in enumerate(sides):
-        below, next_below = edge.start.y <= point.y, sides[(k + 1) % len(sides)].start.y <= point.y
-        left = edge.normal.dot(point - edge.start) < 0
-        inside ^= (below != next_below) & (left == below)
-    return inside
+def _is_inside(edge: Edge, point: Vec2) -> Bool[Array, ""]:
+    """Whether a point lies inside a polygon: a ray along x crosses its outline an odd number of times."""
+    below = edge.start.y <= point.y
+    left = edge.normal.dot(point - edge.start) < 0
+    return jnp.sum((below != jnp.roll(below, -1)) & (left == below)) % 2 == 1
 
 
 def _edge_supports(pad: PolygonOutline, outline: Outline, finger_pose: FingerPose) -> EdgeSupport:
     """The points of a smooth outline that face a pad's edges."""
-    return pad_on_curve.edge_support_points(edges(pad), outline, finger_pose.center, _pad_angle(finger_pose))
+    return pad_on_curve.edge_support_points(pad.edges, outline, finger_pose.center, _pad_angle(finger_pose))
 
 
 def _smooth_candidates(
@@ -209,7 +206,7 @@ def _smooth_candidates(
 
     They are the closest point of the outline for each corner of the pad, and then the points that face the pad's edges.
     """
-    too_deep, corner = -2 * MAX_PENETRATION * length, corners(pad).turned(angle, center)
+    too_deep, corner = -2 * MAX_PENETRATION * length, Corner.of(pad).turned(angle, center)
     closest = jax.vmap(outline.closest)(corner.point)
     faces = (corner.onward.dot(closest.normal) >= -TILT_TOLERANCE) & (
         corner.back.dot(closest.normal) >= -TILT_TOLERANCE
@@ -276,58 +273,35 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
     pad, angle = finger.shape.outline(), _pad_angle(finger_pose)
     if isinstance(outline, DiskOutline):
         return outline.radius - pad.closest((outline.center - finger_pose.center).unrotate(angle)).distance
-    pad_corners = finger_pose.center + corners(pad).point.rotate(angle)
+    pad_corners = finger_pose.center + pad.edges.start.rotate(angle)
     if not isinstance(outline, PolygonOutline):
         return pad_on_curve.penetration_depth(pad, _edge_supports(pad, outline, finger_pose), outline, pad_corners)
-    slider_corners = (corners(outline).point - finger_pose.center).unrotate(angle)
-    # computed once, because the derivative of a maximum compares it with each value
-    slider_in_pad, pad_in_slider = compute_once(
-        (pad.closest(slider_corners).distance, outline.closest(pad_corners).distance), finger_pose.center.x
+    slider_corners = (outline.edges.start - finger_pose.center).unrotate(angle)
+    depths = (
+        -jax.vmap(pad.closest)(slider_corners).distance,
+        -jax.vmap(outline.closest)(pad_corners).distance,
+        _chord_depths(pad, slider_corners),
     )
-    return jnp.maximum(jnp.maximum(jnp.max(-pad_in_slider), jnp.max(-slider_in_pad)), _chord_depth(pad, slider_corners))
+    return largest(jnp.concatenate(depths))
 
 
-def _chord_depth(pad: PolygonOutline, slider_corners: Vec2) -> Scalar:
-    """Depth in the pad of the midpoint of the chord that the pad cuts from an edge; negative if it cuts none.
+def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Float[Array, " edges"]:
+    """Depth in the pad of the midpoint of the chord that the pad cuts from each edge of a slider; -inf without a chord.
 
-    The edges join consecutive corners of the slider, here in the pad's frame, and the deepest midpoint counts. Depth is
-    concave along a chord, so the midpoint is at least half as deep as the deepest point of the chord.
+    The edges join consecutive corners of the slider, here in the pad's frame. Depth is concave along a chord, so the
+    midpoint is at least half as deep as the deepest point of the chord.
     """
-    edge_depths = [-side.normal.dot(slider_corners - side.start) for side in edges(pad)]
-    depths = compute_once([(first, jnp.roll(first, -1)) for first in edge_depths], slider_corners.x[0])
-    enter, leave = jnp.zeros_like(slider_corners.x), jnp.ones_like(slider_corners.x)
-    for first, last in depths:
+    side = pad.edges
+
+    def depth_of_chord(start: Vec2, end: Vec2) -> Scalar:
+        first, last = (-side.normal.dot(corner - side.start) for corner in (start, end))
         crossing = first / jnp.where(first != last, first - last, 1.0)
-        enter = jnp.where((first < 0) & (last > first), jnp.maximum(enter, crossing), enter)
-        leave = jnp.where((last < 0) & (first > last), jnp.minimum(leave, crossing), leave)
-    enter, leave = compute_once((enter, leave), slider_corners.x[0])
-    middle = (enter + leave) / 2
-    depth = functools.reduce(jnp.minimum, [first + middle * (last - first) for first, last in depths])
-    return jnp.max(jnp.where(enter < leave, depth, -jnp.inf))
+        enter = largest(jnp.where((first < 0) & (last > first), jnp.maximum(crossing, 0), 0.0))
+        leave = -largest(-jnp.where((last < 0) & (first > last), jnp.minimum(crossing, 1), 1.0))
+        depth = -largest(-(first + (enter + leave) / 2 * (last - first)))
+        return jnp.where(enter < leave, depth, -jnp.inf)
 
-
-def edges(outline: Outline) -> tuple[Edge, ...]:
-    """Return the edges of a polygon with at most twelve; pads, and the polygons that they touch, must be such polygons.
-
-    Raises:
-        TypeError: If the outline is not that of a polygon.
-        ValueError: If the polygon has more edges.
-    """
-    if not isinstance(outline, PolygonOutline):
-        raise TypeError(f"not a polygon's outline: {type(outline).__name__}")
-    if isinstance(outline.edges, Edge):
-        count = outline.edges.start_x.shape[0]
-        raise ValueError(
-            f"hand: pads can touch a Polygon of up to twelve vertices; got {count}, in a pad or in the polygon"
-        )
-    return outline.edges
-
-
-def corners(outline: Outline) -> Corner:
-    """The corners of a polygon with few edges, as arrays."""
-    sides = edges(outline)
-    entries_by_corner = [Corner(edge.start, edge.along, -sides[k - 1].along) for k, edge in enumerate(sides)]
-    return jax.tree.map(lambda *entries: jnp.stack(entries), *entries_by_corner)
+    return jax.vmap(depth_of_chord)(slider_corners, jax.tree.map(lambda entry: jnp.roll(entry, -1), slider_corners))
 
 
 def _pad_angle(finger_pose: FingerPose) -> Vec2:

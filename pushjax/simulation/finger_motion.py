@@ -11,7 +11,7 @@ from pushjax._internal.xla import compute_once, map_items
 from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, sinc, wrap_to_pi
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import FingerPose
-from pushjax.simulation.detection import corners, penetration_depth
+from pushjax.simulation.detection import penetration_depth
 from pushjax.simulation.fixtures import Fixtures, Wall
 from pushjax.simulation.hand import Finger, Hand, Pad, RoundFinger
 
@@ -144,7 +144,7 @@ class FingerMotion(NamedTuple):
         """Displacement of each corner of a pad over the step, world, m."""
         assert self.angle is not None
         assert self.turning is not None
-        corner = corners(pad.shape.outline()).point
+        corner = Vec2.of(pad.shape.vertices.T)
         turned = corner.rotate(cos_sin(self.angle + self.turning)) - corner.rotate(cos_sin(self.angle))
         return Vec2(self.path.x + turned.x, self.path.y + turned.y)
 

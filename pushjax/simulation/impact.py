@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from pushjax._internal.xla import compute_once, decide
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import Outline
-from pushjax.simulation.detection import corners, is_convex, penetration_depth
+from pushjax.simulation.detection import is_convex, penetration_depth
 from pushjax.simulation.finger_motion import TOUCHING, BodyFrame, FingerMotion
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Pad, RoundFinger
@@ -82,7 +82,7 @@ def _advanced(motion: FingerMotion, outline: Outline, start: BodyFrame, length: 
         if isinstance(still_motion.finger, Pad):
             assert pose.angle is not None
             assert still_motion.turning is not None
-            offset = corners(still_motion.finger.shape.outline()).point.rotate(pose.angle)
+            offset = Vec2.of(still_motion.finger.shape.vertices.T).rotate(pose.angle)
             approach = jnp.max(approach - normal.dot(offset.perp()) * still_motion.turning)
         turning = jnp.zeros_like(x) if still_motion.turning is None else jnp.abs(still_motion.turning)
         return gap, jnp.maximum(approach, 0.0), largest_speed * turning

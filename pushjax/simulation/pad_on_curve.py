@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import compute_once
+from pushjax._internal.xla import largest
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Outline
@@ -39,11 +39,11 @@ class EdgeSupport(NamedTuple):
     height: Scalar
 
 
-def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2, angle: Vec2) -> EdgeSupport:
+def edge_support_points(edges: Edge, outline: Outline, center: Vec2, angle: Vec2) -> EdgeSupport:
     """Find the support points of an outline: those that face each edge of a pad.
 
     Args:
-        edges: Edges of the pad, in its own frame.
+        edges: Edges of the pad, as arrays, in its own frame.
         outline: The smooth outline.
         center: Center of the pad in the outline's frame, m.
         angle: Angle of the pad in the outline's frame, as a unit vector.
@@ -58,16 +58,11 @@ def edge_support_points(edges: tuple[Edge, ...], outline: Outline, center: Vec2,
         normal, length = jax.tree.map(lambda entry: jnp.full_like(height, entry), (normal, edge.length))
         return EdgeSupport(facing.valid, facing.point, normal, local, relative.dot(edge.along), length, height)
 
-    # All edges at once: unrolled edge by edge, the program for a jaw took much longer to trace and to compile.
-    stacked = jax.tree.map(lambda *entries: jnp.stack(entries), *edges)
-    return jax.tree.map(jnp.ravel, jax.vmap(supports_of_edge)(stacked))
+    return jax.tree.map(jnp.ravel, jax.vmap(supports_of_edge)(edges))
 
 
 def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
     """Depth of the deepest corner in the outline, or of the deepest support point in the pad, m; negative if apart."""
-    # The derivative of a maximum compares it with each value. Were these computed anew there, none might be equal.
-    corner_distance, support_distance = compute_once(
-        (jax.vmap(outline.closest)(corners).distance, pad.closest(supports.local).distance), corners.x[0]
-    )
-    support_depth = jnp.max(jnp.where(supports.valid, -support_distance, -jnp.inf))
-    return jnp.maximum(jnp.max(-corner_distance), support_depth)
+    corner_depths = -jax.vmap(outline.closest)(corners).distance
+    support_depths = jnp.where(supports.valid, -jax.vmap(pad.closest)(supports.local).distance, -jnp.inf)
+    return largest(jnp.concatenate([corner_depths, support_depths]))

@@ -7,9 +7,8 @@ the wall.
 import jax
 import jax.numpy as jnp
 
-from pushjax._math.vec import Vec2
 from pushjax.geometry.disk import DiskOutline
-from pushjax.geometry.polygon_outline import Edge, PolygonOutline
+from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, FingerPose
 
@@ -24,7 +23,7 @@ def wall_candidates(outline: Outline, wall: FingerPose) -> Candidate:
     normal = wall.angle
     assert normal is not None
     if isinstance(outline, PolygonOutline):
-        points = _vertices(outline)
+        points = outline.edges.start
         valid = jnp.ones(points.x.shape, bool)
     else:
         points, valid = outline.facing(-normal)
@@ -35,10 +34,3 @@ def wall_candidates(outline: Outline, wall: FingerPose) -> Candidate:
 def num_wall_contacts(outline: Outline) -> int:
     """Number of contacts with one wall."""
     return 1 if isinstance(outline, DiskOutline) else 2
-
-
-def _vertices(outline: PolygonOutline) -> Vec2:
-    """Vertices of a polygon, as arrays."""
-    if isinstance(outline.edges, Edge):
-        return outline.edges.start
-    return jax.tree.map(lambda *entries: jnp.stack(entries), *(edge.start for edge in outline.edges))

@@ -20,6 +20,7 @@ STEPS = 3000  # a jam is located to a step: 15 to 40 um of closing, some 0.05 de
 # conditions, which have one solution there, rotate it about its middle (see
 # test_recorded_drift_violates_the_conditions).
 DRIFTED = {1, 11}
+FINE_POLYGON = pj.Polygon.regular(64, 0.02)
 
 
 def six(vertices: np.ndarray) -> np.ndarray:
@@ -373,6 +374,12 @@ def test_grasps_refuse_bad_input():
         pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.02), (0, 0, 0, 0.01), 5), **still)
     with pytest.raises(ValueError, match=r"friction has shape \(3,\); expected a scalar or \(2,\)"):
         pj.rollout(slider, jaw, pj.line((0, 0, 0, 0.05), (0, 0, 0, 0.04), 5), pose=jnp.zeros(3), friction=jnp.ones(3))
-    many = pj.Slider(pj.Polygon.regular(13, 0.02), slider.surface)
-    with pytest.raises(ValueError, match="pads can touch a Polygon of up to twelve vertices; got 13"):
-        pj.rollout(many, jaw, pj.line((0, 0, 0, 0.07), (0, 0, 0, 0.06), 5), **still)
+
+
+def test_a_jaw_grasps_a_polygon_of_many_vertices_as_it_grasps_the_disk():
+    surface, jaw = pj.Ellipsoid(np.eye(3), 0.02), pj.Hand.parallel_jaw(0.027, 0.01)
+    path, held = pj.line((0, 0, 0, 0.05), (0, 0, 0, 0.038), 24), {"pose": (0.004, 0.003, 0.2), "friction": 0.3}
+    polygon, disk = (pj.rollout(pj.Slider(s, surface), jaw, path, **held) for s in (FINE_POLYGON, pj.Disk(0.02)))
+    assert polygon.status[-1] == disk.status[-1] == pj.Status.GRASPED
+    # the sagitta of an edge, and the last part of a step
+    np.testing.assert_allclose(polygon.pose[-1, :2], disk.pose[-1, :2], atol=5e-5)

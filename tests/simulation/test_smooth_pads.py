@@ -132,6 +132,26 @@ def test_places_are_at_their_distance(name):
         assert min(float(d) for d in touches.distance) == pytest.approx(-float(deep(at)), abs=1e-9)
 
 
+@pytest.mark.parametrize("name", ["ellipse", "butterfly", "disk", "square", "star"])
+def test_the_gradient_of_an_overlap_has_length_one(name, rng):
+    """The derivative of a maximum must not lose parts where the compiler rounds what it compares in two ways."""
+    angle = np.pi * np.arange(10) / 5
+    star = np.where(np.arange(10) % 2, 0.009, 0.02)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    known = shapes() | {"disk": pj.Disk(0.02), "square": pj.Polygon.rectangle(0.03, 0.03), "star": pj.Polygon(star)}
+    outline = known[name].outline()
+
+    def depth(center, turn):
+        pose = FingerPose(Vec2.of(center), Vec2(jnp.cos(turn), jnp.sin(turn)))
+        return penetration_depth(pad(), outline, pose)
+
+    centers, turns = rng.uniform(-0.035, 0.035, (400, 2)), rng.uniform(-3, 3, 400)
+    depths, slopes = jax.jit(jax.vmap(jax.value_and_grad(depth)))(centers, turns)
+    deepest = 0 if name in ("square", "star") else 0.004  # the depth of edges that cross is that of a chord's middle
+    near = (depths > -0.004) & (depths < deepest)
+    assert near.sum() > 30
+    np.testing.assert_allclose(np.linalg.norm(slopes[near], axis=1), 1, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_a_jaw_closes_to_the_width():
     """A wide jaw closes to the ellipse's width.
