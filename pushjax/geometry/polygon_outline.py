@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, largest, tree_where
+from pushjax._internal.xla import compute_once, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersection, roundoff
 
@@ -112,7 +112,8 @@ class PolygonOutline(Outline):
         return first, ClosestPoint(distance, point, normal)
 
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        return -largest(-_first_touches(self.edges, x, path, radius))
+        # computed once, because the derivative of a minimum compares it with each value
+        return jnp.min(compute_once(_first_touches(self.edges, x, path, radius), x.x))
 
 
 def _at(tree, index: Int[Array, ""]):
