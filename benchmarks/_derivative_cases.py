@@ -166,8 +166,8 @@ def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray
         path = first[None] + jnp.arange(steps + 1)[:, None] / steps * (last - first)[None]
         run = pj.rollout(slider, hand, path, pose=x[2:5] * unit[:3], friction=x[:2])
         travel = last - first
-        done = (run.configuration - first) @ travel / (travel @ travel)
-        stops = jnp.round(done[-1:] * steps / SMALLEST_PART).astype(jnp.int32)
+        done = (run.configuration[-1] - first) @ travel / (travel @ travel)
+        stops = jnp.round(done * steps / SMALLEST_PART).astype(jnp.int32)[None]
         return scaled(run), jnp.concatenate([run.status, run.mode.ravel(), stops])
 
     n = len(given[0])

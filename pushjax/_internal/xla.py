@@ -90,9 +90,15 @@ def largest(values: Float[Array, " values"]) -> Scalar:
     """Return the largest entry.
 
     The derivative of `max` compares the maximum with each entry, and finds none equal where the compiler rounds the
-    entries twice. An index is found once.
+    entries twice. An index is found once. A masked sum is differentiated without a scatter.
     """
-    return values[jnp.argmax(values)]
+    is_largest = jnp.arange(values.size) == jnp.argmax(values)
+    return jnp.sum(jnp.where(is_largest, values, 0.0))
+
+
+def smallest(values: Float[Array, " values"]) -> Scalar:
+    """Return the smallest entry, like `largest`."""
+    return -largest(-values)
 
 
 def structure_and_shapes(tree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:

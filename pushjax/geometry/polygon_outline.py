@@ -98,6 +98,7 @@ class PolygonOutline(Outline):
         nearest = self._nearest_edge(x)
         first = _closest_on_edge(_at(self.edges, nearest), x)
         on_edge, on_vertex, squared = _test_second_contacts(self.edges, x, nearest, first.distance)
+        on_edge, on_vertex = compute_once((on_edge, on_vertex), x.x)
         second = jnp.argmin(jnp.where(on_edge | on_vertex, squared, jnp.inf))
         other, on_edge, found = _at((self.edges, on_edge, on_edge | on_vertex), second)
         # For an edge, also past its end, the distance is that to the edge's line. For a vertex, distance and normal are

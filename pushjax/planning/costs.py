@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_non_negative, check_positive, check_shape
+from pushjax._internal.xla import smallest
 from pushjax._math.vec import Vec2, norm
 from pushjax.geometry import se2
 from pushjax.geometry.polygon import Polygon
@@ -129,7 +130,7 @@ class WayPoints(Cost):
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         poses = _poses(push)
-        nearest = [jnp.min(goal.squared_error(poses)) for goal in self.goals]
+        nearest = [smallest(goal.squared_error(poses)) for goal in self.goals]
         return sum(nearest, jnp.zeros((), poses.dtype))
 
 
@@ -189,7 +190,7 @@ class Clearance(Cost):
                 continue
             corners = se2.transform(each.pose, _outline_points(each.shape))
             found.append(_shape_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
-        return jnp.min(jnp.stack(found))
+        return smallest(jnp.stack(found))
 
 
 class HandClearance(Cost):
@@ -220,13 +221,13 @@ class HandClearance(Cost):
         for each in self.fixtures:
             for finger, radius in enumerate(self.hand.radius):
                 found.append(_fixture_distance(each, centers[:, finger]) - radius)
-        return (jnp.maximum(self.distance - jnp.min(jnp.stack(found)), 0) / self.distance) ** 2
+        return (jnp.maximum(self.distance - smallest(jnp.stack(found)), 0) / self.distance) ** 2
 
 
 def _fixture_distance(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest distance of points from a wall or fixture, m, negative inside."""
     if isinstance(fixture, Wall):
-        return jnp.min((points - fixture.point[None]) @ fixture.normal)
+        return smallest((points - fixture.point[None]) @ fixture.normal)
     return _shape_distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
 
 
@@ -247,7 +248,7 @@ def _outline_points(shape: Shape) -> Float[Array, "points 2"]:
 def _shape_distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest signed distance of points from a shape, both in its body frame, m."""
     outline = shape.outline()
-    return jnp.min(jax.vmap(lambda point: outline.closest(Vec2.of(point)).distance)(points))
+    return smallest(jax.vmap(lambda point: outline.closest(Vec2.of(point)).distance)(points))
 
 
 def _poses(push: Trajectory) -> Float[Array, "poses 3"]:

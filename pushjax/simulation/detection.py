@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import largest, structure_and_shapes
+from pushjax._internal.xla import largest, smallest, structure_and_shapes
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.ellipse import EllipseOutline
@@ -118,14 +118,8 @@ class Corner(NamedTuple):
     back: Vec2
 
     @staticmethod
-    def of(polygon: Outline) -> "Corner":
-        """The corners of a polygon.
-
-        Raises:
-            TypeError: If the outline is not that of a polygon.
-        """
-        if not isinstance(polygon, PolygonOutline):
-            raise TypeError(f"not a polygon's outline: {type(polygon).__name__}")
+    def of(polygon: PolygonOutline) -> "Corner":
+        """The corners of a polygon."""
         return Corner(polygon.edges.start, polygon.edges.along, -polygon.edges.previous)
 
     def turned(self, angle: Vec2, shift: Vec2) -> "Corner":
@@ -286,7 +280,7 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
 
 
 def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Float[Array, " edges"]:
-    """Depth in the pad of the midpoint of the chord that the pad cuts from each edge of a slider; -inf without a chord.
+    """Depth in the pad of the midpoint of the chord that it cuts from each edge of a slider; negative without a chord.
 
     The edges join consecutive corners of the slider, here in the pad's frame. Depth is concave along a chord, so the
     midpoint is at least half as deep as the deepest point of the chord.
@@ -297,8 +291,8 @@ def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Float[Array, " e
         first, last = (-side.normal.dot(corner - side.start) for corner in (start, end))
         crossing = first / jnp.where(first != last, first - last, 1.0)
         enter = largest(jnp.where((first < 0) & (last > first), jnp.maximum(crossing, 0), 0.0))
-        leave = -largest(-jnp.where((last < 0) & (first > last), jnp.minimum(crossing, 1), 1.0))
-        depth = -largest(-(first + (enter + leave) / 2 * (last - first)))
+        leave = smallest(jnp.where((last < 0) & (first > last), jnp.minimum(crossing, 1), 1.0))
+        depth = smallest(first + (enter + leave) / 2 * (last - first))
         return jnp.where(enter < leave, depth, -jnp.inf)
 
     return jax.vmap(depth_of_chord)(slider_corners, jax.tree.map(lambda entry: jnp.roll(entry, -1), slider_corners))

@@ -152,6 +152,21 @@ def test_the_gradient_of_an_overlap_has_length_one(name, rng):
     np.testing.assert_allclose(np.linalg.norm(slopes[near], axis=1), 1, rtol=1e-6)
 
 
+@pytest.mark.parametrize("shift", [0, 1, 3])
+def test_a_corner_on_a_vertex_touches_the_edge_that_it_is_pressed_against(shift):
+    """It does so whichever of the two edges is longer, and wherever the vertices begin."""
+    vertices = 1e-3 * np.array([(0, 0), (120, 0), (120, 40), (40, 40), (40, 80), (0, 80)], float)
+    outline = pj.Polygon(np.roll(vertices, shift, axis=0)).outline()
+    corner = np.asarray(pad().shape.vertices)[np.argmax(np.asarray(pad().shape.vertices) @ [-1, 1])]
+    pose = placed(0.12 - corner[0], -corner[1], 0.0)
+    for push, normal in (((0.0, 1e-3), (0, 1)), ((-1e-3, 0.0), (-1, 0))):
+        displacement, of_pad = Vec2.of(jnp.asarray(push)), len(pad().shape.vertices)
+        found = contact_candidates(pad(), outline, pose, lambda _, d=displacement: d, jnp.asarray(LENGTH))
+        touching = int(np.argmin(np.abs(np.asarray(found.distance)[:of_pad])))
+        np.testing.assert_allclose(found.distance[touching], 0, atol=1e-12)
+        np.testing.assert_allclose([found.normal.x[touching], found.normal.y[touching]], normal, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_jaw_closes_to_the_width():
     """A wide jaw closes to the ellipse's width.
