@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 Scalar = Float[Array, ""]
 
@@ -84,6 +84,11 @@ def update_if(condition: Bool[Array, ""], update: Callable, state):
 def tree_where(condition, yes, no):
     """Apply `where` to each leaf of two pytrees of scalars with the same structure."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def entry_at(tree, index: Int[Array, ""]):
+    """Return the entry with this index of every array of a pytree."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def largest(values: Float[Array, " values"]) -> Scalar:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, tree_where
+from pushjax._internal.xla import compute_once, entry_at, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersection, roundoff
 
@@ -90,17 +90,17 @@ class PolygonOutline(Outline):
         return jnp.argmin(from_edge.dot(from_edge))
 
     def closest(self, x: Vec2) -> ClosestPoint:
-        return _closest_on_edge(_at(self.edges, self._nearest_edge(x)), x)
+        return _closest_on_edge(entry_at(self.edges, self._nearest_edge(x)), x)
 
     def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
         if self.convex:
             return (self.closest(x),)
         nearest = self._nearest_edge(x)
-        first = _closest_on_edge(_at(self.edges, nearest), x)
+        first = _closest_on_edge(entry_at(self.edges, nearest), x)
         on_edge, on_vertex, squared = _test_second_contacts(self.edges, x, nearest, first.distance)
         on_edge, on_vertex = compute_once((on_edge, on_vertex), x.x)
         second = jnp.argmin(jnp.where(on_edge | on_vertex, squared, jnp.inf))
-        other, on_edge, found = _at((self.edges, on_edge, on_edge | on_vertex), second)
+        other, on_edge, found = entry_at((self.edges, on_edge, on_edge | on_vertex), second)
         # For an edge, also past its end, the distance is that to the edge's line. For a vertex, distance and normal are
         # those of any closest vertex.
         at_vertex = _closest_on_edge(other, x)
@@ -115,11 +115,6 @@ class PolygonOutline(Outline):
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
         # computed once, because the derivative of a minimum compares it with each value
         return jnp.min(compute_once(_first_touches(self.edges, x, path, radius), x.x))
-
-
-def _at(tree, index: Int[Array, ""]):
-    """The entry with this index of every array."""
-    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 def _first_touches(edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Float[Array, " edges"]:

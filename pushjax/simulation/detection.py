@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import largest, smallest, structure_and_shapes
+from pushjax._internal.xla import entry_at, largest, smallest, structure_and_shapes
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.ellipse import EllipseOutline
@@ -172,7 +172,7 @@ def _vertex_edge_candidates(
         second = jnp.argmin(jnp.where(jnp.arange(gap.size) == first, jnp.inf, gap))
         distance = jnp.where(touches, height, OUT_OF_REACH)
         candidates = Candidate(distance, corner.point - edge.normal.scale(height), -edge.normal)
-        nearest, other = (jax.tree.map(lambda leaf, k=k: leaf[k], candidates) for k in (first, second))
+        nearest, other = (entry_at(candidates, k) for k in (first, second))
         # next to a convex corner, a point inside is pushed out by the nearest edge alone
         outside = other.distance >= -END_TOLERANCE[length.dtype.itemsize] * length
         keeps_other = outside | past[first] | past[second]
