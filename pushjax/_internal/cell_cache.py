@@ -17,19 +17,7 @@ Labels = dict[str, str]
 
 
 class CellCache:
-    """Cells of a run, saved in a file until `delete` is called.
-
-    Args:
-        experiment: Name of the experiment.
-        folder: Folder of the file. If the file exists, its cells are loaded. None: the cells are not saved.
-        settings: Settings of the run.
-
-    Raises:
-        ValueError: If the file holds the cells of a run with other settings.
-
-    Attributes:
-        cells: All cells known so far.
-    """
+    """Cells of a run, saved in a file until `delete` is called."""
 
     def __init__(self, experiment: str, folder: Path | None, settings: dict[str, Any]):
         self.path = None if folder is None else _cache_file(experiment, folder)
@@ -47,23 +35,15 @@ class CellCache:
         todo: Sequence[tuple[Labels, Callable[[], dict[str, Any]]]],
         progress: ProgressCallback = no_progress,
     ) -> list[dict[str, Any]]:
-        """Return the cells of a run, and compute those that are not known.
-
-        A cell is known if there is one with its labels. The others are computed and saved.
-
-        Args:
-            todo: Labels of each cell, and the function that computes the rest of it.
-            progress: Called with the number of cells done and their total.
-
-        Returns:
-            The cells, in the order of `todo`. A computed one ends with `run_s`, the time that it took in s.
-        """
+        """Return the cells of a run in the order of `todo`, and compute and save those that are not known."""
         cells = []
+        # a known cell has all these labels; `compute` returns the rest of a cell
         for labels, compute in todo:
             cell = next((cell for cell in self.cells if labels.items() <= cell.items()), None)
             if cell is None:
                 begin = time.perf_counter()
                 results = compute()
+                # `run_s` is the time of the computation, s
                 cell = self.add(labels | results | {"run_s": time.perf_counter() - begin})
             cells.append(cell)
             progress(len(cells), len(todo))
@@ -80,7 +60,7 @@ class CellCache:
 
     @staticmethod
     def delete(experiment: str, folder: Path) -> None:
-        """Delete the file of an experiment, if there is one: to be called when the results are on the disk."""
+        """Delete the file of an experiment, if there is one, once the results are on the disk."""
         _cache_file(experiment, folder).unlink(missing_ok=True)
 
 

@@ -1,8 +1,7 @@
 """Checks of arguments, and their conversion to arrays.
 
-A value is checked if it is known. Inside `jit`, `vmap` or `grad` it may be a tracer: its shape is still checked, its
-values are not, and an invalid value is reported as a status. Every message names the argument, the value that was given
-and the values that are allowed.
+A value is checked if it is known. Of a tracer (inside `jit`, `vmap` or `grad`) only the shape is checked, and a status
+reports an invalid value. Every message names the argument, the given value and the allowed values.
 """
 
 import functools
@@ -30,18 +29,7 @@ def concrete(value: Any) -> np.ndarray | None:
 
 
 def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array:
-    """Return `value` as a floating array.
-
-    Args:
-        value: Array, number, or nested sequence of numbers.
-        dtype: Dtype of the result. Default: the value's own dtype if that is floating, else the default floating dtype
-            (float32 unless x64 is enabled).
-        name: Name of the argument, for messages.
-
-    Raises:
-        TypeError: If the value does not consist of real numbers, or has fewer than 32 bits.
-        ValueError: If the rows of a nested sequence differ in length.
-    """
+    """Return `value` (array, number, nested sequence) as a floating array; TypeError unless it holds real numbers."""
     array = value
     if not isinstance(value, jax.Array):
         holds_jax_arrays = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
@@ -53,6 +41,7 @@ def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array
         raise TypeError(f"{name}: expected real numbers; got {value!r}")
     if jnp.issubdtype(array.dtype, jnp.floating) and array.dtype.itemsize < 4:
         raise TypeError(f"{name}: expected float32 or float64; got {array.dtype}, which is too coarse for contacts")
+    # By default the result has the value's own dtype if that is floating, else the default one (float32 without x64).
     if dtype is None:
         is_floating = jnp.issubdtype(array.dtype, jnp.floating)
         dtype = jax.dtypes.canonicalize_dtype(array.dtype) if is_floating else jnp.result_type(float)
@@ -62,26 +51,16 @@ def as_float(value: Any, dtype: Any = None, name: str = "argument") -> jax.Array
 
 
 def on_device(array: np.ndarray) -> jax.Array:
-    """Return `array` as a JAX array without compiling anything.
-
-    Outside of a trace `jnp.asarray` would compile a program for every shape.
-    """
+    """Return `array` as a JAX array without compiling anything."""
+    # outside of a trace `jnp.asarray` would compile a program for every shape
     return jax.device_put(array) if outside_trace() else jnp.asarray(array)
 
 
 def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that evaluates `function` with NumPy if all arrays are known, else with `jax.numpy`.
+    """Return a function that evaluates `function` with NumPy if all arrays are known, else with `jax.numpy`."""
 
-    Evaluation with NumPy compiles nothing. Its results are cast to the common dtype of the arrays.
-
-    Args:
-        function: Called as `function(np, *arrays)` or `function(jnp, *arrays)`. Keyword arguments are passed on
-            unchanged.
-
-    Returns:
-        The function of the arrays and the keyword arguments.
-    """
-
+    # Called as `function(np, *arrays)` or `function(jnp, *arrays)`, with the keyword arguments unchanged. NumPy
+    # compiles nothing. Its results are cast to the common dtype of the arrays.
     @functools.wraps(function)
     def call(*arrays: jax.Array, **static: Any) -> Any:
         known = [concrete(array) for array in arrays]
@@ -127,7 +106,7 @@ def check_type(name: str, value: Any, *kinds: type) -> None:
     """Raise TypeError unless `value` is an instance of one of `kinds`."""
     if not isinstance(value, kinds):
         *wanted, given = (kind.__name__ for kind in (*kinds, type(value)))
-        if given in wanted:  # that of another package
+        if given in wanted:  # a class of the same name in another package
             *wanted, given = (f"{kind.__module__}.{kind.__name__}" for kind in (*kinds, type(value)))
         raise TypeError(f"{name}: expected a {' or '.join(wanted)}; got a {given}")
 
@@ -158,14 +137,7 @@ def check_non_negative(name: str, value: Any) -> None:
 
 
 def checked_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
-    """Return the argument `weights` as an array (count,) of non-negative numbers that are not all zero.
-
-    None stands for ones. The weights are not divided by their sum.
-
-    Raises:
-        ValueError: If the shape is different, a weight is negative or not finite, or all weights are zero.
-        TypeError: If the weights are not real numbers.
-    """
+    """Return `weights` (None: ones) as (count,) non-negative numbers, not all zero and not normalized."""
     value = as_float(np.ones(count) if weights is None else weights, dtype, "weights")
     check_shape("weights", value, (count,))
     check_finite("weights", value)

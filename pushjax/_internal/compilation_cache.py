@@ -18,8 +18,8 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
     This enables JAX's own cache, for all programs of the process and not only for those of this library. A later
     process loads a program if it is the same program with the same shapes and dtypes, compiled by the same version of
     JAX with the same flags. The folder is limited to 2 GiB. If JAX already uses a folder and no other one is given,
-    nothing is changed, and the limit is the one that JAX has there. Unless `jax_logging_level` is set, XLA then logs
-    fatal errors only: its loader warns of every program that it loads, without reason.
+    nothing changes, and JAX's own limit applies. Unless `jax_logging_level` is set, XLA then logs fatal errors only:
+    its loader warns of every program that it loads, without reason.
 
     Args:
         folder: Folder of the cache. Default: the folder that JAX already uses (`JAX_COMPILATION_CACHE_DIR`, or
@@ -42,11 +42,9 @@ def enable_compilation_cache(folder: str | Path | None = None) -> Path:
 
 
 def _silence_loader() -> None:
-    """Keep XLA's loader from logging a line about SIGILL for every program that it loads from the cache.
-
-    It logs that two tuning flags of AVX-512 processors are unsupported, and then loads and runs the program
-    (jax-ml/jax#38445). The levels and handlers of Python's loggers stay as they are.
-    """
+    """Keep XLA's loader from logging a line about SIGILL for every program that it loads from the cache."""
+    # XLA logs that two tuning flags of AVX-512 processors are unsupported, and then loads and runs the program
+    # (jax-ml/jax#38445). The levels and handlers of Python's loggers stay as they are.
     loggers = [(logger, logger.level, [*logger.handlers]) for logger in map(logging.getLogger, ("jax", "jaxlib"))]
     jax.config.update("jax_logging_level", "CRITICAL")
     for logger, level, handlers in loggers:
@@ -55,10 +53,8 @@ def _silence_loader() -> None:
 
 
 def _default_folder() -> Path:
-    """Return the default folder, one for each kind of processor.
-
-    Machines that share a home folder may not be able to run each other's compiled programs.
-    """
+    """Return the default folder, one for each kind of processor."""
+    # machines that share a home folder may not be able to run each other's compiled programs
     return platformdirs.user_cache_path("pushjax", appauthor=False) / "compiled" / processor()
 
 

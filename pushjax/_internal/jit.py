@@ -1,7 +1,7 @@
 """Compilation of the library's functions, without Python's garbage collector and with short compile times.
 
-A function that is called by itself can be compiled for a short compile time (`quick_jit`). A function that is
-part of a user's program is compiled for a short run time.
+A function that is called by itself can be compiled for a short compile time (`quick_jit`). A function that is part of a
+user's program is compiled for a short run time.
 """
 
 import functools
@@ -34,34 +34,28 @@ with ThreadPoolExecutor(1) as thread:  # this module may be imported within a tr
 
 
 def outside_trace() -> bool:
-    """Return whether nothing is being traced: the caller is not inside `jit`, `grad` or `vmap`."""
+    """Return whether the caller is not inside `jit`, `grad` or `vmap`."""
     return get_opaque_trace_state() == NO_TRACE
 
 
 def eager_context() -> AbstractContextManager[Any]:
-    """Return a context in which arrays are computed at once, also while a program is being traced.
-
-    Outside of a trace they are anyway. There JAX's own context would only compute one by one the constants of each
-    function that is compiled, which took a third of the time of the default parameters of a task.
-    """
+    """Return a context in which arrays are computed at once, also while a program is being traced."""
+    # Outside of a trace they are anyway. There JAX's own context would only compute one by one the constants of each
+    # function that is compiled, which took a third of the time of the default parameters of a task.
     return nullcontext() if outside_trace() else jax.ensure_compile_time_eval()
 
 
 def jit(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` with `equinox.filter_jit`, and trace it without the garbage collector (see `without_gc`).
-
-    Every argument that is not an array is a constant of the program.
-    """
+    """Compile `function` with `equinox.filter_jit`, and trace it without the garbage collector (`without_gc`)."""
+    # every argument that is not an array is a constant of the program
     return without_gc(eqx.filter_jit(function))
 
 
 def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile `function` as `jit` does, but with the compiler options `QUICK_OPTIONS` when it is called by itself.
-
-    With these options compilation takes a third of the time (JAX up to 0.10), and the program takes up to twice as long
-    to run. Inside `jit` the function is part of the surrounding program and is compiled with that program's options.
-    Inside `grad` and `vmap` it is compiled with the default options, because batches may be large.
-    """
+    """Compile `function` as `jit` does, but with `QUICK_OPTIONS` when it is called by itself."""
+    # With these options compilation takes a third of the time (JAX up to 0.10), and the program takes up to twice as
+    # long to run. Inside `jit` the function is compiled with the options of the surrounding program. Inside `grad` and
+    # `vmap` it is compiled with the default options, because batches may be large.
     quick = eqx.filter_jit(function, compiler_options=QUICK_OPTIONS)  # pyright: ignore[reportCallIssue]
     thorough = eqx.filter_jit(function)
 
@@ -73,15 +67,11 @@ def quick_jit(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def without_gc(function: Callable[P, R]) -> Callable[P, R]:
-    """Return `function` with Python's garbage collector disabled during its calls.
+    """Return `function` with Python's garbage collector disabled, in all threads, during its calls."""
 
-    The first call of a program traces it, and traces it again for each surrounding `vmap` and `grad`. That creates
-    millions of objects, nearly all of which stay. The collector would scan them at every few hundred new objects and
-    find nothing; it took up to half of the time of tracing.
-
-    So the collector is disabled during the call, in all threads.
-    """
-
+    # The first call of a program traces it, and traces it again for each surrounding `vmap` and `grad`. That creates
+    # millions of objects, nearly all of which stay. The collector would scan them at every few hundred new objects and
+    # find nothing; it took up to half of the time of tracing.
     @functools.wraps(function, updated=())
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if not gc.isenabled():  # disabled by an outer call, or by the user

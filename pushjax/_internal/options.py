@@ -6,11 +6,6 @@ import tyro
 
 
 def cli_option(metavar: str) -> Any:
-    """Return the tyro settings of an option whose help text states the default itself.
-
-    tyro then does not add the default to the help text.
-
-    Args:
-        metavar: Placeholder that the help shows for the option's value.
-    """
+    """Return the tyro settings of an option with the placeholder `metavar`, whose help text states the default."""
+    # the empty hint keeps tyro from adding the default to the help text
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")

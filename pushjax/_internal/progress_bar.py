@@ -22,11 +22,7 @@ class _Rate(ProgressColumn):
 
 
 class Reporter:
-    """Reports progress: a bar on a terminal, or lines on standard error without a terminal.
-
-    Call it with `(done, total)` to report how far the work has come. Without a terminal, it prints a line for every
-    tenth of the work. It prints one too if the last line is ten seconds old, later a minute.
-    """
+    """Report progress as a bar on a terminal, or as lines on standard error without a terminal."""
 
     def __init__(self, bar: Progress):
         self.bar = bar
@@ -39,7 +35,7 @@ class Reporter:
         self.bar.update(self.task, completed=done, total=total)
         self.done, self.total = done, total
         tenth = 10 * done // total if total else 0
-        if self.bar.disable and tenth > self.tenth:
+        if self.bar.disable and tenth > self.tenth:  # without a terminal
             self._print_line(f"{self.words}: {100 * done // total}%")
         self.tenth = tenth
 

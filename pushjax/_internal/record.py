@@ -18,17 +18,7 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "matplotlib")
 
 
 def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> dict[str, Any]:
-    """Return the record of one run.
-
-    Args:
-        experiment: Name of the experiment.
-        settings: Settings of the run.
-        **figures: The experiment's results: "cells" or "rows", and further results of its own.
-
-    Returns:
-        A dictionary with the entries "experiment", "versions", "machine", "date" (UTC) and "settings", followed by the
-        figures.
-    """
+    """Return the record of one run: where, when and with which settings it ran, followed by its figures."""
     import pushjax
 
     return {
@@ -47,7 +37,7 @@ def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> 
 
 
 def _processor() -> str:
-    """Return the name of the processor's model, or its architecture where the system does not tell."""
+    """Return the name of the processor's model, or its architecture where the system does not name it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -55,17 +45,8 @@ def _processor() -> str:
 
 
 def write_json(record: dict[str, Any], path: Path) -> None:
-    """Write a record as JSON, with NumPy and JAX arrays and numbers as lists and Python numbers.
-
-    JSON has no NaN and no infinity. Where a number is one of them, null is written, and a warning names the field.
-
-    Args:
-        record: The record.
-        path: The file. Its folder is created.
-
-    Raises:
-        TypeError: If a value cannot be written to JSON.
-    """
+    """Write a record as JSON, with NumPy and JAX arrays and numbers as lists and Python numbers."""
+    # JSON has no NaN and no infinity: null is written for such a number, and a warning names the field
     path.parent.mkdir(parents=True, exist_ok=True)
     plain, missing = json.loads(json.dumps(record, default=to_builtin)), []
     path.write_text(json.dumps(_with_null(plain, "", missing), indent=2, allow_nan=False) + "\n")

@@ -11,37 +11,20 @@ from pushjax._math.vec import Scalar
 
 
 class Proposal(NamedTuple):
-    """The next point of a search for a root, as the function at the current point proposes it.
+    """The next point of a search for a root, as the function at the current point proposes it."""
 
-    Attributes:
-        is_above: Whether the root lies above the current point.
-        next: The next point, by Newton's method for example.
-        usable: Whether `next` may be taken. If not, the bracket is halved.
-        is_tiny: Whether the step to `next` is so small that it may leave the bracket, as it can by roundoff after
-            convergence.
-    """
-
-    is_above: Bool[Array, ""]
-    next: Scalar
-    usable: Bool[Array, ""] | bool
+    is_above: Bool[Array, ""]  # whether the root lies above the current point
+    next: Scalar  # by Newton's method for example
+    usable: Bool[Array, ""] | bool  # whether `next` may be taken; if not, the bracket is halved
+    # Whether the step to `next` is so small that it may leave the bracket, as it can by roundoff after convergence.
     is_tiny: Bool[Array, ""]
 
 
 def bracketed_root(
     propose: Callable[[Scalar], Proposal], start: Scalar, low: Scalar, high: Scalar, iterations: int
 ) -> Scalar:
-    """Find a root in a bracket by a fixed number of iterations: the proposed steps, with bisection as the safeguard.
-
-    Args:
-        propose: Function of the current point.
-        start: Initial point.
-        low: Lower end of the bracket.
-        high: Upper end of the bracket.
-        iterations: Number of iterations.
-
-    Returns:
-        The last point. Its derivatives would be those of the iterations; callers stop them with `stop_gradient`.
-    """
+    """Return a root in a bracket after a fixed number of proposed steps, with bisection as the safeguard."""
+    # JAX would differentiate the iterations, so callers use `stop_gradient`.
 
     def iterate(_, carry):
         point, low, high = carry

@@ -25,7 +25,7 @@ def sample_wishart(key: PRNGKeyArray, factor: Lower, dof: Scalar) -> Lower:
 
 
 def bartlett(key: PRNGKeyArray, size: int, dof: Scalar) -> Lower:
-    """Sample a lower triangular T with T T' ~ W(I, dof) / dof; NaN unless `dof` is above `size` - 1."""
+    """Return a random lower triangular T with T T' ~ W(I, dof) / dof; NaN unless `dof` is above `size` - 1."""
     lower_key, diagonal_key = jax.random.split(key)
     normal_draws = jax.random.normal(lower_key, (size * (size - 1) // 2,), dof.dtype)
     chi_squares = 2 * jax.random.gamma(diagonal_key, (dof - jnp.arange(size, dtype=dof.dtype)) / 2, dtype=dof.dtype)

@@ -7,12 +7,12 @@ quadratic form in (S, a), without cross terms, are
     T(S, S) + <N, adj S> + a' N a,      N symmetric, 3 x 3,
 
 because adj S = -a a' for every z and F. So H is convex if, for some N, both N and the 6 x 6 matrix of the first two
-terms are positive semi-definite. For three variables and degree four the converse holds too, because there every convex
-form is sos-convex (Ahmadi & Parrilo 2013).
+terms are positive semi-definite. The converse holds too, because every convex form of degree four in three variables
+is sos-convex (Ahmadi & Parrilo 2013).
 
 These two blocks are the 9 x 9 Gram matrix of Zhou et al. 2017 (section V) in a basis of symmetric and antisymmetric
-parts. That matrix is not unique: there are nine directions in which it may change. N holds six of them. The other three
-are the cross terms, which improve no eigenvalue, because the form does not change if z and F are exchanged.
+parts. Nine directions change that matrix but not H. N holds six of them. The other three are the cross terms, which
+improve no eigenvalue, because the form does not change if z and F are exchanged.
 
 The quartic H depends only on the 6 x 6 block G: H(F) = v' G v, where v holds the six products of two components of F.
 """
@@ -68,24 +68,14 @@ INITIAL_SCALES = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
 
 
 class Gram(NamedTuple):
-    """The two blocks of a 9 x 9 Gram matrix (see the header of this module), as lower triangles.
+    """The two blocks G and N of a 9 x 9 Gram matrix (see the header of this module), as lower triangles, 1/N^4."""
 
-    Attributes:
-        symmetric: The 6 x 6 block G, with v' G v = H, 1/N^4.
-        antisymmetric: The 3 x 3 block N, 1/N^4.
-    """
-
-    symmetric: Lower
-    antisymmetric: Lower
+    symmetric: Lower  # G, 6 x 6, with v' G v = H
+    antisymmetric: Lower  # N, 3 x 3
 
     @staticmethod
     def of(coefficients: Column, n: Column) -> "Gram":
-        """Return the Gram matrix of a quartic for a given block N.
-
-        Args:
-            coefficients: The 15 coefficients, in the order of `Quartic`.
-            n: The entries (xx, yy, zz, xy, xz, yz) of N.
-        """
+        """Return the Gram matrix of a quartic for a block N with the entries `n` (xx, yy, zz, xy, xz, yz)."""
         parts = (*zip(COEFFICIENT_PLACES, coefficients, strict=True), *zip(ADJUGATE_PLACES, n, strict=True))
         return Gram(_weighted_sum(6, parts), _weighted_sum(3, tuple(zip(ANTISYMMETRIC_PLACES, n, strict=True))))
 
@@ -119,18 +109,11 @@ def antisymmetric_of(symmetric: Lower) -> Column:
 
 
 class Certificate(NamedTuple):
-    """The result of `max_feasible_scale`.
+    """The result of `max_feasible_scale`."""
 
-    Attributes:
-        scale: The scale s that was found. Gram(N) - s * reference is positive definite. Unless the search stopped at
-            `enough`, no scale is larger by more than the tolerance.
-        n: The entries (xx, yy, zz, xy, xz, yz) of the N that attains it.
-        converged: Whether the search ended within `MAX_ROUNDS`.
-    """
-
-    scale: Scalar
-    n: Column
-    converged: Bool[Array, ""]
+    scale: Scalar  # s; unless the search stopped at `enough`, no scale is larger by more than the tolerance
+    n: Column  # entries (xx, yy, zz, xy, xz, yz) of N; Gram(N) - s * reference is positive definite
+    converged: Bool[Array, ""]  # whether the search ended within `MAX_ROUNDS`
 
 
 def max_feasible_scale(
@@ -139,9 +122,9 @@ def max_feasible_scale(
     """Find the largest scale s for which Gram(N) - s * reference is positive semi-definite for some N.
 
     Gram(N) stands for `Gram.of(coefficients, N)`. If the quartic is convex, the largest s is not below zero. The search
-    follows the central path of this problem: it applies Newton's method to the logarithmic barrier, and each round
-    takes the best of a few step lengths. The result lies strictly inside the feasible set. So it is a proof, whatever
-    the roundoff of the search.
+    follows the central path: it applies Newton's method to the logarithmic barrier, and each round takes the best of a
+    few step lengths. The result lies strictly inside the feasible set. So it is a proof, whatever the roundoff of the
+    search.
 
     Args:
         coefficients: The 15 coefficients of the quartic, in the order of `Quartic`.
@@ -151,7 +134,7 @@ def max_feasible_scale(
         tolerance: The search stops once s is known to be within this of the largest.
 
     Returns:
-        The scale, its N, and whether the search converged.
+        The scale `scale`, the entries `n` of its N, and whether the search `converged`.
     """
     start = _initial_scale(coefficients, n, reference)
     zero = 0 * start
@@ -178,10 +161,7 @@ def max_feasible_scale(
 
 
 def _initial_scale(coefficients: Column, n: Column, reference: Gram) -> Scalar:
-    """Return the largest scale in `INITIAL_SCALES` for which Gram(n) - scale * reference is positive definite.
-
-    It is zero if zero is possible.
-    """
+    """Return the largest of `INITIAL_SCALES` for which Gram(n) - scale * reference is positive definite."""
     gram = Gram.of(coefficients, n)
 
     def keep_feasible(largest, scale):
@@ -191,15 +171,10 @@ def _initial_scale(coefficients: Column, n: Column, reference: Gram) -> Scalar:
 
 
 class _Barrier(NamedTuple):
-    """The logarithmic barrier at a Gram matrix.
+    """The logarithmic barrier at a Gram matrix."""
 
-    Attributes:
-        logdet: Sum of the log determinants of both blocks. It has no meaning unless `positive`.
-        positive: Whether both blocks are positive definite.
-    """
-
-    logdet: Scalar
-    positive: Bool[Array, ""]
+    logdet: Scalar  # sum of the log determinants of both blocks; it has no meaning unless `positive`
+    positive: Bool[Array, ""]  # whether both blocks are positive definite
 
 
 def _barrier(gram: Gram) -> _Barrier:
@@ -209,14 +184,9 @@ def _barrier(gram: Gram) -> _Barrier:
 
 
 def _newton_step(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight: Scalar):
-    """Take one Newton step toward the maximum of weight * s + logdet of both blocks of Gram(N) - s * reference.
-
-    The unknowns are the six entries of N, then s.
-
-    Returns:
-        The new s, the new N, and the Newton decrement.
-    """
+    """Take a Newton step toward the maximum of weight * s + logdet; return s, N and the Newton decrement."""
     gram = Gram.of(coefficients, n).plus(-s, reference)
+    # the unknowns are the six entries of N, then s
     gradient = [0 * s] * 6 + [weight]
     hessian = [[0 * s] * (i + 1) for i in range(7)]
     value = weight * s
@@ -252,7 +222,7 @@ def _newton_step(coefficients: Column, n: Column, s: Scalar, reference: Gram, we
 
 
 def _after_step(s: Scalar, n: Column, step: Column, step_length):
-    """Return s and N after a step of length `step_length`. `step` holds six entries for N, then one for s."""
+    """Return s and N after a step of length `step_length`."""
     return s + step_length * step[6], tuple(a + step_length * b for a, b in zip(n, step, strict=False))
 
 

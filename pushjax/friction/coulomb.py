@@ -1,6 +1,6 @@
 """Exact Coulomb friction of support points: the wrench for a twist, and random wrench-twist pairs.
 
-What is random is drawn by JAX. The rest is computed with NumPy where values are known, because that compiles nothing.
+JAX samples the random numbers. NumPy computes the rest where values are known, because that compiles nothing.
 """
 
 from typing import NamedTuple
@@ -18,18 +18,7 @@ FACET_FRACTION = 0.1  # fraction of the wrench-twist pairs that lie on a facet
 
 
 def wrenches(xp, point, limit, twist, in_disk):
-    """Return the wrenches that balance friction for given twists. On a facet, `in_disk` chooses one.
-
-    Args:
-        xp: numpy or jax.numpy.
-        point: Support points, (points, 2), body frame, m.
-        limit: Their friction limits, (points,), N.
-        twist: Twists (vx, vy, omega), (twists, 3), body frame, m and rad. Only their directions matter.
-        in_disk: The force at each point in units of its limit, if it does not slide, (twists, points, 2).
-
-    Returns:
-        Wrenches (fx, fy, tau), (twists, 3), body frame, N and N m. Zero for a zero twist.
-    """
+    """Return the body wrenches (twists, 3), N and N m, that balance friction for body twists (twists, 3), any norm."""
     largest = xp.max(xp.abs(twist), axis=1, keepdims=True)
     v = twist / xp.where(largest > 0, largest, 1)  # so that squares neither underflow nor overflow
     vx, vy, omega = v[:, 0:1], v[:, 1:2], v[:, 2:3]
@@ -40,32 +29,25 @@ def wrenches(xp, point, limit, twist, in_disk):
     speed_scale = xp.abs(omega) * xp.max(xp.abs(point)) + xp.maximum(xp.abs(vx), xp.abs(vy))
     is_pivot = squared_speed <= (8 * xp.finfo(squared_speed.dtype).eps * speed_scale) ** 2
     sliding = velocity / xp.sqrt(xp.where(is_pivot, 1, squared_speed))[..., None]
+    # `in_disk`, (twists, points, 2), is the force in units of its limit where a point does not slide: on a facet it
+    # chooses the wrench. A zero twist gives a zero wrench.
     force = limit[None, :, None] * xp.where(is_pivot[..., None], xp.where(largest[..., None] > 0, in_disk, 0), sliding)
     torque = x * force[..., 1] - y * force[..., 0]
     return xp.concatenate([xp.sum(force, axis=1), xp.sum(torque, axis=1, keepdims=True)], axis=1)
 
 
 class PairDraws(NamedTuple):
-    """What is random about wrench-twist pairs.
+    """The random numbers behind wrench-twist pairs."""
 
-    Attributes:
-        free: Twists (vx, vy, length * omega) of any norm, for the pairs that do not lie on a facet, (pairs, 3).
-        pivot: Support points, for the pairs that lie on a facet: their twist is a rotation about this point, (pairs,
-            2), m.
-        positive: Whether the rotation about `pivot` is counterclockwise, (pairs,).
-        on_facet: Whether the pair lies on a facet, (pairs,).
-        uniform: Numbers in [0, 1) that give a point of the unit disk (`in_unit_disk`), (pairs, 2, points).
-    """
-
-    free: Float[Array, "pairs 3"]
-    pivot: Float[Array, "pairs 2"]
-    positive: Bool[Array, "pairs"]
+    free: Float[Array, "pairs 3"]  # twists (vx, vy, length * omega) of any norm, of pairs that are not on a facet
+    pivot: Float[Array, "pairs 2"]  # support points, m; the twist of a pair on a facet rotates about this point
+    positive: Bool[Array, "pairs"]  # whether that rotation is counterclockwise
     on_facet: Bool[Array, "pairs"]
-    uniform: Float[Array, "pairs 2 points"]
+    uniform: Float[Array, "pairs 2 points"]  # numbers in [0, 1), see `in_unit_disk`
 
 
 def draw(key: Key[Array, ""], point: Array, limit: Array, pairs: int) -> PairDraws:
-    """Draw what is random about `pairs` wrench-twist pairs, given the support points and their friction limits."""
+    """Sample the random numbers of `pairs` wrench-twist pairs, given the support points and their friction limits."""
     return (_draw_alone if outside_trace() else _draw)(key, point, limit, pairs)
 
 
@@ -89,7 +71,7 @@ _draw_alone = eqx.filter_jit(_draw, compiler_options=DRAW_OPTIONS)  # pyright: i
 
 @in_numpy
 def pairs_of(xp, point, limit, length, free, pivot, positive, on_facet, uniform):
-    """Return the wrenches and twists of `Support.wrench_twist_pairs`, from the draws of `draw`."""
+    """Return the wrenches and twists of `Support.wrench_twist_pairs`, given the random numbers of `draw`."""
     # A rotation about r moves the origin with (r_y, -r_x) omega.
     about = xp.stack([pivot[:, 1], -pivot[:, 0], xp.broadcast_to(length, positive.shape)], axis=1)
     normalized = xp.where(on_facet[:, None], xp.where(positive[:, None], about, -about), free)
@@ -99,7 +81,7 @@ def pairs_of(xp, point, limit, length, free, pivot, positive, on_facet, uniform)
 
 
 def draw_uniform(key: Key[Array, ""], points: int, dtype) -> Float[Array, "2 {points}"]:
-    """Draw two numbers in [0, 1) for each of `points` points."""
+    """Sample two numbers in [0, 1) for each of `points` points."""
     return jax.vmap(lambda k: jax.random.uniform(k, (points,), dtype))(jax.random.split(key))
 
 

@@ -6,14 +6,14 @@ its own norm. The loss is
     mean |grad H(F_i) - s_i V_i|^2 + 2 mean (H(F_i) - 1)^2 + 1e-3 |a|^2,     s_i = max(0, grad H(F_i) . V_i),
 
 where a is the vector of the coefficients of the monomials of H. H and its gradient are linear in a. So the loss is a
-convex quadratic a'Qa - 2b'a + c in few coefficients, once it is known which s_i are not clipped. The pairs enter only
-through Q and b. A few rounds of minimization find which s_i are clipped.
+convex quadratic a'Qa - 2b'a + c, once it is known which s_i are not clipped. The pairs enter only through Q and b. A
+few rounds of minimization find which s_i are clipped.
 
-H is convex by construction: H(F) = sum_k (F' L_k L_k' F)^(d/2). For the ellipsoid there is one term, to which a small
-multiple of F'F is added, so that the limit is finite in every direction, whatever the pairs. For the quartic there are
-five terms. With these the loss came within 0.4 % of the optimum over all sos-convex quartics (a semidefinite program)
-on every set of pairs tried, and for most sets it agreed to all digits. The minimization is unconstrained and uses
-gradients, so fits can be batched; the semidefinite program cannot.
+H is convex by construction: H(F) = sum_k (F' L_k L_k' F)^(d/2). The ellipsoid has one term plus a small multiple of
+F'F, which makes the limit finite in every direction, whatever the pairs. The quartic has five terms. With these the
+loss came within 0.4 % of the optimum over all sos-convex quartics (a semidefinite program) on every set of pairs tried,
+and for most sets it agreed to all digits. The minimization is unconstrained and uses gradients, so fits can be batched;
+the semidefinite program cannot.
 
 Reference: Zhou et al. 2016, for the terms of the loss.
 """
@@ -67,7 +67,7 @@ class FitReport(eqx.Module):
 
     Attributes:
         angle: Mean angle between predicted and given twists, normalized, rad.
-        loss: Loss of the fit, as in the header of this module.
+        loss: Loss of the fit (see the header of this module).
         clipped: Number of pairs with s_i = 0: their predicted twist opposes the given one.
         converged: Whether the optimizer converged, and its last round left the same s_i clipped as the one before.
         steps: Number of optimizer steps, summed over all rounds.
@@ -280,7 +280,7 @@ _fit_in_jax = quick_jit(functools.partial(_fit, jnp))
 
 
 def _fit_in_numpy(*arrays: Array, degree: int, terms: int):
-    """Return what `_fit` returns, computed in float64 and without compiling anything."""
+    """Return the results of `_fit`, computed in float64 and without compiling anything."""
     dtype = arrays[0].dtype
     with np.errstate(all="ignore"):
         found = _fit(np, *(np.asarray(array, np.float64) for array in arrays), degree=degree, terms=terms)

@@ -28,13 +28,7 @@ QUADRATIC_SUMS = monomial_sums(QUADRATIC_MONOMIALS)
 
 
 class Minimum(NamedTuple):
-    """Result of a minimization.
-
-    Attributes:
-        x: The parameters, (n,).
-        steps: Number of steps.
-        converged: Whether the optimizer converged.
-    """
+    """Result of a minimization: the parameters, the number of steps, and whether the optimizer converged."""
 
     x: Any
     steps: Any
@@ -56,19 +50,12 @@ class Quadratic(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs in the basis of the m monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a.
-
-    Attributes:
-        value: The monomials at each F_i, shape (pairs, m).
-        gradient: Their gradients, shape (3, pairs, m).
-        twist: Unit twists V_i, shape (3, pairs).
-        share: Weights of the pairs, shape (pairs,). They sum to one.
-    """
+    """Pairs in the basis of the m monomials: H(F_i) = value[i] . a and grad H(F_i) = gradient[:, i] a."""
 
     value: Float[Array, "pairs m"]
     gradient: Float[Array, "3 pairs m"]
-    twist: Float[Array, "3 pairs"]
-    share: Float[Array, "pairs"]
+    twist: Float[Array, "3 pairs"]  # unit twists V_i
+    share: Float[Array, "pairs"]  # weights that sum to one
 
     @property
     def along(self) -> Float[Array, "pairs m"]:
@@ -100,10 +87,8 @@ def evaluate_monomials(xp, f: Array, v: Array, share: Array, degree: int) -> Pai
 
 
 def loss_of(xp, pairs: Pairs, unclipped: Bool[Array, "pairs"], value_weight: Array, ridge: Array) -> Quadratic:
-    """Return the loss as a quadratic in the coefficients a, given which pairs are not clipped.
-
-    For these |g - s V| is the norm of the component of the gradient g perpendicular to V.
-    """
+    """Return the loss as a quadratic in the coefficients a, given which pairs are not clipped."""
+    # Of a pair that is not clipped, |g - s V| is the norm of the component of the gradient g perpendicular to V.
     across = pairs.gradient - (pairs.twist * unclipped[None])[:, :, None] * pairs.along[None]
     rows = xp.concatenate([across, xp.sqrt(value_weight) * pairs.value[None]])
     rows = (rows * xp.sqrt(pairs.share)[None, :, None]).reshape(-1, pairs.value.shape[1])
@@ -123,21 +108,17 @@ def _sums(xp, degree: int, dtype: Any) -> Float[Array, "m entries"]:
 
 
 def coefficients_of_forms(xp, p: Float[Array, "terms 9"], degree: int) -> Float[Array, "m"]:
-    """Return the coefficients of H, given the flattened P_k.
-
-    H is the sum of (F' P_k F)^2 for degree 4, and F' (P_0 + `LEAST_EIGENVALUE` I) F for degree 2.
-    """
+    """Return the coefficients of H, given the flattened P_k."""
+    # degree 4: H = sum_k (F' P_k F)^2; degree 2: H = F' (P_0 + LEAST_EIGENVALUE I) F
     floor = xp.asarray(LEAST_EIGENVALUE * np.eye(3).ravel(), p.dtype)
     return _sums(xp, degree, p.dtype) @ ((p.T @ p).reshape(81) if degree == 4 else p[0] + floor)
 
 
 def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimum:
-    """Minimize the loss over the factors of the terms, by BFGS.
-
-    The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
-    needs a factorization, and it slows down where the optimum lies on the border of convexity. NumPy saves the
-    compilation, which takes longer than the minimization.
-    """
+    """Minimize the loss over the factors of the terms, by BFGS."""
+    # The steps of BFGS are small matrix products, which can be batched. Levenberg-Marquardt needs fewer steps, but each
+    # needs a factorization, and it slows down where the optimum lies on the border of convexity. NumPy saves the
+    # compilation, which takes longer than the minimization.
 
     def objective(parameters):
         lower, p = forms_of(xp, parameters)
@@ -165,19 +146,10 @@ def minimize_loss(xp, loss: Quadratic, parameters: Array, degree: int) -> Minimu
 
 
 def leave_saddle(xp, loss: Quadratic, parameters: Array) -> tuple[Array, Float[Array, ""]]:
-    """Move the factor L of an ellipsoid off a point where its gradient is zero, but the loss of P = L L' is not least.
-
-    There L is singular, and the loss decreases along P + t v v', with v in the null space of L'. The step t is that of
-    least loss.
-
-    Args:
-        loss: The loss.
-        parameters: Lower triangle of L, (6,).
-
-    Returns:
-        The lower triangle after the step, and the decrease of the loss: zero if there is no such direction, and NaN
-        if the loss is not finite.
-    """
+    """Move the factor L of an ellipsoid, (6,), off a saddle; return it and the decrease of the loss."""
+    # The gradient by L is zero at a saddle, but the loss of P = L L' is not least. There L is singular, and the loss
+    # decreases along P + t v v', with v in the null space of L'. The step t minimizes the loss along that line. The
+    # decrease is zero if there is no such direction, and NaN if the loss is not finite.
     lower, p = forms_of(xp, parameters)
     sums = _sums(xp, 2, parameters.dtype)
     slope = (loss.gradient(coefficients_of_forms(xp, p, 2)) @ sums).reshape(3, 3)

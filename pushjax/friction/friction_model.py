@@ -47,9 +47,9 @@ class FrictionModel(eqx.Module):
             ray is 2 / n. None if the limit surface is known exactly. Not checked if traced.
         friction: Coefficient of contact friction mu, or the range (lowest, highest), shape (2,), on which it is
             uniformly distributed.
-        sampler: Distribution of a `Quartic`. "gram" is the paper's: it takes every convex quartic, and repairs draws
+        sampler: Distribution of a `Quartic`. "gram" (Zhou et al. 2017) takes every convex quartic, and repairs samples
             that are not convex. "sum_of_squares" takes a sum of squared quadratic forms, as fits about the center of
-            pressure are; its draws are always convex.
+            pressure are; its samples are always convex.
         resample_every: Number of steps after which a rollout samples again. None to sample once per rollout.
 
     Raises:
@@ -105,7 +105,7 @@ class FrictionModel(eqx.Module):
             surface: The mean of the surfaces.
 
         Returns:
-            The distribution. Its `sample` draws from it.
+            The distribution, whose `sample` returns random surfaces.
 
         Raises:
             ValueError: If the mean is a `Quartic` and `dof` is less than 9, or if the sampler is "sum_of_squares" and

@@ -33,22 +33,17 @@ FORMAT, VERSION = "pushjax limit surface", 1
 
 
 class Form(Protocol):
-    """H as a function of the normalized wrench, without the checks and arrays of `LimitSurface`.
+    """H as a function of the normalized wrench, without the checks and arrays of `LimitSurface`."""
 
-    The contact solvers and rollouts compute with it. Its methods take and return `Vec3` and scalars instead of arrays;
-    `pushjax._math.vec` says why. Forms are pytrees. `value`, `gradient` and `hessian` are H and its derivatives by the
-    normalized wrench.
-
-    Attributes:
-        degree: Degree d of H.
-        length: Characteristic length of the surface, m.
-    """
+    # The contact solvers and rollouts compute with it. Its methods take and return `Vec3` and scalars instead of arrays
+    # (`pushjax._math.vec` says why). Forms are pytrees. `value`, `gradient` and `hessian` are H and its derivatives by
+    # the normalized wrench.
 
     @property
     def degree(self) -> int: ...
 
     @property
-    def length(self) -> Scalar: ...
+    def length(self) -> Scalar: ...  # m
 
     def scaled(self, factor: Scalar) -> "Form":
         """Return the form of factor * H."""
@@ -65,7 +60,7 @@ class Form(Protocol):
     def hessian(self, f: Vec3) -> Symmetric3: ...
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        """Restrict H to a line: return the degree + 1 coefficients c_k of H(a + s b) = sum_k c_k s^k."""
+        """Return the degree + 1 coefficients c_k of H on a line: H(a + s b) = sum_k c_k s^k."""
         ...
 
 
@@ -101,10 +96,8 @@ class LimitSurface(eqx.Module):
         """Return H as a `Form`, for computations below the public interface."""
 
     def is_valid(self) -> Bool[Array, ""]:
-        """Whether numbers that were traced when the surface was made can be computed with.
-
-        An ellipsoid must be convex. A quartic must be so at three wrenches, because more takes too long.
-        """
+        """Return whether a surface that was made of traced numbers can be computed with."""
+        # An ellipsoid must be convex. A quartic must be convex at three wrenches only, because more takes too long.
         form = jax.lax.stop_gradient(self.form())
         hessians = [form.hessian(Vec3(*axis)) for axis in jnp.eye(3, dtype=self.length.dtype)]
         sizes = jnp.stack([matrix.trace() for matrix in hessians])
@@ -133,7 +126,7 @@ class LimitSurface(eqx.Module):
             The wrench, and whether it was found.
 
         Raises:
-            ValueError: If the twist is zero or not finite, unless it is traced.
+            ValueError: If the twist has another shape, or is known and zero or not finite.
         """
 
     def _normalized_wrench(self, wrench: ArrayLike) -> Vec3:
@@ -196,10 +189,10 @@ class LimitSurface(eqx.Module):
             twist: Body twist (vx, vy, omega), shape (3,). Only its direction matters.
 
         Returns:
-            Wrench (fx, fy, tau), shape (3,), N and N m. Zero for a traced twist that is zero or not finite.
+            Wrench (fx, fy, tau), shape (3,), N and N m. Zero if it was not found.
 
         Raises:
-            ValueError: If the twist is zero or not finite, unless it is traced.
+            ValueError: If the twist has another shape, or is known and zero or not finite.
         """
         return self.inverse(twist).wrench
 
@@ -253,10 +246,7 @@ class LimitSurface(eqx.Module):
         return surface
 
     def _normalized_twist(self, twist: ArrayLike) -> tuple[Vec3, Array]:
-        """Return the normalized twist, scaled to norm one, and whether the twist is finite and not zero.
-
-        If it is not, the vector is +x, to avoid NaN downstream.
-        """
+        """Return the twist, normalized and scaled to norm one, and whether it is finite and not zero."""
         v = as_float(twist, self.length.dtype, "twist")
         check_shape("twist", v, (3,))
         check_finite("twist", v)
@@ -266,6 +256,7 @@ class LimitSurface(eqx.Module):
         normalized = jnp.stack([v[0], v[1], v[2] * self.length])
         size = jnp.max(jnp.abs(normalized))  # scale to order one first, so that squares neither underflow nor overflow
         usable = jnp.isfinite(size) & (size > 0)
+        # otherwise +x, to avoid NaN downstream
         normalized = jnp.where(
             usable, normalized / jnp.where(usable, size, 1.0), jnp.array([1.0, 0.0, 0.0], normalized.dtype)
         )
@@ -290,13 +281,7 @@ def checked_length(length: ArrayLike, dtype) -> Float[Array, ""]:
 
 
 def angle_between(a: Vec3, b: Vec3, xp: Any = jnp) -> Scalar:
-    """Return the angle between two vectors, rad. Small angles are accurate too. Zero if a vector is zero.
-
-    Args:
-        a: One vector.
-        b: The other.
-        xp: numpy or jax.numpy.
-    """
+    """Return the angle between two vectors, rad, also accurate if small; zero if a vector is zero."""
     sine, cosine = norm(a.cross(b), xp), a.dot(b)
     # arctan2(0, 0) is zero, but its derivative is NaN
     return xp.arctan2(sine, xp.where((sine == 0) & (cosine == 0), 1.0, cosine))
@@ -308,6 +293,6 @@ def angle_tolerance(angle: Scalar) -> float:
 
 
 def norm(a: Vec3, xp: Any = jnp) -> Scalar:
-    """Return the Euclidean norm, with numpy or jax.numpy. Its derivative at the zero vector is zero."""
+    """Return the Euclidean norm; its derivative at the zero vector is zero."""
     squared = a.dot(a)
     return xp.where(squared > 0, xp.sqrt(xp.where(squared > 0, squared, 1.0)), 0.0)

@@ -23,16 +23,8 @@ LOWER_ENTRIES = np.eye(9)[np.flatnonzero(np.tril(np.ones((3, 3))))]  # (6, 9), f
 
 
 def monomial_sums(monomials: np.ndarray) -> np.ndarray:
-    """Return the matrix that turns a flattened 3 x 3 x ... array into the coefficients of a form.
-
-    The entry (i, j, ...) of the array is a factor of F_i F_j .... For each monomial, its entries are summed.
-
-    Args:
-        monomials: Exponents of each monomial of degree d, (m, 3).
-
-    Returns:
-        The matrix, (m, 3^d).
-    """
+    """Return the matrix (m, 3^d) that sums a flattened array of factors of F_i F_j ... to coefficients of a form."""
+    # `monomials` are the exponents of the m monomials of degree d, (m, 3)
     degree = int(monomials[0].sum())
     sums = np.zeros((len(monomials), 3**degree))
     for flat, index in enumerate(np.ndindex(*(3,) * degree)):
@@ -62,14 +54,9 @@ def unpack_lower(lower: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:
 
 
 def initial_factors(degree: int, terms: int, dtype: Any) -> np.ndarray:
-    """Return the lower triangles of the L_k at which a search begins.
-
-    Each P_k is a multiple of the identity, stretched along a direction of its own. Equal terms would stay equal
-    throughout the search. A single term is not stretched.
-
-    Returns:
-        The lower triangles, row by row, (terms, 6).
-    """
+    """Return the lower triangles of the L_k at which a search begins, row by row, (terms, 6)."""
+    # Each P_k is a multiple of the identity, stretched along a direction of its own, because equal terms would stay
+    # equal throughout the search. A single term is not stretched.
     directions = fibonacci_hemisphere(terms)
     stretch = 0.5 if terms > 1 else 0.0
     lower = np.linalg.cholesky(np.eye(3) + stretch * (3 * directions[:, :, None] * directions[:, None] - np.eye(3)))
@@ -78,37 +65,21 @@ def initial_factors(degree: int, terms: int, dtype: Any) -> np.ndarray:
 
 
 class SumOfSquares(NamedTuple):
-    """A quartic as a sum of squares.
+    """A quartic as a sum of squares."""
 
-    Attributes:
-        lower: The factors L_k, shape (terms, 3, 3).
-        error: Largest error of a coefficient of the sum, relative to the largest coefficient.
-    """
-
-    lower: Float[Array, "terms 3 3"]
-    error: Float[Array, ""]
+    lower: Float[Array, "terms 3 3"]  # the factors L_k
+    error: Float[Array, ""]  # largest error of a coefficient of the sum, relative to the largest coefficient
 
 
 def decompose(coefficients: Float[Array, "15"], terms: int = TERMS) -> SumOfSquares:
-    """Write a quartic as a sum of squares of quadratic forms.
-
-    The terms are not unique. These are the ones that the Levenberg-Marquardt method reaches from `initial_factors`.
-    Every result of `fit_limit_surface` is such a sum. Not every convex quartic is; if it is not, `error` is large.
-
-    The L_k can be differentiated with respect to the coefficients. A change of the coefficients may be met by many
-    changes of the L_k. The derivative is the smallest of them.
-
-    Args:
-        coefficients: Coefficients of the quartic, shape (15,), in the order of `Quartic`.
-        terms: Number of terms.
-
-    Returns:
-        The factors of the terms, and the error of their sum.
-    """
+    """Write a quartic as a sum of squares of quadratic forms."""
+    # The terms are not unique. The Levenberg-Marquardt method reaches these from `initial_factors`. Every result of
+    # `fit_limit_surface` is such a sum. Not every convex quartic is; if it is not, `error` is large.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(coefficients)))
     target = coefficients / scale
     start = jnp.asarray(initial_factors(4, terms, coefficients.dtype))
     factors = without_derivatives(_search_factors, target, start)
+    # many changes of the L_k meet a change of the coefficients; the derivative is the smallest
     jacobian = jax.lax.stop_gradient(jax.jacobian(_coefficients)(factors).reshape(len(MONOMIALS), -1))
     change = target - jax.lax.stop_gradient(target)
     factors = factors + (jnp.linalg.pinv(jacobian) @ change).reshape(factors.shape)

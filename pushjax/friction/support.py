@@ -1,14 +1,13 @@
 """Support points under the slider, which represent its pressure distribution, and their exact Coulomb friction.
 
 A support point at r carries a part p of the weight. Its friction limit is l = mu_s p, where mu_s is the coefficient of
-friction with the table. All forces and wrenches are those that the hand applies to balance the friction of the table,
-so wrench . twist >= 0. A point that slides with velocity v(r) takes the force l v/|v|. The sum over the points gives
-the exact limit surface.
+friction with the table. All forces and wrenches are applied by the hand, to balance the friction of the table, so
+wrench . twist >= 0. A point that slides with velocity v(r) takes the force l v/|v|. The sum over the points gives the
+exact limit surface.
 
 A twist whose center of rotation lies on a support point does not slide that point. The force there may then be any
-vector of length up to l. The wrenches of that twist form a flat facet of the limit surface.
-
-Reference: Goyal, Ruina & Papadopoulos 1991, for the facets.
+vector of length up to l. The wrenches of that twist form a flat facet of the limit surface (Goyal, Ruina &
+Papadopoulos 1991).
 """
 
 from typing import NamedTuple
@@ -155,10 +154,10 @@ class Support(eqx.Module):
     def uniform(shape: Shape, points: int = 64, load: ArrayLike = 1.0) -> "Support":
         """Represent uniform pressure over a shape by one support point for each cell of a grid.
 
-        The cells are nearly square. The load of a cell is in proportion to the area of its part inside the outline, and
-        the support point is the center of that part. Of several spacings, the one whose number of cells is closest to
-        `points` is taken. A rectangle gets exactly `points` if it can be divided into that many squares. For example, a
-        square with 64 points gets 8 by 8.
+        The cells are nearly square. A cell's load is in proportion to its area inside the outline, and its support
+        point is the center of that area. Of several spacings, the method takes the one whose number of cells is closest
+        to `points`. A rectangle gets exactly `points` if it divides into that many squares: a square with 64 points
+        gets 8 by 8.
 
         Args:
             shape: Shape of the slider's base. It must not be traced.
@@ -169,8 +168,8 @@ class Support(eqx.Module):
             The support.
 
         Raises:
-            ValueError: If `points` is less than one, the shape is traced or covers less than about a ten-thousandth of
-                the box around it, or the load is not positive.
+            ValueError: If `points` is less than one, the shape is traced or covers too little of the box around it (for
+                64 points, less than about 1/3000), or the load is not positive.
         """
         check_count("points", points)
         low, high = (concrete(corner) for corner in shape.bounds)
@@ -247,13 +246,12 @@ class Support(eqx.Module):
     def wrench(self, twist: ArrayLike, key: Key[Array, ""] | None = None) -> Float[Array, "3"]:
         """Return the wrench with which a hand balances friction while the slider moves with `twist`.
 
-        If the center of rotation lies on a support point, every wrench of a facet balances friction. Then the result
-        is the center of the facet, or a wrench drawn uniformly from it if a `key` is given. A zero twist does not
-        determine a wrench. Its result is the center of all wrenches, which is zero.
+        If the center of rotation lies on a support point, every wrench of a facet balances friction. Then the result is
+        the center of the facet, or a uniform sample of it if a `key` is given. A zero twist gives a zero wrench.
 
         Args:
             twist: Body twist (vx, vy, omega), shape (3,), m and rad. Only its direction matters.
-            key: PRNG key to draw from a facet, or None for its center.
+            key: PRNG key to sample from a facet, or None for its center.
 
         Returns:
             Wrench (fx, fy, tau) in the body frame, shape (3,), N and N m.
@@ -272,11 +270,11 @@ class Support(eqx.Module):
     def wrench_twist_pairs(
         self, key: Key[Array, ""], pairs: int = 400, length: ArrayLike | None = None
     ) -> WrenchTwistPairs:
-        """Draw wrench-twist pairs on the exact limit surface.
+        """Sample wrench-twist pairs on the exact limit surface.
 
         Nine in ten twists are uniform on the unit sphere of (vx, vy, length * omega). One in ten rotates about a
-        support point, which is drawn with a probability in proportion to its load; the wrench is then drawn from the
-        facet. The pairs are in random order.
+        support point, chosen with a probability in proportion to its load; the wrench is then a sample of the facet.
+        The pairs are in random order.
 
         Args:
             key: PRNG key.
@@ -327,11 +325,7 @@ def _characteristic_length(xp, point, limit):
 
 
 def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Divide a box into cells whose sides are as close to `spacing` as the box allows.
-
-    Returns:
-        A tuple of the centers of the cells, shape (cells, 2), and the sides of a cell, shape (2,), both in m.
-    """
+    """Divide a box into cells with sides near `spacing`: return their centers (cells, 2) and a cell's sides (2,), m."""
     count = np.maximum(np.round((high - low) / spacing), 1).astype(int)
     cell = (high - low) / count
     x, y = (low[k] + (np.arange(count[k]) + 0.5) * cell[k] for k in range(2))
@@ -358,10 +352,8 @@ def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray)
 
 
 def _distances(shape: Shape, points: np.ndarray) -> np.ndarray:
-    """Return signed distances from the outline, m, that are exact near it, and too small far outside.
-
-    With NumPy, where this is simple.
-    """
+    """Return signed distances from the outline, m, that are exact near it, and too small far outside."""
+    # with NumPy for the shapes where this is simple
     if isinstance(shape, Polygon):
         vertices, parts = np.asarray(shape.vertices, np.float64), range(0, len(points), AT_ONCE)
         return np.concatenate([signed_distances(vertices, points[k : k + AT_ONCE]) for k in parts])

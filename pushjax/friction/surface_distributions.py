@@ -16,19 +16,18 @@ Quartic, "sum_of_squares"
 A traced `dof` (under `jit`, `grad` or `vmap`) is not checked. If it is so small that the Wishart distribution does not
 exist, the sampled surface is NaN, and every step of a rollout with it has the status INVALID.
 
-All samples are smooth functions of standard draws (Bartlett's decomposition). So they can be differentiated by `dof`
-and by the mean. Three results of searches have no derivative: the shrinkage of a repaired sample, the block N of a
-mean's Gram matrix, and its diagonal loading. The derivative of the terms P_k of a mean is described in `decompose`.
+All samples are smooth functions of standard random numbers (Bartlett's decomposition). So they can be differentiated by
+`dof` and by the mean. Three results of searches have no derivative: the shrinkage of a repaired sample, the block N of
+a mean's Gram matrix, and its diagonal loading. The terms P_k of a mean have the smallest derivative that meets a change
+of its coefficients.
 
-Zhou et al. 2017 leave three choices open, which are made as follows:
+Zhou et al. 2017 (section V) leave three choices open, which are made as follows:
 
 - The Gram matrix that represents the mean is the one whose least eigenvalue is largest.
 - The small constant on the diagonal (diagonal loading) is `LOADING` times that eigenvalue. It is subtracted from the
   Gram matrix of the mean first, so that it does not shift the mean.
 - A random Gram matrix is converted to 15 coefficients as H(F) = v' G v. This is the least squares fit in the norm that
   does not depend on the frame.
-
-Reference: Zhou et al. 2017, section V.
 """
 
 from abc import abstractmethod
@@ -62,8 +61,8 @@ class SurfaceSample(NamedTuple):
 
     Attributes:
         surface: The limit surface.
-        shrinkage: How far the sample was moved toward the mean to be convex, as a fraction of the distance to the
-            mean. Zero if it was convex.
+        shrinkage: How far the sample was moved toward the mean to be convex, as a fraction of the distance to the mean.
+            Zero if it was convex.
     """
 
     surface: LimitSurface
@@ -101,30 +100,21 @@ class Deterministic(SurfaceDistribution):
 
 
 class WishartEllipsoid(SurfaceDistribution):
-    """Ellipsoids with A ~ W(A_mean, n) / n.
-
-    Attributes:
-        mean: The mean surface.
-        factor: Lower triangular L with L L' = A_mean.
-        dof: Degrees of freedom n.
-    """
+    """Ellipsoids with A ~ W(A_mean, n) / n."""
 
     mean: Ellipsoid
-    factor: Lower
+    factor: Lower  # L with L L' = A_mean
     dof: Float[Array, ""]
 
     @staticmethod
     def of(mean: Ellipsoid, dof: Array) -> "WishartEllipsoid":
-        """Return the distribution around a mean, with `dof` degrees of freedom.
-
-        Raises:
-            ValueError: If A is singular up to roundoff. If it is traced, all samples are NaN instead.
-        """
+        """Return the distribution around a mean; raise ValueError if A is singular up to roundoff."""
         cholesky = Cholesky.of(tril(mean.A))
         if concrete(cholesky.positive) is not None and not cholesky.positive:
             raise ValueError(
                 "surface: A is singular up to roundoff, so no surfaces can be sampled around it; use float64"
             )
+        # all samples of a traced singular A are NaN
         factor = jax.tree.map(lambda entry: jnp.where(cholesky.positive, entry, jnp.nan), cholesky.lower)
         return WishartEllipsoid(mean, factor, dof)
 
@@ -139,24 +129,14 @@ class WishartEllipsoid(SurfaceDistribution):
 
 
 class GramQuartic(SurfaceDistribution):
-    """Quartics whose Gram matrix has a Wishart distribution.
+    """Quartics whose Gram matrix has a Wishart distribution."""
 
-    Only the 6 x 6 block of the 9 x 9 matrix is sampled. H depends on nothing else, and a block of a Wishart matrix is a
-    Wishart matrix too.
-
-    Attributes:
-        mean: The mean surface.
-        gram: Gram matrix of the mean.
-        loading: Multiple of the identity that is not random: the diagonal loading. For a mean on the border of
-            convexity it is zero or a very small negative number.
-        factor: Lower triangular L, where L L' is the 6 x 6 block of `gram` without the loading.
-        dof: Degrees of freedom n.
-    """
-
+    # Only the 6 x 6 block of the 9 x 9 matrix is sampled. H depends on nothing else, and a block of a Wishart matrix is
+    # a Wishart matrix too.
     mean: Quartic
     gram: Gram
-    loading: Float[Array, ""]
-    factor: Lower
+    loading: Float[Array, ""]  # multiple of the identity that is not random
+    factor: Lower  # L, where L L' is the 6 x 6 block of `gram` without the loading
     dof: Float[Array, ""]
 
     @staticmethod
@@ -169,6 +149,7 @@ class GramQuartic(SurfaceDistribution):
         gram = Gram.of(form.c, tuple(scale * n for n in best.n))
         least = best.scale
         # For a mean on the border of convexity the least eigenvalue is zero, up to the tolerance of the search.
+        # Then the loading is zero or a very small negative number.
         loading = scale * jnp.where(least > 0, LOADING * least, least)
         unloaded = gram.plus(-loading, Gram.identity(loading)).symmetric
         return GramQuartic(mean, gram, loading, Cholesky.of(unloaded).lower, dof)
@@ -193,7 +174,7 @@ class GramQuartic(SurfaceDistribution):
 
 
 def _best_gram(coefficients):
-    """Find the Gram matrix of a quartic whose least eigenvalue is largest; `scale` of the result is that eigenvalue."""
+    """Find the Gram matrix of a quartic whose least eigenvalue is largest: that eigenvalue is `scale`."""
     one = jnp.ones_like(coefficients[0])
     start_n = (0.2 * one,) * 3 + (0 * one,) * 3
     tolerance = 1e-6 if one.dtype == jnp.float64 else 1e-4
@@ -201,10 +182,8 @@ def _best_gram(coefficients):
 
 
 def _certify(coefficients, n, reference):
-    """Certify that a quartic is convex, or find how much of the Gram matrix `reference` must be added to make it so.
-
-    `scale` of the result is not negative if the quartic is convex. Otherwise -`scale` is the multiple to add.
-    """
+    """Certify that a quartic is convex, or find how much of the Gram matrix `reference` makes it so."""
+    # `scale` is not negative if the quartic is convex. Otherwise -`scale` is the multiple of `reference` to add.
     return max_feasible_scale(coefficients, n, reference, enough=0.0, tolerance=1e-3)
 
 
@@ -263,15 +242,9 @@ class SumOfSquaresQuartic(SurfaceDistribution):
 
 
 def dof_of_terms(factors: Array, dof: Array) -> Array:
-    """Return the m for which the relative variance of H, averaged over rays, is 2 / dof.
-
-    (F' P F)^2 has the relative variance (8 m + 24) / (m (m + 2)). For a sum, this is multiplied by the sum of the
-    squares of the terms' shares of H, averaged over rays.
-
-    Args:
-        factors: Lower triangular factors of the P_k, shape (terms, 3, 3).
-        dof: Degrees of freedom n.
-    """
+    """Return the m for which the relative variance of H, averaged over rays, is 2 / dof."""
+    # (F' P F)^2 has the relative variance (8 m + 24) / (m (m + 2)). For a sum, this is multiplied by the sum of the
+    # squares of the terms' shares of H, averaged over rays.
     forms = factors @ jnp.swapaxes(factors, 1, 2)
     rays = jnp.asarray(fibonacci_hemisphere(NUM_RAYS), dof.dtype)
     value = jnp.einsum("fi,kij,fj->fk", rays, forms, rays) ** 2

@@ -116,13 +116,11 @@ class Curve(Shape):
         return self.control[0] + moment / (jnp.sum(weight * (x * dy - y * dx)) / 2)
 
     def _quadrature(self) -> tuple[Array, ...]:
-        """Return (x, y, dx, dy, weight) at the nodes of Gauss-Legendre quadrature along the curve.
-
-        The points (x, y), m, are relative to the first control point. The derivatives (dx, dy) are by the segment's
-        parameter. Five nodes per segment are exact for integrands up to degree nine.
-        """
+        """Return (x, y, dx, dy, weight) at Gauss-Legendre nodes; x and y are relative to the first control point, m."""
+        # The derivatives dx and dy are by the segment's parameter.
         # Relative points keep a curve far from the origin from losing digits.
         segments = jax.tree.map(lambda field: field[:, None], spline_segments(self.control - self.control[:1]))
+        # Five nodes per segment are exact for integrands up to degree nine.
         nodes, weights = (
             jnp.asarray(part / 2, self.control.dtype)[None] for part in np.polynomial.legendre.leggauss(5)
         )
@@ -172,25 +170,19 @@ class Curve(Shape):
 
 
 def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array, Array]:
-    """Return the least and largest value of one coordinate over all segments, given its power coefficients.
-
-    The candidates are the ends of the segments and the stationary points between them.
-    """
+    """Return the least and largest value of one coordinate over all segments, given its power coefficients."""
     discriminant = c2 * c2 - 3 * c1 * c3
     # q / (3 c3) and c1 / q are the roots of the derivative, in the forms without cancellation.
     q = -(c2 + jnp.where(c2 < 0, -1.0, 1.0) * jnp.sqrt(jnp.where(discriminant > 0, discriminant, 0.0)))
     stationary = q / jnp.where(c3 == 0, jnp.inf, 3 * c3), c1 / jnp.where(q == 0, jnp.inf, q)
+    # The extremes lie at the ends of the segments or at the stationary points between them.
     candidates = [jnp.zeros_like(c0), *(jax.lax.stop_gradient(jnp.clip(t, 0, 1)) for t in stationary)]
     values = jnp.stack([c0 + t * (c1 + t * (c2 + t * c3)) for t in candidates])
     return jnp.min(values), jnp.max(values)
 
 
 def _checked_points(name: str, points: ArrayLike) -> Array:
-    """Return the argument `name` as an array.
-
-    Raises:
-        ValueError: Unless it holds at least four finite points, each of which differs from the next.
-    """
+    """Return the argument `name` as an array of at least four finite points, each unlike the next, or raise."""
     array = as_float(points, name=name)
     check_shape(name, array, (name, 2))
     if len(array) < 4:
@@ -213,11 +205,8 @@ _BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) 
 
 
 def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return points and first and second derivatives of a known curve, each of shape (parameters, 2).
-
-    The parameters, shape (parameters,), are counted in segments. This repeats `spline_segments` and
-    `SplineSegment.evaluate` in NumPy, to compute in float64 whatever precision JAX runs in.
-    """
+    """Return points and first and second derivatives, (parameters, 2), at parameters counted in segments."""
+    # This repeats `spline_segments` and `SplineSegment.evaluate` in float64, whatever precision JAX runs in.
     index = np.floor(parameter).astype(int)
     t = (parameter - index)[:, None]
     around = np.stack([control[(index + k) % len(control)] for k in (-1, 0, 1, 2)])
@@ -245,11 +234,7 @@ def _checked_signed_area(control: np.ndarray) -> float:
 
 
 def _is_convex(control: Array, claimed: bool | None) -> bool:
-    """Return whether the curve turns inward at none of 32 points per segment, up to roundoff; if traced, `claimed`.
-
-    Raises:
-        ValueError: If it does, although `claimed` is True.
-    """
+    """Return whether the curve turns inward at none of 32 points per segment, up to roundoff; if traced, `claimed`."""
     known = concrete(control)
     if known is None:
         return bool(claimed)
@@ -282,16 +267,11 @@ def _solve(xp, matrix, right):
 
 
 def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
-    """Return the control points, shape (controls, 2), m, that alternating least squares fits to `points`.
-
-    Each iteration solves for the control points at fixed parameters, then moves the parameter of every point toward the
-    closest point of the curve. A point's parameter starts at its fraction of the outline's length. The first iterations
-    minimize the whole distance between a point and the curve's point at its parameter. The later ones weight mostly
-    the distance along the normal, because the parameter can compensate for the distance along the tangent.
-    """
+    """Return the control points, shape (controls, 2), m, that alternating least squares fits to `points`."""
     before, after = (np.linalg.norm(points - np.roll(points, k, axis=0), axis=1) for k in (1, -1))
     weight = np.sqrt((before + after) / 2)[:, None]
     arc_length = np.concatenate([[0], np.cumsum(after)])
+    # A point's parameter starts at its fraction of the outline's length.
     parameter = arc_length[:-1] / arc_length[-1] * controls
     normal, tangent = np.broadcast_to(np.eye(2)[:, None], (2, len(points), 2))
     for iteration in range(FIT_ITERATIONS):
@@ -300,6 +280,8 @@ def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
         design = np.zeros((len(points), controls))
         for k in range(4):
             design[np.arange(len(points)), (index + k - 1) % controls] += basis[:, k]
+        # The first iterations minimize the whole distance between a point and the curve's point at its parameter. The
+        # later ones weight mostly the distance along the normal, because the parameter can compensate for the rest.
         tangent_weight = 1.0 if iteration < FIT_ITERATIONS // 4 else 0.1
         rows = [weight * scale * direction for scale, direction in ((1.0, normal), (tangent_weight, tangent))]
         stacked_design = np.concatenate([(row[:, :, None] * design[:, None]).reshape(len(points), -1) for row in rows])

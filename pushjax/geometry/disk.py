@@ -11,12 +11,7 @@ from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, r
 
 
 class DiskOutline(Outline):
-    """Outline of a disk.
-
-    Attributes:
-        center: Center, m, body frame.
-        radius: Radius, m.
-    """
+    """Outline of a disk, in m in the body frame."""
 
     center: Vec2
     radius: Scalar

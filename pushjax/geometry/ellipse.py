@@ -36,15 +36,10 @@ ARC_NODES = 512
 
 
 class EllipseOutline(Outline):
-    """Outline of an ellipse whose axes are those of the body frame.
-
-    Attributes:
-        center: Center, m, body frame.
-        semi: Semi-axes along x and y, m.
-    """
+    """Outline of an ellipse with its axes along the body axes, in m."""
 
     center: Vec2
-    semi: Vec2
+    semi: Vec2  # semi-axes along x and y
 
     def _evaluate(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
         """Return the point at `q` relative to the center, the outward unit normal, and the speed, m per rad."""
@@ -87,7 +82,7 @@ def _unit(v: Vec2) -> Vec2:
 
 
 def _rotated(q: Vec2, angle: Scalar) -> Vec2:
-    """Rotate `q` by a small angle. The angle is right to second order; the length is always one."""
+    """Return the unit vector `q` rotated by a small angle, exact to second order."""
     return _unit(q + q.perp().scale(angle))
 
 
@@ -105,20 +100,9 @@ def _arc_midpoint(low: Vec2, high: Vec2) -> Vec2:
 def _falling_root_on_circle(
     function, q: Vec2, low: Vec2, high: Vec2, zero_tolerance: Scalar, iterations: int, like: Scalar
 ) -> Vec2:
-    """Find where a function of q falls through zero in a bracket; not differentiated.
-
-    Args:
-        function: Function of q that returns its value, its slope by the angle of q, and the step (an angle) to take.
-        q: Initial guess.
-        low: Start of the bracket; the function is positive after it.
-        high: End of the bracket, counterclockwise from `low`; the function is negative before it.
-        zero_tolerance: Magnitude up to which a value is zero up to roundoff.
-        iterations: Number of iterations.
-        like: As in `compute_once`.
-
-    Returns:
-        The root, a unit vector.
-    """
+    """Find where a function of q falls through zero on the arc from `low` to `high`; not differentiated."""
+    # `function` returns its value, its slope by the angle of q, and the step (an angle) to take. It is positive after
+    # `low` and negative before `high`, which lies counterclockwise from `low`.
 
     def iterate(_, carry):
         q, low, high = carry
@@ -135,15 +119,8 @@ def _falling_root_on_circle(
 def _closest_residual(
     a2_minus_b2: Scalar, ax: Scalar, by: Scalar, q: Vec2, least_slope: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Return f(q), its derivative by the angle of q, and Halley's step to its root, in rad.
-
-    Args:
-        a2_minus_b2: a^2 - b^2, m^2.
-        ax: a |x|, m^2.
-        by: b |y|, m^2.
-        q: Where to evaluate f, a unit vector.
-        least_slope: In the step, a derivative of at most this magnitude is replaced by -least_slope, m^2.
-    """
+    """Return f(q), its derivative by the angle of q, and Halley's step to its root, in rad."""
+    # Here `ax` is a |x| and `by` is b |y|, both in m^2.
     c, s = q
     value = a2_minus_b2 * s * c - ax * s + by * c
     slope = a2_minus_b2 * (c * c - s * s) - ax * c - by * s
@@ -170,10 +147,7 @@ def _closest_parameter(semi: Vec2, rel: Vec2) -> Vec2:
 
 
 def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi: Vec2) -> Vec2:
-    """Find the root of f in the first quadrant, for the arguments of `_closest_residual` and the semi-axes.
-
-    Neither `ax` nor `by` is negative.
-    """
+    """Find the root of f in the first quadrant for `ax` and `by` that are not negative; not differentiated."""
     one, zero = jnp.ones_like(ax), jnp.zeros_like(ax)
     # Halley's method can overshoot a root at an end of the quadrant. Where f has the right sign beyond that end, the
     # bracket extends past it. Where it does not, a root at that end is a critical point that is not the closest point,
@@ -206,11 +180,8 @@ def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi
 
 
 def _center_height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
-    """Return g(q), its derivative by the angle of q, and Newton's step to its root, in rad.
-
-    g is the height, over the line of the path, of the center of a disk that touches at `q`, times the path's length:
-    m^2.
-    """
+    """Return g(q), m^2, its derivative by the angle of q, and Newton's step to its root, in rad."""
+    # g is the height of the touching disk's center over the line of the path, times the path's length.
     scaled_normal = Vec2(semi.y * q.x, semi.x * q.y)
     squared = scaled_normal.dot(scaled_normal)
     speed = jnp.sqrt(squared)

@@ -29,7 +29,7 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
     """Compute the area of the intersection of two simple polygons, convex or not.
 
     The result is exact up to roundoff, and differentiable wherever the area is. Elsewhere, for example where edges
-    coincide, the derivative is that on one side.
+    coincide, the derivative is one-sided.
 
     Args:
         first: Vertices of the first polygon, shape (first_vertices, 2), m. The first vertex is not repeated at the end.
@@ -64,23 +64,14 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
 
 
 class _Edges(NamedTuple):
-    """Edges of a polygon as functions y(x), each field an array over the edges.
+    """Edges of a polygon as functions y(x), each field an array over the edges."""
 
-    Attributes:
-        sign: +1 if the edge runs toward +x, and -1 otherwise.
-        left_x: x of the left end.
-        left_y: y of the left end.
-        right_x: x of the right end.
-        right_y: y of the right end.
-        slope: dy/dx; zero for a vertical edge, where both ends are known without it.
-    """
-
-    sign: Array
+    sign: Array  # +1 if the edge runs toward +x, and -1 otherwise
     left_x: Array
     left_y: Array
     right_x: Array
     right_y: Array
-    slope: Array
+    slope: Array  # dy/dx; zero for a vertical edge, where both ends are known without it
 
     @staticmethod
     def of(vertices: Array) -> "_Edges":
@@ -107,8 +98,8 @@ class _Edges(NamedTuple):
 
 def _pair_areas(a: _Edges, b: _Edges) -> Array:
     """Return the term of each pair of edges in the sum of this module's header."""
-    # Where x of `a` and `b` are equal, that of `a` counts as the smaller one, in every comparison. So the derivative at
-    # a tie is that of polygons that lie side by side, and not a mixture that no small motion has.
+    # Where x of `a` and `b` are equal, x of `a` counts as the smaller one, in every comparison. So at a tie the
+    # derivative applies to polygons that lie side by side, and is not a mixture that no small motion has.
     low, high = (
         jnp.where(a.left_x > b.left_x, a.left_x, b.left_x),
         jnp.where(a.right_x > b.right_x, b.right_x, a.right_x),
@@ -117,8 +108,8 @@ def _pair_areas(a: _Edges, b: _Edges) -> Array:
     at_low = a.at_left(low) - b.at_left(low)
     at_high = a.at_right(high) - b.at_right(high)
     below = jnp.minimum(at_low, 0) + jnp.minimum(at_high, 0)
-    # |d| is written as d - 2 min(d, 0). Its derivative at d = 0 matches that of `below`, so that of the quotient does
-    # not jump.
+    # |d| is written as d - 2 min(d, 0). Its derivative at d = 0 matches the derivative of `below`, so the derivative of
+    # the quotient does not jump.
     share = _safe_divide(below, at_low + at_high - 2 * below)
     return -0.5 * a.sign * b.sign * width * below * share
 

@@ -1,7 +1,7 @@
-"""Distances of points and segments from a polygon, and the curve at a given distance around it, in NumPy.
+"""Distances from a polygon and curves at a given distance around it, in NumPy.
 
-They are for thousands of points at a time, outside of any compiled program. All points are in the polygon's own frame,
-in m.
+The functions serve thousands of points at a time, outside of compiled programs. All points are in the polygon's frame,
+in m, and all vertices run counterclockwise.
 """
 
 from typing import NamedTuple
@@ -15,21 +15,14 @@ CURVE_POINTS = 96  # vertices of the polygon that stands for a curved outline
 
 
 def outline_vertices(shape: Shape) -> np.ndarray:
-    """Return the vertices of a polygon, or points on the outline of another shape, (vertices, 2), body frame, m.
-
-    They are counterclockwise. A curved outline that is convex reaches a little beyond the polygon of these points.
-    """
+    """Return the vertices of a polygon, or points on another outline, (vertices, 2), body frame, m."""
+    # A convex curved outline reaches a little beyond the polygon of these points.
     points = shape.vertices if isinstance(shape, Polygon) else shape.boundary(CURVE_POINTS)
     return np.asarray(points, np.float64)
 
 
 def signed_distances(vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the signed distances of points from a polygon, (...,), m, negative inside.
-
-    Args:
-        vertices: Vertices, counterclockwise, (vertices, 2), m.
-        points: Points, (..., 2), m.
-    """
+    """Return the signed distances of points (..., 2) from a polygon, (...,), m, negative inside."""
     # edges come first, so that the longest loops run over the points
     edges = np.roll(vertices, -1, axis=0) - vertices
     (ax, ay), (ex, ey) = (_by_edge(each, points.ndim) for each in (vertices, edges))
@@ -57,18 +50,10 @@ def segment_distances(
     vertices: np.ndarray,
     start: np.ndarray,
     end: np.ndarray,
-    start_distance: np.ndarray | None = None,
+    start_distance: np.ndarray | None = None,  # `signed_distances` of the ends, computed if not given
     end_distance: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the distance of segments from a polygon, (...,), m, zero or negative where they touch it.
-
-    Args:
-        vertices: Vertices, counterclockwise, (vertices, 2), m.
-        start: First points, (..., 2), m.
-        end: Last points, (..., 2), m.
-        start_distance: `signed_distances` of the first points, (...,), m. None: they are computed.
-        end_distance: The same for the last points.
-    """
+    """Return the distances of segments from a polygon, (...,), m, zero or negative where they touch it."""
     start, end = np.broadcast_arrays(start, end)
     start_distance = signed_distances(vertices, start) if start_distance is None else start_distance
     end_distance = signed_distances(vertices, end) if end_distance is None else end_distance
@@ -87,34 +72,20 @@ def segment_distances(
 
 
 class OffsetCurve(NamedTuple):
-    """Points at one distance from a polygon, at equal spacing.
+    """Points at one distance from a polygon, in order around it."""
 
-    Attributes:
-        points: The points, (points, 2), m.
-        normals: Unit vectors from each point to the nearest point of the polygon, (points, 2).
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
+    points: np.ndarray  # (points, 2), m
+    normals: np.ndarray  # (points, 2), unit vectors toward the nearest point of the polygon
 
 
 def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCurve:
-    """Return points all around a polygon at one distance from it.
-
-    Args:
-        vertices: Vertices, counterclockwise, (vertices, 2), m.
-        distance: The distance, m, positive.
-        count: Number of points on the curve made of shifted edges and of arcs around convex corners. Parts of it that
-            are nearer to another edge are left out, so there are fewer points where the polygon has reflex corners.
-
-    Returns:
-        The points in order around the polygon.
-    """
+    """Return points all around a polygon at one positive distance from it, m."""
     edge = np.roll(vertices, -1, axis=0) - vertices
     length = np.linalg.norm(edge, axis=1)
     outward = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / length[:, None]
     turn = exterior_angles(vertices)
     arc = distance * np.maximum(np.roll(turn, -1), 0)  # at the end of each edge
+    # `count` points are equally spaced on the curve made of shifted edges and of arcs around convex corners.
     ends = np.cumsum(np.stack([length, arc], axis=1).ravel())
     arc_length = (np.arange(count) + 0.5) / count * ends[-1]
     piece = np.searchsorted(ends, arc_length, side="right")
@@ -125,6 +96,7 @@ def offset_curve(vertices: np.ndarray, distance: float, count: int) -> OffsetCur
     away = np.stack([c * outward[k, 0] - s * outward[k, 1], s * outward[k, 0] + c * outward[k, 1]], axis=1)
     fraction = np.where(on_arc, 1.0, along / length[k])
     points = vertices[k] + fraction[:, None] * edge[k] + distance * away
+    # Near reflex corners, parts of the curve are nearer to another edge and drop out, so fewer points remain.
     keep = signed_distances(vertices, points) > distance * (1 - 1e-9) - 1e-12
     return OffsetCurve(points[keep], -away[keep])
 

@@ -1,7 +1,4 @@
-"""Outlines of polygons, convex or not: closest points, second contacts and sweep.
-
-A second contact is another local minimum of the distance to the query point; see `Outline.contact_candidates`.
-"""
+"""Outlines of polygons, convex or not: closest points, second contacts (see `Outline.contact_candidates`) and sweep."""
 
 from typing import NamedTuple
 
@@ -16,31 +13,20 @@ from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersectio
 
 
 class Edge(NamedTuple):
-    """One edge of a polygon, or all of them as arrays (edges,), in the body frame.
-
-    Attributes:
-        start: Start of the edge, m.
-        along: Unit direction from start to end.
-        length: Length, m.
-        bisector_a: Unit bisector of the two outward normals that meet at the start.
-        bisector_b: The same at the end.
-        turn_a: Sine of the angle by which the outline turns at the start; negative at a reflex vertex.
-        turn_b: The same at the end.
-        previous: Unit direction of the edge before this one.
-    """
+    """One edge of a polygon, or all of them as arrays (edges,), in m in the body frame."""
 
     start: Vec2
-    along: Vec2
+    along: Vec2  # unit direction from start to end
     length: Scalar
-    bisector_a: Vec2
-    bisector_b: Vec2
-    turn_a: Scalar
-    turn_b: Scalar
-    previous: Vec2
+    bisector_a: Vec2  # unit bisector of the two outward normals that meet at the start
+    bisector_b: Vec2  # the same at the end
+    turn_a: Scalar  # sine of the angle by which the outline turns at the start; negative at a reflex vertex
+    turn_b: Scalar  # the same at the end
+    previous: Vec2  # unit direction of the edge before this one
 
     @staticmethod
     def of(vertices: Float[Array, "edges 2"]) -> "Edge":
-        """All edges of a polygon that runs counterclockwise."""
+        """Return all edges of a polygon that runs counterclockwise."""
         x, y = vertices[:, 0], vertices[:, 1]
         step_x, step_y = jnp.roll(x, -1) - x, jnp.roll(y, -1) - y
         length = jnp.sqrt(step_x**2 + step_y**2)
@@ -54,19 +40,11 @@ class Edge(NamedTuple):
 
     @property
     def normal(self) -> Vec2:
-        """Outward unit normal; it lies to the right of the edge, because the outline runs counterclockwise."""
+        """Outward unit normal, to the right of the edge because the outline runs counterclockwise."""
         return Vec2(self.along.y, -self.along.x)
 
     def foot(self, x: Vec2) -> tuple[Scalar, Scalar, Vec2]:
-        """Project a point onto the edge.
-
-        Args:
-            x: Query point, m, body frame.
-
-        Returns:
-            A tuple of the arc length of the projection from the start, m, the same clipped to the edge, and the vector
-            from the clipped projection to `x`.
-        """
+        """Return the arc length at the projection of `x`, m, the same clipped to the edge, and `x` minus that foot."""
         rel = x - self.start
         s = rel.dot(self.along)
         clipped = jnp.clip(s, 0, self.length)
@@ -74,15 +52,10 @@ class Edge(NamedTuple):
 
 
 class PolygonOutline(Outline):
-    """Outline of a polygon that runs counterclockwise.
-
-    Attributes:
-        edges: The edges, as arrays.
-        convex: Whether the polygon is known to be convex, so that a finger touches it in one place only.
-    """
+    """Outline of a polygon that runs counterclockwise."""
 
     edges: Edge
-    convex: bool = eqx.field(static=True, default=False)
+    convex: bool = eqx.field(static=True, default=False)  # False also if convexity is not known
 
     def _nearest_edge(self, x: Vec2) -> Int[Array, ""]:
         """Return the index of the edge nearest to `x`."""
@@ -133,13 +106,11 @@ def _first_touches(edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Float[Arr
 
 
 def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
-    """Return the signed distance, closest point and normal for the query point `x`, from its nearest edge alone.
-
-    If `x` projects onto the interior of the edge, the signed distance is linear in `x`, and its sign is right inside
-    and outside. If a vertex is the closest point, the sign is that of the component along the bisector: positive at a
-    convex vertex, because `x` is then outside, and negative at a reflex one. This sign stays right for vertices that
-    are almost straight.
-    """
+    """Return the signed distance, closest point and normal for the query point `x`, from its nearest edge alone."""
+    # If `x` projects onto the interior of the edge, the signed distance is linear in `x`, and its sign is right inside
+    # and outside. If a vertex is closest, the component along the bisector gives the sign: positive at a convex vertex,
+    # because `x` is then outside, and negative at a reflex one. This sign stays right for vertices that are almost
+    # straight.
     position, clipped, from_edge = compute_once(edge.foot(x), x.x)
     projects_inside = (position > 0) & (position < edge.length)
     bisector = tree_where(position <= 0, edge.bisector_a, edge.bisector_b)
@@ -158,26 +129,7 @@ def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:
 def _test_second_contacts(
     edge: Edge, x: Vec2, nearest: Int[Array, ""], nearest_distance: Scalar
 ) -> tuple[Bool[Array, " edges"], Bool[Array, " edges"], Float[Array, " edges"]]:
-    """Test for each edge whether it, or its start vertex, is another local minimum of the distance from `x`.
-
-    An edge is a second contact if `x` projects onto it and lies on its outer side. An edge that `x` faces only through
-    the material is no contact.
-
-    A neighbor of the nearest edge needs care. If they meet at a convex vertex, both have the same closest point, and
-    there is only one minimum. If they meet at a reflex vertex, both can be contacts. There, if `x` is on the outline or
-    behind it, the neighbor is a contact even if `x` projects past its end: a point pressed slightly into one edge is
-    still stopped by the other.
-
-    Args:
-        edge: The edges to test.
-        x: Query point, m, body frame.
-        nearest: Index of the nearest edge.
-        nearest_distance: Signed distance to the nearest edge, m.
-
-    Returns:
-        A tuple of whether the edge is a second contact, whether its start vertex is one, and the squared distance from
-        `x` to the edge, m^2.
-    """
+    """Return whether each edge, or its start vertex, is a second contact of `x`, and its squared distance, m^2."""
     position, _, from_edge = edge.foot(x)
     rel = x - edge.start
     tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + edge.length)
@@ -187,8 +139,12 @@ def _test_second_contacts(
     index = jnp.arange(count)
     is_nearest, next_is_nearest = index == nearest, (index + 1) % count == nearest
     previous_is_nearest = index == (nearest + 1) % count
+    # Two edges that meet at a convex vertex have the same closest point there, so there is only one minimum.
     shares_point = (previous_is_nearest & ~reflex_a) | (next_is_nearest & ~reflex_b)
+    # Two edges that meet at a reflex vertex can both be contacts. If `x` is on the outline or behind it, the neighbor
+    # is a contact even if `x` projects past its end: the other edge still stops a point pressed slightly into one edge.
     is_wedged = ((previous_is_nearest & reflex_a) | (next_is_nearest & reflex_b)) & (nearest_distance <= tolerance)
+    # `x` must lie on the outer side of the edge. An edge that it faces only through the material is no contact.
     is_faced = (position >= -tolerance) & (position <= edge.length + tolerance) & (edge.normal.dot(rel) >= -tolerance)
     on_edge = ~is_nearest & ~shares_point & (is_faced | is_wedged)
     in_vertex_sector = (position <= 0) & (rel.dot(edge.previous) >= 0) & ~reflex_a

@@ -4,8 +4,7 @@ A pose (x, y, theta) places the body frame in the world: the body point p is the
 A twist (vx, vy, omega) and a wrench (fx, fy, tau) are expressed in the body frame about its origin, linear part first.
 Lengths are in m, forces in N. Angles are in rad and are never wrapped.
 
-The last axis of a pose, twist or wrench has length three, that of a point length two. All functions broadcast over the
-axes before it and raise ValueError for other shapes.
+The last axis has length three, or two for points. All functions broadcast over the axes before it.
 """
 
 import jax.numpy as jnp
@@ -80,8 +79,7 @@ def transform(pose: ArrayLike, point: ArrayLike) -> Float[Array, "*batch 2"]:
         The same points in the world frame, shape (..., 2), m.
 
     Raises:
-        ValueError: If the last axis of `pose` does not have length three, or that of `point` length two, or the other
-            axes do not broadcast.
+        ValueError: If a last axis has another length, or the other axes do not broadcast.
     """
     (x, y, theta), (px, py) = _components(pose=pose, point=point)
     c, s = jnp.cos(theta), jnp.sin(theta)

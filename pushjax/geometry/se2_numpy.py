@@ -1,7 +1,4 @@
-"""Operations on many poses in NumPy, for what runs outside of compiled programs.
-
-They agree with `pushjax.geometry.se2`, but keep the arrays' own dtype and compile nothing for new shapes.
-"""
+"""Operations of `pushjax.geometry.se2` in NumPy, in the dtype of the arrays and without compilation for new shapes."""
 
 import numpy as np
 

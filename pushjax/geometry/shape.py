@@ -17,100 +17,51 @@ PAIRS_AT_ONCE = 2**20  # pairs of edges that are compared together
 
 
 class ClosestPoint(NamedTuple):
-    """Signed distance, closest boundary point and outward normal for one query point.
+    """Signed distance, closest boundary point and outward normal for one query point, in the body frame."""
 
-    If the closest point is a corner, the normal lies along the line from the corner to the query point: toward the
-    query point if that is outside, away from it if that is inside. If the query point lies on the boundary, the normal
-    is that of the edge, or at a corner the bisector.
-
-    Attributes:
-        distance: Signed distance, m, negative inside.
-        point: Closest point on the boundary, m, body frame.
-        normal: Outward unit normal there, body frame.
-    """
-
-    distance: Scalar
-    point: Vec2
+    distance: Scalar  # m, negative inside
+    point: Vec2  # m
+    # At a corner, the normal lies along the line from the corner to the query point: toward the query point if that is
+    # outside, away from it if that is inside. If the query point lies on the boundary, the normal is orthogonal to the
+    # edge, or at a corner along the bisector.
     normal: Vec2
 
 
 class FacingPoints(NamedTuple):
-    """Points of an outline whose outward normal is a given direction, as arrays of static length with a mask.
+    """Points of an outline whose outward normal is a given direction, as arrays of static length with a mask."""
 
-    Attributes:
-        point: Points on the outline, m, body frame; its coordinates have shape (points,).
-        valid: Which of the entries are such points, shape (points,). The other entries are padding.
-    """
-
-    point: Vec2
-    valid: Bool[Array, "points"]
+    point: Vec2  # m, body frame; the coordinates have shape (points,)
+    valid: Bool[Array, "points"]  # the other entries are padding
 
 
 class Outline(eqx.Module):
-    """The boundary of a shape, prepared for the distance queries of contact detection.
+    """The boundary of a shape, prepared for the distance queries of contact detection."""
 
-    Its methods take and return `Vec2` instead of arrays; `pushjax._math.vec` says why. Whatever does not depend on the
-    query point is computed once, when `Shape.outline` creates the outline.
-    """
+    # Its methods take and return `Vec2` instead of arrays; `pushjax._math.vec` gives the reason. Whatever does not
+    # depend on the query point is computed once, when `Shape.outline` creates the outline.
 
     @abstractmethod
     def closest(self, x: Vec2) -> ClosestPoint:
-        """Find the closest boundary point to a body point.
-
-        Args:
-            x: Query point, m, body frame.
-
-        Returns:
-            Signed distance, closest point and outward normal.
-        """
+        """Return the signed distance, closest point and outward normal for the query point `x`, m, body frame."""
 
     def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
-        """Find all points at which a round finger centered at `x` can touch the outline at the same time.
-
-        The first is `closest(x)`. An outline that may not be convex returns a second one, for a finger wedged in a
-        concave corner. It is the nearest of the other boundary points that face `x` and are local minima of the
-        distance to `x`. Its distance is negative if `x` is behind the edge on which the point lies. If there is no such
-        point, the second candidate has the point and normal of the first. Its distance is then the first distance plus
-        the perimeter, which is out of reach of any finger.
-
-        Args:
-            x: Center of the finger, m, body frame.
-
-        Returns:
-            The candidates, nearest first. Their number is static.
-        """
+        """Return all points at which a round finger centered at `x` can touch at the same time, nearest first."""
+        # The first is `closest(x)`. An outline that may not be convex returns a second one, for a finger wedged in a
+        # concave corner: the nearest of the other boundary points that face `x` and are local minima of the distance
+        # to `x`. Its distance is negative if `x` is behind the edge on which the point lies. If there is no such point,
+        # the second candidate repeats the point and normal of the first. Its distance is then the first distance plus
+        # the perimeter, which is out of reach of any finger.
         return (self.closest(x),)
 
     @abstractmethod
     def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        """Find the fraction of a straight path after which a disk first touches the outline.
-
-        The result is exact for any length of the path, so a fast disk cannot tunnel through the outline.
-
-        Args:
-            x: Center of the disk at the start, m, body frame. The disk starts outside, or in contact up to roundoff.
-            path: Displacement of the disk, m, body frame.
-            radius: Radius of the disk, m.
-
-        Returns:
-            Fraction of `path` at first contact, from 0 to 1. It is 0 if the disk starts in contact and approaches, and
-            infinite if the disk does not touch within the path.
-        """
+        """Return the fraction of `path`, from 0 to 1, after which a disk first touches, or inf if it never does."""
+        # The result is exact for any length of the path, so a fast disk cannot tunnel through the outline. The disk
+        # starts at `x`, outside or in contact up to roundoff. If it starts in contact and approaches, the result is 0.
 
     def facing(self, direction: Vec2) -> FacingPoints:
-        """Find the locally convex points of a smooth outline at which the outward normal is `direction`.
-
-        A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
-
-        Args:
-            direction: Unit vector, body frame.
-
-        Returns:
-            The points, and a mask of those that are valid.
-
-        Raises:
-            NotImplementedError: If the outline has corners.
-        """
+        """Return the locally convex points of a smooth outline whose outward normal is the unit vector `direction`."""
+        # A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
         raise NotImplementedError(f"{type(self).__name__} has corners, at which the outward normal is not unique")
 
 
@@ -122,7 +73,7 @@ class Shape(eqx.Module):
         """Return the boundary, prepared for distance queries."""
 
     def is_valid(self) -> Bool[Array, ""]:
-        """Whether numbers that were traced when the shape was made describe a shape."""
+        """Return whether the numbers of the shape describe a shape, also if they were traced at its creation."""
         return jnp.ones((), bool)
 
     @property
@@ -155,7 +106,7 @@ class Shape(eqx.Module):
         """Find the signed distance, closest boundary point and outward unit normal for a body point.
 
         Use `vmap` for batches of points. The distance is differentiable in the point and in the parameters of the
-        shape. The exceptions are the medial axis and the corners themselves: there the gradient is that of one
+        shape. The exceptions are the medial axis and the corners themselves: there the gradient belongs to one
         neighboring feature, and is finite.
 
         Args:
@@ -204,19 +155,9 @@ class Shape(eqx.Module):
 
 
 def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
-    """Find the fraction of a straight path at which a moving point comes within `reach` of the origin.
-
-    This is the smaller root of |x + t path|^2 = reach^2, in a form without cancellation. It is valid only for a point
-    that approaches and starts outside, or inside by no more than roundoff.
-
-    Args:
-        x: Start of the point, m.
-        path: Displacement of the point, m.
-        reach: Distance from the origin, m.
-
-    Returns:
-        Fraction of `path`, from 0 to 1, or inf if the point does not come that close within the path.
-    """
+    """Return the fraction of `path` at which a point that starts at `x` comes within `reach` of the origin, or inf."""
+    # This is the smaller root of |x + t path|^2 = reach^2, in a form without cancellation. It is valid only for a point
+    # that approaches and starts outside, or inside by no more than roundoff.
     a = path.dot(path)
     b = x.dot(path)
     squared = x.dot(x)
@@ -232,24 +173,16 @@ def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
 
 
 def roundoff(size: Scalar) -> Scalar:
-    """Bound the roundoff of a few operations on numbers of magnitude up to `size`: 16 eps size."""
+    """Return a bound on the roundoff of a few operations on numbers of magnitude up to `size`."""
     return 16 * jnp.finfo(size.dtype).eps * size
 
 
 def equally_spaced(
     speed: Callable[[Array], Array], nodes: Float[Array, "nodes"], points: int
 ) -> tuple[Float[Array, "points"], Float[Array, ""]]:
-    """Find parameters of points that are equally spaced in arc length along a closed smooth outline.
-
-    Args:
-        speed: Function from an array of parameters to the derivative of the arc length there, m per parameter.
-        nodes: Increasing parameters from start to end, dense enough that the speed is smooth between two of them.
-        points: Number of points.
-
-    Returns:
-        A tuple of the parameters, shape (points,), and the length of the outline, m. The first point is half a spacing
-        from the start.
-    """
+    """Return parameters of points equally spaced in arc length along a closed smooth outline, and its length, m."""
+    # `speed` maps parameters to the derivative of the arc length. The nodes increase from start to end, so densely that
+    # the speed is smooth between two of them.
     nodes_in_unit, weights = (jnp.asarray(part / 2, nodes.dtype) for part in np.polynomial.legendre.leggauss(5))
     nodes_in_unit = nodes_in_unit + 0.5
 
@@ -259,6 +192,7 @@ def equally_spaced(
 
     width = jnp.diff(nodes)
     arc_at_node = jnp.concatenate([jnp.zeros(1, nodes.dtype), jnp.cumsum(arc_length(nodes[:-1], width))])
+    # The first point is half a spacing from the start.
     wanted = (jnp.arange(points, dtype=nodes.dtype) + 0.5) / points * arc_at_node[-1]
     node = jnp.clip(jnp.searchsorted(arc_at_node, wanted, side="right") - 1, 0, width.size - 1)
     start, remaining, full_width = nodes[node], wanted - arc_at_node[node], width[node]
@@ -269,14 +203,8 @@ def equally_spaced(
 
 
 def is_outline(vertices: Float[Array, "vertices 2"], convex: bool) -> Bool[Array, ""]:
-    """Whether a closed polyline runs once around an area, counterclockwise, and is convex if that is claimed.
-
-    Whether edges that are not neighbors cross is not checked, unless it is convex.
-
-    Args:
-        vertices: Vertices, m.
-        convex: Whether it is said to be convex.
-    """
+    """Return whether a closed polyline runs once around an area, counterclockwise, and is convex if that is claimed."""
+    # Only the check of convexity excludes that edges cross that are not neighbors.
     vertices = jax.lax.stop_gradient(vertices)
     before = vertices - jnp.roll(vertices, 1, axis=0)
     after = jnp.roll(before, -1, axis=0)
@@ -291,29 +219,14 @@ def is_outline(vertices: Float[Array, "vertices 2"], convex: bool) -> Bool[Array
 
 
 def signed_area(v: np.ndarray) -> float:
-    """Compute the signed area of a closed polyline, m^2, positive if it runs counterclockwise.
-
-    Args:
-        v: Vertices, shape (vertices, 2), m.
-
-    Returns:
-        Signed area, m^2.
-    """
+    """Return the signed area of a closed polyline (vertices, 2), m^2, positive if it runs counterclockwise."""
     relative = v - v[0]
     next_vertex = np.roll(relative, -1, axis=0)
     return float(np.sum(relative[:, 0] * next_vertex[:, 1] - next_vertex[:, 0] * relative[:, 1]) / 2)
 
 
 def check_simple_polygon(name: str, v: np.ndarray) -> None:
-    """Check that a closed polyline encloses an area and does not touch itself.
-
-    Args:
-        name: Name of the argument, for the error message.
-        v: Vertices, shape (vertices, 2), m.
-
-    Raises:
-        ValueError: If two vertices coincide, the polyline encloses no area, or it crosses or touches itself.
-    """
+    """Raise ValueError unless a closed polyline (vertices, 2) encloses an area and does not touch itself."""
     size = float(np.max(np.ptp(v, axis=0)))
     near = 1e-9 * size
     pairs = np.zeros((0, 2), int) if size == 0 else np.concatenate(list(_edges_that_may_meet(v, near)))
@@ -333,26 +246,18 @@ def check_simple_polygon(name: str, v: np.ndarray) -> None:
 
 
 def find_self_intersection(v: np.ndarray, tolerance: float) -> tuple[int, int] | None:
-    """Find two edges of a closed polyline that cross or touch, other than at a shared vertex.
-
-    Args:
-        v: Vertices, shape (vertices, 2), m.
-        tolerance: Distance within which a vertex touches an edge, m.
-
-    Returns:
-        The indices of the two edges, or None if there are no such edges.
-    """
+    """Return the indices of two edges of a closed polyline that cross or touch off a shared vertex, or None."""
     n, end = len(v), np.roll(v, -1, axis=0)
 
     def orientation(p, q, r):
-        """Return twice the signed area of the triangle (p, q, r): its sign tells on which side of p q lies r."""
+        """Return twice the signed area of the triangle (p, q, r), positive if r lies to the left of p q."""
         return (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1]) - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
 
     for pairs in _edges_that_may_meet(v, tolerance):
         i, j = pairs.T
         p, q, r, s = v[i], end[i], v[j], end[j]
         touching = (orientation(p, q, r) * orientation(p, q, s) < 0) & (orientation(r, s, p) * orientation(r, s, q) < 0)
-        for k, other in ((i, j), (j, i)):  # a vertex on an edge that is not its own
+        for k, other in ((i, j), (j, i)):  # a vertex within `tolerance`, m, of an edge not its own
             on_edge = _is_near_segment(v[k], end[k], v[other], tolerance)
             touching |= on_edge & (other != (k + 1) % n)
         if touching.any():

@@ -2,7 +2,7 @@
 
 The query point is x, and p(u) is the outline's point at the parameter u. The function phi(u) = |x - p(u)|^2 / 2 and its
 derivative are evaluated at `SAMPLES` nodes per segment. Between two nodes, the cubic through their values and
-derivatives has at most one minimum, which equals that of phi to fourth order. Newton's method refines the two least of
+derivatives has at most one minimum, which equals phi's to fourth order. Newton's method refines the two least of
 all minima, and the nearer one is taken, so that two nearly equal minima cannot be confused. JAX does not differentiate
 the refinement. One differentiable iteration of Halley's method follows. It is of third order, so first and second
 derivatives are right.
@@ -30,21 +30,13 @@ CLOSEST_ITERATIONS = {False: 4, True: 6}  # key: whether the type is float64
 
 
 class Minima(NamedTuple):
-    """Local minima of phi, at most one for each interval between two nodes. Every field has one entry per interval.
+    """Local minima of phi, at most one for each interval between two nodes."""
 
-    Attributes:
-        position: Position of the minimum, in intervals from the first node; if there is none, that of the interval's
-            first node.
-        value: phi at the minimum, m^2. If there is none, twice phi at the interval's first node, which is larger than
-            the least minimum.
-        valid: Whether the interval has a minimum.
-        outer_side: Positive if the query point lies on the outer side of the outline.
-    """
-
-    position: Float[Array, "nodes"]
+    position: Float[Array, "nodes"]  # in intervals from the first node; without a minimum, the interval's first node
+    # phi at the minimum, m^2; without one, twice phi at the interval's first node, which is above the least minimum
     value: Float[Array, "nodes"]
-    valid: Bool[Array, "nodes"]
-    outer_side: Float[Array, "nodes"]
+    valid: Bool[Array, "nodes"]  # whether the interval has a minimum
+    outer_side: Float[Array, "nodes"]  # positive if the query point lies on the outer side of the outline
 
     def away_from(self, position: Scalar) -> Bool[Array, "nodes"]:
         """Return which minima are valid and are not the one at `position`."""
@@ -53,20 +45,12 @@ class Minima(NamedTuple):
 
 
 class SplineOutline(Outline):
-    """Outline of a closed cubic spline that runs counterclockwise.
-
-    Attributes:
-        segments: All segments, as one `SplineSegment` of arrays.
-        node: Points at the nodes, m, `SAMPLES` per segment. The outline hardly turns between two of them.
-        velocity: Derivatives of the outline's point at the nodes with respect to the index of the node, m.
-        perimeter: Length of the outline, m.
-        convex: Whether the outline is convex, so that a finger touches it in one place only.
-    """
+    """Outline of a closed cubic spline that runs counterclockwise."""
 
     segments: SplineSegment
-    node: Vec2
-    velocity: Vec2
-    perimeter: Scalar
+    node: Vec2  # points at the nodes, m; the outline hardly turns between two of them
+    velocity: Vec2  # derivatives of the outline's point with respect to the index of the node, m
+    perimeter: Scalar  # m
     convex: bool = eqx.field(static=True)
 
     def _local_minima(self, x: Vec2) -> Minima:
@@ -94,16 +78,8 @@ class SplineOutline(Outline):
         )
 
     def _refine(self, x: Vec2, position: Scalar) -> tuple[Scalar, SplineSegment, Scalar]:
-        """Refine a local minimum of phi, starting close to it.
-
-        Args:
-            x: Query point, m.
-            position: Initial position, in intervals from the first node.
-
-        Returns:
-            A tuple of the refined position, its segment (differentiable), and the parameter on that segment, which can
-            lie a little past the segment's ends.
-        """
+        """Return the refined position of a local minimum, its segment (differentiable) and the parameter on it."""
+        # Positions are in intervals from the first node. The parameter can lie a little past the segment's ends.
         count = self.segments.c0.x.size
         index = jnp.clip(jnp.floor(position / SAMPLES).astype(int), 0, count - 1)
         segment = self.segments.select(index)
@@ -115,7 +91,7 @@ class SplineOutline(Outline):
             rel = x - point
             descent = rel.dot(first)  # minus the first derivative of phi
             curvature = first.dot(first) - rel.dot(second)  # its second derivative
-            # Where the curvature is not that of a minimum, the step is half an interval downhill.
+            # Where the curvature is not positive, the step is half an interval downhill.
             downhill = jnp.abs(descent) * 2 * SAMPLES + jnp.finfo(t.dtype).tiny
             step = descent / jnp.where(curvature > 0, curvature, downhill)
             return Proposal(descent > 0, t + step, usable=True, is_tiny=jnp.abs(step) < 1e-4)
@@ -159,11 +135,9 @@ class SplineOutline(Outline):
         return first_contact(self.segments, x, path, radius, convex=self.convex)
 
     def facing(self, direction: Vec2) -> FacingPoints:
-        """Find the points on which a straight edge on the side of `direction` can rest; see `Outline.facing`.
-
-        There is one candidate per segment. The slope of the height direction . p(t) is a quadratic on a segment, and
-        falls through zero at most once.
-        """
+        """Return the points on which a straight edge on the side of `direction` can rest; see `Outline.facing`."""
+        # There is one candidate per segment. The slope of the height direction . p(t) is a quadratic on a segment, and
+        # falls through zero at most once.
         c1, c2, c3 = (direction.dot(c) for c in (self.segments.c1, self.segments.c2, self.segments.c3))
         a, b, c = jax.lax.stop_gradient((3 * c3, 2 * c2, c1))
         discriminant = b * b - 4 * a * c

@@ -10,36 +10,20 @@ from pushjax._math.vec import Scalar, Vec2
 
 
 class SplineSegment(NamedTuple):
-    """One segment, or an array of segments: p(t) = c0 + c1 t + c2 t^2 + c3 t^3 for t from 0 to 1.
+    """One segment p(t) = c0 + c1 t + c2 t^2 + c3 t^3 for t from 0 to 1, or an array of segments, in m."""
 
-    At a knot, the spline has continuous second derivatives, so the cubics of two neighbors differ by a multiple of
-    (t - knot)^3 only: the jump of c3. With these jumps a segment also represents its two neighbors, for t from -1 to 2.
-
-    Attributes:
-        c0: Constant coefficient, m.
-        c1: Coefficient of t, m.
-        c2: Coefficient of t^2, m.
-        c3: Coefficient of t^3, m.
-        left_jump: Jump of c3 from the previous segment to this one, m.
-        right_jump: Jump of c3 from this segment to the next, m.
-    """
+    # At a knot, the spline has continuous second derivatives, so the cubics of two neighbors differ by a multiple of
+    # (t - knot)^3 only: the jump of c3. With these jumps a segment also represents its neighbors, for t from -1 to 2.
 
     c0: Vec2
     c1: Vec2
     c2: Vec2
     c3: Vec2
-    left_jump: Vec2
-    right_jump: Vec2
+    left_jump: Vec2  # of c3, from the previous segment to this one
+    right_jump: Vec2  # of c3, from this segment to the next
 
     def evaluate(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
-        """Evaluate the point and its first and second derivative with respect to t.
-
-        Args:
-            t: Parameter, from -1 to 2.
-
-        Returns:
-            A tuple of the point and the two derivatives, m.
-        """
+        """Return the point and its first and second derivative with respect to t, for t from -1 to 2, m."""
         # How far t lies past the end of the segment, and how far before its start.
         over, under = jnp.maximum(t - 1, 0), jnp.maximum(-t, 0)
         point = self.c0 + (self.c1 + (self.c2 + self.c3.scale(t)).scale(t)).scale(t)
@@ -52,7 +36,7 @@ class SplineSegment(NamedTuple):
         )
 
     def third_derivative(self, t: Scalar) -> Vec2:
-        """Evaluate the third derivative with respect to t, for t from -1 to 2, m."""
+        """Return the third derivative with respect to t, for t from -1 to 2, m."""
         right, left = jnp.where(t > 1, 6.0, 0.0), jnp.where(t < 0, 6.0, 0.0)
         return self.c3.scale(6) + self.right_jump.scale(right) - self.left_jump.scale(left)
 
@@ -62,14 +46,7 @@ class SplineSegment(NamedTuple):
 
 
 def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
-    """Convert the control points of a closed uniform cubic B-spline to segments.
-
-    Args:
-        control: Control points, shape (controls, 2), m.
-
-    Returns:
-        An array of segments, one for each control point. Segment k starts near control point k.
-    """
+    """Return the segments of a closed uniform cubic B-spline; segment k starts near control point k."""
     before, here, after, next_ = (jnp.roll(control, k, axis=0) for k in (1, 0, -1, -2))
     c3 = (next_ - before) / 6 + (here - after) / 2
     coefficients = (
@@ -84,14 +61,7 @@ def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
 
 
 def outward_normal(velocity: Vec2) -> tuple[Vec2, Scalar]:
-    """Return the outward unit normal and the speed of a counterclockwise outline.
-
-    Args:
-        velocity: Derivative of the outline's point with respect to its parameter, m.
-
-    Returns:
-        A tuple of the outward unit normal and the norm of `velocity`, m.
-    """
+    """Return the outward unit normal of a counterclockwise outline and the norm of `velocity`, m."""
     # Where the speed is zero, the normal is zero, and neither it nor its derivative is NaN.
     squared = velocity.dot(velocity)
     speed = jnp.sqrt(jnp.maximum(squared, jnp.finfo(squared.dtype).tiny))

@@ -28,24 +28,13 @@ SWEEP_ITERATIONS = 10
 # How many of the places where the disk enters the outline on the line of the path are solved for, nearest first. More
 # than one is needed because their order is known only approximately beforehand.
 MAX_ENTRIES = 3
-# Intervals per segment; at their ends it is checked whether the disk fits into the curvature of the hollow. A place
-# that is too tight only between two ends is not seen.
+# Intervals per segment. At their ends the sweep checks whether the disk fits into the curvature of the hollow. It
+# misses a place that is too tight only between two ends.
 HOLLOW_SAMPLES = 16
 
 
 def first_contact(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool) -> Scalar:
-    """Find the fraction of a path after which a disk first touches a closed spline; see `Outline.sweep`.
-
-    Args:
-        segments: All segments of the outline, counterclockwise, as one `SplineSegment` of arrays.
-        x: Center of the disk at the start, m, body frame.
-        path: Displacement of the disk, m, body frame.
-        radius: Radius of the disk, m.
-        convex: Whether the outline is known to be convex.
-
-    Returns:
-        Fraction of `path`, from 0 to 1; infinite if the disk does not touch.
-    """
+    """Return the fraction of `path` after which a disk first touches a closed spline, or inf; see `Outline.sweep`."""
     fixed = jax.lax.stop_gradient((segments, x, path, radius))
     index, t, fraction = _first_root(*fixed, convex=convex)
     # Evaluated again with the differentiable arguments, to give the fraction its derivatives.
@@ -53,19 +42,14 @@ def first_contact(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, 
 
 
 class OffsetPoint(NamedTuple):
-    """The center of a disk that touches a segment from outside: a point of the offset curve.
+    """The center of a disk that touches a segment from outside: a point of the offset curve."""
 
-    Attributes:
-        center: Center of the disk, m.
-        velocity: Derivative of the center with respect to the segment's parameter, m.
-    """
-
-    center: Vec2
-    velocity: Vec2
+    center: Vec2  # m
+    velocity: Vec2  # by the segment's parameter, m
 
     @staticmethod
     def of(segment: SplineSegment, t: Scalar, radius: Scalar) -> "OffsetPoint":
-        """Evaluate the offset curve of `segment` for a disk of `radius` that touches at the parameter `t`."""
+        """Return the point of the offset curve for a disk of `radius` that touches `segment` at the parameter `t`."""
         point, first, second = segment.evaluate(t)
         normal, speed = outward_normal(first)
         # 1 + r kappa; negative where the hollow is too tight for the disk
@@ -73,28 +57,25 @@ class OffsetPoint(NamedTuple):
         return OffsetPoint(point + normal.scale(radius), first.scale(stretch))
 
     def relative_to_path(self, x: Vec2, path: Vec2) -> tuple[Scalar, Scalar, Scalar]:
-        """Return g, its derivative by the segment's parameter, and the position along the path.
-
-        g is the height over the line of the path that starts at `x`. All three are multiplied by the path's length.
-        """
+        """Return g, its derivative by the segment's parameter, and the position along the path, m^2."""
+        # g is the height over the line of the path that starts at `x`. All three include the path's length as a factor.
         rel = Vec2(self.center.x - x.x, self.center.y - x.y)
         return path.cross(rel), path.cross(self.velocity), path.dot(rel)
 
 
 def _contact_fraction(segment: SplineSegment, t: Scalar, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-    """Return the fraction of the path at which a disk touches at the root `t` of g; infinite if not on the path.
-
-    The value is the projection of the touching disk's center on the path. It is well-conditioned even for a path that
-    only grazes the outline. The derivatives are those of the fraction at which the disk reaches the tangent line at
-    `t`, which is the same fraction. One Newton step for `t` makes these derivatives exact to third order. The value of
-    that step is removed by `stop_gradient`, because for a grazing path it is magnified roundoff.
-    """
+    """Return the fraction of the path at which a disk touches at the root `t` of g; infinite if not on the path."""
     height, slope, along = OffsetPoint.of(segment, t, radius).relative_to_path(x, path)
+    # This Newton step makes the derivatives exact to third order. `stop_gradient` removes its value, because for a
+    # grazing path it is magnified roundoff.
     step = -height / jnp.where(slope < 0, slope, -jnp.inf)
     t = t + step - jax.lax.stop_gradient(step)
     point, first, _ = segment.evaluate(t)
     normal, _ = outward_normal(first)
     rel, squared, approach = x - point, path.dot(path), -normal.dot(path)
+    # The value comes from the projection of the touching disk's center on the path, which is well-conditioned even for
+    # a path that only grazes the outline. The derivatives come from `by_tangent`, the fraction at which the disk
+    # reaches the tangent line at `t`. Both fractions are equal.
     fraction = jax.lax.stop_gradient(along / jnp.where(squared > 0, squared, 1.0))
     tolerance = roundoff(jnp.abs(x.x) + jnp.abs(x.y) + jnp.abs(point.x) + jnp.abs(point.y) + radius)
     hits = (approach > 0) & (fraction * approach >= -tolerance) & (fraction <= 1)
@@ -104,37 +85,20 @@ def _contact_fraction(segment: SplineSegment, t: Scalar, x: Vec2, path: Vec2, ra
 
 
 class MonotoneInterval(NamedTuple):
-    """An interval of a segment on which g is monotone, or arrays of such intervals.
+    """An interval of a segment on which g is monotone, or arrays of such intervals."""
 
-    Attributes:
-        start: Segment parameter at the start.
-        end: Segment parameter at the end.
-        height_start: g at the start, m^2.
-        height_end: g at the end, m^2.
-        along_start: Position along the path at the start, times the path's length, m^2.
-        along_end: Position along the path at the end, times the path's length, m^2.
-        flat_start: Whether g' is zero at the start.
-        flat_end: Whether g' is zero at the end.
-    """
-
-    start: Scalar
+    start: Scalar  # segment parameters
     end: Scalar
-    height_start: Scalar
+    height_start: Scalar  # g, m^2
     height_end: Scalar
-    along_start: Scalar
+    along_start: Scalar  # position along the path, times the path's length, m^2
     along_end: Scalar
-    flat_start: Bool[Array, ""]
+    flat_start: Bool[Array, ""]  # whether g' is zero
     flat_end: Bool[Array, ""]
 
     def initial_guess(self) -> tuple[Array, Array, Array]:
-        """Estimate where g falls through zero in the interval.
-
-        g is taken to be linear, or parabolic about an end where it is flat.
-
-        Returns:
-            A tuple of the position as a fraction of the interval, whether g is parabolic about the start, and whether
-            it is parabolic about the end.
-        """
+        """Return a guess of the root as a fraction of the interval, and whether g is parabolic about start and end."""
+        # g is taken to be linear, or parabolic about an end where it is flat.
         fall = self.height_start - self.height_end
         fraction = jnp.clip(self.height_start / jnp.where(fall > 0, fall, 1.0), 0, 1)
         both = self.flat_start & self.flat_end
@@ -145,18 +109,11 @@ class MonotoneInterval(NamedTuple):
 
 
 class FreeInterval(NamedTuple):
-    """An interval of a segment that a disk can touch from outside, or arrays of such intervals.
+    """An interval of a segment that a disk can touch from outside, or arrays of such intervals."""
 
-    Attributes:
-        low: Segment parameter at the start; the interval is empty if `low` equals `high`.
-        high: Segment parameter at the end.
-        at_low: The touching disk at `low`.
-        at_high: The touching disk at `high`.
-    """
-
-    low: Scalar
+    low: Scalar  # segment parameters; the interval is empty if they are equal
     high: Scalar
-    at_low: OffsetPoint
+    at_low: OffsetPoint  # the touching disks at `low` and `high`
     at_high: OffsetPoint
 
 
@@ -192,12 +149,7 @@ def _monotone_intervals(
 
 
 def _free_intervals(segments: SplineSegment, radius: Scalar, convex: bool) -> list[tuple[Array, Array]]:
-    """Return the first and last interval of each segment that a disk can touch from outside.
-
-    These are the intervals in which the disk fits into the curvature. A third one between these two is left out. Each
-    interval is a tuple of arrays of its start and its end, as segment parameters. If a segment has no such interval,
-    its ends are equal.
-    """
+    """Return the first and last interval, as its start and end, of each segment that a disk can touch from outside."""
     zero = jnp.zeros_like(segments.c0.x)
     if convex:
         return [(zero, zero + 1)]
@@ -209,6 +161,7 @@ def _free_intervals(segments: SplineSegment, radius: Scalar, convex: bool) -> li
         _, speed = outward_normal(first)
         return speed * speed * speed + radius * first.cross(second)
 
+    # A segment without an interval gets one whose ends are equal. A third interval between the two is left out.
     fits = clearance(columns, jnp.broadcast_to(grid[None], (zero.size, grid.size))) > 0
     padded = jnp.pad(fits, ((0, 0), (1, 1)))
     rises, falls = fits & ~padded[:, :-2], fits & ~padded[:, 2:]
@@ -251,12 +204,7 @@ def _entry_estimate(interval: MonotoneInterval, squared: Scalar, tolerance: Scal
 
 
 def _first_root(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *, convex: bool):
-    """Find the first root of g on the path.
-
-    Returns:
-        A tuple of its segment's index, the parameter on that segment, and the fraction of the path, which is infinite
-        if there is no root on the path.
-    """
+    """Return the segment's index, the parameter and the fraction of the path at the first root of g, or inf if none."""
     # The free intervals and the extent do not depend on the path, so they are computed once for a batch of paths.
     like = segments.c0.x[0]
     free_intervals = [
@@ -293,11 +241,9 @@ def _first_root(segments: SplineSegment, x: Vec2, path: Vec2, radius: Scalar, *,
 def _root_in_interval(
     segment: SplineSegment, interval: MonotoneInterval, x: Vec2, path: Vec2, radius: Scalar
 ) -> Scalar:
-    """Return where g falls through zero in an interval, by Newton's method with bisection if it leaves the bracket.
-
-    If g is nearly parabolic about an end, Newton's method solves for the squared distance from that end.
-    """
+    """Return where g falls through zero in an interval, by Newton's method with bisection if it leaves the bracket."""
     guess, early, late = interval.initial_guess()
+    # If g is nearly parabolic about an end, Newton's method solves for the squared distance from that end.
     center, parabolic = jnp.where(early, interval.start, interval.end), early | late
 
     def propose(t: Scalar) -> Proposal:

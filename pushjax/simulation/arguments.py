@@ -47,25 +47,9 @@ def check_slider_and_hand(slider: Slider, hand: Hand) -> None:
 def checked_arguments(
     slider: Slider, hand: Hand, pose: ArrayLike, friction: ArrayLike, *paths: ArrayLike, pushes: int | None = None
 ):
-    """Cast everything to one floating dtype, and check it as far as its values are known.
-
-    Args:
-        slider: The slider.
-        hand: The hand.
-        pose: Pose of the slider, (3,), world.
-        friction: Coefficient of friction mu, a scalar or (fingers,).
-        *paths: Configurations, which only help to decide the dtype.
-        pushes: If given, `pose` may also be (pushes, 3).
-
-    Returns:
-        Slider, hand, pose, friction (fingers,), and the dtype.
-
-    Raises:
-        TypeError: For a slider or hand of another type, or a pose or friction that does not consist of real numbers.
-        ValueError: For a wrong shape, a number that is not finite, or a negative friction.
-    """
+    """Return slider, hand, pose and friction (fingers,), checked where known, and the one dtype that they now have."""
     check_slider_and_hand(slider, hand)
-    dtype = common_dtype(slider, hand, pose, friction, *paths)
+    dtype = common_dtype(slider, hand, pose, friction, *paths)  # paths only help to decide it
     start, mu = as_float(pose, dtype, "pose"), as_float(friction, dtype, "friction")
     if pushes is None or start.ndim == 1:
         check_shape("pose", start, (3,))
@@ -84,16 +68,11 @@ def checked_arguments(
 
 
 def warn_about_units(slider: Slider, pose: Array, *paths: Array) -> None:
-    """Warn if numbers are probably in millimeters or degrees, unless any value is traced.
-
-    Args:
-        slider: The slider. The length of its surface, m, says how large it is.
-        pose: Poses of the slider, (..., 3).
-        *paths: Configurations of the hand, (..., dof), world; at least the first two numbers are lengths.
-    """
+    """Warn if numbers are probably in millimeters or degrees, unless any value is traced."""
     if traced((slider, pose, paths)):
         return
     length = float(slider.surface.length)
+    # at least the first two numbers of any configuration are lengths
     reach = max((float(np.max(np.abs(np.asarray(path)[..., :2]), initial=0)) for path in paths), default=0.0)
     angle = float(np.max(np.abs(np.asarray(pose)[..., 2]), initial=0))
     if length > MAX_LENGTH:
@@ -108,11 +87,7 @@ def warn_about_units(slider: Slider, pose: Array, *paths: Array) -> None:
 def checked_rollout_arguments(
     slider: Slider, hand: Hand, path: ArrayLike, pose: ArrayLike, friction: ArrayLike, pushes: int | None = None
 ):
-    """Prepare the arguments of a rollout: slider, hand, path, start and friction, in one dtype and checked.
-
-    `path` is as in `rollout`, and may also be (pushes, steps + 1, dof) if the number of pushes is given. The other
-    arguments are as in `checked_arguments`.
-    """
+    """Return slider, hand, path, start and friction of a rollout, in one dtype and checked where values are known."""
     slider, hand, start, mu, dtype = checked_arguments(slider, hand, pose, friction, path, pushes=pushes)
     path_array = as_float(path, dtype, "path")
     _check_columns(path_array, hand)
@@ -139,14 +114,7 @@ def _check_columns(path: Array, hand: Hand) -> None:
 
 
 def check_start(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> None:
-    """Raise ValueError if a finger starts too deep in the slider, unless values are traced.
-
-    Args:
-        slider: The slider.
-        hand: The hand.
-        poses: Poses of the slider, (3,) or (pushes, 3), world.
-        configuration: First configuration of the hand, (dof,) or (pushes, dof).
-    """
+    """Raise ValueError if a finger starts too deep in the slider, unless values are traced."""
     if traced((slider, hand, poses, configuration)):
         return
     count = max(np.atleast_2d(poses).shape[0], np.atleast_2d(configuration).shape[0])
@@ -183,7 +151,7 @@ def check_opening(hand: Hand, path: Array) -> None:
 
 
 def checked_table(table: Table | None, dtype: Any) -> Table | None:
-    """Return the table in a floating dtype. Raises TypeError for anything else than a table or None."""
+    """Return the table in a floating dtype; raise TypeError for anything else than a table or None."""
     if table is None:
         return None
     check_type("table", table, Table)
@@ -191,7 +159,7 @@ def checked_table(table: Table | None, dtype: Any) -> Table | None:
 
 
 def checked_fixtures(fixtures: Sequence[Wall | Fixture], dtype: Any) -> Fixtures:
-    """Return fixtures in a floating dtype. Raises TypeError for anything else than a sequence of them."""
+    """Return fixtures in a floating dtype; raise TypeError for anything else than a sequence of them."""
     if isinstance(fixtures, Wall | Fixture):
         raise TypeError(f"fixtures: expected a sequence of Wall and Fixture; got one {type(fixtures).__name__}")
     for k, fixture in enumerate(fixtures):
@@ -200,13 +168,7 @@ def checked_fixtures(fixtures: Sequence[Wall | Fixture], dtype: Any) -> Fixtures
 
 
 def check_start_among_fixtures(slider: Slider, fixtures: Fixtures, poses: Array) -> None:
-    """Raise ValueError if the slider starts too deep in a fixture, unless values are traced.
-
-    Args:
-        slider: The slider.
-        fixtures: The fixtures.
-        poses: Poses of the slider, (3,) or (pushes, 3), world.
-    """
+    """Raise ValueError if the slider starts too deep in a fixture, unless values are traced."""
     if not fixtures or traced((slider, fixtures, poses)):
         return
     depth = np.asarray(fixture_overlaps(slider, fixtures, jnp.atleast_2d(poses)))

@@ -12,29 +12,18 @@ OUT_OF_REACH = 1e3  # m, distance of a candidate that does not exist; no finger 
 
 
 class FingerPose(NamedTuple):
-    """Pose of a finger or a wall in the slider's frame.
+    """Pose of a finger or a wall in the slider's frame."""
 
-    Attributes:
-        center: Center of the finger, or a point of the wall, m.
-        angle: Angle of a pad as the unit vector (cos, sin), or unit normal of a wall; None for a round finger.
-    """
-
-    center: Vec2
-    angle: Vec2 | None
+    center: Vec2  # center of the finger, or a point of the wall, m
+    angle: Vec2 | None  # (cos, sin) of a pad's angle, or unit normal of a wall; None for a round finger
 
 
 class Candidate(NamedTuple):
-    """A place where a finger and the slider may touch, in the slider's frame; or several, as arrays.
+    """A place where a finger and the slider may touch, in the slider's frame; or several, as arrays."""
 
-    Attributes:
-        distance: Signed distance, m; negative in penetration.
-        point: Point on the slider, m.
-        normal: Unit normal that points into the slider.
-    """
-
-    distance: Scalar
-    point: Vec2
-    normal: Vec2
+    distance: Scalar  # m; negative in penetration
+    point: Vec2  # on the slider, m
+    normal: Vec2  # of unit length, into the slider
 
 
 # A tuple of candidates, or, for a pad, one `Candidate` of arrays. With the corners of a pad unrolled, the program for a
@@ -43,6 +32,6 @@ Candidates = tuple[Candidate, ...] | Candidate
 
 
 def take(candidates: Candidate, index: Int[Array, ""]) -> Candidate:
-    """`candidates[index]`, computed as a masked sum, which is cheap in a batch."""
+    """Return `candidates[index]`, computed as a masked sum, which is cheap in a batch."""
     mark = jnp.arange(candidates.distance.size) == index
     return jax.tree.map(lambda entries: jnp.sum(jnp.where(mark, entries, 0.0)), candidates)

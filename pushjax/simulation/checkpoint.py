@@ -25,12 +25,9 @@ class CheckpointError(ValueError):
 
 
 def digest(*trees: Any) -> str:
-    """Return a hash of pytrees, 16 hexadecimal digits: of their structure, and of every bit of their arrays.
-
-    Static fields are part of the structure.
-    """
+    """Return a hash of the structure of pytrees and of every bit of their arrays, 16 hexadecimal digits."""
     hasher = hashlib.sha256()
-    leaves, structure = jax.tree.flatten(trees)
+    leaves, structure = jax.tree.flatten(trees)  # static fields are part of the structure
     hasher.update(_without_addresses(structure).encode())
     for leaf in leaves:
         array = np.asarray(leaf)
@@ -40,31 +37,18 @@ def digest(*trees: Any) -> str:
 
 
 def _without_addresses(structure: Any) -> str:
-    """Return the text of a tree structure without memory addresses of functions, which differ between processes.
-
-    So two functions of one name have the same text. `monte_carlo` therefore also hashes the poses of the fingers, which
-    tell the kinematics of two hands apart.
-    """
+    """Return the text of a tree structure without memory addresses of functions, which differ between processes."""
+    # Two functions of one name have the same text. So `monte_carlo` also hashes the poses of the fingers, in which the
+    # kinematics of two hands differ.
     pieces = str(structure).split(" at 0x")
     return pieces[0] + "".join(piece[piece.find(">") :] for piece in pieces[1:])
 
 
 class Checkpoint:
-    """Folder of a run: a manifest, and one file for each block of pushes.
-
-    A block is a range of pushes, from index `first` up to but without index `last`. Blocks are in order, without gaps.
-
-    Args:
-        folder: The folder.
-        identity: What identifies the run, by name; values that JSON can hold.
-        writes: Whether this process writes files.
-
-    Raises:
-        CheckpointError: If the folder holds another run, or is damaged.
-    """
+    """Folder of a run: a manifest, and one file for each block of pushes."""
 
     def __init__(self, folder: Path, identity: dict[str, Any], writes: bool = True):
-        """Open the folder, and write its manifest if it has none."""
+        """Open the folder and write its manifest if it has none; raise CheckpointError if another run wrote it."""
         self.folder, self.writes = folder, writes
         wanted = {"format": FORMAT} | identity
         path = folder / MANIFEST
@@ -107,11 +91,7 @@ class Checkpoint:
         return blocks
 
     def read(self, path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """Read the named arrays of a block.
-
-        Raises:
-            CheckpointError: If the block is incomplete. The other blocks are left as they are.
-        """
+        """Read the named arrays of a block; raise CheckpointError if the block is incomplete."""
         try:
             with np.load(path) as file:
                 return {name: file[name] for name in names}
@@ -122,16 +102,7 @@ class Checkpoint:
             ) from None
 
     def write(self, first: int, last: int, arrays: dict[str, np.ndarray]) -> None:
-        """Write a block.
-
-        Args:
-            first: Index of the first push.
-            last: Index after the last push.
-            arrays: The arrays of the block, by name.
-
-        Raises:
-            CheckpointError: If it cannot be written. All earlier blocks are left as they are.
-        """
+        """Write a block of the pushes from index `first` up to but without index `last`."""
         if self.writes:
             self._write_file(
                 self.folder / f"pushes-{first:012d}-{last:012d}.npz",

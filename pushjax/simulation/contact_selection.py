@@ -32,23 +32,10 @@ SAME_DISTANCE = 1e-5
 def select_contacts(
     candidates: Candidates, finger: Finger | Wall, length: Scalar, outline: Outline, displacement_at: DisplacementAt
 ) -> tuple[Int[Array, ""] | int, ...]:
-    """Select which candidates are contacts, the likeliest first. The selection is not differentiated.
-
-    Distances are compared after the displacement of the finger, with the slider at rest. A tuple of candidates (of a
-    round finger, or of a pad on a disk) is selected as a whole.
-
-    Args:
-        candidates: All candidates, as from `contact_candidates`.
-        finger: The finger, or a wall.
-        length: Characteristic length of the limit surface, m.
-        outline: The slider's outline.
-        displacement_at: Displacement of the finger's material at points of the slider, in the rest of the step.
-
-    Returns:
-        Indices of the selected candidates. If there is no second or third one, the first index is repeated.
-    """
-    if not isinstance(candidates, Candidate):
+    """Return the indices of the candidates that are contacts, the likeliest first; a missing one repeats the first."""
+    if not isinstance(candidates, Candidate):  # of a round finger, or of a pad on a disk
         return tuple(range(len(candidates)))
+    # distances are compared after the displacement of the finger, with the slider at rest
     displacement = displacement_at(candidates.point)
     candidates, length, displacement = jax.lax.stop_gradient((candidates, length, displacement))
     eligible = candidates.distance < OUT_OF_REACH / 2
@@ -71,7 +58,7 @@ def select_contacts(
 
 
 def _mean(points: Vec2, mask: Bool[Array, " candidates"]) -> Vec2:
-    """Mean of the points that a mask marks."""
+    """Return the mean of the points that a mask marks."""
     count = jnp.maximum(jnp.sum(mask), 1)
     return Vec2(*(jnp.sum(jnp.where(mask, entry, 0.0)) / count for entry in points))
 
@@ -79,10 +66,8 @@ def _mean(points: Vec2, mask: Bool[Array, " candidates"]) -> Vec2:
 def _distances_in_other_directions(
     candidates: Candidate, previous: Candidate, length: Scalar
 ) -> tuple[Bool[Array, " candidates"], Scalar]:
-    """Return which candidates constrain a different motion than `previous`, and the distance to each, m.
-
-    The distance is how far a slider that stays in contact at `previous` has to move until it touches at the candidate.
-    """
+    """Return which candidates constrain a different motion than `previous`, and the distance to each, m."""
+    # the distance: how far a slider that stays in contact at `previous` has to move until it touches at the candidate
     lever = (candidates.point - previous.point).cross(candidates.normal) / length
     shared = candidates.normal.dot(previous.normal)
     freedom = jnp.sqrt(jnp.maximum(1 - jnp.maximum(shared, 0) ** 2, 0) + lever**2)
@@ -104,22 +89,13 @@ def selected_candidates(candidates: Candidates, chosen: tuple[Any, ...]) -> tupl
 
 def track_contacts(
     candidates: Candidates,
-    chosen: tuple[Any, ...],
-    at_start: tuple[Candidate, ...],
+    chosen: tuple[Any, ...],  # indices at the start of the step
+    at_start: tuple[Candidate, ...],  # the candidates of these indices at the start of the step
     finger: Finger | Wall,
     outline: Outline,
 ) -> tuple[Any, ...]:
-    """Return the indices of the same contacts later in the step, where `contact_candidates` may order them differently.
-
-    The order changes in an inner corner, where the edge that a pad's corner is nearest to changes.
-
-    Args:
-        candidates: All candidates now.
-        chosen: Indices at the start of the step.
-        at_start: The selected candidates at the start of the step.
-        finger: The finger, or a wall.
-        outline: The slider's outline.
-    """
+    """Return the indices of the same contacts later in the step, where the candidates may have another order."""
+    # the order changes in an inner corner, where another edge becomes nearest to a pad's corner
     if not isinstance(finger, Pad) or not isinstance(candidates, Candidate) or not is_nonconvex_polygon(outline):
         return chosen
     pad_corners = len(finger.shape.vertices)

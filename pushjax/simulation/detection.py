@@ -1,16 +1,14 @@
 """Contact detection: contact points, normals and gaps between fingers and slider during a step.
 
-The fraction of a step in which the hand moves freely (`impact`) is not longer than it is, however long the step. So a
-finger can neither tunnel through the slider nor meet the extension of an edge past its corner. From there on, every
-place where a finger and the slider may touch is a contact candidate with its own gap, closed or open. The contact
+The module `impact` does not overestimate the fraction of a step in which the hand moves freely, however long the step.
+So a finger can neither tunnel through the slider nor meet the extension of an edge past its corner. From there on,
+every place where a finger and the slider may touch is a contact candidate with its own gap, closed or open. The contact
 problem finds which of them are closed within the step.
 
 A round finger has one candidate, or two on an outline that is not convex. A pad has one on a disk. Otherwise it has
 many, of which `contact_selection` selects two or three. Against a polygon, each corner of the pad and of the slider is
-compared with the outline of the other; against a smooth outline, `pad_on_curve` finds the candidates. The nearest is
-selected, and the one that constrains most of the motions that it leaves free; of a polygon that is not convex, another.
-(An edge that lies flat on an edge rests on the two ends of their common part.) The selection is new in each step and
-stays the same within the step.
+compared with the outline of the other; against a smooth outline, `pad_on_curve` finds the candidates. The selection is
+new in each step and stays the same within the step.
 """
 
 import functools
@@ -61,16 +59,7 @@ def contact_candidates(
     displacement_at: DisplacementAt,
     length: Scalar,
 ) -> Candidates:
-    """Return the contact candidates of a finger: every place where it and the slider may touch.
-
-    Args:
-        finger: The finger, or a wall.
-        outline: The slider's outline.
-        finger_pose: Pose of the finger in the slider's frame.
-        displacement_at: Displacement of the finger's material at points of the slider. It decides which edge is touched
-            where a corner lies on a corner.
-        length: Characteristic length of the limit surface, m.
-    """
+    """Return every place where a finger or a wall and the slider may touch, in the slider's frame."""
     if isinstance(finger, Wall):
         return wall_candidates(outline, finger_pose)
     if isinstance(finger, RoundFinger):
@@ -105,41 +94,29 @@ def contact_candidates(
 
 
 class Corner(NamedTuple):
-    """Corners of a polygon, as arrays.
+    """Corners of a polygon, as arrays."""
 
-    Attributes:
-        point: The corners, m.
-        onward: Unit direction in which the next edge leaves each corner.
-        back: Unit direction in which the previous edge leaves each corner.
-    """
-
-    point: Vec2
-    onward: Vec2
-    back: Vec2
+    point: Vec2  # m
+    onward: Vec2  # unit direction in which the next edge leaves the corner
+    back: Vec2  # unit direction in which the previous edge leaves the corner
 
     @staticmethod
     def of(polygon: PolygonOutline) -> "Corner":
-        """The corners of a polygon."""
+        """Return the corners of a polygon."""
         return Corner(polygon.edges.start, polygon.edges.along, -polygon.edges.previous)
 
     def turned(self, angle: Vec2, shift: Vec2) -> "Corner":
-        """The corners rotated by `angle`, a unit vector, and then translated by `shift`."""
+        """Return the corners rotated by `angle`, a unit vector, and then translated by `shift`, m."""
         return Corner(shift + self.point.rotate(angle), self.onward.rotate(angle), self.back.rotate(angle))
 
 
 def _vertex_edge_candidates(
     outline: PolygonOutline, corner: Corner, displacement: Vec2, length: Scalar
 ) -> tuple[Candidate, Candidate]:
-    """For each corner, return the nearest edge of a polygon that it can touch, and the next nearest.
-
-    A corner can touch an edge if it projects onto the edge and points toward it. If there is no such edge, the distance
-    is `OUT_OF_REACH`. If a corner lies on the common vertex of two edges, the edge that it is pressed against by its
-    `displacement` comes first.
-
-    The closest point of the outline would be wrong here. A corner that is slightly inside, next to a vertex of the
-    polygon, may be closest to the wrong edge. A corner that is past the end of an edge touches nothing, although it is
-    near.
-    """
+    """Return the nearest edge of a polygon that each corner can touch, and the next nearest."""
+    # A corner can touch an edge if it projects onto the edge and points toward it. The closest point of the outline
+    # would be wrong here. A corner slightly inside, next to a vertex of the polygon, may be closest to the wrong edge.
+    # A corner past the end of an edge touches nothing, although it is near.
     edge = outline.edges
     own_displacement = jax.tree.map(lambda entry: jnp.broadcast_to(entry, corner.point.x.shape), displacement)
 
@@ -167,6 +144,7 @@ def _vertex_edge_candidates(
         touches = faces & (along >= begin) & (along <= end) & behind
         gap = jnp.maximum(jnp.where(touches, jnp.abs(height), OUT_OF_REACH), tolerance)
         lies_on = touches & (gap <= tolerance)
+        # a corner on the common vertex of two edges touches the one that its displacement presses it against
         most_pressed = jnp.argmax(jnp.where(lies_on, -edge.normal.dot(displacement), -jnp.inf))
         first = jnp.where(jnp.any(lies_on), most_pressed, jnp.argmin(gap))
         second = jnp.argmin(jnp.where(jnp.arange(gap.size) == first, jnp.inf, gap))
@@ -182,24 +160,21 @@ def _vertex_edge_candidates(
 
 
 def _is_inside(edge: Edge, point: Vec2) -> Bool[Array, ""]:
-    """Whether a point lies inside a polygon: a ray along x crosses its outline an odd number of times."""
+    """Return whether a point lies inside a polygon: a ray along x crosses its outline an odd number of times."""
     below = edge.start.y <= point.y
     left = edge.normal.dot(point - edge.start) < 0
     return jnp.sum((below != jnp.roll(below, -1)) & (left == below)) % 2 == 1
 
 
 def _edge_supports(pad: PolygonOutline, outline: Outline, finger_pose: FingerPose) -> EdgeSupport:
-    """The points of a smooth outline that face a pad's edges."""
+    """Return the points of a smooth outline that face a pad's edges."""
     return pad_on_curve.edge_support_points(pad.edges, outline, finger_pose.center, _pad_angle(finger_pose))
 
 
 def _smooth_candidates(
     pad: PolygonOutline, outline: Outline, center: Vec2, angle: Vec2, length: Scalar, supports: EdgeSupport
 ) -> Candidate:
-    """Return the candidates of a pad and a smooth outline.
-
-    They are the closest point of the outline for each corner of the pad, and then the points that face the pad's edges.
-    """
+    """Return the candidates of a pad and a smooth outline: at the pad's corners, and then at its edges."""
     too_deep, corner = -2 * MAX_PENETRATION * length, Corner.of(pad).turned(angle, center)
     closest = jax.vmap(outline.closest)(corner.point)
     faces = (corner.onward.dot(closest.normal) >= -TILT_TOLERANCE) & (
@@ -219,11 +194,7 @@ def _smooth_candidates(
 
 
 def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
-    """Number of contacts that a finger or a wall may have; it is known before any value is.
-
-    A wall has two (one on a disk), and so has a pad. On a polygon that is not convex a pad has three, since three
-    contacts constrain every motion in the plane.
-    """
+    """Return the number of contacts that a finger or a wall may have, which is static."""
     if isinstance(finger, Wall):
         return num_wall_contacts(outline)
     return _num_contacts(*structure_and_shapes((finger, outline)))
@@ -231,7 +202,7 @@ def num_contacts(finger: Finger | Wall, outline: Outline) -> int:
 
 @functools.lru_cache(maxsize=256)  # a trace of a step asks for it dozens of times
 def _num_contacts(structure: Any, shapes: tuple[jax.ShapeDtypeStruct, ...]) -> int:
-    """Number of contacts of a finger on an outline, whose arrays have the given shapes and dtypes."""
+    """Return the number of contacts of a finger on an outline, whose arrays have the given shapes and dtypes."""
 
     def candidates_of(finger: Finger, outline: Outline) -> Candidates:
         zero = jnp.zeros(())
@@ -240,26 +211,22 @@ def _num_contacts(structure: Any, shapes: tuple[jax.ShapeDtypeStruct, ...]) -> i
 
     finger, outline = jax.tree.unflatten(structure, shapes)
     candidates = jax.eval_shape(candidates_of, finger, outline)
+    # three contacts constrain every motion in the plane
     return (3 if is_nonconvex_polygon(outline) else 2) if isinstance(candidates, Candidate) else len(candidates)
 
 
 def is_convex(outline: Outline) -> bool:
-    """Whether an outline is known to be convex."""
+    """Return whether an outline is known to be convex."""
     return outline.convex if isinstance(outline, PolygonOutline) else isinstance(outline, DiskOutline | EllipseOutline)
 
 
 def is_nonconvex_polygon(outline: Outline) -> bool:
-    """Whether an outline is a polygon that is not convex."""
+    """Return whether an outline is a polygon that is not convex."""
     return isinstance(outline, PolygonOutline) and not outline.convex
 
 
 def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: FingerPose) -> Scalar:
-    """Penetration depth of a finger or a wall in the slider, m; where they are apart, minus their exact distance.
-
-    For a pad it is the depth of the deepest corner of either body in the other. Where edges cross and no corner is
-    inside, it is at least half of how deep an edge of the slider is in the pad. For a pad and a smooth outline it is
-    the depth of the deepest corner, or of the deepest point of the outline that faces an edge.
-    """
+    """Return how deep a finger or a wall is in the slider, m; where they are apart, minus their exact distance."""
     if isinstance(finger, Wall):
         return -jnp.min(wall_candidates(outline, finger_pose).distance)
     if isinstance(finger, RoundFinger):
@@ -271,6 +238,7 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
     if not isinstance(outline, PolygonOutline):
         return pad_on_curve.penetration_depth(pad, _edge_supports(pad, outline, finger_pose), outline, pad_corners)
     slider_corners = (outline.edges.start - finger_pose.center).unrotate(angle)
+    # the corners of each body in the other; where edges cross and no corner is inside, the chords
     depths = (
         -jax.vmap(pad.closest)(slider_corners).distance,
         -jax.vmap(outline.closest)(pad_corners).distance,
@@ -280,11 +248,9 @@ def penetration_depth(finger: Finger | Wall, outline: Outline, finger_pose: Fing
 
 
 def _chord_depths(pad: PolygonOutline, slider_corners: Vec2) -> Float[Array, " edges"]:
-    """Depth in the pad of the midpoint of the chord that it cuts from each edge of a slider; negative without a chord.
-
-    The edges join consecutive corners of the slider, here in the pad's frame. Depth is concave along a chord, so the
-    midpoint is at least half as deep as the deepest point of the chord.
-    """
+    """Return the depth in the pad of the middle of the chord that it cuts from each of a slider's edges, m, or -inf."""
+    # The corners are in the pad's frame. Depth is concave along a chord, so the midpoint of a chord is at least half as
+    # deep as its deepest point.
     side = pad.edges
 
     def depth_of_chord(start: Vec2, end: Vec2) -> Scalar:

@@ -22,13 +22,7 @@ ROUNDOFF = 1e-5  # by how much a traced path may close the hand farther than it 
 
 
 def replace_invalid(tree: Any, valid: Bool[Array, ""], length: Scalar) -> Any:
-    """Return bodies with other numbers where they are not valid: regular outlines, and ones for all the rest.
-
-    Args:
-        tree: Shapes, a hand or fixtures.
-        valid: Whether their numbers are in their domain.
-        length: Characteristic length of the limit surface, m; the size of the bodies that replace them.
-    """
+    """Return bodies as they are if they are `valid`, else with regular outlines and `length` for other numbers, m."""
 
     def replace(leaf: Array) -> Array:
         angle = 2 * jnp.pi * jnp.arange(len(leaf), dtype=leaf.dtype) / len(leaf) if leaf.ndim == 2 else None
@@ -39,12 +33,7 @@ def replace_invalid(tree: Any, valid: Bool[Array, ""], length: Scalar) -> Any:
 
 
 def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], length: Scalar) -> Bool[Array, ""]:
-    """Whether the numbers of all bodies are in their domain.
-
-    Args:
-        bodies: The bodies.
-        length: Characteristic length of the limit surface, m.
-    """
+    """Return whether the numbers of all bodies are in their domain."""
     valid = jnp.ones((), bool)
     for body in jax.lax.stop_gradient(tuple(bodies)):
         shape = body if isinstance(body, Shape) else getattr(body, "shape", None)
@@ -64,27 +53,16 @@ def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], leng
 
 
 def within(pose: Float[Array, "*rows coordinates"], length: Scalar) -> Bool[Array, "*rows"]:
-    """Whether lengths and angles are no larger than a float resolves them to a tenth of their unit.
-
-    Args:
-        pose: Lengths, m; or poses, whose third coordinate is an angle, rad.
-        length: Characteristic length of the limit surface, m; the unit of lengths.
-    """
+    """Return whether lengths and angles are no larger than a float resolves to a tenth of `length` and of a radian."""
     pose, unit = jax.lax.stop_gradient((pose, jnp.broadcast_to(length, pose.shape[-1:])))
-    if pose.shape[-1] == 3:
+    if pose.shape[-1] == 3:  # a pose (x, y, theta); otherwise all numbers are lengths
         unit = unit.at[2].set(1.0)
     largest = min(0.1 / float(jnp.finfo(pose.dtype).eps), 1e9)
     return jnp.all(jnp.abs(pose) <= largest * unit.reshape(*(1,) * (pose.ndim - 1), -1), axis=-1)
 
 
 def valid_path(hand: Hand, path: Float[Array, "steps+1 dof"], length: Scalar) -> tuple[Array, Bool[Array, "steps+1"]]:
-    """Poses of the fingers along a path, and which rows of it are valid. The others are replaced by the first of these.
-
-    Args:
-        hand: The hand.
-        path: Configurations, (steps + 1, dof).
-        length: Characteristic length of the limit surface, m.
-    """
+    """Return poses of the fingers along a path, and which rows are valid; the first of these replaces the others."""
     valid = jnp.all(jnp.isfinite(path), axis=1)
     if hand.least is not None:
         valid &= path[:, -1] >= hand.least - ROUNDOFF * length

@@ -1,4 +1,4 @@
-"""Motion of fingers over a step, seen from the slider, and how deep the fingers are in the slider."""
+"""Motion of fingers over a step, relative to the slider, and how deep the fingers are in the slider."""
 
 import functools
 from typing import NamedTuple
@@ -28,34 +28,23 @@ TOUCHING = {4: 3e-6, 8: 1e-10}
 
 
 class BodyFrame(NamedTuple):
-    """A pose with the unit vector of its angle, which is kept because a sine costs as much as solving a contact.
-
-    Attributes:
-        pose: Pose of the slider, world.
-        angle: The unit vector (cos, sin) of the pose's angle.
-    """
+    """Pose of the slider in the world, with the unit vector of its angle."""
 
     pose: Vec3
-    angle: Vec2
+    angle: Vec2  # (cos, sin); kept, because a sine costs as much as solving a contact
 
     @staticmethod
     def at(pose: Vec3) -> "BodyFrame":
-        """A pose, with the unit vector computed."""
+        """Return a pose with the unit vector of its angle."""
         return BodyFrame(pose, compute_once(cos_sin(pose.z), pose.x))
 
     def local(self, world: Vec2) -> Vec2:
-        """A world point in the body frame."""
+        """Return a world point in the body frame."""
         return (world - self.pose.xy).unrotate(self.angle)
 
     def moved(self, contact: Vec2, twist: Vec3, frame_angle: Vec2) -> "BodyFrame":
-        """The pose after a body twist that moves a point of the slider in a straight line.
-
-        Args:
-            contact: The point, body frame, m.
-            twist: The body twist, m and rad.
-            frame_angle: Unit vector of the angle of the body frame in which the twist is given; it rotates the twist to
-                the world.
-        """
+        """Return the pose after a body twist (m, rad) that moves the slider's point `contact` in a straight line."""
+        # `frame_angle` is the angle of the body frame in which the twist is given
         displacement = (twist.xy + contact.perp().scale(twist.z)).rotate(frame_angle)
         # Displacements are chords. So is the turn: 2 asin(z / 2) is the angle whose chord it is.
         square = twist.z * twist.z
@@ -68,26 +57,14 @@ class BodyFrame(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """Motion of one finger over a step, and its friction. A fixture is a finger that stays where it is.
-
-    A finger that turns goes around a fixed point, as a rigid body would: so the motion within a step does not depend on
-    which point of the finger is its center.
-
-    Attributes:
-        finger: The finger, or a wall.
-        friction: Coefficient of friction mu between finger and slider.
-        center: Center of the finger at the start, world, m.
-        path: Displacement of the center, world, m.
-        angle: Angle at the start, world, rad; None if the finger never turns.
-        turning: Change of the angle, rad; None if the finger never turns.
-    """
+    """Motion of one finger over a step, in the world, and its friction; a fixture is a finger that stays in place."""
 
     finger: Finger | Wall
-    friction: Scalar
-    center: Vec2
-    path: Vec2
-    angle: Scalar | None
-    turning: Scalar | None
+    friction: Scalar  # coefficient of friction mu between finger and slider
+    center: Vec2  # at the start, m
+    path: Vec2  # displacement of the center, m
+    angle: Scalar | None  # at the start, rad; None if the finger never turns
+    turning: Scalar | None  # change of the angle, rad; None if the finger never turns
 
     def pose_in_slider(self, slider: BodyFrame, fraction: Scalar) -> FingerPose:
         """Return the pose of the finger in the slider's frame when `fraction` of the step is done."""
@@ -103,7 +80,7 @@ class FingerMotion(NamedTuple):
         )
 
     def part(self, begin: Scalar, size: Scalar) -> "FingerMotion":
-        """The part of the step that starts at the fraction `begin` and has the size `size`."""
+        """Return the motion in the part of the step that starts at the fraction `begin` and has the size `size`."""
         angle, turning = self.angle, self.turning
         if angle is not None and turning is not None:
             angle, turning = angle + begin * turning, size * turning
@@ -111,20 +88,22 @@ class FingerMotion(NamedTuple):
         return FingerMotion(self.finger, self.friction, center, self._chord(begin, size), angle, turning)
 
     def _chord(self, begin: Scalar, size: Scalar) -> Vec2:
-        """Displacement of the center in the part of the step that starts at `begin` and has the size `size`, world."""
+        """Return the center's displacement in the part that starts at `begin` and has the size `size`, world, m."""
         if self.turning is None:
             return self.path.scale(size)
+        # A finger that turns goes around a fixed point, as a rigid body would. So the motion within a step does not
+        # depend on which point of the finger is its center.
         half = self.turning / 2
         direction = cos_sin((2 * begin + size - 1) * half)
         return self.path.rotate(direction).scale(size * sinc(size * half) / sinc(half))
 
     def moves(self) -> Bool[Array, ""]:
-        """Whether the finger does not stay as it is; True also for a motion that is NaN."""
+        """Return whether the finger does not stay as it is, which is True also for a motion that is NaN."""
         moves = (self.path.x != 0) | (self.path.y != 0)
         return moves if self.turning is None else moves | (self.turning != 0)
 
     def largest_displacement(self) -> Scalar:
-        """Largest displacement of a point of the finger over the step, m; for a round finger, a bound of it."""
+        """Return the largest displacement of a point of the finger over the step, m; a bound for a round finger."""
         center = jnp.sqrt(self.path.dot(self.path))
         if self.turning is None or isinstance(self.finger, Wall):
             return center
@@ -134,14 +113,14 @@ class FingerMotion(NamedTuple):
         return jnp.sqrt(jnp.max(chords.dot(chords)))
 
     def arc_length(self) -> Scalar:
-        """Largest length of the way of a point of the finger over the step, m, without the turn of a round finger."""
+        """Return the longest way of a point of the finger over the step, m, without the turn of a round finger."""
         if self.turning is None:
             return jnp.sqrt(self.path.dot(self.path))
         chords = self._corner_chords(self.finger) if isinstance(self.finger, Pad) else self.path
         return jnp.sqrt(jnp.max(chords.dot(chords))) / sinc(self.turning / 2)
 
     def _corner_chords(self, pad: Pad) -> Vec2:
-        """Displacement of each corner of a pad over the step, world, m."""
+        """Return the displacement of each corner of a pad over the step, world, m."""
         assert self.angle is not None
         assert self.turning is not None
         corner = Vec2.of(pad.shape.vertices.T)
@@ -151,27 +130,19 @@ class FingerMotion(NamedTuple):
     def material_displacement(
         self, slider: BodyFrame, point: Vec2, center: Vec2, remaining: Scalar, in_predictor: Bool[Array, ""]
     ) -> Vec2:
-        """Displacement of the finger's material at a point of the slider, slider's frame, m.
-
-        Args:
-            slider: Pose of the slider.
-            point: The point of the slider, slider's frame, m.
-            center: Center of the finger, slider's frame, m.
-            remaining: Fraction of the step that is left; the displacement is the one in that last fraction.
-            in_predictor: True in the predictor stage, which is evaluated at the start of that fraction and not halfway.
-                A turning hand then starts along the tangent of its arc. The chord of the arc would move two fingers
-                toward each other on what they hold, and cause a jam.
-        """
+        """Return how far the finger's material at `point` moves in the last fraction `remaining`, slider's frame, m."""
         translation = self._chord(1 - remaining, remaining).unrotate(slider.angle)
         if self.turning is None:
             return translation
+        # The predictor stage evaluates the start of that fraction, not its middle. A turning hand then starts along the
+        # tangent of its arc. The chord would move two fingers toward each other on the object between them: a jam.
         translation = translation.unrotate(cos_sin(jnp.where(in_predictor, remaining * self.turning / 2, 0.0)))
-        # the chord of a rotation about the center; seen from halfway through the turn it is exact
+        # the chord of a rotation about the center, which is exact in the frame halfway through the turn
         return translation + (point - center).perp().scale(2 * jnp.sin(remaining * self.turning / 2))
 
 
 def finger_motions(hand: Hand, friction: Array, before: tuple, after: tuple) -> tuple[FingerMotion, ...]:
-    """Motion of each finger over a step, from its poses before and after (see `unstack_finger_poses`)."""
+    """Return the motion of each finger over a step, from its poses before and after (see `unstack_finger_poses`)."""
     motions = []
     for k, finger in enumerate(hand.fingers):
         start, end = before[k], after[k]
@@ -196,11 +167,7 @@ def fixture_motions(fixtures: Fixtures) -> tuple[FingerMotion, ...]:
 
 
 def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
-    """Return the coordinates of each finger's pose, as a tuple of scalars for each finger.
-
-    Args:
-        poses: Poses (fingers, 3) or centers (fingers, 2), world, m and rad, or with an axis of steps in front.
-    """
+    """Return each finger's coordinates as scalars, or (steps,) arrays, from poses or centers (..., fingers, width)."""
     return tuple(
         tuple(poses[..., finger, coordinate] for coordinate in range(poses.shape[-1]))
         for finger in range(poses.shape[-2])
@@ -208,16 +175,7 @@ def unstack_finger_poses(poses: Array) -> tuple[tuple[Array, ...], ...]:
 
 
 def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: Vec3, fraction: float) -> Scalar:
-    """Depth of the deepest finger in the slider after a fraction of the step, m; negative where all are apart.
-
-    Not differentiated.
-
-    Args:
-        outline: The slider's outline.
-        motions: Motion of each finger over the step.
-        pose: Pose of the slider, world.
-        fraction: Fraction of the step that the fingers have done.
-    """
+    """Return the depth of the deepest finger after `fraction` of the step, m; negative where all are apart."""
     outline, motions, pose = jax.lax.stop_gradient((outline, motions, pose))
     frame = BodyFrame.at(pose)
 
@@ -230,26 +188,16 @@ def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: V
 
 
 def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:
-    """Largest displacement of a point of a finger in the step, m. Not differentiated."""
+    """Return the largest displacement of a point of a finger in the step, m, not differentiated."""
     motions = jax.lax.stop_gradient(motions)
     return functools.reduce(jnp.maximum, [motion.largest_displacement() for motion in motions])
 
 
 def holding_distance(displacement: Scalar, length: Scalar) -> Scalar:
-    """Distance within which a finger holds a slider that jams, m.
-
-    Args:
-        displacement: Largest displacement of a finger in the part of the step that jams, m.
-        length: Length of the limit surface, m.
-    """
+    """Return within which distance a finger holds a slider that jams in a part with this largest displacement, m."""
     return jnp.maximum(GRASP_GAP * length, 4 * displacement)
 
 
 def allowed_penetration(displacement: Scalar, length: Scalar) -> Scalar:
-    """Largest depth of a finger in the slider after a step, m, unless it was deeper before.
-
-    Args:
-        displacement: Largest displacement of a finger in the step, m.
-        length: Length of the limit surface, m.
-    """
+    """Return how deep a finger may be in the slider after a step, m, unless it was deeper before."""
     return jnp.maximum(DEPTH_FLOOR * length, DEPTH_PER_DISPLACEMENT * displacement)

@@ -39,11 +39,6 @@ class Wall(eqx.Module):
         normal: Direction from the wall into the free space, (2,), world. It is scaled to unit length.
         friction: Coefficient of friction mu between wall and slider.
 
-    Attributes:
-        point: The point on the wall, (2,), world, m.
-        normal: Unit normal into the free space, (2,), world.
-        friction: Coefficient of friction.
-
     Raises:
         ValueError: For a wrong shape; where they are not traced, also for values that are not finite, a normal of
             length zero or a negative friction.
@@ -104,12 +99,12 @@ class Fixture(eqx.Module):
 
     @property
     def body(self) -> RoundFinger | Pad:
-        """The body as contact detection takes it."""
+        """Return the body as a finger, for contact detection."""
         return RoundFinger(self.shape.radius) if isinstance(self.shape, Disk) else Pad(self.shape)
 
     @property
     def center(self) -> Vec2:
-        """Origin of `body`, world, m."""
+        """Return the origin of `body`, world, m."""
         origin = Vec2.of(self.pose[:2])
         if not isinstance(self.shape, Disk):
             return origin

@@ -71,10 +71,10 @@ class Hand(eqx.Module):
     Args:
         fingers: The fingers: numbers (radii of disks, m), `Polygon`s (convex pads, in the finger's own frame, m),
             `RoundFinger`s or `Pad`s.
-        kinematics: Function from a configuration (dof,) to the poses (fingers, 3) of the fingers, world, m and rad. For
-            a hand that never turns and has no pads, it may give their centers (fingers, 2) instead. It is traced. A
-            new function, such as a lambda that is made in a loop, compiles every program anew. From centers, every
-            finger moves in a straight line in each step; two that turn while they hold something would close on it.
+        kinematics: Function from a configuration (dof,) to the poses (fingers, 3) of the fingers, world, m and rad; JAX
+            traces it. A new function, such as a lambda that is made in a loop, compiles every program anew. For a hand
+            that never turns and has no pads, it may give centers (fingers, 2) instead. Then every finger moves in a
+            straight line in each step, and two that turn while they hold something would close on it.
         dof: Number of coordinates of a configuration.
         least: Smallest allowed value of the last coordinate, the opening, m; None for no limit.
 
@@ -103,7 +103,7 @@ class Hand(eqx.Module):
 
     @property
     def radius(self) -> Float[Array, "fingers"]:
-        """Radii of the fingers, m; only for a hand whose fingers are all round."""
+        """Radii of the fingers, (fingers,), m; only for a hand whose fingers are all round."""
         return jnp.stack([finger.radius for finger in self.fingers])  # pyright: ignore[reportAttributeAccessIssue]
 
     @property
@@ -114,9 +114,7 @@ class Hand(eqx.Module):
 
     @staticmethod
     def finger(radius: ArrayLike = 0.0) -> "Hand":
-        """One round finger that does not turn.
-
-        Its configuration is (x, y), the position of its center, world, m.
+        """One round finger that does not turn; its configuration (x, y) is the position of its center, world, m.
 
         Args:
             radius: Radius of the finger, m.
@@ -152,7 +150,7 @@ class Hand(eqx.Module):
         """Two rectangular pads that face each other along the hand's y axis.
 
         The configuration is (x, y, theta, d): the pose of the hand, world, m and rad, and the opening d between the
-        faces, m. The pose of a pad is that of the middle of its face. The first pad is at y = d/2 in the hand's frame.
+        faces, m. A pad's pose is at the middle of its face. The first pad is at y = d/2 in the hand's frame.
 
         Args:
             width: Width of the faces along the hand's x axis, m.
@@ -177,7 +175,7 @@ class Hand(eqx.Module):
 
 
 def _finger(finger: Any) -> Finger:
-    """Convert a radius or a polygon to a finger."""
+    """Return a finger made from a radius or a polygon, or the finger that is given."""
     if isinstance(finger, RoundFinger | Pad):
         return finger
     return Pad(finger) if isinstance(finger, Polygon) else RoundFinger(finger)
@@ -188,7 +186,7 @@ def _one(q: Array) -> Array:
 
 
 def _placed(q: Array, offsets: list[tuple[Any, Any]]) -> Array:
-    """Poses of fingers that turn with the hand, at `offsets` in its frame."""
+    """Return the poses of fingers that turn with the hand, at `offsets` in its frame, m."""
     c, s = jnp.cos(q[2]), jnp.sin(q[2])
     return jnp.stack([jnp.stack([q[0] + c * x - s * y, q[1] + s * x + c * y, q[2]]) for x, y in offsets])
 

@@ -1,4 +1,9 @@
-"""When a finger first touches a slider at rest."""
+"""The fraction of a step after which a finger first touches a slider at rest.
+
+A round finger that does not turn is swept along its path. Any other finger advances again and again, by what its
+distance from the slider allows at most, so that it cannot pass through (conservative advancement; Mirtich 1996,
+section 2.3).
+"""
 
 import jax
 import jax.numpy as jnp
@@ -20,25 +25,14 @@ LEAST_APPROACH = 1e-2
 
 
 def time_of_impact(motion: FingerMotion, outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
-    """Return the fraction of a step after which a finger first touches the slider, or one if it never does.
-
-    A round finger that does not turn is swept along its path. Any other finger advances again and again, by what its
-    distance from the slider allows at most, so that it cannot pass through (conservative advancement; Mirtich 1996,
-    section 2.3).
-
-    Args:
-        motion: Motion of the finger over the step.
-        outline: The slider's outline.
-        start: Pose of the slider.
-        length: Characteristic length of the limit surface, m.
-    """
+    """Return the fraction of a step after which a finger first touches the slider, or one if it never does."""
     if isinstance(motion.finger, RoundFinger) and motion.turning is None:
         return _swept(motion, outline, start)
     return _advanced(motion, outline, start, length)
 
 
 def _swept(motion: FingerMotion, outline: Outline, start: BodyFrame) -> Scalar:
-    """The same for a round finger that moves in a straight line."""
+    """Return the fraction for a round finger that moves in a straight line."""
     assert isinstance(motion.finger, RoundFinger)
     radius = motion.finger.radius
     center, path = compute_once((start.local(motion.center), motion.path.unrotate(start.angle)), start.pose.x)
@@ -54,7 +48,7 @@ def _swept(motion: FingerMotion, outline: Outline, start: BodyFrame) -> Scalar:
 
 
 def _advanced(motion: FingerMotion, outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
-    """The same for any finger, by conservative advancement. A finger that touches begins to push at once."""
+    """Return the fraction for any finger, by conservative advancement."""
     assert not isinstance(motion.finger, Wall)
     x = start.pose.x
 
@@ -62,11 +56,12 @@ def _advanced(motion: FingerMotion, outline: Outline, start: BodyFrame, length: 
         return -penetration_depth(motion.finger, outline, compute_once(motion.pose_in_slider(start, fraction), x))
 
     fixed = still_motion, still_outline, still_start = jax.lax.stop_gradient((motion, outline, start))
+    # a finger that touches begins to push at once
     touches = TOUCHING[x.dtype.itemsize] * jax.lax.stop_gradient(length)
     largest_speed = still_motion.arc_length()
 
     def bounds_at(fraction: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-        """The gap, and the most by which speed and acceleration can close it."""
+        """Return the gap, and the most by which speed and acceleration can close it."""
         if not is_convex(outline):
             return gap_after(*fixed, fraction), largest_speed, jnp.zeros_like(x)
         # a plane separates convex bodies, and each point of the finger comes to it by its own motion

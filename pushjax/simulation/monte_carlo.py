@@ -68,9 +68,9 @@ def monte_carlo(
 
     Push i is `random_rollout(fold_in(key, i), ...)`. Its bits depend on key, `batch_size`, `trajectories` and machine,
     and on whether `n` exceeds `batch_size`, but not on the number of devices and processes. Each device compiles its
-    own program, once. On a CPU, the program of a run of at most `batch_size` pushes is compiled for a short compile
-    time, and that of a longer run for a short run time. Memory does not depend on `n`, except for the results, some 60
-    bytes a push, and for paths and starts of each push.
+    own program, once. On a CPU, a run of at most `batch_size` pushes is compiled for a short compile time, a longer one
+    for a short run time. Memory does not depend on `n`, except for the results, some 60 bytes a push, and for paths and
+    starts of each push.
 
     This function runs on the host. Under `jit`, `vmap` or `grad`, use `random_rollout`.
 
@@ -82,7 +82,7 @@ def monte_carlo(
         path: Configurations of the hand, as in `rollout`: (steps + 1, dof), or (n, steps + 1, dof) for a path of each
             push.
         pose: Pose of the slider at the start, world, m and rad: (3,), or (n, 3) for a start of each push.
-        model: Distribution from which friction is drawn around `slider.surface`.
+        model: Distribution from which friction is sampled around `slider.surface`.
         solver: Solver of contact problems, as in `rollout`.
         table: A table whose friction depends on direction or place, as in `rollout`.
         fixtures: Walls and bodies that the slider may touch, as in `rollout`; their friction is not random.
@@ -103,7 +103,7 @@ def monte_carlo(
         ValueError: As in `rollout` and `FrictionModel.around`. Also for a key that is not one PRNG key, for `n` or
             `batch_size` below one, and for devices that are neither of this process nor equally many of each process.
         CheckpointError: A ValueError, for a checkpoint that belongs to another run, is damaged, or cannot be written.
-            What the folder holds is kept.
+            What is in the folder stays there.
         TypeError: Under `jit`, `vmap` or `grad`. Also as in `rollout`, and for a model of another type.
 
     Reference: Zhou et al. 2017, sections V and VI.
@@ -139,7 +139,7 @@ def monte_carlo(
 
 
 def _checkpoint(folder: Path, run: "_Run", setup: Setup, slider: Slider, path: Array, start: Array) -> Checkpoint:
-    """Return the checkpoint of a run, which knows the run by its arguments, versions and platform."""
+    """Return the checkpoint of a run, which identifies the run by its arguments, versions and platform."""
     hand, model, solver = setup.hand, setup.model, setup.solver
     identity = {"n": run.n, "batch_size": run.tile, "trajectories": run.keep_trajectories}
     identity |= {"key": digest(setup.key, run.impl), "slider": digest(slider)}
@@ -181,7 +181,7 @@ def _progress_report(progress: bool | ProgressCallback, n: int) -> Iterator[Prog
 
 
 def _key_data(key: Any) -> tuple[Any, Any]:
-    """The raw data of a key, and the name of its PRNG implementation."""
+    """Return the raw data of a key, and the name of its PRNG implementation."""
     message = f"key must be one key, of jax.random.key or PRNGKey; got {key!r}"
     if not isinstance(key, (jax.Array, np.ndarray)):
         raise ValueError(message)
@@ -195,18 +195,7 @@ def _key_data(key: Any) -> tuple[Any, Any]:
 
 
 class _Run:
-    """A Monte Carlo run.
-
-    Args:
-        n: Number of pushes.
-        tile: Number of pushes that a device computes at once.
-        setup: What all pushes share.
-        impl: Name of the PRNG implementation.
-        devices: Devices of the run.
-        start: Pose of the slider at the start, (3,) or (n, 3), world, m and rad.
-        path: Configurations of the hand, (steps + 1, dof) or (n, steps + 1, dof).
-        keep_trajectories: Whether to keep trajectories.
-    """
+    """A Monte Carlo run, which computes the pushes in rounds of one tile on each device."""
 
     def __init__(
         self,
@@ -215,8 +204,8 @@ class _Run:
         setup: Setup,
         impl: Any,
         devices: Devices,
-        start: np.ndarray,
-        path: np.ndarray,
+        start: np.ndarray,  # pose of the slider, (3,) or (n, 3), world, m and rad
+        path: np.ndarray,  # (steps + 1, dof) or (n, steps + 1, dof)
         keep_trajectories: bool,
     ):
         self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
@@ -241,19 +230,19 @@ class _Run:
         return value
 
     def _block_is_due(self, pushes: int, seconds: float) -> bool:
-        """Whether a block of the checkpoint is to be written; all processes get the answer of the first."""
+        """Return whether to write a block of the checkpoint; all processes get the answer of the first."""
         due = pushes >= BLOCK_PUSHES or seconds >= BLOCK_SECONDS
         return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.multiprocess else due
 
     def compute_all(self, saved: Checkpoint | None, report: ProgressCallback) -> PushResults:
-        """Compute all pushes that `saved` does not hold, and return all pushes."""
+        """Return all pushes; compute those that are not in `saved`."""
         with ThreadPoolExecutor(len(self.setups)) as pool:
             return self._compute_rounds(saved, report, pool)
 
     def _compute_rounds(
         self, saved: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor
     ) -> PushResults:
-        """Compute the pushes round by round; as `compute_all`, with one thread of `pool` for each device."""
+        """Return all pushes, computed round by round, with one thread of `pool` for each device."""
         parts, done = self._saved_blocks(saved)
         # block: results that are not in the checkpoint yet; block_begin: index of their first push
         block, block_begin, block_time = [], done, time.perf_counter()
@@ -278,12 +267,9 @@ class _Run:
         return _concatenated(parts + block)
 
     def _start_round(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[PushResults]]:
-        """Start the round that begins with push `first`; the last round repeats its last push.
-
-        Returns:
-            Index of the first push, index after the last one, and the results on each device.
-        """
+        """Start the round of push `first`; return that index, the index after its end, and results on each device."""
         last = min(first + self.round, self.n)
+        # the last round repeats its last push
         indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
         poses = np.broadcast_to(self.start, (self.n, 3))[indices]
         # a path that all pushes share is sent once
@@ -302,7 +288,7 @@ class _Run:
         return first, last, device_results
 
     def _saved_blocks(self, saved: Checkpoint | None) -> tuple[list[PushResults], int]:
-        """Pushes that the checkpoint holds, in blocks, and their number."""
+        """Return the pushes that are in the checkpoint, in blocks, and their number."""
         if saved is None:
             return [], 0
         blocks = saved.blocks()

@@ -31,37 +31,20 @@ from pushjax.simulation.random_rollout import draw, rollout_under_draws
 
 
 class Setup(NamedTuple):
-    """What all pushes share.
+    """What all pushes share."""
 
-    Attributes:
-        key: Raw data of the PRNG key.
-        surfaces: Distribution of limit surfaces around their mean.
-        model: Distribution of friction.
-        shape: Outline of the slider.
-        hand: The hand.
-        solver: Solver of contact problems; None for the default.
-        table: A table whose friction depends on direction or place; None for uniform friction.
-        fixtures: Walls and bodies that the slider may touch.
-    """
-
-    key: Array
+    key: Array  # raw data of the PRNG key
     surfaces: SurfaceDistribution
     model: FrictionModel
-    shape: Shape
+    shape: Shape  # of the slider
     hand: Hand
-    solver: ContactSolver | StickingSolver | None
-    table: Table | None
+    solver: ContactSolver | StickingSolver | None  # None for the default
+    table: Table | None  # None for uniform friction
     fixtures: Fixtures
 
 
 class PushResults(NamedTuple):
-    """Results of pushes, with the names and meanings of the fields of `MonteCarlo`.
-
-    The fields are also the names of the arrays in the files of a checkpoint.
-
-    Attributes:
-        trajectory: None, unless it is kept.
-    """
+    """Results of pushes, as the fields of `MonteCarlo` of the same names; also the names of arrays in a checkpoint."""
 
     pose: Any
     status: Any
@@ -72,37 +55,21 @@ class PushResults(NamedTuple):
     stopped: Any
     friction: Any
     shrinkage: Any
-    trajectory: Any
+    trajectory: Any  # None, unless it is kept
 
 
 class Devices(NamedTuple):
-    """Devices of a run, those of the first process first.
+    """Devices of a run; the devices of the first process come first."""
 
-    Attributes:
-        count: Number of devices of all processes.
-        local: Devices of this process.
-        first: Index of the first of this process's devices among all.
-        multiprocess: Whether other processes take part.
-        writes: Whether this process writes files.
-    """
-
-    count: int
-    local: tuple[Any, ...]
-    first: int
-    multiprocess: bool
-    writes: bool
+    count: int  # of all processes
+    local: tuple[Any, ...]  # of this process
+    first: int  # index of the first of `local` among all
+    multiprocess: bool  # whether other processes take part
+    writes: bool  # whether this process writes files
 
     @staticmethod
     def of(devices: Sequence[Any] | None) -> "Devices":
-        """Return the devices of a run.
-
-        Args:
-            devices: Devices to use, as JAX lists them; None for all devices of all processes.
-
-        Raises:
-            ValueError: If there are no devices, or if they are neither all of this process nor equally many of each
-                process.
-        """
+        """Return the devices of a run, from JAX devices, or from all devices of all processes for None."""
         all_devices = list(jax.devices() if devices is None else devices)
         if not all_devices:
             raise ValueError("devices must not be empty")
@@ -126,26 +93,14 @@ def start_round(
     setups: list[Setup],
     impl: Any,
     devices: Devices,
-    indices: np.ndarray,
-    poses: np.ndarray,
-    paths: np.ndarray,
+    indices: np.ndarray,  # of the pushes, (devices, tile), for the devices of all processes; so are poses and paths
+    poses: np.ndarray,  # (devices, tile, 3)
+    paths: np.ndarray,  # (devices, tile, steps + 1, dof), or (steps + 1, dof) for all pushes
     keep_trajectories: bool,
-    quick: bool,
-    pool: Executor,
+    quick: bool,  # whether to compile for a short compile time
+    pool: Executor,  # one thread for each device of this process
 ) -> list[PushResults]:
-    """Start one round, and return its results on each device of this process without waiting for them.
-
-    Args:
-        setups: The setup on each device of this process.
-        impl: Name of the PRNG implementation.
-        devices: Devices of the run.
-        indices: Indices of the pushes, (devices, tile), for the devices of all processes.
-        poses: Poses of the slider at the start, (devices, tile, 3), for the devices of all processes.
-        paths: Configurations of the hand, (steps + 1, dof) for all pushes, or (devices, tile, steps + 1, dof).
-        keep_trajectories: Whether to keep trajectories.
-        quick: Whether to compile for a short compile time, with `QUICK_OPTIONS`.
-        pool: Threads, one for each device of this process.
-    """
+    """Start one round, and return its results on each device of this process without waiting for them."""
     programs = _PROGRAMS[quick]
 
     def start_on(k: int) -> PushResults:
@@ -165,7 +120,7 @@ def start_round(
 
 
 def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
-    """Copy the results of a round to the host, in the order of the pushes; each process gets those of all processes."""
+    """Return the results of a round on the host, from all processes, in the order of the pushes."""
     local = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *results)
     if not devices.multiprocess:
         return local
@@ -191,7 +146,7 @@ def _push_tile(
 
 
 def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:
-    """Make one push, and keep of it what `PushResults` holds."""
+    """Make one push, and return its results."""
     shape, hand, solver, table, fixtures = shared
     push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table, fixtures)
     mode = push.mode
@@ -210,15 +165,10 @@ def _push_results(draws, shared: tuple, path, pose, resample_every, keep_traject
 
 
 class _Programs(NamedTuple):
-    """The two programs of a tile, compiled by JAX at their first call.
+    """The two programs of a tile, which JAX compiles at their first call."""
 
-    Attributes:
-        draw: `_draw_tile`.
-        push: `_push_tile`.
-    """
-
-    draw: Any
-    push: Any
+    draw: Any  # of `_draw_tile`
+    push: Any  # of `_push_tile`
 
     @staticmethod
     def of(options: dict[str, str | bool | int] | None) -> "_Programs":
@@ -230,16 +180,14 @@ class _Programs(NamedTuple):
 
 @without_gc
 def _draw_while_tracing(programs: _Programs, draw_args: tuple, push_args: Callable[[Any], tuple]) -> Any:
-    """Return the draws of a tile, and trace the program of the pushes while that of the draws is compiled.
-
-    XLA compiles without Python's lock. JAX keeps what is traced for the call that follows.
-    """
+    """Return the draws of a tile, and trace the program of the pushes while XLA compiles the other program."""
     (device,) = draw_args[-1].devices()
     sharding = jax.sharding.SingleDeviceSharding(device)
     draws = jax.tree.map(
         lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
         programs.draw.eval_shape(*draw_args),
     )
+    # XLA compiles without Python's lock, and JAX keeps what is traced for the call that follows
     with ThreadPoolExecutor(1) as thread:
         drawn = thread.submit(programs.draw, *draw_args)
         programs.push.lower(*push_args(draws))

@@ -18,36 +18,19 @@ from pushjax.geometry.shape import Outline
 
 
 class EdgeSupport(NamedTuple):
-    """Support points: points of an outline that face the edges of a pad, as arrays over the points of all edges.
+    """Points of an outline that face the edges of a pad (support points), as arrays over the points of all edges."""
 
-    Attributes:
-        valid: Whether the support point exists.
-        point: Point of the outline, in the outline's frame, m.
-        normal: Outward unit normal of the pad's edge, in the outline's frame.
-        local: The point in the pad's frame, m.
-        along: Coordinate of the point along the edge, m.
-        length: Length of the edge, m.
-        height: Height of the point above the edge, m.
-    """
-
-    valid: Bool[Array, "points"]
-    point: Vec2
-    normal: Vec2
-    local: Vec2
-    along: Scalar
-    length: Scalar
-    height: Scalar
+    valid: Bool[Array, "points"]  # whether the point exists
+    point: Vec2  # in the outline's frame, m
+    normal: Vec2  # outward unit normal of the pad's edge, in the outline's frame
+    local: Vec2  # the point in the pad's frame, m
+    along: Scalar  # coordinate of the point along the edge, m
+    length: Scalar  # of the edge, m
+    height: Scalar  # of the point above the edge, m
 
 
 def edge_support_points(edges: Edge, outline: Outline, center: Vec2, angle: Vec2) -> EdgeSupport:
-    """Find the support points of an outline: those that face each edge of a pad.
-
-    Args:
-        edges: Edges of the pad, as arrays, in its own frame.
-        outline: The smooth outline.
-        center: Center of the pad in the outline's frame, m.
-        angle: Angle of the pad in the outline's frame, as a unit vector.
-    """
+    """Return the points of a smooth outline that face each edge of a pad, which is at `center`, m, and `angle`."""
 
     def supports_of_edge(edge: Edge) -> EdgeSupport:
         normal = edge.normal.rotate(angle)
@@ -62,7 +45,7 @@ def edge_support_points(edges: Edge, outline: Outline, center: Vec2, angle: Vec2
 
 
 def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
-    """Depth of the deepest corner in the outline, or of the deepest support point in the pad, m; negative if apart."""
+    """Return the depth of the deepest corner in the outline or support point in the pad, m; negative if apart."""
     corner_depths = -jax.vmap(outline.closest)(corners).distance
     support_depths = jnp.where(supports.valid, -jax.vmap(pad.closest)(supports.local).distance, -jnp.inf)
     return largest(jnp.concatenate([corner_depths, support_depths]))

@@ -57,8 +57,8 @@ def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Fl
     """Circular path of equal steps: the hand turns about a point like a rigid body.
 
     Args:
-        start: First configuration, (dof,): x and y (m), then, if there are more than two numbers, the angle of the hand
-            (rad), which turns with it, and numbers that stay, such as an opening.
+        start: First configuration, (dof,): x and y, m; then, if there are more, the angle of the hand, rad, which turns
+            with it, and numbers that stay, such as an opening.
         center: Point about which the hand turns, (2,), world, m.
         angle: Angle by which it turns, rad, counterclockwise.
         steps: Number of steps.
@@ -130,9 +130,9 @@ def through(configurations: ArrayLike, steps: int | Sequence[int]) -> Float[Arra
 def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
     """Resample a recorded path into steps of equal length along it; its first and last points stay.
 
-    Length is measured in the units of the configuration, straight from point to point. Interpolation would turn an
-    angle that jumps from pi to -pi back through zero, so unwrap such angles first. A path that does not move repeats
-    its first point.
+    Length is in the units of the configuration, straight from point to point. Interpolation would turn an angle that
+    jumps from pi to -pi back through zero, so unwrap such angles first. A path that does not move repeats its first
+    point.
 
     Args:
         path: Recorded configurations, (points, dof).
@@ -151,7 +151,7 @@ def resample(path: ArrayLike, steps: int) -> Float[Array, "{steps}+1 dof"]:
 
 
 def arc_length(points: Float[Array, "points n"]) -> Float[Array, "points"]:
-    """Length from the first point to each point, straight from point to point."""
+    """Return the length from the first point to each point, straight from point to point."""
     squared = jnp.sum(jnp.diff(points, axis=0) ** 2, axis=1)
     moves = squared > 0  # the derivative of the square root is infinite where a recording pauses
     distances = jnp.where(moves, jnp.sqrt(jnp.where(moves, squared, 1.0)), 0.0)
@@ -159,22 +159,12 @@ def arc_length(points: Float[Array, "points n"]) -> Float[Array, "points"]:
 
 
 def interpolate_arc_length(path: Array, arc: Float[Array, "points"], at: Float[Array, "k"]) -> Float[Array, "k dof"]:
-    """Interpolate a path at the lengths `at`.
-
-    Args:
-        path: Points of the path, (points, dof).
-        arc: Length from the first point to each point, as from `arc_length`.
-        at: Lengths at which the result is wanted. Beyond an end of the path, the result is that end.
-    """
+    """Return the configurations at the lengths `at`; beyond an end of the path, that end."""
     return jnp.stack([jnp.interp(at, arc, column) for column in path.T], axis=1)
 
 
 def checked_path(path: ArrayLike, dof: int | None, dtype: Any = None) -> Float[Array, "points dof"]:
-    """Return a path as a floating array.
-
-    Raises:
-        ValueError: For a wrong shape, fewer than two configurations, or values that are not finite.
-    """
+    """Return a path as a floating array; raise ValueError for fewer than two rows or for values that are not finite."""
     array = as_float(path, dtype, "path")
     check_shape("path", array, ("steps + 1", "dof" if dof is None else dof))
     if array.shape[0] < 2:

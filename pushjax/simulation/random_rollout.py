@@ -57,23 +57,14 @@ class RandomRollout(NamedTuple):
 
 
 def draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel, steps: int) -> Draws:
-    """Sample the friction of one push.
-
-    A single draw equals that of `model.sample(key, surface)`. Of several draws, draw k equals that with the key
-    `fold_in(key, k)`.
-
-    Args:
-        key: PRNG key.
-        surfaces: Distribution of limit surfaces, `model.around(surface)`.
-        model: Distribution of friction.
-        steps: Number of steps of the push.
-    """
+    """Sample the friction of one push of `steps` steps."""
 
     def sample_once(key):
         surface_key, friction_key = jax.random.split(key)
         sample = surfaces.sample(surface_key)
         return Draws(sample.surface, model.sample_friction(friction_key), sample.shrinkage)
 
+    # a single draw equals `model.sample(key, surface)`
     if model.resample_every is None:
         return jax.tree.map(lambda leaf: leaf[None], sample_once(key))
     indices = jnp.arange(-(-steps // model.resample_every))
@@ -91,19 +82,7 @@ def rollout_under_draws(
     table: Table | None,
     fixtures: Fixtures,
 ) -> Trajectory:
-    """Roll out a push under friction that was sampled before.
-
-    Args:
-        draws: The sampled friction.
-        shape: Outline of the slider.
-        hand: The hand.
-        path: Configurations of the hand, (steps + 1, dof).
-        pose: Pose of the slider at the start, (3,), world, m and rad.
-        solver: Solver of contact problems; None for the default.
-        resample_every: Number of steps after which the next draw is used; None for one draw.
-        table: A table whose friction depends on direction or place; None for uniform friction.
-        fixtures: Walls and bodies that the slider may touch.
-    """
+    """Return a push under friction that was sampled before."""
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
     surfaces_and_frictions = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
 
@@ -132,7 +111,7 @@ def random_rollout(
 ) -> RandomRollout:
     """Push the slider along a path under friction sampled from `model` around the slider's surface.
 
-    The result is differentiable as that of `rollout`, and also in the range of the model's friction and in its `dof`.
+    The result is differentiable like a `rollout`, and also in the range of the model's friction and in its `dof`.
     Derivatives in `dof` are correct in the mean over keys. For a single key they are not, because its sample jumps.
     With the sampler "gram", the mean leaves out how the shrinkage of repaired samples changes.
 

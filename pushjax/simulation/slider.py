@@ -68,8 +68,8 @@ class Slider(eqx.Module):
             degree: Degree of the limit surface, 2 (an ellipsoid) or 4.
 
         Returns:
-            The slider. Its limit surface is fitted to 400 wrench-twist pairs of the support. The pairs are drawn with
-            the key 0, so the same arguments give the same bits.
+            The slider. Its limit surface is fitted to 400 wrench-twist pairs of the support, sampled with the key 0, so
+            the same arguments give the same bits.
 
         Raises:
             ValueError: As in `Support.wrench_twist_pairs` and `fit_limit_surface`.
@@ -80,14 +80,7 @@ class Slider(eqx.Module):
 
 @quick_jit
 def overlaps(slider: Slider, hand: Hand, poses: Array, configuration: Array) -> Array:
-    """Return the depth of the deepest finger in the slider, m, for each pose.
-
-    Args:
-        slider: The slider.
-        hand: The hand.
-        poses: Poses of the slider, (poses, 3), world.
-        configuration: Configuration of the hand, (dof,) for all poses or (poses, dof).
-    """
+    """Return the depth of the deepest finger in the slider, m, for each pose of the slider (poses, 3), world."""
 
     def depth_of(pose: Array, configuration: Array) -> Array:
         finger_poses = unstack_finger_poses(hand.poses(configuration))

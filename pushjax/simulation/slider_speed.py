@@ -1,8 +1,8 @@
 """How far a slider may move while the hand moves by a given distance.
 
-Without friction, a slider squirts out of a narrow wedge, between a finger and a wall, say, much faster than the finger
-closes it. On the way out it loses the contacts that drive it, but a step that is computed as a whole does not see that,
-and takes the slider as far as the contacts would if they lasted.
+Without friction, a slider squirts out of a narrow wedge, such as one between a finger and a wall, much faster than the
+finger closes it. On the way out it loses the contacts that drive it. A step that is computed as a whole ignores this
+loss, and takes the slider as far as the contacts would if they lasted.
 """
 
 from typing import NamedTuple
@@ -21,40 +21,28 @@ ALLOWED_IN_SMALLEST = 1.0
 
 
 class SpeedJudgment(NamedTuple):
-    """Whether a slider moved no farther than it may.
+    """Whether a slider moved no farther than it may."""
 
-    Attributes:
-        allowed: Whether it did so in the part of the step that was computed.
-        allowed_in_double: Whether it would do so in a part of twice the size, at the same speed.
-    """
-
-    allowed: Bool[Array, ""]
-    allowed_in_double: Bool[Array, ""]
+    allowed: Bool[Array, ""]  # in the part of the step that was computed
+    allowed_in_double: Bool[Array, ""]  # in a part of twice the size, at the same speed
 
 
 def judge_speed(
     twist: Vec3,
     force: tuple[Vec2, ...],
     contact_point: Float[Array, "contacts 2"],
-    displacement: Scalar,
+    displacement: Scalar,  # largest displacement of a finger in this part, m
     length: Scalar,
-    is_smallest: Bool[Array, ""],
+    is_smallest: Bool[Array, ""],  # whether the part cannot be divided any more
 ) -> SpeedJudgment:
-    """Judge how far a slider moved in a part of a step: where forces act on it, and how far it turned.
-
-    Args:
-        twist: Twist of the slider over the part.
-        force: Force of each contact, N.
-        contact_point: Point of each contact, m.
-        displacement: Largest displacement of a finger in this part, m.
-        length: Length of the limit surface, m. It makes angles distances.
-        is_smallest: Whether the part cannot be divided any more.
-    """
+    """Return whether a slider moved no farther in a part of a step than it may."""
     twist, force, length = jax.lax.stop_gradient((twist, force, length))
     weight = jnp.stack([contact_force.x for contact_force in force])
     total = jnp.sum(weight)
     middle = Vec2.of(weight @ contact_point / jnp.where(total > 0, total, 1.0))
     at_middle = twist.xy + middle.perp().scale(twist.z)
+    # how far the slider moved where forces act on it, and how far it turned; the limit surface's length, m, makes the
+    # angle a distance
     motion = jnp.sqrt(at_middle.dot(at_middle)) + length * jnp.abs(twist.z)
 
     def is_allowed(multiple: int, fraction: Scalar | float) -> Bool[Array, ""]:

@@ -17,28 +17,27 @@ class Step(eqx.Module):
     its motion, in the body frame of that halfway pose. Where nothing pushes, twist, wrench, force, contact points and
     normals are zero, and the modes are SEPARATED. Otherwise the wrench lies on the limit surface ("on H = 1" below),
     and the forces, which act at the contact points, sum to it. The tangent of a contact with normal n is (-n_y, n_x).
-    A contact without force is where its finger might touch next; if that is past the end of an edge, the point is off
-    the outline.
+    A contact without force is where its finger might touch next; past the end of an edge, it is off the outline.
 
     Contacts are in the order of the fingers, and then of the fixtures. A round finger has one contact, or two on an
     outline that is not convex. A pad has two contacts in general, one on a disk, and three on a polygon that is not
     convex. A wall has two contacts, or one on a disk. The contacts of one finger may change places from step to step.
 
-    The contact point moves in a straight line, and the rest of the slider turns about it. The twist is that of chords:
-    the slider turns by 2 asin(twist[2] / 2). So the pose after the step agrees with the exponential of the twist to
-    second order only. For a step that was divided (`pushjax.simulation.substeps`), the twist is the sum over its parts,
-    and wrench, force, contacts and mode are those halfway through the last part in which the slider moved.
+    The contact point moves in a straight line, and the rest of the slider turns about it. The twist is one of chords:
+    the slider turns by 2 asin(twist[2] / 2), and its pose after the step agrees with the exponential of the twist to
+    second order only. For a step that was divided (`pushjax.simulation.substeps`), the twist is the sum over its parts;
+    wrench, force, contacts and mode come from halfway through the last part in which the slider moved.
 
-    MOVING, FREE, JAMMED and GRASPED promise a bound on the overlap after the step. The bound is the overlap before the
-    step or, if that is more, a tenth of the largest displacement of the fingers in the step, but at least 1e-5 of the
-    surface's length.
+    MOVING, FREE, JAMMED and GRASPED promise a bound on the overlap after the step: the overlap before the step or, if
+    that is more, a tenth of the largest displacement of the fingers in the step, but at least 1e-5 of the surface's
+    length.
 
     Attributes:
         pose: Pose of the slider after the step, (3,), world, m and rad.
         twist: Twist of the slider over the step, (3,), body frame, m and rad.
         wrench: Wrench on the slider, (3,), body frame, N and N m, on H = 1.
         force: Forces along normal and tangent of each contact, (contacts, 2), N, on H = 1.
-        contact_point: Points of contact, where the forces act, (contacts, 2), body frame, m. Not differentiated.
+        contact_point: Points where the forces act, (contacts, 2), body frame, m. Not differentiated.
         contact_normal: Unit normals of the contacts, into the slider, (contacts, 2), body frame. Not differentiated.
         mode: `ContactMode` of each contact, (contacts,).
         status: `Status` of the step.
@@ -70,10 +69,8 @@ class Trajectory(eqx.Module):
         twist: Twist of the slider over each step, (steps, 3), body frame, m and rad.
         wrench: Wrench on the slider in each step, (steps, 3), body frame, N and N m, on H = 1.
         force: Forces along normal and tangent of each contact, (steps, contacts, 2), N, on H = 1.
-        contact_point: Points of contact halfway through each step, where the forces act, (steps, contacts, 2), body
-            frame, m; zero where nothing pushes. Not differentiated.
-        contact_normal: Unit normals of the contacts, into the slider, (steps, contacts, 2), body frame; zero where
-            nothing pushes. Not differentiated.
+        contact_point: Points of contact, (steps, contacts, 2), body frame, m. Not differentiated.
+        contact_normal: Unit normals into the slider, (steps, contacts, 2), body frame. Not differentiated.
         mode: `ContactMode` of each contact, (steps, contacts).
         status: `Status` of each step, (steps,).
         overlap: Depth of the deepest finger or fixture in the slider after each step, (steps,), m. Not differentiated.
@@ -115,12 +112,8 @@ def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
 
 
 def to_arrays(record: ScalarStep, length: Scalar) -> Step:
-    """Convert the record of one step to arrays, or a stacked record, whose scalars have an axis of steps.
-
-    Args:
-        record: The record. The torque of its wrench is divided by `length`.
-        length: Characteristic length of the limit surface, m.
-    """
+    """Return the record of one step as arrays, or a stacked record, whose scalars have an axis of steps."""
+    # the torque of the record is divided by the length of the limit surface
     wrench = (record.wrench.x, record.wrench.y, record.wrench.z * length)
     return Step(
         pose=jnp.stack(record.pose, axis=-1),

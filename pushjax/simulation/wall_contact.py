@@ -1,7 +1,7 @@
 """Contact detection for a wall: a straight line without ends, behind which the slider must not be.
 
-The slider touches a wall at corners of a polygon, or at points of a smooth outline whose normal is opposite to that of
-the wall.
+The slider touches a wall at corners of a polygon, or at points of a smooth outline whose normal is opposite to the
+wall's normal.
 """
 
 import jax
@@ -14,12 +14,7 @@ from pushjax.simulation.candidate import OUT_OF_REACH, Candidate, FingerPose
 
 
 def wall_candidates(outline: Outline, wall: FingerPose) -> Candidate:
-    """Return every place where a slider may touch a wall, as arrays.
-
-    Args:
-        outline: The slider's outline.
-        wall: A point of the wall, and its unit normal into the free space, in the slider's frame.
-    """
+    """Return every place where a slider may touch a wall, in the slider's frame, as arrays."""
     normal = wall.angle
     assert normal is not None
     if isinstance(outline, PolygonOutline):
@@ -32,5 +27,5 @@ def wall_candidates(outline: Outline, wall: FingerPose) -> Candidate:
 
 
 def num_wall_contacts(outline: Outline) -> int:
-    """Number of contacts with one wall."""
+    """Return the number of contacts with one wall."""
     return 1 if isinstance(outline, DiskOutline) else 2

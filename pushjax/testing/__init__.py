@@ -9,12 +9,12 @@ has two rows, a_n and a_t. Its point on the slider moves by (a_n . V, a_t . V) a
     V = k grad H(F),  k > 0,  F = sum of the contacts' wrenches,
     0 <= f_n  _|_  w_n + gap >= 0,   |f_t| <= mu f_n,   f_t = +mu f_n where w_t < 0,  -mu f_n where w_t > 0,
 
-(Zhou et al. 2017, section IV; the gap is that of Stewart & Trinkle 1996). There are three checks of a batch:
+(Zhou et al. 2017, section IV; the gap as in Stewart & Trinkle 1996). There are three checks of a batch:
 `violations` measures how far given solutions violate these conditions; `squeeze_power` shows whether a problem that is
 said to have no solution has the physical reason for that; and `search` looks for a solution where a solver found none.
 
-Two more modules use JAX: `testing.problems` draws random problems, and `testing.convexity` checks whether quartics are
-convex.
+Two more modules use JAX: `testing.problems` generates random problems, and `testing.convexity` checks whether quartics
+are convex.
 """
 
 from pushjax.testing.batch import ProblemBatch as ProblemBatch

@@ -100,31 +100,21 @@ class ProblemBatch:
         return ProblemBatch(self.degree, *(getattr(self, f.name)[index] for f in fields(self)[1:]))
 
     def gathered(self) -> tuple["ProblemBatch", np.ndarray]:
-        """Move the active contacts to the front, and drop the columns that no problem needs.
-
-        Returns:
-            batch: The problems, with as many contacts as the problem with the most active contacts (at least one).
-            order: Indices of these contacts in this batch, (N, contacts).
-        """
+        """Return the batch with its active contacts in front, and their indices (N, contacts) in this batch."""
         max_active = max(int(self.active.sum(axis=1).max(initial=0)), 1)
+        # The problem with the most active contacts determines the number of columns.
         order = np.argsort(~self.active, axis=1, kind="stable")[:, :max_active]
         row = np.arange(len(self))[:, None]
         gathered_fields = {f.name: getattr(self, f.name)[row, order] for f in fields(self)[3:]}
         return ProblemBatch(self.degree, self.coefficients, self.length, **gathered_fields), order
 
     def speed(self) -> np.ndarray:
-        """Return the unit of displacement of each problem, max(|displacement| + |gap|) over the active contacts.
-
-        It is a length, because displacements are those of one time step, whose duration does not matter. A displacement
-        and a gap of the same size shift a contact's condition equally. If all of them are zero, nothing moves, and the
-        unit is one.
-
-        Returns:
-            The unit, (N,), in m.
-        """
+        """Return the unit of displacement, max(|displacement| + |gap|) over active contacts, (N,), in m."""
+        # It is a length, because a displacement belongs to one time step, whose duration does not matter. A
+        # displacement and a gap of the same size shift a contact's condition equally.
         each = np.linalg.norm(self.displacement, axis=2) + np.abs(self.gap)
         largest = np.where(self.active, each, 0.0).max(axis=1, initial=0.0)
-        return np.where(largest > 0, largest, 1.0)
+        return np.where(largest > 0, largest, 1.0)  # if nothing moves, the unit is one
 
     def rows(self) -> np.ndarray:
         """Return the contact Jacobian: the rows a_n and a_t of every contact, (N, m, 2, 3); see `pushjax.testing`."""
@@ -135,21 +125,14 @@ class ProblemBatch:
         return np.concatenate([direction, torque[..., None]], axis=3)
 
     def approach(self) -> np.ndarray:
-        """Return the motion along (n, t) that keeps each contact point with its pusher, less the gap along n.
-
-        Returns:
-            The motion, (N, m, 2), in m.
-        """
+        """Return the motion along (n, t) that keeps contact points with their pushers, less the gap, (N, m, 2), m."""
         tangent = np.stack([-self.normal[..., 1], self.normal[..., 0]], axis=2)
         along = np.einsum("nmi,nmi->nm", self.displacement, self.normal) - self.gap
         return np.stack([along, np.einsum("nmi,nmi->nm", self.displacement, tangent)], axis=2)
 
     def hessian_table(self) -> np.ndarray:
-        """Return the coefficients (N, 3, 3, q) of the Hessian of H.
-
-        hess H(F) is linear in the q products of two coordinates of F (for degree 2: in the constant one), see
-        `products`.
-        """
+        """Return the coefficients (N, 3, 3, q) of the Hessian of H, which is linear in the q `products`."""
+        # The products are those of two coordinates of F; for degree 2, the constant one.
         if self.degree == 2:
             return (self.coefficients + np.swapaxes(self.coefficients, 1, 2))[..., None]
         return np.einsum("nk,kijq->nijq", self.coefficients, HESSIANS)

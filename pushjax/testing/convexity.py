@@ -1,7 +1,4 @@
-"""Check of the convexity of quartics by a sweep of the Hessian, for millions of quartics at once.
-
-It does not use the certificates of convexity that it is there to check.
-"""
+"""Check of the convexity of quartics by a sweep of the Hessian, without the certificates that it tests."""
 
 from functools import partial
 from typing import Any
@@ -24,10 +21,10 @@ BATCH = 20_000  # quartics that are checked at once, to bound the memory
 def least_curvatures(coefficients: np.ndarray) -> np.ndarray:
     """Return the smallest curvature that a search finds: the minimum of z' hess H(F) z over unit F and z.
 
-    But for roundoff, the result is never below the true minimum. The Hessian is evaluated in 200 directions F. From the
-    four lowest, F and z are improved in turns: z becomes the eigenvector of the smallest eigenvalue of the Hessian at
-    F, then F that of the Hessian at z (the form is symmetric in F and z). Each step can only lower the value. Computed
-    in float64, whatever the dtype of the coefficients.
+    But for roundoff, the result is never below the true minimum. The search evaluates the Hessian in 200 directions F.
+    From the four lowest, it improves F and z in turns: z becomes the eigenvector of the smallest eigenvalue of the
+    Hessian at F, then F likewise at z (the form is symmetric in F and z). Each step can only lower the value. The
+    computation is in float64.
 
     Args:
         coefficients: Coefficients (n, 15) in the order of `Quartic`.
@@ -100,12 +97,10 @@ def _least_eigenvalue(xx, yy, zz, xy, xz, yz):
 
 
 def _eigenvector(entries, value):
-    """Return the unit eigenvector of an eigenvalue of a symmetric 3 x 3 matrix.
-
-    It is the longest cross product of two rows of the matrix minus the eigenvalue times the identity.
-    """
+    """Return the unit eigenvector of an eigenvalue of a symmetric 3 x 3 matrix."""
     xx, yy, zz, xy, xz, yz = entries
     m = jnp.array([[xx - value, xy, xz], [xy, yy - value, yz], [xz, yz, zz - value]])
+    # It is the longest cross product of two rows of m.
     crosses = jnp.stack([jnp.cross(m[0], m[1]), jnp.cross(m[0], m[2]), jnp.cross(m[1], m[2])])
     squared = jnp.sum(crosses**2, axis=1)
     best = jnp.argmax(squared)

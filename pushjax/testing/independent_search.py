@@ -42,14 +42,14 @@ class SearchResult(NamedTuple):
 def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple[int, ...] = (2, 8)) -> SearchResult:
     """Search for any solution of each problem, from random starts.
 
-    From each start the conditions, written as equations (`_Equations`), are solved by the Levenberg-Marquardt method,
-    and the result is accepted if it passes `violations`. Where the slider can stay, the solution is zero, and nothing
-    is searched. If the search finds nothing, that proves nothing, but it is stronger evidence with more starts.
+    From each start the Levenberg-Marquardt method solves the conditions, written as equations. The result counts if it
+    passes `violations`. Where the slider can stay, the solution is zero, and nothing is searched. If the search finds
+    nothing, that proves nothing, but it is stronger evidence with more starts.
 
     Args:
         batch: The problems.
         starts: Number of random starts of each problem.
-        seed: Seed of the starts. Other batches or portions draw other starts from the same seed.
+        seed: Seed of the starts. With other batches or portions, the same seed gives other starts.
         portions: Sizes of the first groups of starts; the last group has all the rest. After each group, problems that
             have a solution leave the search.
 
@@ -98,18 +98,17 @@ def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searc
 
 
 class _Equations:
-    """The conditions as 2 m equations in the 2 m force components, for B starts at once on the last axis.
+    """The conditions as 2 m equations in the 2 m force components, for B starts at once on the last axis."""
 
-    H is scaled so that its mean Hessian over the sphere has trace 3. Lengths are relative to the problem's speed. The
-    equation V = grad H(F) has no free factor, so the size of the forces is an unknown too. The unknowns are y, with
-    f = y / rho, where rho is about the derivative of w_n by f_n. With phi(a, b) = a + b - |(a, b)| (Fischer 1992),
-    which is zero where 0 <= a _|_ b >= 0 and smooth except at a = b = 0, the equations of a contact are
-
-        phi(f_n, w_n + gap) = 0,      phi(mu f_n + f_t, -phi(mu f_n - f_t, -w_t)) = 0.
-
-    The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
-    where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
-    """
+    # H is scaled so that its mean Hessian over the sphere has trace 3. Lengths are relative to the problem's speed. The
+    # equation V = grad H(F) has no free factor, so the size of the forces is an unknown too. The unknowns are y, with
+    # f = y / rho, where rho is about the derivative of w_n by f_n. With phi(a, b) = a + b - |(a, b)| (Fischer 1992),
+    # which is zero where 0 <= a _|_ b >= 0 and smooth except at a = b = 0, the equations of a contact are
+    #
+    #     phi(f_n, w_n + gap) = 0,      phi(mu f_n + f_t, -phi(mu f_n - f_t, -w_t)) = 0.
+    #
+    # The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
+    # where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
 
     def __init__(self, batch: ProblemBatch, problem: np.ndarray, rng: np.random.Generator):
         n, m = batch.friction.shape
@@ -177,16 +176,13 @@ class _Equations:
         return value, by_y
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """Draw the starts y (2 m, B): random forces in the friction cones.
-
-        Half of them are scaled so that the normal motion of some contacts is about right. The other half resist a
-        random twist, because on an ill-conditioned surface random forces hardly ever do.
-        """
+        """Return random starts y (2 m, B), with forces in the friction cones."""
         m, count = self.friction.shape
         normal_force = np.where((rng.random((m, count)) < 0.6) & self.active, rng.exponential(size=(m, count)), 0.0)
         side = rng.uniform(-1, 1, (m, count))
         side = np.where(rng.random((m, count)) < 0.5, np.sign(side), side)
         force = _interleave(normal_force, side * self.friction * normal_force)
+        # One half of the starts: forces whose size makes the normal motion of some contacts about right.
         twist = self.evaluate(force * self.rho)[2]
         motion = np.einsum("ijb,jb->ib", self.rows[0::2], twist)
         numerator, denominator = (
@@ -199,6 +195,7 @@ class _Equations:
             1 / (self.degree - 1)
         )
 
+        # The other half resist a random twist, because on an ill-conditioned surface random forces hardly ever do.
         resisting_force = np.einsum("bij,jb->ib", self.resisting[self.problem], rng.normal(size=(3, count)))
         resisting_force *= np.where(resisting_force[0::2].sum(axis=0) < 0, -1.0, 1.0)
         force = np.where(rng.random(count) < 0.5, self.in_cone(resisting_force), force)
@@ -211,16 +208,15 @@ class _Equations:
         return _interleave(normal, np.clip(force[1::2], -limit, limit))
 
     def follow_modes(self, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Move most starts a few Newton steps toward a random choice of contact modes.
-
-        The choice need not have a solution. It consists of one to three edges of friction cones, which are enough for
-        a solution because wrenches have three dimensions. A contact sticks if both of its edges are chosen.
-        """
+        """Return the starts after a few Newton steps of most of them toward a random choice of contact modes."""
+        # The choice need not have a solution. It consists of one to three edges of friction cones, which are enough for
+        # a solution because wrenches have three dimensions.
         count = y.shape[1]
         order_key = rng.random(y.shape) + np.repeat(2.0 * ~self.active, 2, axis=0)
         rank = order_key.argsort(axis=0).argsort(axis=0)
         chosen = rank < rng.choice([1, 2, 3], p=[0.1, 0.3, 0.6], size=count)
         left, right = chosen[0::2] & self.active, chosen[1::2] & self.active
+        # A contact sticks if both of its edges are chosen.
         separates, sticks = ~(left | right), left & right
         slope = self.friction * np.where(left, 1.0, -1.0)
         damping = 10 ** rng.uniform(-13, -6, count)
@@ -291,13 +287,13 @@ class _Equations:
 
 
 def _fischer_burmeister(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a + b - |(a, b)| and its derivatives; at the corner, one of its generalized derivatives."""
+    """Return phi(a, b) and its derivatives; at the corner, one of its generalized derivatives."""
     size = np.sqrt(a * a + b * b) + np.finfo(float).tiny
     return a + b - size, 1 - a / size, 1 - b / size
 
 
 def _interleave(normal: np.ndarray, tangent: np.ndarray) -> np.ndarray:
-    """Interleave two arrays (m, B) into one (2 m, B): each contact's normal entry, then its tangential entry."""
+    """Return two arrays (m, B) as one (2 m, B): each contact's normal entry, then its tangential entry."""
     return np.stack([normal, tangent], axis=1).reshape(-1, *normal.shape[1:])
 
 

@@ -14,12 +14,8 @@ SHARE = 1e-10
 
 
 def _edges(batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return the wrench and the power of each edge of the friction cones, at unit normal force.
-
-    Returns:
-        wrench: Normalized wrenches (N, 2 m, 3).
-        power: f . displacement - f_n gap, (N, 2 m), in m.
-    """
+    """Return the normalized wrench (N, 2 m, 3) and the power (N, 2 m), in m, of each friction-cone edge."""
+    # Both are at unit normal force. The power is f . displacement - f_n gap.
     rows, motion = batch.rows(), batch.approach()
     signed_friction = batch.friction[..., None] * np.array([1.0, -1.0])
     wrench = rows[:, :, None, 0] + signed_friction[..., None] * rows[:, :, None, 1]
@@ -32,11 +28,11 @@ def squeeze_power(batch: ProblemBatch) -> np.ndarray:
     """Return the largest work of the pushers on contact forces that balance each other, per newton of normal force.
 
     It is max sum f . displacement - sum f_n gap over forces in the friction cones with no resultant wrench and with
-    sum f_n = 1. If the squeeze power is not positive, the problem has a solution (existence theorem of
-    copositive complementarity problems). If it is positive, the problem may or may not have one. Pushers that move as
-    one rigid body do no work on balanced forces, so their squeeze power is zero up to roundoff.
+    sum f_n = 1. If it is not positive, the problem has a solution (existence theorem of copositive complementarity
+    problems). If it is positive, the problem may or may not have one. It is zero up to roundoff for pushers that move
+    as one rigid body, because they do no work on balanced forces.
 
-    It solves one linear program for each problem, with forces that balance to 1e-10 (SHARE).
+    Each problem takes one linear program, with forces that balance to 1e-10.
 
     Args:
         batch: The problems.

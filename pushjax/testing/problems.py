@@ -1,6 +1,6 @@
 """Random contact problems of a given difficulty, for tests and benchmarks.
 
-Everything is drawn from a PRNG key. For a batch, use `vmap` over split keys.
+All numbers come from a PRNG key. For a batch, use `vmap` over split keys.
 """
 
 import math
@@ -39,7 +39,7 @@ class ContactProblem(NamedTuple):
 def random_contact_problem(
     key: Key[Array, ""], *, degree: int = 4, condition: float = 1e3, friction: float = 3.0
 ) -> ContactProblem:
-    """Draw a problem with one contact anywhere on a slider of some 0.1 m.
+    """Generate a problem with one contact anywhere on a slider of some 0.1 m.
 
     The direction of the push is uniform over the half plane of directions that push. The length of the displacement is
     log-uniform from 0.1 to 10 mm.
@@ -72,12 +72,12 @@ def random_contact_problem(
 def random_surface(
     key: Key[Array, ""], *, degree: int = 4, condition: float | Array = 1e3, length: float | Array = 0.05
 ) -> LimitSurface:
-    """Draw a limit surface whose Hessian has a condition number that is log-uniform up to about `condition`.
+    """Generate a limit surface whose Hessian has a condition number that is log-uniform up to about `condition`.
 
     A surface of degree 2 has random axes and eigenvalues. A surface of degree 4 is a sum of squares of five quadratics.
-    Some of these are squares of a single linear form, which leaves almost flat directions. A multiple of |F|^4, whose
-    own condition number is 3, is added so that the condition number over a sweep of the sphere is the one that was
-    drawn.
+    Some of these are squares of a single linear form, which leaves almost flat directions. The surface also contains a
+    multiple of |F|^4, whose own condition number is 3, so that the condition number over a sweep of the sphere takes
+    its random value.
 
     Args:
         key: PRNG key.
@@ -111,7 +111,7 @@ def random_surface(
     low, high = _spectrum(c)
     drawn_condition = jnp.maximum(drawn_condition, 3.5)
     # The Hessian of |F|^4 has eigenvalues 4 and 12 on the unit sphere. With the weight e of |F|^4, the condition number
-    # is at most (high + 12 e) / (low + 4 e), which is set to the drawn one.
+    # is at most (high + 12 e) / (low + 4 e), which is set to the random one.
     round_weight = jnp.maximum(0.0, (high - drawn_condition * low) / (4 * drawn_condition - 12))
     round_quartic = squared_quadratics(jnp.eye(3)[None])
     c = c + round_weight * round_quartic
@@ -154,9 +154,7 @@ def random_contacts_problem(
     slots: int | None = None,
     fixtures: int = 0,
 ) -> ContactsProblem:
-    """Draw a problem with several contacts on a slider of some 0.1 m, from the mix of cases that a solver must handle.
-
-    Each of the following choices is drawn anew for each problem.
+    """Generate a problem with several contacts on a slider of some 0.1 m, from the cases that a solver must handle.
 
     The contact points and normals are of one of five kinds, with equal probability:
 
@@ -177,9 +175,8 @@ def random_contacts_problem(
       behind or only just touch.
 
     The size of the displacements is log-uniform from 0.1 to 10 mm. In half of the problems all contacts have the same
-    friction coefficient.
-
-    All arguments but `degree`, `slots` and `fixtures` may be traced, so that one compiled program draws all problems.
+    friction coefficient. All arguments but `degree`, `slots` and `fixtures` may be traced, so that one compiled program
+    generates all problems.
 
     Args:
         key: PRNG key.
@@ -199,7 +196,7 @@ def random_contacts_problem(
     """
     k_surface, k_uniform, k_normal = jax.random.split(key, 3)
     num_slots = int(contacts) if slots is None else slots
-    # All numbers of a kind are drawn in one call, because each call takes a quarter of a second to compile.
+    # One call generates all numbers of a kind, because each call takes a quarter of a second to compile.
     uniform_numbers = _Numbers(jax.random.uniform(k_uniform, (24 + 13 * num_slots,)))
     normal_numbers = _Numbers(jax.random.normal(k_normal, (3 + 2 * num_slots,)))
     length = 0.02 + 0.08 * uniform_numbers.take()
@@ -209,6 +206,7 @@ def random_contacts_problem(
     size = 10 ** (2 * uniform_numbers.take() - 4)
     gap = _random_gaps(uniform_numbers, num_slots, gaps)
     push, dragged = _random_pushes(uniform_numbers, normal_numbers, surface, mu, point, normal, middle)
+    # With the gaps added, pushes of the last kind act as they do without gaps.
     push = size * push + jnp.where(dragged, gap, 0.0)[:, None] * normal
     order = jnp.argsort(uniform_numbers.take(num_slots))
     index = jnp.arange(num_slots)
@@ -225,7 +223,7 @@ class _Numbers:
         self.values, self.taken = values, 0
 
     def take(self, *shape: int) -> Array:
-        """Return the next numbers that were not taken yet, in the given shape."""
+        """Return the next unused numbers in the given shape."""
         begin, self.taken = self.taken, self.taken + math.prod(shape)
         assert self.taken <= self.values.size
         return self.values[begin : self.taken].reshape(shape)
@@ -242,13 +240,7 @@ def _perpendicular(v: Array) -> Array:
 
 
 def _random_points_and_normals(uniform: _Numbers, mu: Array, contacts: int | Array) -> tuple[Array, Array, Array]:
-    """Draw the points and normals of `random_contacts_problem`.
-
-    Returns:
-        points: Contact points, (m, 2), in m.
-        normals: Inward normals, (m, 2).
-        middle: Middle of the slider, (1, 2), in m.
-    """
+    """Return random points (m, 2), m, inward normals (m, 2) and the middle of the slider, (1, 2), m."""
     m = mu.size
     shared = uniform.take(12)
     phase, x, y, angle, along = uniform.take(5, m)
@@ -306,12 +298,7 @@ def _random_points_and_normals(uniform: _Numbers, mu: Array, contacts: int | Arr
 def _random_pushes(
     uniform: _Numbers, gauss: _Numbers, surface: LimitSurface, mu: Array, point: Array, normal: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Draw the displacements of `random_contacts_problem`, up to their size.
-
-    Returns:
-        push: Displacements, (m, 2), the largest of length about one.
-        dragged: Whether they are of the last kind, to which the gaps have to be added.
-    """
+    """Return random displacements (m, 2), the largest of length one, and whether they are of the last kind."""
     m = point.shape[0]
     shared, (fast, into) = uniform.take(6), uniform.take(2, m, 1)
     spin_rate, drift, free = gauss.take(), gauss.take(1, 2), gauss.take(m, 2)
@@ -343,14 +330,14 @@ def _random_pushes(
 
 
 def _random_friction(uniform: _Numbers, m: int, most: float | Array) -> Array:
-    """Draw the friction coefficients of `random_contacts_problem`, shape (m,)."""
+    """Return the friction coefficients of `random_contacts_problem`, (m,)."""
     same, (mu, kind) = uniform.take(), uniform.take(2, m)
     mu = most * jnp.where(kind < 0.1, 0.0, jnp.where(kind < 0.2, 4 * mu, mu))
     return jnp.where(same < 0.5, mu[0], mu)
 
 
 def _random_gaps(uniform: _Numbers, m: int, share: float | Array) -> Array:
-    """Draw the gaps of `random_contacts_problem`, shape (m,), m; a fraction `share` of the problems has gaps."""
+    """Return the gaps of `random_contacts_problem`, (m,), m; a fraction `share` of the problems has gaps."""
     has_gaps, (kind, size) = uniform.take(), uniform.take(2, m)
     gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
     return jnp.where(has_gaps < share, gap, 0.0)
