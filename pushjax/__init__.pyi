@@ -7,14 +7,14 @@ from ._internal.compilation_cache import enable_compilation_cache as enable_comp
 from .contact.cones import friction_cone as friction_cone
 from .contact.cones import motion_cone as motion_cone
 from .contact.exhaustive import Exhaustive as Exhaustive
+from .contact.paper import HessianIteration as HessianIteration
+from .contact.paper import Projected as Projected
 from .contact.problem import Contacts as Contacts
 from .contact.problem import Motion as Motion
 from .contact.problem import solve_contacts as solve_contacts
-from .contact.projected import Projected as Projected
 from .contact.scaled_problem import ContactSolver as ContactSolver
 from .contact.status import ContactMode as ContactMode
 from .contact.status import Status as Status
-from .contact.sticking import HessianIteration as HessianIteration
 from .contact.sticking import ScalarRoot as ScalarRoot
 from .friction.ellipsoid import Ellipsoid as Ellipsoid
 from .friction.fit import FitReport as FitReport

@@ -53,7 +53,7 @@ LONG = (
     "several_contacts",
     "monte_carlo",
     "rollout",
-    "single_first",
+    "continuing",
 )
 
 BESIDE = Path(__file__).parents[2] / "shared" / "data"

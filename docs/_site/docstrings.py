@@ -17,6 +17,7 @@ BASES = (
     "LimitSurface",
     "SurfaceDistribution",
     "ContactSolver",
+    "Exhaustive",
     "StickingSolver",
     "Outline",
 )

@@ -12,15 +12,10 @@ SEARCH_RESULT = "found"
 
 
 def without_derivatives(search: Callable, *args) -> Any:
-    """Return `search(*args)` as a constant with respect to every derivative.
-
-    `stop_gradient` on the arguments gives the same numbers. But JAX then still traces every loop of the search several
-    times, which took most of the time of tracing a gradient.
-
-    Args:
-        search: Function of `args`. It must not close over anything that is differentiated.
-        *args: Its arguments, pytrees of arrays.
-    """
+    """Return `search(*args)` as a constant with respect to every derivative."""
+    # `stop_gradient` on the arguments gives the same numbers. But JAX then still traces every loop of the search
+    # several times, which took most of the time of tracing a gradient. `search` must not close over anything that is
+    # differentiated.
 
     @eqx.filter_custom_jvp
     def opaque(args):

@@ -29,12 +29,11 @@ PLACES = 256
 
 
 class Rounds(NamedTuple):
-    """A computation of a number of rounds that differs between examples.
+    """A computation of a number of rounds that differs between examples."""
 
-    It is `state = begin(*args)`, then `state = advance(state, *args)` while `is_ongoing(state, *args)`, and then
-    `finish(state, *args)`. If it is over at once, `advance` must not change the result, because in a batch it is called
-    anyway.
-    """
+    # It is `state = begin(*args)`, then `state = advance(state, *args)` while `is_ongoing(state, *args)`, and then
+    # `finish(state, *args)`. In a batch `advance` is also called where the computation is over at once. There it must
+    # not change the result.
 
     begin: Callable[..., Any]
     advance: Callable[..., Any]
@@ -57,17 +56,9 @@ def tile_size(on_cpu: int = TILE) -> int:
 def where_needed_without_derivatives(
     needed: Bool[Array, ""], compute: Callable[..., Any], otherwise: Any, *args: Any
 ) -> Any:
-    """Return `compute(*args)` where `needed` holds, else `otherwise`; it cannot be differentiated.
-
-    It handles one example, or a batch under any number of nested `vmap`. In a batch, `compute` runs only for the
-    examples that need it.
-
-    Args:
-        needed: Whether this example needs the computation.
-        compute: Function of `args`, which may be `Rounds`. It must not close over anything that is batched.
-        otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
-        *args: Arguments of `compute`, pytrees of arrays.
-    """
+    """Return `compute(*args)` where `needed` holds, else `otherwise`; it cannot be differentiated."""
+    # It handles one example, or a batch under any number of nested `vmap`. In a batch, `compute` (which may be
+    # `Rounds`) runs only for the examples that need it. It must not close over anything that is batched.
 
     @jax.custom_batching.custom_vmap
     def chosen(needed, otherwise, args):
@@ -85,20 +76,11 @@ def where_needed(
     compute: Callable[..., Any],
     otherwise: Any,
     *args: Any,
-    rounds: Rounds | None = None,
+    rounds: Rounds | None = None,  # takes the place of `compute` where no derivatives are taken
 ) -> Any:
-    """Return `compute(*args)` where `needed` holds, else `otherwise`; it can be differentiated.
-
-    In a batch, `compute` runs only for the examples that need it. Where derivatives are taken, it runs for all of them.
-
-    Args:
-        needed: Whether this example needs the computation.
-        compute: Function of `args`. It must not close over anything that is batched or differentiated.
-        otherwise: Result where `needed` is False, of the same structure as the result of `compute`.
-        *args: Arguments of `compute`, pytrees of arrays.
-        rounds: The same function as `compute`, in rounds. It takes the place of `compute` where no derivatives are
-            taken. None: `compute` is used everywhere.
-    """
+    """Return `compute(*args)` where `needed` holds, else `otherwise`; it can be differentiated."""
+    # In a batch, `compute` runs only for the examples that need it. Where derivatives are taken, it runs for all of
+    # them. It must not close over anything that is batched or differentiated.
 
     @eqx.filter_custom_jvp
     def chosen(needed, otherwise, args):
@@ -114,16 +96,8 @@ def where_needed(
 
 
 def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed, otherwise, args):
-    """Batching rule of `where_needed_without_derivatives`: return the results, and which leaves are batched (all).
-
-    Args:
-        compute: Function of one example's arguments.
-        size: Number of examples in the batch.
-        batched: For each of `needed`, `otherwise` and `args`, which of its leaves have a batch axis.
-        needed: Which examples need the computation.
-        otherwise: Results of the other examples.
-        args: Arguments of `compute`.
-    """
+    """Batching rule of `where_needed_without_derivatives`: the results, and which leaves are batched (all)."""
+    # `batched` has, for each of `needed`, `otherwise` and `args`, which leaves have a batch axis.
 
     def broadcast_unbatched(tree, is_batched):
         """Give each leaf a batch axis, because the loop over tiles writes the results of single examples."""
@@ -168,15 +142,8 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
 
 
 def _compute_in_tiles(compute: Callable[..., Any], args_batched: Any, needed, otherwise, args):
-    """Return the results of a batch: computed tile by tile for the examples that need it, `otherwise` for the others.
-
-    Args:
-        compute: Function of one example's arguments.
-        args_batched: Which leaves of `args` are batched, on axis 0. The other leaves are shared by all examples.
-        needed: (batch,), which examples need the computation.
-        otherwise: Results of the other examples, each leaf batched on axis 0.
-        args: Arguments of `compute`.
-    """
+    """Return the results of a batch: computed by tiles for the examples that need it, `otherwise` for the others."""
+    # Leaves of `args` without a batch axis (`args_batched`) are shared by all examples. All batch axes are axis 0.
     tile = min(tile_size(), needed.shape[0])
     needed_count = jnp.sum(needed.astype(jnp.int32))
     indices, args_at, axes = _gathering(needed, tile, args, args_batched)
@@ -192,15 +159,7 @@ def _compute_in_tiles(compute: Callable[..., Any], args_batched: Any, needed, ot
 
 
 def _compute_in_rounds(rounds: Rounds, args_batched: Any, needed, otherwise, args):
-    """Return the results of a batch, in which examples that have ended give their places to the next ones.
-
-    Args:
-        rounds: The computation.
-        args_batched: As in `_compute_in_tiles`, like the other arguments.
-        needed: (batch,), which examples need the computation.
-        otherwise: Results of the other examples, each leaf batched on axis 0.
-        args: Arguments of the computation.
-    """
+    """Return the results of a batch, in which examples that have ended give their places to the next ones."""
     batch = needed.shape[0]
     places = min(tile_size(PLACES), batch)
     indices, args_at, axes = _gathering(needed, places, args, args_batched)
@@ -232,15 +191,9 @@ def _compute_in_rounds(rounds: Rounds, args_batched: Any, needed, otherwise, arg
 
 
 def _gathering(needed: Bool[Array, " batch"], tile: int, args: Any, args_batched: Any):
-    """Prepare to gather the examples that need a computation.
-
-    Returns:
-        indices: Indices of these examples in the batch, then padding, (batch + tile,). The padding is `batch`, which is
-            out of range.
-        args_at: Function from some of these indices, (tile,), to the arguments of those examples. For padding, they are
-            the arguments of the last example.
-        axes: Axes of the arguments for `vmap`.
-    """
+    """Prepare to gather the examples that need a computation: their indices, their arguments, and axes for `vmap`."""
+    # The indices, (batch + tile,), end with padding, which is `batch` and so out of range. For padding, `args_at` takes
+    # the arguments of the last example.
     batch = needed.shape[0]
     indices = jnp.nonzero(needed, size=batch + tile, fill_value=batch)[0].astype(jnp.int32)
 

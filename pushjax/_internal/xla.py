@@ -14,32 +14,20 @@ Scalar = Float[Array, ""]
 
 
 def compute_once(values, runtime_scalar: Scalar):
-    """Return `values` unchanged, but force XLA to compute each of them exactly once.
-
-    XLA may recompute a value inside every fusion that uses it, and round it differently there (with or without fused
-    multiply-add). At a tie, two copies of one comparison may then give different results. For example, a finger that is
-    nearest to a corner is equally near to both of its edges. Two copies of the comparison selected fields of different
-    edges, and the slider jumped (observed on the CPU with JAX 0.8 to 0.10). Recomputation is also slow.
-
-    On the CPU, an optimization barrier does not prevent recomputation. A division does, because XLA never duplicates
-    divisions. So each value is divided by a one that is computed at run time, which the compiler cannot simplify.
-
-    In reverse mode, cotangents that pass through `compute_once` are also computed once. Without it, they are computed
-    once for every input. With it, `grad` of two contacts takes an eighth of the time to run and three fifths of the
-    time to compile. Under `jacrev` there is no such gain, because the cotangents are batched and `runtime_scalar` is
-    not.
-
-    Args:
-        values: Pytree of floating and boolean scalars.
-        runtime_scalar: Any finite scalar that is not a compile-time constant. Its value does not matter. If it is not
-            finite, floats become NaN and booleans become False.
-
-    Returns:
-        The pytree of values.
-
-    Raises:
-        TypeError: If a value is neither floating nor boolean.
-    """
+    """Return a pytree of floating and boolean scalars unchanged, but force XLA to compute each of them exactly once."""
+    # XLA may recompute a value inside every fusion that uses it, and round it differently there (with or without fused
+    # multiply-add). At a tie, two copies of one comparison may then give different results. For example, a finger that
+    # is nearest to a corner is equally near to both of its edges. Two copies of the comparison selected fields of
+    # different edges, and the slider jumped (observed on the CPU with JAX 0.8 to 0.10). Recomputation is also slow.
+    #
+    # On the CPU, an optimization barrier does not prevent recomputation. A division does, because XLA never duplicates
+    # divisions. So each value is divided by a one that is computed at run time, which the compiler cannot simplify.
+    # Where `runtime_scalar` is not finite, floats become NaN and booleans become False.
+    #
+    # In reverse mode, cotangents that pass through `compute_once` are also computed once. Without it, they are computed
+    # once for every input. With it, `grad` of two contacts takes an eighth of the time to run and three fifths of the
+    # time to compile. Under `jacrev` there is no such gain, because the cotangents are batched and `runtime_scalar` is
+    # not.
     # the barrier keeps a scalar that is a constant of the program from being simplified away with its divisions
     one = jax.lax.optimization_barrier(jax.lax.stop_gradient(runtime_scalar)) * 0 + 1
 
@@ -54,26 +42,14 @@ def compute_once(values, runtime_scalar: Scalar):
 
 
 def decide(conditions, runtime_scalar: Scalar):
-    """Compute conditions exactly once, so that all code that uses a condition sees the same result.
-
-    This is `compute_once` under a name that says why it is called.
-
-    Args:
-        conditions: Pytree of boolean scalars.
-        runtime_scalar: As in `compute_once`.
-
-    Returns:
-        The pytree of conditions.
-    """
+    """Compute conditions exactly once (`compute_once`), so that all code that uses a condition has the same result."""
     return compute_once(conditions, runtime_scalar)
 
 
 def update_if(condition: Bool[Array, ""], update: Callable, state):
-    """Return `update(state)` if `condition` holds, else `state`.
-
-    Under `vmap`, `lax.cond` always runs both branches. This function skips `update` if the condition is False for the
-    whole batch: it is a `while_loop` of at most one iteration. It cannot be differentiated in reverse mode.
-    """
+    """Return `update(state)` if `condition` holds, else `state`; it has no derivatives in reverse mode."""
+    # Under `vmap`, `lax.cond` always runs both branches. This loop of at most one iteration skips `update` if the
+    # condition is False for the whole batch.
 
     def run_update(loop_state):
         return loop_state[0] & False, update(loop_state[1])
@@ -92,11 +68,9 @@ def entry_at(tree, index: Int[Array, ""]):
 
 
 def largest(values: Float[Array, " values"]) -> Scalar:
-    """Return the largest entry.
-
-    The derivative of `max` compares the maximum with each entry, and finds none equal where the compiler rounds the
-    entries twice. An index is found once. A masked sum is differentiated without a scatter.
-    """
+    """Return the largest entry."""
+    # The derivative of `max` compares the maximum with each entry, and finds none equal where the compiler rounds the
+    # entries twice. An index is found once. A masked sum is differentiated without a scatter.
     is_largest = jnp.arange(values.size) == jnp.argmax(values)
     return jnp.sum(jnp.where(is_largest, values, 0.0))
 
@@ -107,21 +81,15 @@ def smallest(values: Float[Array, " values"]) -> Scalar:
 
 
 def structure_and_shapes(tree) -> tuple[Any, tuple[jax.ShapeDtypeStruct, ...]]:
-    """Return the structure of a pytree of arrays, and the shapes and dtypes of its leaves. Both can be hashed."""
+    """Return the structure of a pytree of arrays, and the shapes and dtypes of its leaves, both hashable."""
     leaves, structure = jax.tree.flatten(tree)
     return structure, tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
 
 
 def map_items(function: Callable, items: tuple) -> tuple:
-    """Return `(function(item), ...)` for all items, in a loop if they have the same structure, shapes and dtypes.
-
-    A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
-    Compilation takes most of the time of a first call.
-
-    Args:
-        function: Function of one item.
-        items: Pytrees of arrays.
-    """
+    """Return `(function(item), ...)` for pytrees, in a loop if they have the same structure, shapes and dtypes."""
+    # A loop compiles `function` once. Other items are unrolled, which compiles `function` once for every item.
+    # Compilation takes most of the time of a first call.
     if len(items) == 1 or len({structure_and_shapes(item) for item in items}) > 1:
         return tuple(function(item) for item in items)
     stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import compute_once, tree_where
-from pushjax._math.vec import Scalar, Vec3, linear_combination
+from pushjax._math.vec import Scalar, Vec3
 
 
 class Symmetric3(NamedTuple):
@@ -62,72 +61,6 @@ class Symmetric3(NamedTuple):
         return jnp.array([[self.xx, self.xy, self.xz], [self.xy, self.yy, self.yz], [self.xz, self.yz, self.zz]])
 
 
-class Basis(NamedTuple):
-    """A basis of three vectors, and its dual basis: the cross products divided by the determinant.
-
-    Attributes:
-        vectors: The three vectors.
-        crosses: Their cross products: v2 x v3, v3 x v1, v1 x v2.
-        det: Determinant of the three vectors.
-        inverse: 1 / det where `regular`, else zero.
-        regular: Whether |det| exceeds the `least` that was given to `of`. Where it does not, every solution is zero.
-    """
-
-    vectors: tuple[Vec3, Vec3, Vec3]
-    crosses: tuple[Vec3, Vec3, Vec3]
-    det: Scalar
-    inverse: Scalar
-    regular: Bool[Array, ""]
-
-    @staticmethod
-    def of(v1: Vec3, v2: Vec3, v3: Vec3, least: Scalar | float) -> "Basis":
-        """Return the basis of three vectors; it is regular where |det| exceeds `least`."""
-        x1, x2, x3 = v2.cross(v3), v3.cross(v1), v1.cross(v2)
-        det = v1.dot(x1)
-        regular = jnp.abs(det) > least
-        inverse = jnp.where(regular, 1.0 / jnp.where(regular, det, 1.0), 0.0)
-        return Basis((v1, v2, v3), (x1, x2, x3), det, inverse, regular)
-
-    def products(self, v: Vec3) -> Vec3:
-        """Return the products vector_i . v."""
-        return Vec3(*(vector.dot(v) for vector in self.vectors))
-
-    def with_products(self, b: Vec3) -> Vec3:
-        """Return v with vector_i . v = b_i."""
-        return linear_combination(self.crosses, b).scale(self.inverse)
-
-    def total(self, weight: Vec3) -> Vec3:
-        """Return the sum of weight_i vector_i."""
-        return linear_combination(self.vectors, weight)
-
-    def weights(self, v: Vec3) -> Vec3:
-        """Return the weights for which the sum of weight_i vector_i is v."""
-        return Vec3(*(cross.dot(v) for cross in self.crosses)).scale(self.inverse)
-
-
-def complete_basis(
-    v1: Vec3, v2: Vec3, v3: Vec3, used2: Bool[Array, ""], used3: Bool[Array, ""], relative: float
-) -> Basis:
-    """Complete the vectors in use to a basis of three.
-
-    An unused vector is replaced by a direction orthogonal to the vectors in use, so that nothing acts along it.
-
-    Args:
-        v1: First vector, always used.
-        v2: Second vector.
-        v3: Third vector.
-        used2: Whether v2 is used.
-        used3: Whether v3 is used; only if v2 is.
-        relative: The basis is regular where |det| exceeds this times the product of the three lengths.
-    """
-    zero = jnp.zeros_like(v1.x)
-    orthogonal = tree_where(jnp.abs(v1.x) > jnp.abs(v1.y), Vec3(-v1.y, v1.x, zero), Vec3(zero, -v1.z, v1.y))
-    v2 = tree_where(used2, v2, orthogonal)
-    v3 = tree_where(used3, v3, v1.cross(v2))
-    v1, v2, v3 = compute_once((v1, v2, v3), v1.x)
-    return Basis.of(v1, v2, v3, relative * jnp.sqrt(v1.dot(v1) * v2.dot(v2) * v3.dot(v3)))
-
-
 Lower = tuple[tuple[Scalar, ...], ...]  # the lower triangle of a symmetric matrix or of a factor, row by row
 Column = tuple[Scalar, ...]
 
@@ -143,17 +76,11 @@ def add_scaled(m: Lower, factor: Scalar, other: Lower) -> Lower:
 
 
 class Cholesky(NamedTuple):
-    """The Cholesky factorization m = L L' of a symmetric matrix.
+    """The Cholesky factorization m = L L' of a symmetric matrix."""
 
-    Attributes:
-        lower: L.
-        inverse_diagonal: Reciprocals of the diagonal of L.
-        positive: Whether m is positive definite up to roundoff. Where it is not, the other fields are meaningless.
-    """
-
-    lower: Lower
-    inverse_diagonal: Column
-    positive: Bool[Array, ""]
+    lower: Lower  # L
+    inverse_diagonal: Column  # reciprocals of the diagonal of L
+    positive: Bool[Array, ""]  # whether m is positive definite up to roundoff; else the other fields are meaningless
 
     @staticmethod
     def of(m: Lower) -> "Cholesky":

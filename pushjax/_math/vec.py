@@ -1,9 +1,9 @@
 """Small vectors as pytrees of scalars.
 
 `vmap` puts the batch first, so arrays of shape (3,) keep an inner axis of length three in every operation, which the
-compiler cannot vectorize. Separate scalars become arrays over the batch, which it can. (With JAX 0.10, arrays with the
-batch last are as fast and compile faster, but such code has to be written for a batch.) All code below the public
-interface uses `Vec2` and `Vec3`, and converts from and to arrays at the interface (`of`, `array`).
+compiler cannot vectorize. Separate scalars become arrays over the batch, which it can. `of` and `array` convert from
+and to arrays. The problem of several contacts (`pushjax.contact`) uses arrays with the batch last instead
+(`pushjax._math.arrays`). They are as fast and compile faster, but such code has to be written for a batch.
 """
 
 from collections.abc import Iterable
@@ -105,11 +105,9 @@ class Vec3(NamedTuple):
 
 
 def unstack(array: Array) -> tuple[Array, ...]:
-    """Return `(array[0], array[1], ...)`.
-
-    Reverse mode then concatenates the cotangents. With indexing it would add up as many arrays that are zero but for
-    one entry.
-    """
+    """Return `(array[0], array[1], ...)`."""
+    # Reverse mode then concatenates the cotangents. With indexing it would add up as many arrays that are zero but for
+    # one entry.
     return tuple(part.reshape(array.shape[1:]) for part in jax.lax.split(array, (1,) * array.shape[0]))
 
 
@@ -127,10 +125,8 @@ def cos_sin(angle: Scalar) -> Vec2:
 
 
 def sinc(angle: Scalar) -> Scalar:
-    """Return sin(angle) / angle for an angle of at most a quarter of a turn, rad; smooth at zero.
-
-    It is the Taylor series, to an error of 2e-16.
-    """
+    """Return sin(angle) / angle for an angle of at most a quarter of a turn, rad; smooth at zero."""
+    # the Taylor series, to an error of 2e-16
     square, result = angle * angle, jnp.ones_like(angle)
     for k in range(20, 0, -2):
         result = 1 - square / (k * (k + 1)) * result

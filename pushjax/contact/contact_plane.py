@@ -33,34 +33,18 @@ from pushjax.friction.limit_surface import Form
 
 
 class Contact(NamedTuple):
-    """One contact in the body frame, in scalars.
+    """One contact in the body frame, in scalars."""
 
-    Attributes:
-        point: Contact point, m.
-        normal: Unit normal into the slider.
-        displacement: Displacement of the pusher's material point over the step, m.
-        friction: Coefficient of friction mu.
-        gap: Distance still to close along the normal, m.
-    """
-
-    point: Vec2
-    normal: Vec2
-    displacement: Vec2
-    friction: Scalar
-    gap: Scalar
+    point: Vec2  # m
+    normal: Vec2  # of unit length, into the slider
+    displacement: Vec2  # of the pusher's material point over the step, m
+    friction: Scalar  # coefficient mu
+    gap: Scalar  # distance still to close along the normal, m
 
     def where(self, condition: Bool[Array, ""]) -> "Contact":
-        """This contact where the condition holds, else a contact out of reach.
-
-        The contact out of reach does not depend on the numbers of this one. Call this before anything is computed from
-        those numbers: a NaN that is only masked afterwards comes back in the gradient.
-
-        Args:
-            condition: Whether to keep this contact.
-
-        Returns:
-            The contact.
-        """
+        """Return this contact where the condition holds, else a contact out of reach whose numbers are constants."""
+        # Call this before anything is computed from the numbers: a NaN that is only masked afterwards comes back in the
+        # gradient.
         zero, one = jnp.zeros_like(self.gap), jnp.ones_like(self.gap)
         zero_vector = Vec2(zero, zero)
         return tree_where(condition, self, Contact(zero_vector, Vec2(one, zero), zero_vector, zero, one))
@@ -71,39 +55,19 @@ class Contact(NamedTuple):
         return Vec2(self.displacement.dot(normal) - self.gap, self.displacement.dot(tangent))
 
     def wrench(self, force: Vec2, length: Scalar) -> Vec3:
-        """The normalized wrench of a contact force.
-
-        Args:
-            force: Contact force along (normal, tangent).
-            length: Characteristic length of the limit surface, m.
-
-        Returns:
-            The wrench (fx, fy, tau / length).
-        """
+        """The normalized wrench (fx, fy, tau / length) of a contact force along (normal, tangent)."""
         f = self.normal.scale(force.x) + self.normal.perp().scale(force.y)
         return Vec3(f.x, f.y, self.point.cross(f) / length)
 
 
 class LimitCurve(NamedTuple):
-    """h along the friction cone, h(s) = sum_k c_k s^k.
+    """h along the friction cone, h(s) = sum_k c_k s^k."""
 
-    Attributes:
-        c: The coefficients c_k, d + 1 of them.
-    """
-
-    c: tuple[Scalar, ...]
+    c: tuple[Scalar, ...]  # the d + 1 coefficients c_k
 
     @staticmethod
     def of(form: Form, contact: Contact) -> "LimitCurve":
-        """The limit curve of a contact.
-
-        Args:
-            form: H of the limit surface, in scalars.
-            contact: The contact.
-
-        Returns:
-            The curve, of the same degree as H.
-        """
+        """The limit curve of a contact, of the same degree as H."""
         one, zero = jnp.ones_like(contact.gap), jnp.zeros_like(contact.gap)
         along_normal = contact.wrench(Vec2(one, zero), form.length)
         along_tangent = contact.wrench(Vec2(zero, one), form.length)

@@ -1,374 +1,301 @@
-"""Solve sets of one, two or three cone edges, and check each solution against every condition of the problem.
+"""Sets of one, two or three cone edges of a batch of problems: their equations, solved for many sets at once.
 
-The checks do not depend on how a set was found or solved, so a wrong answer cannot pass. The equations of each set
-are in the header of `exhaustive`, which tries all sets. `projected` tries those that its iteration points to.
+A wrench of each of S sets is (3, S, batch). The equations of each kind of set are in the header of `exhaustive`. The
+checks do not depend on how a set was found or solved, so a wrong answer cannot pass.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, decide, tree_where
-from pushjax._math.linalg import Basis
-from pushjax._math.vec import Scalar, Vec3
-from pushjax.contact.edge_segment import WrenchSegment, cubic_root, monotone_intervals
-from pushjax.contact.scaled_problem import Index, ScaledProblem, dynamic_index
+from pushjax._math.arrays import combined, cross, dot, dual, products, times
+from pushjax.contact.cubic import Roots
+from pushjax.contact.scaled_problem import NO_EDGE, ScaledProblem, violation_per_weight
 from pushjax.contact.tolerances import (
-    TOO_FAST,
     kinematic_tolerance,
-    max_twist_ratio,
     min_determinant,
     relative_tolerance,
-    same_solution_tolerance,
     zero_wrench_tolerance,
 )
-from pushjax.friction.inverse_map import aligned_wrench
-from pushjax.friction.limit_surface import Form
+from pushjax.friction.inverse_map import aligned_wrenches
 
-NO_EDGE = -1  # the number of an unused generator
+Numbers = np.ndarray | Array  # of edges or contacts: a static table (sets,), or numbers that differ, (sets, batch)
 
 
-class Incumbent(NamedTuple):
-    """The best set so far, and its solution.
+class Sets(NamedTuple):
+    """Sets of edges; a static table (3, sets), or numbers that differ between problems, (3, sets, batch)."""
 
-    Attributes:
-        edges: Numbers of the set's generators (see `scaled_problem`), the used ones first, then `NO_EDGE`.
-        contacts: Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the
-            same, the second condition is that this contact sticks. They are the contacts of the edges. An exception
-            is the third one in the case that `solve_three_edges` describes.
-        weight: Weight of each generator in the wrench, up to one common factor.
-        twist: Dimensionless twist.
-        power: Power F . V with the wrench F scaled to H = 1. Of several solutions, the one with the largest is kept.
-        found: Whether any set passed every check.
-        second_found: Whether a set with a different twist passed too.
-        too_fast: Whether a set passed whose twist exceeds `max_twist_ratio` by a factor of at most `TOO_FAST`. Such a
-            twist is not accepted as an answer. But it shows that the problem is not a jam.
+    edges: Numbers  # numbers of the edges, then `NO_EDGE`
+    # Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the same, the second
+    # condition is that the contact sticks.
+    contacts: Numbers
+
+    @staticmethod
+    def of(edges: Numbers) -> "Sets":
+        """Sets of one edge or of two, (1 or 2, sets) or (1 or 2, sets, batch)."""
+        xp = np if isinstance(edges, np.ndarray) else jnp
+        none = xp.full((3 - len(edges), *edges.shape[1:]), NO_EDGE, np.int32)
+        return Sets(xp.concatenate([edges, none]), xp.concatenate([edges // 2, none]))
+
+
+class Solutions(NamedTuple):
+    """A solution of each of S sets."""
+
+    edges: Int[Array, "3 sets batch"]  # numbers of the edges, then `NO_EDGE`
+    contacts: Int[Array, "3 sets batch"]  # as in `Sets`
+    weight: Float[Array, "3 sets batch"]  # of each edge in the wrench
+    twist: Float[Array, "3 sets batch"]  # dimensionless
+    power: Float[Array, "sets batch"]  # with the wrench on H = 1
+    passes: Bool[Array, "sets batch"]  # whether it satisfies every condition
+
+    @staticmethod
+    def of(sets: Sets, weight: Array, twist: Array, power: Array, passes: Array) -> "Solutions":
+        """The solutions of sets."""
+        edges, contacts = (jnp.broadcast_to(with_batch(x), weight.shape) for x in sets)
+        return Solutions(edges, contacts, weight, twist, power, passes)
+
+
+def along(x: Array, index: Array, axis: int) -> Array:
+    """The entries of an array at indices along one axis; other axes broadcast."""
+    return jnp.take_along_axis(x, index, axis=axis, mode="promise_in_bounds")
+
+
+def at(x: Array, index: Numbers) -> Array:
+    """The entries (..., sets, batch) of a contact or edge of each set, from (..., contacts or edges, batch)."""
+    if isinstance(index, np.ndarray):
+        return jnp.concatenate([x[..., k : k + 1, :] for k in index], axis=-2)  # a gather takes ten times as long
+    if index.ndim == 1:
+        return jnp.take(x, index, axis=-2, mode="clip")
+    return along(x, index.reshape((1,) * (x.ndim - 2) + index.shape), -2)
+
+
+def own(x: Array, index: Numbers) -> Array:
+    """The entries (sets, batch) of one edge of each set, from those of every edge, (edges, sets, batch)."""
+    numbers = jnp.arange(len(x)).reshape(-1, 1, 1)
+    return jnp.any(x & (numbers == with_batch(index[None])), axis=0)
+
+
+def with_batch(numbers: Numbers) -> Array:
+    """Numbers of sets with an axis for the batch, which has length one if they are static."""
+    return jnp.asarray(numbers).reshape(*numbers.shape, 1) if numbers.ndim == 2 else jnp.asarray(numbers)
+
+
+def _motions(problem: ScaledProblem, twist: Float[Array, "3 sets batch"]) -> tuple[Array, Array]:
+    """Motion of each contact point relative to its pusher, (n, gap added) and t, each (m, sets, batch)."""
+    normal = jnp.sum(problem.normal[:, :, None] * twist[:, None], axis=0) - problem.goal[0][:, None]
+    return normal, jnp.sum(problem.tangent[:, :, None] * twist[:, None], axis=0) - problem.goal[1][:, None]
+
+
+def is_kinematic(problem: ScaledProblem, twist: Float[Array, "3 sets batch"], sets: Sets) -> Bool[Array, "sets batch"]:
+    """Whether no contact is violated, and those of the set touch and slip to the side of their edge, or not at all."""
+    edges, contacts = (with_batch(x)[:, None] for x in sets)
+    own = contacts == jnp.arange(problem.count)[None, :, None, None]  # (3, contacts, sets, batch)
+    is_one = contacts[0] == contacts[1]  # both edges are of one contact, which sticks
+    touches, sticks = jnp.any(own, axis=0), own[0] & is_one
+    side = jnp.sum(jnp.where(own & ~is_one[None], 1 - 2 * (edges % 2), 0), axis=0).astype(twist.dtype)
+    normal, slip = _motions(problem, twist)
+    violation = jnp.maximum(-normal, jnp.where(touches, jnp.abs(normal), 0.0))
+    violation = jnp.maximum(violation, jnp.maximum(jnp.where(sticks, jnp.abs(slip), 0.0), side * slip))
+    violation = jnp.where(problem.active[:, None], violation, jnp.where(touches, jnp.inf, 0.0))
+    return jnp.max(violation, axis=0) <= kinematic_tolerance(twist)
+
+
+def solve_one(problem: ScaledProblem, sets: Sets) -> Solutions:
+    """Solve sets of one edge."""
+    owner, wrench = sets.contacts[0], at(problem.edges, sets.edges[0])
+    motion = problem.surface.gradient(wrench)
+    normal_motion = dot(at(problem.normal, owner), motion)
+    # both may be negative: a receding pusher can drag the slider along
+    scale = at(problem.goal[0], owner) / jnp.where(normal_motion != 0, normal_motion, 1.0)
+    degree_times_h = dot(motion, wrench)  # Euler's identity
+    power = _power(problem, scale * degree_times_h, degree_times_h / problem.surface.degree)
+    weight = jnp.stack([jnp.ones_like(scale), *(jnp.zeros_like(scale),) * 2])
+    twist = motion * scale[None]
+    passes = (normal_motion != 0) & (scale > 0) & is_kinematic(problem, twist, sets)
+    return Solutions.of(sets, weight, twist, power, passes)
+
+
+def _power(problem: ScaledProblem, power: Array, h: Array) -> Array:
+    """The power on H = 1 of a wrench with this power and this value of H."""
+    return jnp.where(h > 0, power / problem.surface.root(jnp.where(h > 0, h, 1.0)), 0.0)
+
+
+class Segment(NamedTuple):
+    """The wrenches between the two edges of each set, and the motions there that fit both conditions but for a factor.
+
+    The wrenches (1 - s) g1 + s g2 are written as center + u along, with u = s - nearest, about the point nearest to
+    zero: two fingers that press against each other leave a small wrench, and powers of g1 and g2 themselves would
+    cancel.
     """
 
-    edges: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
-    contacts: tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
-    weight: Vec3
-    twist: Vec3
-    power: Scalar
-    found: Bool[Array, ""]
-    second_found: Bool[Array, ""]
-    too_fast: Bool[Array, ""]
+    center: Float[Array, "3 sets batch"]  # the wrench nearest to zero
+    along: Float[Array, "3 sets batch"]  # g2 - g1
+    nearest: Float[Array, "sets batch"]  # s at the center
+    motion: Float[Array, "terms 3 sets batch"]  # coefficients of grad H as a polynomial in u, the constant first
+    rows: Float[Array, "2 3 sets batch"]  # of the two conditions
+    goal: Float[Array, "2 sets batch"]  # their right-hand sides
+
+    @staticmethod
+    def of(problem: ScaledProblem, sets: Sets) -> "Segment":
+        """The segments of sets of two edges."""
+        first, second, _ = sets.edges
+        surface = problem.surface
+        g1 = at(problem.edges, first)
+        along = at(problem.edges, second) - g1
+        squared = dot(along, along)
+        nearest = jnp.clip(-dot(g1, along) / jnp.where(squared > 0, squared, 1.0), 0, 1)
+        center = g1 + nearest[None] * along
+        at_center, at_along = surface.hessian(center), surface.hessian(along)
+        ends = times(at_center, center) / (surface.degree - 1), times(at_along, along) / (surface.degree - 1)
+        middle = (times(at_center, along), times(at_along, center)) if surface.degree == 4 else ()
+        rows, goal = conditions(problem, sets.contacts[:2])
+        return Segment(center, along, nearest, jnp.stack([ends[0], *middle, ends[1]]), rows, goal)
+
+    def roots(self) -> Roots:
+        """The values of u where both conditions can hold, and the intervals in which they are."""
+        # orthogonal to the twists that satisfy both conditions up to a common factor
+        across = self.rows[0] * self.goal[1][None] - self.rows[1] * self.goal[0][None]
+        return Roots.of(jnp.sum(self.motion * across[None], axis=1), -self.nearest, 1 - self.nearest)
+
+    def are_independent(self) -> Bool[Array, "sets batch"]:
+        """Whether the two conditions do not depend on each other."""
+        orthogonal, (row1, row2) = cross(*self.rows), self.rows
+        return dot(orthogonal, orthogonal) > float(jnp.finfo(row1.dtype).eps) * dot(row1, row1) * dot(row2, row2)
+
+    def motion_at(self, u: Float[Array, "sets batch"]) -> Float[Array, "3 sets batch"]:
+        """grad H at u."""
+        motion = self.motion[-1]
+        for term in reversed(self.motion[:-1]):
+            motion = motion * u[None] + term
+        return motion
 
 
-def no_incumbent(runtime_scalar: Scalar) -> Incumbent:
-    """The state before any set has been tried."""
-    zero = jnp.zeros_like(runtime_scalar)
-    none, no = jnp.full(zero.shape, NO_EDGE, jnp.int32), jnp.zeros(zero.shape, bool)
-    zero_vector = Vec3(zero, zero, zero)
-    return Incumbent((none, none, none), (none, none, none), zero_vector, zero_vector, zero, no, no, no)
+def solve_two(problem: ScaledProblem, sets: Sets) -> Solutions:
+    """Solve sets of two edges, with a solution for each root that the cubic of a set may have."""
+    segment = Segment.of(problem, sets)
+    roots, independent = segment.roots(), segment.are_independent()
+    intervals = len(roots.ends) - 1
+
+    def repeated(x: Array) -> Array:
+        return jnp.concatenate([x] * intervals, axis=-2)
+
+    exists = (roots.exist() & independent[None]).reshape(-1, independent.shape[1])
+    u = roots.all().reshape(exists.shape)
+    segment, all_sets = jax.tree.map(repeated, segment), Sets(*(repeated(with_batch(x)) for x in sets))
+    motion = segment.motion_at(u)
+    along_rows = products(segment.rows, motion)
+    size = jnp.sum(along_rows * along_rows, axis=0)
+    scale = jnp.sum(segment.goal * along_rows, axis=0) / jnp.where(size > 0, size, 1.0)
+    wrench = segment.center + u[None] * segment.along
+    degree_times_h = dot(motion, wrench)
+    power = _power(problem, scale * degree_times_h, degree_times_h / problem.surface.degree)
+    is_wrench = dot(wrench, wrench) > zero_wrench_tolerance(u.dtype) ** 2
+    s, twist = segment.nearest + u, motion * scale[None]
+    passes = exists & (scale > 0) & is_wrench & is_kinematic(problem, twist, all_sets)
+    return Solutions.of(all_sets, jnp.stack([1 - s, s, jnp.zeros_like(s)]), twist, power, passes)
 
 
-def solve_one_edge(problem: ScaledProblem, incumbent: Incumbent, edge: Index) -> Incumbent:
-    """Solve and check the set of one edge.
+def conditions(problem: ScaledProblem, contacts: Sequence[Numbers] | Numbers) -> tuple[Array, Array]:
+    """Rows (n, 3, sets, batch) and right-hand sides (n, sets, batch) of the conditions of two or three contacts.
 
-    Args:
-        problem: The dimensionless contact problem.
-        incumbent: The best set so far.
-        edge: Number of the generator.
-
-    Returns:
-        The best set so far, this one included.
+    These are the normal conditions. If the first two contacts are the same, the second condition is the tangential one.
     """
-    contact, side = edge // 2, 1 - 2 * (edge % 2)
-    generator = dynamic_index(problem.generators, edge)
-    motion = compute_once(problem.form.gradient(generator), problem.runtime_scalar)
-    row, approach = dynamic_index(problem.normal, contact), dynamic_index(problem.approach, contact).x
-    normal_motion = row.dot(motion)
-    # Both may be negative: a receding pusher can drag the slider along.
-    scale = approach / jnp.where(normal_motion != 0, normal_motion, 1.0)
-    twist = compute_once(motion.scale(scale), approach)
-    ((touching, slip),), none_violated = _contact_states(problem, twist, (contact,))
-    tolerance = kinematic_tolerance(twist)
-    passes = (normal_motion != 0) & (scale > 0) & touching & none_violated & (side * slip <= tolerance)
-    one = jnp.ones_like(approach)
-    # By Euler's identity, H is the power of the unscaled motion divided by the degree.
-    raw_power = scale * motion.dot(generator)
-    power = _power_on_limit_surface(
-        problem.form, raw_power, raw_power / (problem.form.degree * jnp.where(scale > 0, scale, 1.0))
-    )
-    edges, contacts = (edge, NO_EDGE, NO_EDGE), (contact, NO_EDGE, NO_EDGE)
-    return _update_incumbent(incumbent, passes, edges, contacts, Vec3(one, 0 * one, 0 * one), twist, power)
+    sticks = with_batch(contacts[0][None] == contacts[1][None])[0]
+    rows = [at(problem.normal, c) for c in contacts]
+    goal = [at(problem.goal[0], c) for c in contacts]
+    rows[1] = jnp.where(sticks[None], at(problem.tangent, contacts[1]), rows[1])
+    goal[1] = jnp.where(sticks, at(problem.goal[1], contacts[1]), goal[1])
+    return jnp.stack(rows), jnp.stack(goal)
 
 
-def solve_two_edges(problem: ScaledProblem, incumbent: Incumbent, edge1: Index, edge2: Index) -> Incumbent:
-    """Solve and check a set of two edges: of two contacts, which slide, or both of one contact, which sticks.
-
-    Every root of the set's cubic equation is tried.
-
-    Args:
-        problem: The dimensionless contact problem.
-        incumbent: The best set so far.
-        edge1: Number of the first generator.
-        edge2: Number of the second generator.
-
-    Returns:
-        The best set so far, this one included.
-    """
-    c1, c2 = edge1 // 2, edge2 // 2
-    sticks = c1 == c2
-    form, runtime_scalar = problem.form, problem.runtime_scalar
-    ends = compute_once(
-        (dynamic_index(problem.generators, edge1), dynamic_index(problem.generators, edge2)), runtime_scalar
-    )
-    segment = compute_once(WrenchSegment.between(form, *ends), runtime_scalar)
-    approach1, approach2 = dynamic_index(problem.approach, c1), dynamic_index(problem.approach, c2)
-    row1 = dynamic_index(problem.normal, c1)
-    row2 = tree_where(sticks, dynamic_index(problem.tangent, c1), dynamic_index(problem.normal, c2))
-    b1, b2 = approach1.x, jnp.where(sticks, approach1.y, approach2.x)
-    # Orthogonal to the twists that satisfy both conditions up to a common factor.
-    across = row1.scale(b2) - row2.scale(b1)
-    constant, linear, quadratic, leading = (across.dot(motion) for motion in segment.motions)
-    cubic = compute_once((constant, linear, quadratic, leading), runtime_scalar)
-    orthogonal = row1.cross(row2)
-    independent = orthogonal.dot(orthogonal) > jnp.finfo(runtime_scalar.dtype).eps * row1.dot(row1) * row2.dot(row2)
-    intervals, pending = zip(*monotone_intervals(cubic, -segment.nearest, 1 - segment.nearest), strict=True)
-    pending = compute_once(tuple(has & independent for has in pending), runtime_scalar)
-
-    def try_next_root(state):
-        pending, incumbent = state
-        first, second, third = pending
-        interval = tree_where(first, intervals[0], tree_where(second, intervals[1], intervals[2]))
-        # Drop the first one that is pending.
-        pending = first & False, first & second, (first | second) & third
-        u = cubic_root(cubic, interval)
-        motion = segment.motion(u)
-        u1, u2 = row1.dot(motion), row2.dot(motion)
-        squared = u1 * u1 + u2 * u2
-        scale = (b1 * u1 + b2 * u2) / jnp.where(squared > 0, squared, 1.0)
-        twist = compute_once(motion.scale(scale), runtime_scalar)
-        ((touching1, slip1), (touching2, slip2)), none_violated = _contact_states(problem, twist, (c1, c2))
-        tolerance = kinematic_tolerance(twist)
-        fits_slip = ((1 - 2 * (edge1 % 2)) * slip1 <= tolerance) & ((1 - 2 * (edge2 % 2)) * slip2 <= tolerance)
-        no_slip = jnp.abs(slip1) <= tolerance
-        passes = (scale > 0) & touching1 & touching2 & none_violated & jnp.where(sticks, no_slip, fits_slip)
-        f = segment.at(u)
-        passes &= f.dot(f) > (zero_wrench_tolerance(runtime_scalar.dtype)) ** 2
-        degree_times_h = motion.dot(f)  # Euler's identity
-        s = segment.nearest + u
-        power = _power_on_limit_surface(form, scale * degree_times_h, degree_times_h / form.degree)
-        edges, contacts = (edge1, edge2, NO_EDGE), (c1, c2, NO_EDGE)
-        return pending, _update_incumbent(incumbent, passes, edges, contacts, Vec3(1 - s, s, 0 * s), twist, power)
-
-    # Few examples of a batch have more than one root, so all take their next root in the same iteration.
-    return jax.lax.while_loop(
-        lambda state: state[0][0] | state[0][1] | state[0][2], try_next_root, (pending, incumbent)
-    )[1]
-
-
-def solve_three_edges(problem: ScaledProblem, incumbent: Incumbent, contacts: tuple, num_choices: Index) -> Incumbent:
-    """Solve and check sets of three edges: one of each of three contacts, or both of one contact and one of another.
+def solve_three(problem: ScaledProblem, contacts: Numbers) -> Solutions:
+    """Solve sets of three edges, given by their contacts, (3, sets): one edge each, or one contact that sticks.
 
     The conditions of these contacts fix the twist. Where one of them sticks, the third edge may also belong to another
     contact that happens to touch under this twist. This occurs where two fingers are exactly opposite each other and
     move together, so that their normal conditions are the same, and a third contact limits how far the slider turns,
     at a force of zero.
-
-    Args:
-        problem: The dimensionless contact problem.
-        incumbent: The best set so far.
-        contacts: Numbers of the three contacts. If the first two are the same, both edges of that one are in the set
-            and it sticks.
-        num_choices: How many choices of edges to try: 8, or 2 where one contact sticks. In the latter case, if a
-            further contact touches, both edges of every contact but the first are tried instead.
-
-    Returns:
-        The best set so far, these included.
     """
+    twist, regular = _solve_rows(*conditions(problem, contacts))
+    normal, slip = _motions(problem, twist)
+    active, tolerance = problem.active[:, None], kinematic_tolerance(twist)[None]
+    touches = active & (jnp.abs(normal) <= tolerance)
+    feasible = regular & jnp.all(~active | (normal >= -tolerance), axis=0)
+    for numbers in contacts:
+        feasible &= own(touches, numbers)
+    # whether an edge may carry force: both edges may where the contact sticks
+    may_carry = jnp.stack([touches & (slip <= tolerance), touches & (slip >= -tolerance)], axis=1)
+    may_carry = may_carry.reshape(2 * problem.count, *feasible.shape)
+    f, aligned = aligned_wrenches(problem.surface, twist, feasible, relative_tolerance(twist.dtype))
+    per_weight = jnp.repeat(violation_per_weight(problem.friction), 2, axis=0)
+
+    def try_choice(best: tuple[Array, Array, Array], numbers: Array):
+        edges = jnp.stack([at(problem.edges, k) for k in numbers])
+        weight, inside, share = _cone_coordinates(f, edges, jnp.stack([at(per_weight, k) for k in numbers]))
+        for k in numbers:
+            inside &= own(may_carry, k)
+        better = inside & (share > best[0])  # of several sets, the one with f farthest inside
+        numbers = with_batch(numbers)
+        return (
+            jnp.where(better, share, best[0]),
+            jnp.where(better[None], weight, best[1]),
+            jnp.where(better[None], numbers, best[2]),
+        ), None
+
+    none = jnp.full(twist.shape, NO_EDGE, jnp.int32)
+    choices = jnp.asarray(_choices_of_edges(contacts, problem.count), jnp.int32)
+    share, weight, edges = jax.lax.scan(try_choice, (jnp.full_like(f[0], -1.0), 0 * f, none), choices)[0]
+    h = problem.surface.value(f)
+    passes = feasible & aligned & (h > 0) & (share >= 0)
+    return Solutions.of(Sets(edges, contacts), weight, twist, _power(problem, dot(f, twist), h), passes)
+
+
+def _choices_of_edges(contacts: Numbers, m: int) -> Numbers:
+    """Numbers of three edges of each set, (choices, 3, sets) or with the batch: every choice that may be needed."""
+    xp = np if isinstance(contacts, np.ndarray) else jnp
     c1, c2, c3 = contacts
-    sticks = jnp.asarray(c1 == c2)
-    twist, regular = solve_rows(*_conditions_of_three(problem, contacts, sticks))
-    twist = compute_once(twist, problem.runtime_scalar)
-    tolerance = kinematic_tolerance(twist)
-    m = problem.count
-    states, none_violated = _contact_states(problem, twist, tuple(range(m)))
-    feasible = regular & none_violated
-    # Whether the left edge and the right edge may carry force; both may where the contact sticks.
-    may_carry = tuple((touching & (slip <= tolerance), touching & (slip >= -tolerance)) for touching, slip in states)
-    touches = tuple(left | right for left, right in may_carry)
-    for contact in contacts:
-        feasible &= dynamic_index(touches, contact)
-    if m > 2:  # the third edge of a set with a contact that sticks may be that of any other contact
-        others = sum((touching & (c1 != k) & (c3 != k)).astype(jnp.int32) for k, touching in enumerate(touches))
-        num_choices = jnp.where(sticks & feasible & (others > 0), 2 * (m - 1), num_choices)
-    feasible = compute_once(feasible, problem.runtime_scalar)
-    f, aligned = aligned_wrench(problem.form, twist, feasible, relative_tolerance(problem.runtime_scalar.dtype))
-    h = problem.form.value(f)
-    feasible, may_carry = compute_once((feasible & aligned & (h > 0), may_carry), problem.runtime_scalar)
-    pairs = tuple(zip(problem.generators[::2], problem.generators[1::2], strict=True))
-    per_weight = tuple(problem.violation_per_weight(k) for k in range(m))
-    of_contact = tuple(zip(pairs, may_carry, per_weight, strict=True))
-
-    def try_choice(choice, state):
-        best_share, weight, best_edges = state
-        side = jnp.where(sticks, 0, choice // 4), jnp.where(sticks, 1, choice // 2 % 2), choice % 2
-        last = c3
-        if m > 2:  # after c3 the other contacts in a circle, without c1
-            last = jnp.where(sticks, (c1 + 1 + ((c3 - c1 - 1) % m + choice // 2) % (m - 1)) % m, c3)
-        owners = (c1, c2, last)
-        chosen = tuple(dynamic_index(of_contact, c) for c in owners)
-        generators = tuple(tree_where(k == 0, *pair) for (pair, *_), k in zip(chosen, side, strict=True))
-        candidate, inside, least_share = _cone_coordinates(f, generators, tuple(entry[2] for entry in chosen))
-        for (_, (left, right), _), k in zip(chosen, side, strict=True):
-            inside &= jnp.where(k == 0, left, right)
-        better = decide(inside & (least_share > best_share), h)  # of several sets, the one with f farthest inside
-        best_share, weight = jnp.where(better, least_share, best_share), tree_where(better, candidate, weight)
-        edges = tuple(jnp.where(better, 2 * c + k, old) for c, k, old in zip(owners, side, best_edges, strict=True))
-        return best_share, weight, edges
-
-    no_edges = tuple(jnp.full(h.shape, NO_EDGE, jnp.int32) for _ in contacts)
-    start = (jnp.full_like(h, -1.0), Vec3(h, h, h), no_edges)  # the weights are placeholders
-    best_share, weight, best_edges = jax.lax.fori_loop(0, num_choices, try_choice, start)
-    return _update_incumbent(
-        incumbent,
-        feasible & (best_share >= 0),
-        best_edges,
-        contacts,
-        weight,
-        twist,
-        _power_on_limit_surface(problem.form, f.dot(twist), h),
-    )
+    choices = []
+    for k in range(2 if m == 2 else max(8, 2 * (m - 1))):
+        sticks = c1 == c2
+        # after c3 the other contacts in a circle, without c1
+        last = xp.where(sticks, (c1 + 1 + ((c3 - c1 - 1) % m + k // 2) % max(m - 1, 1)) % m, c3)
+        first, second = xp.where(sticks, 0, k // 4 % 2), xp.where(sticks, 1, k // 2 % 2)
+        choices.append(xp.stack([2 * c1 + first, 2 * c2 + second, 2 * last + k % 2]))
+    return xp.stack(choices)
 
 
-def _conditions_of_three(
-    problem: ScaledProblem, contacts: tuple, sticks: Bool[Array, ""]
-) -> tuple[tuple[Vec3, Vec3, Vec3], Vec3]:
-    """The rows and right-hand sides of the three conditions that fix the twist.
-
-    Args:
-        problem: The dimensionless contact problem.
-        contacts: Numbers of the three contacts.
-        sticks: Whether the first two are the same, so that the second condition is the tangential one.
-    """
-    c1, c2, c3 = contacts
-    approach = dynamic_index(problem.approach, c1)
-    second = jnp.where(sticks, approach.y, dynamic_index(problem.approach, c2).x)
-    rows = (
-        dynamic_index(problem.normal, c1),
-        tree_where(sticks, dynamic_index(problem.tangent, c1), dynamic_index(problem.normal, c2)),
-        dynamic_index(problem.normal, c3),
-    )
-    return rows, Vec3(approach.x, second, dynamic_index(problem.approach, c3).x)
-
-
-def _update_incumbent(
-    incumbent: Incumbent, passes, edges: tuple, contacts: tuple, weight: Vec3, twist: Vec3, power: Scalar
-) -> Incumbent:
-    """Keep the better of two sets: more power on H = 1, or, where that is equal, the smaller twist."""
-    squared, squared_before = twist.dot(twist), incumbent.twist.dot(incumbent.twist)
-    above_limit, far_above_limit = (squared > (factor * max_twist_ratio(power.dtype)) ** 2 for factor in (1, TOO_FAST))
-    passes &= power > 0
-    passes, too_fast = decide((passes & ~above_limit, passes & above_limit & ~far_above_limit), power)
-    difference = twist - incumbent.twist
-    second_found = (
-        passes
-        & incumbent.found
-        & (difference.dot(difference) > same_solution_tolerance(power.dtype) ** 2 * (squared + squared_before))
-    )
-    tie = jnp.abs(power - incumbent.power) <= 4 * relative_tolerance(power.dtype) * incumbent.power
-    # Twists that differ by roundoff are the same motion. The set with fewer edges, which was found first, is better
-    # conditioned.
-    smaller = squared < (1 - 8 * relative_tolerance(power.dtype)) * squared_before
-    better = passes & (~incumbent.found | jnp.where(tie, smaller, power > incumbent.power))
-    better, second_found = compute_once((better, incumbent.second_found | second_found), power)
-    edges, contacts = (
-        tuple(jnp.where(better, jnp.asarray(new, jnp.int32), old) for new, old in zip(numbers, before, strict=True))
-        for numbers, before in ((edges, incumbent.edges), (contacts, incumbent.contacts))
-    )
-    return Incumbent(
-        edges,
-        contacts,
-        tree_where(better, weight, incumbent.weight),
-        tree_where(better, twist, incumbent.twist),
-        jnp.where(better, power, incumbent.power),
-        incumbent.found | passes,
-        second_found,
-        incumbent.too_fast | too_fast,
-    )
-
-
-def _power_on_limit_surface(form: Form, power: Scalar, h: Scalar) -> Scalar:
-    """The power on H = 1 of a wrench with this power and this value of H."""
-    root = jnp.sqrt(jnp.where(h > 0, h, 1.0))
-    if form.degree == 4:
-        root = jnp.sqrt(root)
-    return jnp.where(h > 0, power / root, 0.0)
-
-
-def _contact_states(
-    problem: ScaledProblem, twist: Vec3, contacts: tuple[Index, ...]
-) -> tuple[list[tuple[Bool[Array, ""], Scalar]], Bool[Array, ""]]:
-    """The kinematic state of contacts under a twist.
-
-    Args:
-        problem: The dimensionless contact problem.
-        twist: Dimensionless twist.
-        contacts: Numbers of the contacts whose state is wanted.
-
-    Returns:
-        For each of `contacts`, whether it is active and just touches, and its tangential slip. And whether no contact
-        of the whole problem is violated.
-    """
-    tolerance = kinematic_tolerance(twist)
-    slips = problem.slips(twist)
-    none_violated = jnp.ones((), bool)
-    for slip, active in zip(slips, problem.active, strict=True):
-        none_violated &= (slip.x >= -tolerance) | ~active
-    states = []
-    for contact in contacts:
-        slip, active = dynamic_index(tuple(zip(slips, problem.active, strict=True)), contact)
-        states.append((active & (jnp.abs(slip.x) <= tolerance), slip.y))
-    return states, none_violated
-
-
-def solve_rows(rows: tuple[Vec3, Vec3, Vec3], b: Vec3) -> tuple[Vec3, Bool[Array, ""]]:
-    """Solve rows . v = b, with two steps of refinement.
+def _solve_rows(rows: Float[Array, "3 3 sets batch"], b: Float[Array, "3 sets batch"]) -> tuple[Array, Array]:
+    """Solve rows . v = b, with two steps of refinement; and whether the rows are independent.
 
     In a wedge near its jam the rows are nearly dependent and v is large, so v is refined.
+    """
+    basis, regular = dual(rows, min_determinant(b.dtype))
+    v = combined(basis, b)
+    for _ in range(2):
+        v = v + combined(basis, b - products(rows, v))
+    return v, regular
 
-    Args:
-        rows: The three rows.
-        b: Right-hand side.
+
+def _cone_coordinates(f: Array, edges: Array, per_weight: Array) -> tuple[Array, Array, Array]:
+    """Weights of wrenches f, (3, sets, batch), in three edges each, (3, 3, sets, batch).
 
     Returns:
-        v, and whether the rows are independent.
+        The weights, whether f lies between the edges, and the least weight as a share of the sum. A weight below zero
+        is kept. Large forces may cancel in the wrench, and relative to the wrench such a weight can be more than
+        roundoff.
     """
-    basis = Basis.of(*rows, min_determinant(b.x.dtype))
-    v = compute_once(basis.with_products(b), b.x)
-    v = compute_once(v + basis.with_products(b - basis.products(v)), b.x)
-    return v + basis.with_products(b - basis.products(v)), basis.regular
-
-
-def _cone_coordinates(
-    f: Vec3, generators: tuple[Vec3, Vec3, Vec3], violation_per_weight: tuple[Scalar, ...]
-) -> tuple[Vec3, Bool[Array, ""], Scalar]:
-    """Weights of the wrench f in three generators, and whether f lies between them.
-
-    Args:
-        f: The wrench.
-        generators: The three generators.
-        violation_per_weight: `ScaledProblem.violation_per_weight` of each generator's contact. A weight may be below
-            zero by an amount that is inversely proportional to it.
-
-    Returns:
-        The weights, whether f lies between the generators, and the least weight as a fraction of their sum.
-    """
-    basis = Basis.of(*generators, min_determinant(f.x.dtype))
-    weights = compute_once(basis.weights(f), basis.det)
-    weights = compute_once(weights + basis.weights(f - basis.total(weights)), basis.det)
-    total = jnp.abs(weights.x) + jnp.abs(weights.y) + jnp.abs(weights.z)
-    least_share = jnp.minimum(jnp.minimum(weights.x, weights.y), weights.z) / jnp.where(total > 0, total, 1.0)
-    residual = f - basis.total(weights)
-    reproduces = residual.dot(residual) <= (64 * jnp.finfo(f.x.dtype).eps * total) ** 2
-    inside = basis.regular & reproduces & (f.dot(f) > (zero_wrench_tolerance(f.x.dtype) * total) ** 2)
-    for weight, violation in zip(weights, violation_per_weight, strict=True):
-        inside &= violation * weight >= -relative_tolerance(f.x.dtype) / 2 * total
-    # A weight below zero is kept. Large forces may cancel in the wrench, and relative to the wrench such a weight can
-    # be more than roundoff.
-    return weights, inside, jnp.maximum(least_share, 0)
+    eps, tolerance = float(jnp.finfo(f.dtype).eps), relative_tolerance(f.dtype)
+    basis, regular = dual(edges, min_determinant(f.dtype))
+    weight = products(basis, f)
+    weight = weight + products(basis, f - combined(edges, weight))
+    total = jnp.sum(jnp.abs(weight), axis=0)
+    share = jnp.min(weight, axis=0) / jnp.where(total > 0, total, 1.0)
+    left = f - combined(edges, weight)
+    inside = regular & (dot(left, left) <= (64 * eps * total) ** 2)
+    inside &= dot(f, f) > (zero_wrench_tolerance(f.dtype) * total) ** 2
+    inside &= jnp.all(per_weight * weight >= -tolerance / 2 * total[None], axis=0)
+    return weight, inside, jnp.maximum(share, 0)

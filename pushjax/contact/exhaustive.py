@@ -19,7 +19,7 @@ three edges   The conditions alone fix the twist. The slip under this twist show
 If the three conditions of a system depend on one another (parallel or concurrent normals), its solutions form a
 segment. The system is skipped, because the ends of the segment are solutions of other sets. At an end where another
 contact just touches, at a force of zero, the conditions and the edges belong to different contacts. Where one contact
-sticks, `solve_three_edges` therefore tries the edges of every contact that touches. (Where three contacts slide, it
+sticks, `solve_three` therefore tries the edges of every contact that touches. (Where three contacts slide, it
 does not: of 20 000 random problems of four contacts, two of them fixtures, one such motion was missed.) Each solution
 is checked against every condition of the problem, so a wrong answer cannot pass.
 
@@ -32,16 +32,18 @@ Reference: Zhou et al. 2017, section IV.B, for the problem. Deviation: this enum
 LCPs.
 """
 
-from collections.abc import Callable
 from itertools import combinations, permutations
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
 
-from pushjax._internal.autodiff import without_derivatives
-from pushjax.contact.edge_sets import Incumbent, no_incumbent, solve_one_edge, solve_three_edges, solve_two_edges
-from pushjax.contact.refinement import refine_and_check
-from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution, ScaledProblem
+from pushjax._math.arrays import dot
+from pushjax.contact.edge_sets import Numbers, Sets, Solutions, along, solve_one, solve_three, solve_two
+from pushjax.contact.scaled_problem import NO_EDGE, ContactSolver, EdgeSet, Found, ScaledProblem
+from pushjax.contact.tolerances import TOO_FAST, is_slow, relative_tolerance, same_solution_tolerance
 
 
 class Exhaustive(ContactSolver):
@@ -52,52 +54,69 @@ class Exhaustive(ContactSolver):
     fourth just touches (see the header of this module).
     """
 
-    def solve(self, problem: ScaledProblem) -> ScalarSolution:
-        """Solve a dimensionless contact problem.
+    proves_jams: ClassVar[bool] = True
+
+    def search(self, problem: ScaledProblem) -> Found:
+        """Find the cone edges that carry the force.
 
         Args:
-            problem: The contact problem.
+            problem: Dimensionless contact problems, with an axis for the batch.
 
         Returns:
-            The motion. Its derivatives are those of the solution, not of the search.
+            The best set of cone edges of each problem, and its solution.
         """
-        return refine_and_check(problem, without_derivatives(enumerate_sets, problem), proves_jams=True)
+        return best_of_sets(problem, *_all_sets(problem.count))
 
 
-def enumerate_sets(problem: ScaledProblem) -> Incumbent:
-    """Try every set of cone edges, and keep the best solution.
+class Continuing(Exhaustive):
+    """The default in rollouts: one contact alone, then the cone edges of the stage before, are tried first."""
+
+
+def _all_sets(m: int) -> tuple[Sets, Sets, np.ndarray]:
+    """All sets of one edge and of two, and the contacts of all sets of three, (3, sets), for m contacts."""
+    sticking = [(2 * i, 2 * i + 1) for i in range(m)]
+    sliding = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]
+    triples = [(i, i, j) for i, j in permutations(range(m), 2)] + list(combinations(range(m), 3))
+    one, two = np.arange(2 * m, dtype=np.int32)[None], np.array(sticking + sliding, np.int32).T
+    return Sets.of(one), Sets.of(two), np.array(triples, np.int32).reshape(-1, 3).T
+
+
+def best_of_sets(problem: ScaledProblem, one: Sets, two: Sets, three: Numbers) -> Found:
+    """The best solution of each problem with these sets of one edge, of two, and of three, given by their contacts.
 
     The best solution has the largest power, with its wrench scaled to H = 1. Of solutions with equal power, it has the
-    smallest twist. The search is not differentiable.
-
-    Args:
-        problem: The dimensionless contact problem.
-
-    Returns:
-        The set of cone edges of that solution, with the solution; `found` is False if no set passes.
+    smallest twist. Twists that differ by roundoff are the same motion. The set with fewer edges, which comes first, is
+    better conditioned.
     """
-    incumbent = no_incumbent(problem.runtime_scalar)
-    m = problem.count
-    singles = [(edge,) for edge in range(2 * m)]
-    incumbent = _try_sets(lambda best, edges: solve_one_edge(problem, best, *edges), incumbent, singles)
-    sliding = [(2 * i + a, 2 * j + b) for i, j in combinations(range(m), 2) for a in (0, 1) for b in (0, 1)]
-    sticking = [(2 * i, 2 * i + 1) for i in range(m)]
-    pairs = sticking + sliding
-    incumbent = _try_sets(lambda best, edges: solve_two_edges(problem, best, *edges), incumbent, pairs)
-    # Each entry has the numbers of three contacts, then how many choices of edges to try. If the first two numbers are
-    # the same, that contact sticks.
-    triples = [(i, i, j, 2) for i, j in permutations(range(m), 2)] + [(*c, 8) for c in combinations(range(m), 3)]
-    return _try_sets(lambda best, entry: solve_three_edges(problem, best, entry[:3], entry[3]), incumbent, triples)
+    solutions = [solve_one(problem, one)]
+    solutions += [solve_two(problem, two)] if two.edges.shape[1] else []
+    solutions += [solve_three(problem, three)] if three.shape[1] else []
+    return _best(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *solutions))
 
 
-def _try_sets(
-    try_set: Callable[[Incumbent, tuple], Incumbent], incumbent: Incumbent, sets: list[tuple[int, ...]]
-) -> Incumbent:
-    """Call `try_set` for each set in turn, in a compiled loop.
+def _best(solutions: Solutions) -> Found:
+    """The best solution: most power on H = 1, of those with equal power the smallest twist, of those the first."""
+    dtype = solutions.power.dtype
+    tolerance = relative_tolerance(dtype)
+    squared = dot(solutions.twist, solutions.twist)
+    slow, too_fast = is_slow(squared), is_slow(squared, TOO_FAST)
+    passes = solutions.passes & (solutions.power > 0)
+    accepted = passes & slow
+    power = jnp.where(accepted, solutions.power, 0.0)
+    ties = accepted & (power >= (1 - 4 * tolerance) * jnp.max(power, axis=0, keepdims=True))
+    smallest = jnp.min(jnp.where(ties, squared, jnp.inf), axis=0, keepdims=True)
+    index = jnp.argmax(ties & ((1 - 8 * tolerance) * squared <= smallest), axis=0)
+    best = jax.tree.map(lambda x: _of_set(x, index), solutions)
+    difference = solutions.twist - best.twist[:, None]
+    far = same_solution_tolerance(dtype) ** 2 * (squared + dot(best.twist, best.twist)[None])
+    found = jnp.any(accepted, axis=0)
+    edges, contacts = (jnp.where(found[None], x, NO_EDGE) for x in (best.edges, best.contacts))
+    chosen = EdgeSet(edges, contacts, best.weight)
+    second_found = jnp.any(accepted & (dot(difference, difference) > far), axis=0) & found
+    power, twist = jnp.where(found, best.power, 0.0), jnp.where(found[None], best.twist, 0.0)
+    return Found(chosen, twist, power, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
 
-    Unrolled, the program would take minutes to compile.
-    """
-    if not sets:
-        return incumbent
-    columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*sets, strict=True))
-    return jax.lax.scan(lambda incumbent, numbers: (try_set(incumbent, numbers), None), incumbent, columns)[0]
+
+def _of_set(x: Array, index: Int[Array, " batch"]) -> Array:
+    """The entries (..., batch) of one set of each example, from (..., sets, batch)."""
+    return along(x, jnp.expand_dims(index, tuple(range(x.ndim - 1))), -2).squeeze(-2)

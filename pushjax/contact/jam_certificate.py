@@ -11,281 +11,177 @@ LCP is copositive). The converse is false.
 
 A linear program in so few variables has few basic solutions, and all are tried. They are sets of four edges, and sets
 of two or three edges that balance by themselves (frictionless fingers straight opposite, or fingers whose normals meet
-in one point). Such sets have to balance to BALANCE_TOLERANCE.
+in one point). Such sets have to balance to BALANCE_TOLERANCE. They are computed as sets of four, with two dummy edges
+that carry no force: a pure moment, and the direction `across` that is orthogonal to the set's other edges.
 
 The weights of four edges are determinants. The cross product of the two edges of one contact is 2 mu t x n. It is
 written in this form, with mu taken out, so the weights are exact for the smallest friction, and no sign depends on
 roundoff.
 """
 
-import functools
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.autodiff import without_derivatives
-from pushjax._internal.xla import compute_once, decide, tree_where, update_if
-from pushjax._math.vec import Scalar, Vec3
-from pushjax.contact.scaled_problem import ScaledProblem, dynamic_index
+from pushjax._math.arrays import cross, dot, unit
+from pushjax.contact.scaled_problem import ScaledProblem, selected
 
 # The unbalanced part that two or three edges may have and still balance, relative to their sum: roundoff of the numbers
 # that a user computes them from. By the size of the floating-point type in bytes.
 BALANCE_TOLERANCE = {4: 2e-6, 8: 1e-10}
 DETERMINANT_ROUNDOFF = 2  # bound on the roundoff of a determinant, in units of eps times its terms
-
-Numbers = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""], Int[Array, ""]]  # numbers of four edges
+SETS_AT_ONCE = 32
 
 
 class Squeeze(NamedTuple):
-    """The squeeze power.
+    """The squeeze power, dimensionless; times `ScaledProblem.unit` it is in m."""
 
-    Attributes:
-        power: Dimensionless; times `ScaledProblem.displacement_unit` it is in m. Minus infinity where no internal
-            equilibrium exists, as for one contact.
-        presses: Whether the power is positive for certain, and not only by roundoff.
-    """
+    power: Float[Array, "*batch"]  # minus infinity where no internal equilibrium exists, as for one contact
+    presses: Bool[Array, "*batch"]  # whether the power is positive for certain, and not only by roundoff
+    edges: Int[Array, "4 *batch"]  # numbers of the edges of the equilibrium
 
-    power: Scalar
-    presses: Bool[Array, ""]
-
-
-class _Edges(NamedTuple):
-    """Every cone edge, then two dummy edges that carry no force.
-
-    The dummy edges have the numbers `moment` and `across`. They are a pure moment and the direction orthogonal to a
-    set's other edges. With them a set of two or three edges is computed as a set of four.
-
-    Attributes:
-        wrench: Wrench of each edge, of unit normal force.
-        power: Power of that wrench.
-        active: Whether the edge's contact takes part.
-        friction: Coefficient of friction of the edge's contact.
-        edge_cross: Cross product of the two edges of the edge's contact, divided by mu: 2 t x n.
-    """
-
-    wrench: tuple[Vec3, ...]
-    power: tuple[Scalar, ...]
-    active: tuple[Bool[Array, ""], ...]
-    friction: tuple[Scalar, ...]
-    edge_cross: tuple[Vec3, ...]
-
-    @property
-    def moment(self) -> int:
-        """Number of the dummy edge that is a pure moment."""
-        return len(self.wrench) - 2
-
-    @property
-    def across(self) -> int:
-        """Number of the dummy edge orthogonal to a set's other edges."""
-        return len(self.wrench) - 1
-
-    def four(self, numbers: Numbers) -> "_FourEdges":
-        """The four edges with these numbers."""
-        pair_firsts = numbers[0], numbers[2]
-        return _FourEdges(
-            tuple(dynamic_index(self.wrench, e) for e in numbers),
-            tuple(dynamic_index(self.power, e) for e in numbers),
-            tuple(dynamic_index(self.friction, e) for e in pair_firsts),
-            tuple(dynamic_index(self.edge_cross, e) for e in pair_firsts),
-            functools.reduce(jnp.logical_and, (dynamic_index(self.active, e) for e in numbers)),
+    @staticmethod
+    def none(like: Float[Array, "*batch"]) -> "Squeeze":
+        """No internal equilibrium."""
+        return Squeeze(
+            jnp.full_like(like, -jnp.inf), jnp.zeros(like.shape, bool), jnp.zeros((4, *like.shape), jnp.int32)
         )
 
-    def kind(self, numbers: Numbers) -> "_SetKind":
-        """What kind of set the four edges with these numbers are."""
+
+class _Four(NamedTuple):
+    """Four cone edges, or numbers of sets of four."""
+
+    wrench: Float[Array, "3 4 *rest"]
+    power: Float[Array, "4 *rest"]
+    active: Bool[Array, "*rest"]
+    friction: Float[Array, "2 *rest"]  # of the first and the third edge
+    edge_cross: Float[Array, "3 2 *rest"]  # 2 t x n of the contacts of the first and the third edge
+    # Whether the first two, and the last two, are of one contact; and whether the fourth is `across`, the third the
+    # moment.
+    same12: Bool[Array, "*rest"]
+    same34: Bool[Array, "*rest"]
+    has_across: Bool[Array, "*rest"]
+    has_moment: Bool[Array, "*rest"]
+
+
+class _Rows(NamedTuple):
+    """What the sets are made from: every cone edge, then the moment and `across`."""
+
+    wrench: Float[Array, "3 edges *batch"]
+    numbers: Float[Array, "6 edges *batch"]  # power, friction, 2 t x n, and whether the edge's contact takes part
+
+    @staticmethod
+    def of(problem: ScaledProblem) -> "_Rows":
+        """The edges of a problem."""
+        goal, mu = problem.goal, problem.friction
+        power = jnp.stack([goal[0] + mu * goal[1], goal[0] - mu * goal[1]], axis=1).reshape(-1, *mu.shape[1:])
+        numbers = jnp.stack([mu, *(2 * cross(problem.tangent, problem.normal)), problem.active.astype(mu.dtype)])
+        numbers = jnp.concatenate([power[None], jnp.repeat(numbers, 2, axis=1)])
+        dummies = np.zeros((9, 2))
+        dummies[2, 0] = dummies[4] = dummies[8] = 1  # a moment; friction one; active
+        dummies = jnp.asarray(dummies, mu.dtype).reshape(9, 2, *(1,) * (mu.ndim - 1))
+        rows = jnp.concatenate([problem.edges, numbers])
+        rows = jnp.concatenate([rows, jnp.broadcast_to(dummies, (9, 2, *mu.shape[1:]))], axis=1)
+        return _Rows(rows[:3], rows[3:])
+
+    def four(self, numbers: Array, values: Float[Array, "9 4 *rest"]) -> _Four:
+        """The sets of four edges with these numbers, (4, ...), given the rows of their edges."""
         first, second, third, fourth = numbers
-        return _SetKind(
-            first // 2 == second // 2, third // 2 == fourth // 2, fourth == self.across, third == self.moment
-        )
+        moment = self.wrench.shape[1] - 2
+        has_across = fourth == moment + 1
+        kinds = first // 2 == second // 2, (third // 2 == fourth // 2) & ~has_across, has_across, third == moment
+        wrench, power, friction, edge_cross, active = values[:3], values[3], values[4], values[5:8], values[8]
+        return _Four(wrench, power, jnp.all(active > 0, axis=0), friction[::2], edge_cross[:, ::2], *kinds)
+
+    def stacked(self) -> Float[Array, "9 edges *batch"]:
+        """All rows in one array."""
+        return jnp.concatenate([self.wrench, self.numbers])
 
 
-class _FourEdges(NamedTuple):
-    """Four of the edges.
-
-    Attributes:
-        wrench: Wrench of each edge.
-        power: Power of each edge.
-        friction: Coefficients of friction of the first and the third edge.
-        edge_cross: `edge_cross` of the first and the third edge.
-        active: Whether all four edges are active.
-    """
-
-    wrench: tuple[Vec3, ...]
-    power: tuple[Scalar, ...]
-    friction: tuple[Scalar, ...]
-    edge_cross: tuple[Vec3, ...]
-    active: Bool[Array, ""]
-
-    def pair_cross(self, pair: int, same_contact: Bool[Array, ""]) -> tuple[Vec3, Scalar, Scalar]:
-        """Cross product of the first two edges (pair 0) or of the last two (pair 1).
-
-        Args:
-            pair: 0 or 1.
-            same_contact: Whether both edges are of one contact.
-
-        Returns:
-            A vector and a factor whose product is the cross product, and the size of the vector's terms.
-        """
-        g, h = self.wrench[2 * pair : 2 * pair + 2]
-        of_two_contacts = g.cross(h), jnp.ones_like(g.x), _norm1(g) * _norm1(h)
-        edge_cross = self.edge_cross[pair]
-        return tree_where(same_contact, (edge_cross, self.friction[pair], _norm1(edge_cross)), of_two_contacts)
-
-
-def squeeze_power(problem: ScaledProblem, wanted: bool | Bool[Array, ""]) -> Squeeze:
-    """Compute the squeeze power of a hand.
-
-    Args:
-        problem: The dimensionless contact problem.
-        wanted: Whether to compute it. Where not, the result is that without an internal equilibrium. If it is wanted
-            for no example of a batch, it takes no time.
-
-    Returns:
-        The squeeze power. It is differentiable.
-    """
-    lowest = jnp.full_like(problem.runtime_scalar, -jnp.inf)
+def search_squeeze(problem: ScaledProblem) -> Squeeze:
+    """Compute the squeeze power of hands, by all sets of edges; not differentiable."""
+    start = Squeeze.none(problem.unit)
     if problem.count < 2:
-        return Squeeze(lowest, jnp.zeros((), bool))
-    edges = _edges(problem)
-    power, presses, best = without_derivatives(_search_if_wanted, edges, wanted, problem.runtime_scalar)
-    # Only the best set is differentiated. Whether its equilibrium exists is not decided again, because with other
-    # roundoff the answer could be no.
-    best_edges = compute_once(edges.four(best), problem.runtime_scalar)
-    differentiable = _solve_equilibrium(best_edges, edges.kind(best))
-    return Squeeze(jnp.where(power > lowest, differentiable.power, lowest), presses)
+        return start
+    rows, table = _Rows.of(problem), _sets(2 * problem.count)
+    stacked = rows.stacked()
+
+    def try_sets(best: Squeeze, numbers: Int[Array, "4 sets"]):
+        values = jnp.take(stacked, numbers.reshape(-1), axis=1, mode="clip").reshape(9, *numbers.shape, -1)
+        found = _equilibrium(rows.four(numbers[..., None], values))
+        power = jnp.where(found.exists, found.power, -jnp.inf)
+        index = jnp.argmax(power, axis=0)
+        largest = jnp.max(power, axis=0)
+        better = largest > best.power
+        presses = best.presses | jnp.any(found.exists & (found.power > found.roundoff), axis=0)
+        edges = jnp.where(better[None], jnp.take(numbers, index, axis=1), best.edges)
+        return Squeeze(jnp.where(better, largest, best.power), presses, edges), None
+
+    return jax.lax.scan(try_sets, start, jnp.asarray(table))[0]
 
 
-def _edges(problem: ScaledProblem) -> _Edges:
-    """The edges of a problem, with the two dummy edges."""
-    zero = jnp.zeros_like(problem.runtime_scalar)
-    one = zero + 1
-    zero_vector, moment = Vec3(zero, zero, zero), Vec3(zero, zero, one)
-    wrench = (*problem.generators, moment, zero_vector)
-    edge_cross = tuple(t.cross(n).scale(2) for n, t in zip(problem.normal, problem.tangent, strict=True))
-    edge_numbers = range(2 * problem.count)
-    return _Edges(
-        wrench,
-        (*_powers(problem), zero, zero),
-        (*(problem.active[k // 2] for k in edge_numbers), *(jnp.ones((), bool),) * 2),
-        (*(problem.friction[k // 2] for k in edge_numbers), one, one),
-        (*(edge_cross[k // 2] for k in edge_numbers), zero_vector, zero_vector),
-    )
+def squeeze_power(problem: ScaledProblem, edges: Int[Array, "4 *batch"]) -> Float[Array, "*batch"]:
+    """The power of the equilibrium of four edges that `search_squeeze` found; differentiable.
 
-
-class _SetKind(NamedTuple):
-    """What kind of set four edges are.
-
-    Attributes:
-        same12: Whether the first two edges are of one contact.
-        same34: Whether the last two edges are of one contact.
-        has_across: Whether the fourth edge is the dummy `across`; then the first three have to balance by themselves.
-        has_moment: Whether the third edge is the dummy `moment`.
+    Whether it exists is not decided again, because with other roundoff the answer could be no.
     """
-
-    same12: Bool[Array, ""]
-    same34: Bool[Array, ""]
-    has_across: Bool[Array, ""]
-    has_moment: Bool[Array, ""]
+    rows = _Rows.of(problem)
+    return _equilibrium(rows.four(edges, selected(rows.stacked(), edges))).power
 
 
-def _sets(num_edges: int) -> list[tuple[int, ...]]:
-    """All sets of four edges, all of three with `across`, and all of two with `moment` and `across`.
+def _sets(num_edges: int) -> np.ndarray:
+    """All sets of four edges, all of three with `across`, and all of two with the moment and `across`, (n, 4, sets).
 
-    Two edges of one contact come first in their set, because their cross product is exact.
+    Two edges of one contact come first in their set, because their cross product is exact. The last sets are repeated.
     """
 
     def pair_first(numbers: tuple[int, ...]) -> tuple[int, ...]:
         same_contact = [(a, b) for a, b in pairwise(numbers) if a // 2 == b // 2]
         return (*same_contact[0], *(e for e in numbers if e not in same_contact[0])) if same_contact else numbers
 
-    fours = [pair_first(four) for four in combinations(range(num_edges), 4)]
-    return fours + [(*pair_first(three), num_edges + 1) for three in combinations(range(num_edges + 1), 3)]
-
-
-def _search_if_wanted(edges: _Edges, wanted: bool | Bool[Array, ""], runtime_scalar: Scalar) -> tuple:
-    """Search all sets of four edges, where this is wanted.
-
-    Returns:
-        The largest power, whether any power is positive for certain, and the numbers of the edges of the largest power.
-    """
-    lowest = jnp.full_like(runtime_scalar, -jnp.inf)
-    no_squeeze = lowest, jnp.zeros(lowest.shape, bool), (jnp.zeros(lowest.shape, jnp.int32),) * 4
-    search = functools.partial(_search, edges, runtime_scalar)
-    return update_if(jnp.asarray(wanted), search, no_squeeze)
-
-
-def _search(edges: _Edges, runtime_scalar: Scalar, start: tuple) -> tuple:
-    """The search of `_search_if_wanted` over all sets of four edges, starting from the result `start`."""
-
-    def try_set(state, numbers):
-        largest, presses, best = state
-        # `compute_once`, or everything that uses an edge would select it again
-        equilibrium = _solve_equilibrium(compute_once(edges.four(numbers), runtime_scalar), edges.kind(numbers))
-        better = equilibrium.exists & (equilibrium.power > largest)
-        positive = equilibrium.exists & (equilibrium.power > equilibrium.roundoff)
-        better, positive = compute_once((better, positive), runtime_scalar)
-        largest = jnp.where(better, equilibrium.power, largest)
-        return (largest, presses | positive, tree_where(better, numbers, best)), None
-
-    columns = tuple(jnp.asarray(column, jnp.int32) for column in zip(*_sets(edges.moment), strict=True))
-    return jax.lax.scan(try_set, start, columns)[0]
-
-
-def _powers(problem: ScaledProblem) -> tuple[Scalar, ...]:
-    """The power of each generator: the pusher's displacement along it, less the gap, dimensionless."""
-    powers = []
-    for approach, mu in zip(problem.approach, problem.friction, strict=True):
-        powers += [approach.x + mu * approach.y, approach.x - mu * approach.y]
-    return tuple(powers)
-
-
-def _norm1(v: Vec3) -> Scalar:
-    """The sum of the components' absolute values."""
-    return jnp.abs(v.x) + jnp.abs(v.y) + jnp.abs(v.z)
+    sets = [pair_first(four) for four in combinations(range(num_edges), 4)]
+    sets += [(*pair_first(three), num_edges + 1) for three in combinations(range(num_edges + 1), 3)]
+    at_once = min(SETS_AT_ONCE, len(sets))
+    table = np.array(sets + [sets[-1]] * (-len(sets) % at_once), np.int32)
+    return table.reshape(-1, at_once, 4).transpose(0, 2, 1)
 
 
 class _Equilibrium(NamedTuple):
-    """The internal equilibrium of four edges: a basic solution of the linear program.
+    """The internal equilibrium of four edges: a basic solution of the linear program."""
 
-    Attributes:
-        power: Its power.
-        roundoff: Roundoff of the power.
-        exists: Whether the four edges have an equilibrium with forces inside the cones.
-    """
-
-    power: Scalar
-    roundoff: Scalar
-    exists: Bool[Array, ""]
+    power: Float[Array, "*rest"]
+    roundoff: Float[Array, "*rest"]  # of the power
+    exists: Bool[Array, "*rest"]  # whether the four edges have an equilibrium with forces inside the cones
 
 
-def _solve_equilibrium(four: _FourEdges, kind: _SetKind) -> _Equilibrium:
+def _equilibrium(four: _Four) -> _Equilibrium:
     """Compute the internal equilibrium of four edges.
 
-    By Cramer's rule, the weight of each edge is the determinant of the other three, with alternating sign. In the local
-    names, x is the cross product of two edges without the factor mu, and s is the size of the terms of x.
+    By Cramer's rule, the weight of each edge is the determinant of the other three, with alternating sign.
     """
-    g1, g2, g3, g4 = four.wrench
-    x12, mu12, s12 = four.pair_cross(0, kind.same12)
-    x34, mu34, s34 = four.pair_cross(1, kind.same34)
-    orthogonal = _orthogonal_direction(x12, g2.cross(g3), g3.cross(g1))
-    with_across = orthogonal, (g3.cross(orthogonal), jnp.ones_like(g3.x), _norm1(g3))
-    g4, (x34, mu34, s34) = tree_where(kind.has_across, with_across, (g4, (x34, mu34, s34)))
-    friction_scale = jax.lax.stop_gradient(1 / jnp.maximum(jnp.maximum(mu12, mu34), jnp.finfo(g1.x.dtype).tiny))
+    g1, g2, g3, g4 = (four.wrench[:, k] for k in range(4))
+    cross12, mu12, size12 = _pair_cross(four, 0, four.same12)
+    orthogonal = _orthogonal_direction(cross12, cross(g2, g3), cross(g3, g1))
+    g4 = jnp.where(four.has_across[None], orthogonal, g4)
+    cross34, mu34, size34 = _pair_cross(four._replace(wrench=jnp.stack([g1, g2, g3, g4], axis=1)), 1, four.same34)
+    friction_scale = jax.lax.stop_gradient(1 / jnp.maximum(jnp.maximum(mu12, mu34), jnp.finfo(g1.dtype).tiny))
     mu12, mu34 = mu12 * friction_scale, mu34 * friction_scale
-    # `compute_once`, because a weight with cancellation, rounded in two ways, would differ by more than roundoff
-    weights = compute_once(
-        (mu34 * g2.dot(x34), -mu34 * g1.dot(x34), mu12 * g4.dot(x12), -mu12 * g3.dot(x12)), g1.x + g2.y
+    weights = jnp.stack(
+        [mu34 * dot(g2, cross34), -mu34 * dot(g1, cross34), mu12 * dot(g4, cross12), -mu12 * dot(g3, cross12)]
     )
     # The dummy edges carry no force. In an equilibrium their weights are roundoff.
-    third, fourth = weights[2:]
-    dummy_weight = jnp.where(kind.has_moment, jnp.abs(third), 0.0) + jnp.where(kind.has_across, jnp.abs(fourth), 0.0)
-    weights = (*weights[:2], jnp.where(kind.has_moment, 0.0, third), jnp.where(kind.has_across, 0.0, fourth))
-    total = weights[0] + weights[1] + weights[2] + weights[3]
-    absolute_total = sum((jnp.abs(weight) for weight in weights), 0 * total)
+    no = jnp.zeros_like(four.has_moment)
+    is_dummy = jnp.stack([no, no, four.has_moment, four.has_across])
+    is_dummy = jnp.broadcast_to(is_dummy, weights.shape)
+    dummy_weight = jnp.sum(jnp.where(is_dummy, jnp.abs(weights), 0.0), axis=0)
+    weights = jnp.where(is_dummy, 0.0, weights)
+    total, absolute_total = jnp.sum(weights, axis=0), jnp.sum(jnp.abs(weights), axis=0)
     eps, tolerance = jnp.finfo(total.dtype).eps, BALANCE_TOLERANCE[total.dtype.itemsize]
-    term_size = mu34 * s34 * (_norm1(g1) + _norm1(g2)) + mu12 * s12 * (_norm1(g3) + _norm1(g4))
+    term_size = mu34 * size34 * (_norm1(g1) + _norm1(g2)) + mu12 * size12 * (_norm1(g3) + _norm1(g4))
     roundoff = jax.lax.stop_gradient(DETERMINANT_ROUNDOFF * eps * term_size)
     # all weights have one sign up to roundoff, are more than roundoff, and the dummy edges carry nothing
     exists = (
@@ -295,17 +191,31 @@ def _solve_equilibrium(four: _FourEdges, kind: _SetKind) -> _Equilibrium:
         & (dummy_weight <= tolerance * absolute_total)
     )
     per_total = 1 / jnp.where(total != 0, total, 1.0)
-    power, largest_power = 0 * total, 0 * total
-    for weight, edge_power in zip(weights, four.power, strict=True):
-        power, largest_power = power + weight * edge_power, jnp.maximum(largest_power, jnp.abs(edge_power))
-    return _Equilibrium(per_total * power, jnp.abs(per_total) * largest_power * roundoff, exists)
+    power, largest_power = jnp.sum(weights * four.power, axis=0), jnp.max(jnp.abs(four.power), axis=0)
+    return _Equilibrium(per_total * power, jax.lax.stop_gradient(jnp.abs(per_total) * largest_power * roundoff), exists)
 
 
-def _orthogonal_direction(*products: Vec3) -> Vec3:
+def _pair_cross(four: _Four, pair: int, same_contact: Bool[Array, "*rest"]) -> tuple[Array, Array, Array]:
+    """Cross product of the first two edges (pair 0) or of the last two (pair 1).
+
+    It is the product of the vector and the factor that are returned. The last is the size of the vector's terms.
+    """
+    g, h = four.wrench[:, 2 * pair], four.wrench[:, 2 * pair + 1]
+    edge_cross, friction = four.edge_cross[:, pair], four.friction[pair]
+    return (
+        jnp.where(same_contact[None], edge_cross, cross(g, h)),
+        jnp.where(same_contact, friction, 1.0),
+        jnp.where(same_contact, _norm1(edge_cross), _norm1(g) * _norm1(h)),
+    )
+
+
+def _norm1(v: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
+    """The sum of the components' absolute values."""
+    return jnp.sum(jnp.abs(v), axis=0)
+
+
+def _orthogonal_direction(*products: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
     """A unit vector along the longest product; a constant to every derivative."""
-    longest = products[0]
-    for product in products[1:]:
-        longest = tree_where(
-            decide(product.dot(product) > longest.dot(longest), product.x + longest.x), product, longest
-        )
-    return compute_once(jax.lax.stop_gradient(longest.unit()), longest.x)
+    stacked = jax.lax.stop_gradient(jnp.stack(products, axis=1))
+    longest = jnp.argmax(jnp.sum(stacked * stacked, axis=0), axis=0)
+    return unit(selected(stacked, longest[None])[:, 0])

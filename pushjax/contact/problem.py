@@ -1,6 +1,6 @@
 """The contact problem as a user states it, in arrays, and `solve_contacts`, which solves it."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,12 +19,12 @@ from pushjax._internal.checks import (
     concrete,
 )
 from pushjax._internal.jit import quick_jit
-from pushjax._math.vec import Vec2, Vec3, unstack
+from pushjax._math.vec import Scalar, Vec2, Vec3, unstack
 from pushjax.contact.contact_plane import Contact
-from pushjax.contact.exhaustive import Exhaustive
-from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution, nondimensionalize
+from pushjax.contact.exhaustive import Continuing, Exhaustive
+from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.single import solve_single
-from pushjax.contact.single_first import single_first
+from pushjax.contact.solving import solve
 from pushjax.contact.sticking import ScalarRoot, StickingSolver
 from pushjax.friction.limit_surface import Form, LimitSurface
 
@@ -182,7 +182,10 @@ def solve_contacts(
     check_type("surface", surface, LimitSurface)
     check_type("contacts", contacts, Contacts)
     check_solver(solver)
-    _check_num_contacts(contacts.point.shape[0])
+    count = contacts.point.shape[0]
+    _check_num_contacts(count)
+    if isinstance(solver, StickingSolver) and count != 1:
+        raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
     return _solved(surface, contacts, solver)
 
 
@@ -202,8 +205,10 @@ def _check_num_contacts(contacts: int) -> None:
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     """`solve_contacts`, compiled."""
     form, friction = to_scalars(surface, contacts.friction)
-    scalar_contacts = contacts_in_scalars(contacts, friction)
-    result = solve_in_scalars(form, scalar_contacts, unstack(contacts.active), solver, margin=True)
+    friction = jnp.where(_is_unit(contacts.normal), friction, jnp.nan)  # `Contacts` could not check a traced normal
+    scalars, active = contacts_in_scalars(contacts, friction), unstack(contacts.active)
+    solver = solver or (ScalarRoot() if len(friction) == 1 else Exhaustive())
+    result = solve_in_scalars(form, scalars, active, solver, None, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
         twist=result.twist.array(),
@@ -216,82 +221,73 @@ def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | S
     )
 
 
+class ScalarSolution(NamedTuple):
+    """The answer to a contact problem, in scalars."""
+
+    twist: Vec3  # m, m, rad
+    wrench: Vec3  # normalized, on H = 1
+    force: tuple[Vec2, ...]  # along (normal, tangent), N
+    mode: tuple[Int[Array, ""], ...]  # `ContactMode`
+    status: Int[Array, ""]  # `Status`
+    margin: Scalar  # minus the hand's squeeze power, m, as in `Motion`
+    unique: Bool[Array, ""]  # False where the solver found another twist that satisfies every condition
+    best: EdgeSet | None  # the cone edges that carry the force, or else the guess; None without a guess
+
+
 def solve_in_scalars(
     form: Form,
     contacts: tuple[Contact, ...],
     active: tuple[Bool[Array, ""], ...],
     solver: ContactSolver | StickingSolver | None,
+    guess: EdgeSet | None,
     *,
-    margin: bool,
+    margin: bool = False,
 ) -> ScalarSolution:
-    """`solve_contacts` in scalars.
+    """Solve a contact problem whose contacts are scalars.
 
-    Args:
-        form: H of the limit surface, in scalars.
-        contacts: The contacts. One that is not active must be out of reach (`contacts_in_scalars`).
-        active: For each contact, False if it is only padding.
-        solver: As in `solve_contacts`. Without a margin, None solves several contacts by one of them first
-            (`single_first`).
-        margin: Whether the margin is wanted. If not, it is infinite wherever there is a motion, and takes no time.
-
-    Returns:
-        The motion, in scalars.
+    `guess` may be the cone edges that carried the force before; the default solver tries them first.
 
     Raises:
-        ValueError: As for `solve_contacts`.
+        ValueError: For more than eight contacts, or for more than one with a solver of one contact.
     """
-    _check_num_contacts(len(contacts))  # also for callers other than `solve_contacts`
+    count = len(contacts)
+    _check_num_contacts(count)
     if solver is None:
-        if len(contacts) > 1 and not margin:
-            return single_first(form, contacts, active)
-        solver = ScalarRoot() if len(contacts) == 1 else Exhaustive()
-    if not isinstance(solver, StickingSolver):
-        return solver.solve(nondimensionalize(form, contacts, active, margin=margin))
-    if len(contacts) != 1:
-        raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {len(contacts)}")
-    single = solve_single(form, contacts[0], solver)
-    infinite_margin = jnp.full_like(single.twist.x, jnp.inf)
+        solver = ScalarRoot() if count == 1 else Continuing()
+    if isinstance(solver, StickingSolver):
+        if count != 1:
+            raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
+        one = solve_single(form, contacts[0].where(active[0]), solver)
+        infinite = jnp.full_like(one.twist.x, jnp.inf)
+        return ScalarSolution(one.twist, one.wrench, (one.force,), (one.mode,), one.status, infinite, one.unique, guess)
+    answer = solve((form, contacts, active), guess, solver, margin=margin)
+    twist, wrench, force = answer.solution
+    forces, modes = tuple(Vec2(*unstack(f)) for f in force.T), tuple(unstack(answer.mode))
+    best = None if guess is None else answer.best
     return ScalarSolution(
-        single.twist, single.wrench, (single.force,), (single.mode,), single.status, infinite_margin, single.unique
+        Vec3.of(twist), Vec3.of(wrench), forces, modes, answer.status, answer.margin, answer.unique, best
     )
 
 
 def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
-    """The limit surface in scalars, and the friction of the contacts.
-
-    If the surface has numbers that cannot be computed with, it is replaced by one with all numbers one, which keeps NaN
-    out. The friction is then replaced by NaN, which makes every contact invalid.
-
-    Args:
-        surface: The limit surface.
-        friction: Coefficients of friction, (contacts,).
-
-    Returns:
-        H in scalars, and the coefficients of friction.
-    """
+    """The limit surface in scalars, and the friction of the contacts, (contacts,)."""
     form = surface.form()
+    # A surface with numbers that cannot be computed with is replaced by one with all numbers one, which keeps NaN out.
+    # The friction is then NaN, which makes every contact invalid.
     usable = surface.is_valid()
     return jax.tree.map(lambda entry: jnp.where(usable, entry, 1.0), form), jnp.where(usable, friction, jnp.nan)
 
 
+def _is_unit(normal: Float[Array, "contacts 2"]) -> Bool[Array, "contacts"]:
+    """Whether normals have unit length."""
+    return jnp.abs(jnp.sum(normal**2, axis=1) - 1) <= 2 * UNIT_TOLERANCE
+
+
 def contacts_in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, ...]:
-    """The contacts in scalars. A contact that is not active is out of reach, whatever its numbers are.
-
-    Args:
-        contacts: The contacts, in arrays.
-        friction: Coefficients of friction, (contacts,), from `to_scalars`.
-
-    Returns:
-        One `Contact` for each contact. Its friction is NaN where the normal is not of unit length.
-    """
+    """The contacts in scalars. A contact that is not active is out of reach, whatever its numbers are."""
     vectors = (contacts.point, contacts.normal, contacts.displacement)
-    converted = []
-    for point, normal, displacement, mu, gap, active in zip(
-        *(unstack(array) for array in (*vectors, friction, contacts.gap, contacts.active)), strict=True
-    ):
-        normal_vector = Vec2.of(normal)
-        # `Contacts` could not check a traced normal.
-        is_unit = jnp.abs(normal_vector.dot(normal_vector) - 1) <= 2 * UNIT_TOLERANCE
-        mu = jnp.where(is_unit, mu, jnp.nan)
-        converted.append(Contact(Vec2.of(point), normal_vector, Vec2.of(displacement), mu, gap).where(active))
-    return tuple(converted)
+    rows = zip(*(unstack(array) for array in (*vectors, friction, contacts.gap, contacts.active)), strict=True)
+    return tuple(
+        Contact(Vec2.of(point), Vec2.of(normal), Vec2.of(displacement), mu, gap).where(active)
+        for point, normal, displacement, mu, gap, active in rows
+    )

@@ -2,241 +2,201 @@
 
 With the normalized twist (vx, vy, length omega) and wrench (fx, fy, tau / length), a contact is two rows, a_n and a_t.
 The slider's contact point moves by (a_n . V, a_t . V) along normal and tangent, and the force (f_n, f_t) has the wrench
-f_n a_n + f_t a_t. The friction cone has two edges. Their wrenches are the generators a_n + mu a_t (the pusher slides
-left) and a_n - mu a_t (right).
+f_n a_n + f_t a_t. The friction cone has two edges. Their wrenches are a_n + mu a_t (the pusher slides left) and
+a_n - mu a_t (right). Edges are numbered 2 i for the left and 2 i + 1 for the right edge of contact i.
 
 Displacements are divided by the longest displacement of a pusher, and H by the sum of its values at the three unit
 wrenches. So tolerances are relative, and powers of the coefficients of H stay within the range of float32.
 
-Generators are numbered 2 i for the left and 2 i + 1 for the right edge of contact i.
+Arrays have vectors along the first axis, then contacts, then the batch, if there is one.
 """
 
-import functools
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, decide, tree_where
-from pushjax._math.vec import Scalar, Vec2, Vec3
-from pushjax.contact.contact_plane import Contact
-from pushjax.friction.limit_surface import Form
+from pushjax.friction.polynomial import Polynomial
 
-Index = int | Int[Array, ""]  # of a contact or generator: a Python integer, or traced in a loop
+NO_EDGE = -1  # the number of an edge or a contact that is not there
 
 
-class ScalarSolution(NamedTuple):
-    """The answer to a contact problem, in scalars.
+class ContactArrays(NamedTuple):
+    """Contacts of a slider, in its body frame."""
 
-    Attributes:
-        twist: Twist of the slider over the step (m, m, rad).
-        wrench: Normalized wrench on H = 1.
-        force: For each contact, the force along (normal, tangent), N.
-        mode: For each contact, its `ContactMode`.
-        status: `Status`.
-        margin: Minus the hand's squeeze power, m, as in `Motion`.
-        unique: False where the solver found another twist that satisfies every condition.
-    """
-
-    twist: Vec3
-    wrench: Vec3
-    force: tuple[Vec2, ...]
-    mode: tuple[Int[Array, ""], ...]
-    status: Int[Array, ""]
-    margin: Scalar
-    unique: Bool[Array, ""]
+    surface: Polynomial
+    length: Float[Array, "*batch"]  # characteristic length of the surface, m
+    point: Float[Array, "2 contacts *batch"]  # m
+    normal: Float[Array, "2 contacts *batch"]  # of unit length, into the slider
+    displacement: Float[Array, "2 contacts *batch"]  # of the pusher's material point over the step, m
+    gap: Float[Array, "contacts *batch"]  # distance still to close along the normal, m
+    friction: Float[Array, "contacts *batch"]  # coefficient of friction mu
+    active: Bool[Array, "contacts *batch"]  # False for padding
 
 
 class ScaledProblem(NamedTuple):
-    """A contact problem in dimensionless numbers, with one tuple entry for each contact.
+    """A contact problem in dimensionless numbers."""
 
-    Attributes:
-        form: H, divided by `form_scale`.
-        normal: The rows a_n.
-        tangent: The rows a_t.
-        generators: Wrenches of the friction cones' edges with unit normal force, two for each contact.
-        approach: Displacement (n, t) of the slider's contact point that keeps it with its pusher, the gap subtracted.
-        friction: Coefficients of friction mu.
-        active: Whether the contact takes part: False for padding, and for every contact if the problem is not valid.
-        displacement_unit: Unit of displacement, m: the longest displacement of a pusher or the largest penetration
-            depth, whichever is larger; one if both are zero.
-        form_scale: Number by which H was divided.
-        pushes: Whether any contact would be violated if the slider stayed.
-        valid: Whether every number is finite and no friction negative. If not, nothing pushes.
-        margin: Whether the margin is wanted also where there is a motion.
-    """
-
-    form: Form
-    normal: tuple[Vec3, ...]
-    tangent: tuple[Vec3, ...]
-    generators: tuple[Vec3, ...]
-    approach: tuple[Vec2, ...]
-    friction: tuple[Scalar, ...]
-    active: tuple[Bool[Array, ""], ...]
-    displacement_unit: Scalar
-    form_scale: Scalar
-    pushes: Bool[Array, ""]
-    valid: Bool[Array, ""]
-    margin: bool
-
-    @property
-    def runtime_scalar(self) -> Scalar:
-        """A finite scalar that is not a compile-time constant, for `compute_once` and `decide`."""
-        return self.displacement_unit
+    surface: Polynomial  # H, divided by `surface_scale`
+    length: Float[Array, "*batch"]  # m
+    normal: Float[Array, "3 contacts *batch"]  # the rows a_n
+    tangent: Float[Array, "3 contacts *batch"]  # the rows a_t
+    edges: Float[Array, "3 edges *batch"]  # wrenches of the cone edges with unit normal force
+    goal: Float[Array, "2 contacts *batch"]  # motion (n, t) of the contact point that keeps it with its pusher
+    friction: Float[Array, "contacts *batch"]
+    active: Bool[Array, "contacts *batch"]  # False for padding, and for every contact if the problem is not valid
+    unit: Float[Array, "*batch"]  # of displacement, m
+    surface_scale: Float[Array, "*batch"]
+    pushes: Bool[Array, "*batch"]  # whether any contact would be violated if the slider stayed
+    valid: Bool[Array, "*batch"]  # whether every number is finite and no friction negative; if not, nothing pushes
 
     @property
     def count(self) -> int:
         """Number of contacts."""
-        return len(self.friction)
+        return self.friction.shape[0]
 
-    def violation_per_weight(self, contact: Index) -> Scalar:
-        """How far a contact's force is outside its friction cone if one of its edges has weight minus one.
+    def slips(self, twist: Float[Array, "3 *batch"]) -> Float[Array, "2 contacts *batch"]:
+        """Motion (n, t) of each contact point relative to its pusher; a normal motion below zero is a violation."""
+        rows = jnp.stack([self.normal, self.tangent], axis=1)
+        return jnp.sum(rows * twist[:, None, None], axis=0) - self.goal
 
-        The checks of an edge's weight multiply it by this number. So they allow the same error of the force, whatever
-        the coefficient of friction is.
 
-        Args:
-            contact: Number of the contact.
+class EdgeSet(NamedTuple):
+    """The cone edges that carry the force of a solution."""
 
-        Returns:
-            The distance, in units of the normal force.
-        """
-        return jnp.maximum(2 * dynamic_index(self.friction, contact), 1)
+    edges: Int[Array, "3 *batch"]  # numbers of the edges, the used ones first, then `NO_EDGE`
+    # Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the same, the second
+    # condition is that this contact sticks. They are the contacts of the edges, but for the third one in a case that
+    # `edge_sets.solve_three` describes.
+    contacts: Int[Array, "3 *batch"]
+    weight: Float[Array, "3 *batch"]  # of each edge in the wrench, up to one common factor
 
-    def slips(self, twist: Vec3) -> tuple[Vec2, ...]:
-        """Motion of each contact point relative to its pusher.
+    @staticmethod
+    def none(like: Float[Array, "*batch"]) -> "EdgeSet":
+        """No set."""
+        numbers = jnp.full((3, *like.shape), NO_EDGE, jnp.int32)
+        return EdgeSet(numbers, numbers, jnp.zeros((3, *like.shape), like.dtype))
 
-        Args:
-            twist: Dimensionless twist.
+    def exists(self) -> Bool[Array, "*batch"]:
+        """Whether there is a set."""
+        return self.edges[0] >= 0
 
-        Returns:
-            For each contact, the motion along the normal, with the gap added, and along the tangent (the slip). A
-            negative normal component violates the contact.
-        """
-        rows = zip(self.normal, self.tangent, self.approach, strict=True)
-        return tuple(Vec2(n.dot(twist), t.dot(twist)) - b for n, t, b in rows)
+
+class Found(NamedTuple):
+    """The best set of cone edges that a search found, and its solution."""
+
+    best: EdgeSet
+    twist: Float[Array, "3 *batch"]  # dimensionless
+    power: Float[Array, "*batch"]  # F . V with the wrench F scaled to H = 1; of several solutions, the largest is kept
+    second_found: Bool[Array, "*batch"]  # whether a set with a different twist passed too
+    # Whether a set passed whose twist exceeds `max_twist_ratio` by a factor of at most `TOO_FAST`. Such a twist is not
+    # accepted as an answer. But it shows that the problem is not a jam.
+    too_fast: Bool[Array, "*batch"]
+
+    @staticmethod
+    def guessed(best: EdgeSet) -> "Found":
+        """A set whose solution is not known yet."""
+        none = jnp.zeros_like(best.weight[0])
+        return Found(best, jnp.zeros_like(best.weight), none, none > 0, none > 0)
 
 
 class ContactSolver(eqx.Module):
-    """Finds the motion of a slider under several contacts. It has settings only, no state."""
+    """Finds the motion of a slider under several contacts. It has settings only, no state.
+
+    Attributes:
+        proves_jams: Whether finding no solution proves that there is none.
+    """
+
+    proves_jams: eqx.AbstractClassVar[bool]
 
     @abstractmethod
-    def solve(self, problem: ScaledProblem) -> ScalarSolution:
-        """Solve a dimensionless contact problem.
+    def search(self, problem: ScaledProblem) -> Found:
+        """Find the cone edges that carry the force.
 
         Args:
-            problem: The contact problem.
+            problem: Dimensionless contact problems, with an axis for the batch.
 
         Returns:
-            The motion. Its derivatives are those of the solution, not of the search.
+            The best set of cone edges of each problem, and its solution.
         """
 
 
-def nondimensionalize(
-    form: Form, contacts: tuple[Contact, ...], active: tuple[Bool[Array, ""], ...], *, margin: bool
-) -> ScaledProblem:
-    """Make a problem of several contacts dimensionless.
+def nondimensionalize(given: ContactArrays) -> ScaledProblem:
+    """Make a problem of several contacts dimensionless."""
+    given = _broadcast(given)
+    vectors = jnp.concatenate([given.point, given.normal, given.displacement, given.gap[None], given.friction[None]])
+    usable = jnp.isfinite(jnp.sum(vectors, axis=0)) & (given.friction >= 0)
+    valid = jnp.all(usable | ~given.active, axis=0) & jnp.isfinite(given.length)
+    active = given.active & valid[None]
+    # Contacts that take no part are out of reach. They are replaced before anything is computed from their numbers: a
+    # NaN that is only masked afterwards comes back in the gradient.
+    neutral = jnp.asarray([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0], vectors.dtype)
+    vectors = jnp.where(active[None], vectors, neutral.reshape(8, *(1,) * active.ndim))
+    point, normal, displacement, (gap, friction) = vectors[:2], vectors[2:4], vectors[4:6], vectors[6:]
+    unit = _displacement_unit(displacement, jnp.where(active, -gap, 0.0))
+    scale = jax.lax.stop_gradient(given.surface.scale())
 
-    Args:
-        form: H of the limit surface, in scalars.
-        contacts: The contacts, in the body frame.
-        active: For each contact, False if it is only padding.
-        margin: Whether the margin is wanted also where there is a motion.
+    length = jnp.where(valid, given.length, 1.0)
+    moment_n = (point[0] * normal[1] - point[1] * normal[0]) / length[None]
+    moment_t = (point[0] * normal[0] + point[1] * normal[1]) / length[None]
+    a_n = jnp.stack([normal[0], normal[1], moment_n])
+    a_t = jnp.stack([-normal[1], normal[0], moment_t])
+    # a sum over an axis, because XLA would compute other sums again wherever an edge is used
+    along = jnp.stack([jnp.ones_like(friction), friction])[:, :, None]  # (n, t), contact, side
+    sides = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], gap.dtype).reshape(2, 1, 2, *(1,) * (gap.ndim - 1))
+    rows = jnp.stack([a_n, a_t], axis=1)[:, :, :, None]
+    edges = jnp.sum(rows * (along * sides)[None], axis=1).reshape(3, 2 * len(gap), *gap.shape[1:])
+    along_normal = jnp.sum(displacement * normal, axis=0) - gap
+    goal = jnp.stack([along_normal, displacement[1] * normal[0] - displacement[0] * normal[1]]) / unit[None, None]
+    pushes = jnp.any(active & (goal[0] > 0), axis=0)
+    surface = Polynomial(given.surface.table / scale[None, None, None])
+    return ScaledProblem(surface, length, a_n, a_t, edges, goal, friction, active, unit, scale, pushes, valid)
 
-    Returns:
-        The dimensionless problem. If a number of an active contact is not finite, or its friction is negative, `valid`
-        is False and nothing pushes.
-    """
-    sums = (jnp.where(a, sum(jax.tree.leaves(c)), 0.0) for c, a in zip(contacts, active, strict=True))
-    valid = jnp.isfinite(sum(sums))
-    for contact, is_active in zip(contacts, active, strict=True):
-        valid &= (contact.friction >= 0) | ~is_active
-    zero, one = jnp.zeros_like(contacts[0].gap), jnp.ones_like(contacts[0].gap)
-    zero_vector = Vec2(zero, zero)
-    # This is not a compile-time constant if the length, a point or a displacement is an argument of the program.
-    runtime_scalar = form.length + sum((contact.point.x + contact.displacement.x for contact in contacts), zero)
-    # Without `compute_once`, the sum over all inputs would be recomputed for every row below.
-    valid, runtime_scalar = compute_once((valid, runtime_scalar), runtime_scalar)
-    takes_part = tuple(decide(valid & is_active, runtime_scalar) for is_active in active)
-    contacts = tuple(contact.where(used) for used, contact in zip(takes_part, contacts, strict=True))
 
-    displacements = [tree_where(a, c.displacement, zero_vector) for a, c in zip(takes_part, contacts, strict=True)]
-    depths = [jnp.where(a, -c.gap, 0.0) for a, c in zip(takes_part, contacts, strict=True)]
-    displacement_unit = _displacement_unit(displacements, depths)
-    form_scale = _form_scale(form)
-    runtime_scalar = jnp.where(valid, runtime_scalar, 1.0)
-    displacement_unit = compute_once(displacement_unit, runtime_scalar)
-
-    normals, tangential_moments, approaches = [], [], []
-    for contact in contacts:
-        normals.append(contact.wrench(Vec2(one, zero), form.length))
-        tangential_moments.append(contact.wrench(Vec2(zero, one), form.length).z)
-        approaches.append(contact.approach().scale(1 / displacement_unit))
-    normals, tangential_moments, approaches = compute_once(
-        (tuple(normals), tuple(tangential_moments), tuple(approaches)), runtime_scalar
+def _broadcast(given: ContactArrays) -> ContactArrays:
+    """The contacts with all arrays of one batch; the surface may be shared."""
+    batch = jnp.broadcast_shapes(*(array.shape[-(array.ndim - 2) :] if array.ndim > 2 else () for array in given[2:5]))
+    batch = jnp.broadcast_shapes(
+        batch, given.surface.table.shape[3:], given.length.shape, *(array.shape[1:] for array in given[5:])
     )
-    tangents = tuple(Vec3(-n.y, n.x, moment) for n, moment in zip(normals, tangential_moments, strict=True))
-    pushes = jnp.zeros((), bool)
-    for used, approach in zip(takes_part, approaches, strict=True):
-        pushes |= used & (approach.x > 0)
-    friction = tuple(contact.friction for contact in contacts)
-    generators = []
-    for n, t, mu in zip(normals, tangents, friction, strict=True):
-        generators += [n + t.scale(mu), n - t.scale(mu)]
-    generators, pushes = compute_once((tuple(generators), pushes), runtime_scalar)
-    scaled_form = form.scaled(1 / form_scale)
-    per_contact = (normals, tangents, generators, approaches, friction, takes_part)
-    return ScaledProblem(scaled_form, *per_contact, displacement_unit, form_scale, pushes, valid, margin)
+
+    def broadcast(array: Array, axes: int) -> Array:
+        return jnp.broadcast_to(array, (*array.shape[:axes], *batch))
+
+    vectors = (broadcast(array, 2) for array in given[2:5])
+    return ContactArrays(given.surface, broadcast(given.length, 0), *vectors, *(broadcast(a, 1) for a in given[5:]))
 
 
-def _displacement_unit(displacements: list[Vec2], depths: list[Scalar]) -> Scalar:
+def _displacement_unit(displacement: Array, depth: Array) -> Array:
     """The longest of the displacements or the largest of the depths, if that is larger; one where all are zero.
 
     Units are constants to every derivative, because the answer does not depend on them.
     """
+    displacement, depth = jax.lax.stop_gradient((displacement, depth))
     # Divide by the largest component first, because the square of a small displacement underflows.
-    component = _largest([jnp.abs(x) for displacement in displacements for x in displacement])
+    component = jnp.max(jnp.abs(displacement), axis=(0, 1))
     component = jnp.where(component > 0, component, 1.0)
-    squared = _largest([d.scale(1 / component).dot(d.scale(1 / component)) for d in displacements])
-    unit = jnp.maximum(component * jnp.sqrt(squared), _largest(depths))
-    return jax.lax.stop_gradient(jnp.where(unit > 0, unit, 1.0))
+    squared = jnp.max(jnp.sum((displacement / component[None, None]) ** 2, axis=0), axis=0)
+    unit = jnp.maximum(component * jnp.sqrt(squared), jnp.max(depth, axis=0))
+    return jnp.where(unit > 0, unit, 1.0)
 
 
-def _form_scale(form: Form) -> Scalar:
-    """The sum of H at the three unit wrenches, a constant to every derivative.
+def selected(values: Array, index: Int[Array, "picks *batch"]) -> Array:
+    """The entries with these numbers along the second axis, (k, n, ...) to (k, picks, ...); zero for `NO_EDGE`.
 
-    It depends on the surface alone. So a batch that shares one surface also shares the scaled one, which is not read
-    again for each example.
+    A masked sum, because a gather is slow in a batch and its derivative is a scatter.
     """
-    zero, one = jnp.zeros_like(form.length), jnp.ones_like(form.length)
-    axes = (Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one))
-    scale = jax.lax.stop_gradient(sum((form.value(axis) for axis in axes), zero))
-    return compute_once(jnp.where(scale > 0, scale, 1.0), form.length)
+    numbers = jnp.arange(values.shape[1]).reshape(1, -1, *(1,) * (index.ndim - 1))
+    return jnp.sum(jnp.where((index[:, None] == numbers)[None], values[:, None], 0), axis=2)
 
 
-def _largest(values: list[Scalar]) -> Scalar:
-    """The largest of some values, as a constant to every derivative."""
-    return functools.reduce(jnp.maximum, jax.lax.stop_gradient(values))
+def violation_per_weight(friction: Array) -> Array:
+    """How far a contact's force is outside its friction cone if one of its edges has weight minus one.
 
-
-def dynamic_index(values: tuple[Any, ...], index: Index) -> Any:
-    """Return `values[index]`, also for an index that a loop runs over.
-
-    A traced index selects by `where`, because a gather is slow in a batch.
-
-    Args:
-        values: Pytrees of the same structure.
-        index: Number of an entry, not negative.
-
-    Returns:
-        The entry.
+    The checks of an edge's weight multiply it by this number. So they allow the same error of the force, whatever the
+    coefficient of friction is.
     """
-    if isinstance(index, int):
-        return values[index]
-    chosen = values[0]
-    for k, value in enumerate(values[1:], start=1):
-        chosen = jax.tree.map(lambda a, b, k=k: jnp.where(index == k, a, b), value, chosen)
-    return chosen
+    return jnp.maximum(2 * friction, 1)

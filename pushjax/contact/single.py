@@ -15,23 +15,14 @@ from pushjax.friction.limit_surface import Form
 
 
 class SingleSolution(NamedTuple):
-    """The answer for one contact, in scalars.
+    """The solution for one contact, in scalars."""
 
-    Attributes:
-        twist: Twist of the slider over the step (m, m, rad).
-        wrench: Normalized wrench on H = 1.
-        force: Contact force along (normal, tangent), N.
-        mode: `ContactMode`.
-        status: `Status`.
-        unique: False where another twist satisfies every condition too.
-    """
-
-    twist: Vec3
-    wrench: Vec3
-    force: Vec2
-    mode: Int[Array, ""]
-    status: Int[Array, ""]
-    unique: Bool[Array, ""]
+    twist: Vec3  # of the slider over the step (m, m, rad)
+    wrench: Vec3  # normalized, on H = 1
+    force: Vec2  # along (normal, tangent), N
+    mode: Int[Array, ""]  # `ContactMode`
+    status: Int[Array, ""]  # `Status`
+    unique: Bool[Array, ""]  # False where another twist satisfies every condition too
 
 
 def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> SingleSolution:
@@ -40,10 +31,6 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     The contact point follows the pusher exactly along the normal. Along the tangent it follows the pusher exactly where
     the contact sticks, else it moves along the motion cone's edge. So where the contact sticks, only the rotation is
     computed from the surface, and the slip is zero up to roundoff.
-
-    A sliding motion is scaled by v_n / motion_n, where v is `Contact.approach`. This needs no guard against a small
-    motion_n. Sliding left means motion_n v_t > motion_t v_n, so for motion_t > 0 the factor stays below v_t / motion_t.
-    For motion_t <= 0 motion_n is not small, because motion_n = d h - mu motion_t >= d h by Euler's identity.
 
     Args:
         form: H of the limit surface, in scalars.
@@ -81,6 +68,9 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     s = jnp.where(slides_left, mu, jnp.where(slides_right, -mu, sticking.ratio))
     motion = curve.motion(s)
     squared = motion.dot(motion)
+    # A sliding motion is scaled by v_n / motion_n. This needs no guard against a small motion_n. Sliding left means
+    # motion_n v_t > motion_t v_n, so for motion_t > 0 the factor stays below v_t / motion_t. For motion_t <= 0 motion_n
+    # is not small, because motion_n = d h - mu motion_t >= d h by Euler's identity.
     factor = jnp.where(
         slides, v.x / jnp.where(slides, motion.x, 1.0), v.dot(motion) / jnp.where(squared > 0, squared, 1.0)
     )
@@ -115,18 +105,16 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
 
 
 def _replace_invalid(contact: Contact) -> tuple[Bool[Array, ""], Contact]:
-    """Whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
+    """Return whether every number of a contact is usable, and the contact, replaced by one out of reach if not."""
     usable = jnp.isfinite(sum(jax.tree.leaves(contact))) & (contact.friction >= 0)
     return usable, contact.where(usable)
 
 
 def _can_drag(curve: LimitCurve, mu: Scalar, v: Vec2) -> Bool[Array, ""]:
-    """Whether a pusher that does not approach could also hold on to the slider and drag it along.
-
-    Where the motion cone opens beyond 90 degrees, a pusher that moves along the surface, or slightly away from it, may
-    move inside the cone. But the slider may also stay behind, which satisfies every condition too. That is the answer
-    given: nothing pushes.
-    """
+    """Return whether a pusher that does not approach could also hold on to the slider and drag it along."""
+    # Where the motion cone opens beyond 90 degrees, a pusher that moves along the surface, or slightly away from it,
+    # may move inside the cone. The slider may also stay behind, which satisfies every condition too. `solve_single`
+    # gives this answer: nothing pushes.
     left, right = curve.motion(mu), curve.motion(-mu)
     drags_left = (left.x < 0) & (v.y > 0) & (left.cross(v) < 0)
     drags_right = (right.x < 0) & (v.y < 0) & (right.cross(v) > 0)

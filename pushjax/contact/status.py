@@ -6,8 +6,8 @@ from enum import IntEnum
 class ContactMode(IntEnum):
     """How the pusher and the slider move relative to each other at a contact.
 
-    LEFT and RIGHT name the pusher's slip relative to the slider, seen along the inward normal. Left is toward the
-    tangent t = (-n_y, n_x). When the pusher slides left, the friction on the slider is +mu f_n.
+    LEFT and RIGHT name the pusher's slip relative to the slider. Left is toward the tangent t = (-n_y, n_x), where n is
+    the inward normal. When the pusher slides left, the friction on the slider is +mu f_n.
 
     Attributes:
         SEPARATED: The contact does not touch. Every contact also has this mode where the slider does not move.

@@ -1,31 +1,26 @@
 """Tolerances of a dimensionless contact problem (`scaled_problem`): what counts as zero, as equal, and as too large."""
 
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
-from pushjax._math.vec import Scalar, Vec3
+from pushjax._math.arrays import dot
+
+# Up to this factor above `max_twist_ratio`, a twist still shows that a motion exists. Beyond it, rows that are
+# dependent up to roundoff can give any number.
+TOO_FAST = 8
 
 
-def kinematic_tolerance(twist: Vec3) -> Scalar:
+def kinematic_tolerance(twist: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
     """Tolerance on the violation of a kinematic condition, in units of the fastest pusher.
 
     It is `relative_tolerance` plus the roundoff of the twist, but at most `ill_conditioned_tolerance`. The roundoff
     matters where the slider moves much faster than its pushers, as when it escapes from a wedge. In float32 the upper
     bound equals `relative_tolerance`, so nothing is added. For a twist that is too fast to be an answer
     (`max_twist_ratio`), the tolerance is the roundoff alone.
-
-    Args:
-        twist: Dimensionless twist.
-
-    Returns:
-        The tolerance.
     """
-    dtype = twist.x.dtype
-    eps = float(jnp.finfo(dtype).eps)
-    size = jnp.abs(twist.x) + jnp.abs(twist.y) + jnp.abs(twist.z)
-    slow = twist.dot(twist) <= max_twist_ratio(dtype) ** 2
-    return jnp.where(
-        slow, jnp.minimum(relative_tolerance(dtype) + 64 * eps * size, ill_conditioned_tolerance(dtype)), 8 * eps * size
-    )
+    eps, size = float(jnp.finfo(twist.dtype).eps), jnp.sum(jnp.abs(twist), axis=0)
+    usual = jnp.minimum(relative_tolerance(twist.dtype) + 64 * eps * size, ill_conditioned_tolerance(twist.dtype))
+    return jnp.where(is_slow(dot(twist, twist)), usual, 8 * eps * size)
 
 
 def ill_conditioned_tolerance(dtype) -> float:
@@ -45,9 +40,9 @@ def max_twist_ratio(dtype) -> float:
     return (1e-8 if jnp.finfo(dtype).bits > 32 else 1e-4) / float(jnp.finfo(dtype).eps)
 
 
-# Up to this factor above `max_twist_ratio`, a twist still shows that a motion exists. Beyond it, rows that are
-# dependent up to roundoff can give any number.
-TOO_FAST = 8
+def is_slow(squared: Float[Array, "*rest"], factor: float = 1) -> Bool[Array, "*rest"]:
+    """Whether a twist with this square is at most a multiple of `max_twist_ratio`."""
+    return squared <= (factor * max_twist_ratio(squared.dtype)) ** 2
 
 
 def relative_tolerance(dtype) -> float:

@@ -14,20 +14,15 @@ from pushjax.friction.limit_surface import InverseMap, LimitSurface, angle_betwe
 
 
 class EllipsoidForm(NamedTuple):
-    """The `Form` of an ellipsoid: H(F) = F' A F.
+    """The `Form` of an ellipsoid: H(F) = F' A F."""
 
-    Attributes:
-        a: The matrix A, 1/N^2.
-        length: Characteristic length, m.
-    """
-
-    a: Symmetric3
-    length: Scalar
+    a: Symmetric3  # A, 1/N^2
+    length: Scalar  # m
 
     degree = 2
 
-    def scaled(self, factor: Scalar) -> "EllipsoidForm":
-        return EllipsoidForm(Symmetric3(*(factor * entry for entry in self.a)), self.length)
+    def table(self) -> Float[Array, "6 1"]:
+        return 2 * jnp.stack(self.a)[:, None]
 
     def gradient(self, f: Vec3) -> Vec3:
         return self.a.times(f).scale(2.0)
@@ -88,11 +83,9 @@ class Ellipsoid(LimitSurface):
         return bool(np.linalg.eigvalsh(np.asarray(self.A, np.float64))[0] > 0)
 
     def inverse(self, twist: ArrayLike) -> InverseMap:
-        """Solve A F = V, and refine the solution twice; see `LimitSurface.inverse`.
-
-        Refinement is needed because the solve uses the adjugate. By itself it loses twice as many digits as the
-        condition number implies.
-        """
+        """Solve A F = V, and refine the solution twice; see `LimitSurface.inverse`."""
+        # Refinement is needed because the solve uses the adjugate. By itself it loses twice as many digits as the
+        # condition number implies.
         v, usable = self._normalized_twist(twist)
         form = self.form()
         f = compute_once(form.a.solve(v), v.x)

@@ -45,8 +45,8 @@ class Form(Protocol):
     @property
     def length(self) -> Scalar: ...  # m
 
-    def scaled(self, factor: Scalar) -> "Form":
-        """Return the form of factor * H."""
+    def table(self) -> Float[Array, "6 products"]:
+        """Return H as a `polynomial.Polynomial` has it."""
         ...
 
     def value(self, f: Vec3) -> Scalar: ...

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete
 from pushjax._internal.xla import compute_once
+from pushjax._math.arrays import ENTRIES
 from pushjax._math.directions import fibonacci_hemisphere
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3, unstack
@@ -22,6 +23,16 @@ MONOMIALS = np.array(
     ]
 )  # fmt: skip
 
+# For each entry of the Hessian and each product of two components of F, both in the order of `ENTRIES`: the number of
+# the coefficient, and its factor.
+HESSIAN_TERMS = [
+    [
+        (int(np.flatnonzero((MONOMIALS == exponents).all(axis=1))[0]), float(exponents[i] * (exponents[j] - (i == j))))
+        for exponents in (np.bincount((i, j, *product), minlength=3) for product in ENTRIES)
+    ]
+    for i, j in ENTRIES
+]
+
 # How far below zero the smallest curvature may be, relative to the largest. A fitted surface may lie on the border of
 # convexity, where roundoff can make its smallest curvature negative. Coefficients stored in float32 are themselves only
 # this accurate.
@@ -31,20 +42,15 @@ MAX_NEWTON_ROUNDS = 100
 
 
 class QuarticForm(NamedTuple):
-    """The `Form` of a quartic H.
+    """The `Form` of a quartic H."""
 
-    Attributes:
-        c: The 15 coefficients, in the order of `MONOMIALS`, 1/N^4.
-        length: Characteristic length, m.
-    """
-
-    c: tuple[Scalar, ...]
-    length: Scalar
+    c: tuple[Scalar, ...]  # the 15 coefficients, in the order of `MONOMIALS`, 1/N^4
+    length: Scalar  # m
 
     degree = 4
 
-    def scaled(self, factor: Scalar) -> "QuarticForm":
-        return QuarticForm(tuple(factor * c for c in self.c), self.length)
+    def table(self) -> Float[Array, "6 6"]:
+        return jnp.stack([jnp.stack([factor * self.c[k] for k, factor in row]) for row in HESSIAN_TERMS])
 
     def value(self, f: Vec3) -> Scalar:
         return f.dot(self.gradient(f)) / 4
@@ -86,12 +92,10 @@ class QuarticForm(NamedTuple):
         )
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
-        """Return the five coefficients c_k of H(a + s b) = sum_k c_k s^k.
-
-        H = xx A + yy B + zz C, where A, B and C are linear in the six products of two components of F. Along a + s b
-        each of these products is quadratic in s. This needs two thirds of the arithmetic of the alternative: gradients
-        and a Hessian at both ends.
-        """
+        """Return the five coefficients c_k of H(a + s b) = sum_k c_k s^k."""
+        # H = xx A + yy B + zz C, where A, B and C are linear in the six products of two components of F. Along a + s b
+        # each of these products is quadratic in s. This needs two thirds of the arithmetic of the alternative:
+        # gradients and a Hessian at both ends.
         product_terms = (_products(a, a), _products(a, b, twice=True), _products(b, b))
         pairs = compute_once(tuple((products[:3], self._square_factors(products)) for products in product_terms), a.x)
         squares, factors = ([row[k] for row in pairs] for k in range(2))
@@ -175,10 +179,7 @@ class Quartic(LimitSurface):
         return least_curvature(np.asarray(self.coefficients)) >= -CONVEXITY_TOLERANCE
 
     def inverse(self, twist: ArrayLike) -> InverseMap:
-        """Solve grad H(F) = v by a safeguarded Newton's method; see `LimitSurface.inverse`.
-
-        The safeguard uses that v - grad H is minus the gradient of a convex function.
-        """
+        """Solve grad H(F) = v by a safeguarded Newton's method; see `LimitSurface.inverse`."""
         v, usable = self._normalized_twist(twist)
         form = self.form()
         f, rounds = _inverse(form.c, v)
@@ -192,15 +193,7 @@ class Quartic(LimitSurface):
 
 @jax.custom_jvp
 def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
-    """Return F with grad H(F) = v, and the number of Newton rounds. `c` holds the 15 coefficients.
-
-    Each round minimizes the convex function H(F) - v . F further:
-
-    1. Compute the Newton step.
-    2. Take the best of its halvings. H along the step is a known polynomial, so they cost nothing.
-    3. Replace F by its best multiple (in closed form, by homogeneity). This makes the iteration independent of the
-       scale of H.
-    """
+    """Return F with grad H(F) = v, and the number of Newton rounds, for the 15 coefficients c."""
     form = QuarticForm(c, jnp.ones_like(v.x))
 
     def rescaled(f: Vec3) -> Vec3:
@@ -217,6 +210,9 @@ def _inverse(c: tuple[Scalar, ...], v: Vec3) -> tuple[Vec3, Int[Array, ""]]:
     halvings = 0.5 ** jnp.arange(10, dtype=v.x.dtype)
 
     def newton_round(state):
+        # Each round minimizes the convex function H(F) - v . F further. It takes the best of the halvings of the Newton
+        # step. H along the step is a known polynomial, so they cost nothing. The best multiple of F (in closed form, by
+        # homogeneity) makes the iteration independent of the scale of H.
         f, _, rounds = state
         step = form.hessian(f).solve(residual(f))
         coefficients = form.restrict(f, step)
@@ -249,10 +245,7 @@ def _inverse_jvp(primals, tangents) -> Any:
 def least_curvature(coefficients: np.ndarray) -> float:
     """Return the smallest eigenvalue of the Hessian over the unit sphere, relative to the largest one found.
 
-    z' hess H(F) z is 12 times a symmetric form T(F, F, z, z). So the search alternates. It starts at the directions F
-    with the smallest eigenvalues out of 2000 that cover the half sphere. z becomes the eigenvector of the smallest
-    eigenvalue of the Hessian at F, then F becomes that of the Hessian at z. Each half step can only lower the
-    eigenvalue.
+    The search alternates between the two arguments of the form z' hess H(F) z, from many starts.
 
     Args:
         coefficients: Coefficients of the quartic, shape (15,).
@@ -260,6 +253,9 @@ def least_curvature(coefficients: np.ndarray) -> float:
     Returns:
         The ratio, negative if the quartic is not convex.
     """
+    # z' hess H(F) z is 12 times a symmetric form T(F, F, z, z). The search starts at the directions F with the smallest
+    # eigenvalues out of 2000 that cover the half sphere. z becomes the eigenvector of the smallest eigenvalue of the
+    # Hessian at F, then F becomes the one of the Hessian at z. Each half step can only lower the eigenvalue.
     tensor = _curvature_tensor(np.asarray(coefficients, np.float64))
     direction = fibonacci_hemisphere(2000)
     values, vectors = np.linalg.eigh(np.einsum("ijkl,nk,nl->nij", tensor, direction, direction))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
+from pushjax._math.arrays import ENTRIES
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3, cos_sin, unstack
 from pushjax.friction.limit_surface import Form
@@ -23,20 +24,12 @@ NEAR_ZERO = 1e-3  # squared norm r^2 of the anisotropy below which series give c
 
 
 class WrenchTransform(NamedTuple):
-    """The linear map T F = (S f, tau - c x f) of normalized wrenches F = (f, tau).
+    """The linear map T F = (S f, tau - c x f) of normalized wrenches F = (f, tau)."""
 
-    Attributes:
-        xx: Entry of the symmetric matrix S.
-        yy: Entry of S.
-        xy: Entry of S.
-        cx: x of the center of pressure c, divided by the characteristic length.
-        cy: y of c, divided by the characteristic length.
-    """
-
-    xx: Scalar
+    xx: Scalar  # xx, yy and xy are the entries of the symmetric matrix S
     yy: Scalar
     xy: Scalar
-    cx: Scalar
+    cx: Scalar  # center of pressure c, divided by the characteristic length
     cy: Scalar
 
     def times(self, f: Vec3) -> Vec3:
@@ -57,15 +50,10 @@ class WrenchTransform(NamedTuple):
 
 
 class TransformedForm(NamedTuple):
-    """The `Form` H(T F) of a limit surface on a table.
+    """The `Form` H(T F) of a limit surface on a table."""
 
-    Attributes:
-        base: The form H.
-        transform: The map T.
-    """
-
-    base: Form
-    transform: WrenchTransform
+    base: Form  # H
+    transform: WrenchTransform  # T
 
     @property
     def degree(self) -> int:
@@ -75,8 +63,11 @@ class TransformedForm(NamedTuple):
     def length(self) -> Scalar:
         return self.base.length
 
-    def scaled(self, factor: Scalar) -> "TransformedForm":
-        return TransformedForm(self.base.scaled(factor), self.transform)
+    def table(self) -> Float[Array, "6 products"]:
+        t, zero = self.transform, jnp.zeros_like(self.transform.xx)
+        matrix = ((t.xx, t.xy, zero), (t.xy, t.yy, zero), (t.cy, -t.cx, zero + 1))  # of T
+        table = _product(_of_products(tuple(zip(*matrix, strict=True))), self.base.table())
+        return table if self.degree == 2 else _product(table, _of_products(matrix))
 
     def value(self, f: Vec3) -> Scalar:
         return self.base.value(self.transform.times(f))
@@ -96,6 +87,20 @@ class TransformedForm(NamedTuple):
 
     def restrict(self, a: Vec3, b: Vec3) -> tuple[Scalar, ...]:
         return self.base.restrict(self.transform.times(a), self.transform.times(b))
+
+
+def _of_products(matrix: tuple[tuple[Scalar, ...], ...]) -> Float[Array, "6 6"]:
+    """Return the matrix that maps the six products F_i F_j to (T F)_i (T F)_j, for a 3 x 3 matrix T."""
+    rows = []
+    for i, j in ENTRIES:
+        terms = [matrix[i][k] * matrix[j][m] + (k != m) * (matrix[i][m] * matrix[j][k]) for k, m in ENTRIES]
+        rows.append(jnp.stack(terms))
+    return jnp.stack(rows)
+
+
+def _product(a: Float[Array, "6 n"], b: Float[Array, "n m"]) -> Float[Array, "6 m"]:
+    """Return the matrix product, not in the lower precision that accelerators use for it."""
+    return jnp.sum(a[:, :, None] * b[None], axis=1)
 
 
 class Table(eqx.Module):
@@ -144,20 +149,12 @@ class Table(eqx.Module):
             setattr(self, name, array)
 
     def is_valid(self) -> Bool[Array, ""]:
-        """Whether numbers that were traced when the table was made can be computed with."""
+        """Return whether numbers that were traced when the table was made can be computed with."""
         others = jnp.concatenate([self.log_gradient, self.log_hessian, self.origin])
         return jnp.all(jnp.abs(self.anisotropy) <= MAX_ANISOTROPY) & jnp.all(jnp.abs(others) <= MAX_NUMBER)
 
     def wrench_transform(self, pose: Vec3, length: Scalar) -> WrenchTransform:
-        """Return the map T of the wrenches of a slider, in its body frame.
-
-        Args:
-            pose: Pose (x, y, angle) of the slider in the world frame, m and rad.
-            length: Characteristic length of its limit surface, m.
-
-        Returns:
-            The map T.
-        """
+        """Return the map T of the wrenches of a slider at a pose (world, m and rad), in its body frame."""
         heading = cos_sin(pose.z)
         # The entries (a, b) of the symmetric matrix [[a, b], [b, -a]] rotate by twice the angle.
         a, b = unstack(self.anisotropy)

@@ -1,7 +1,7 @@
 """Rollouts of pushes and grasps: one step, and a path of steps.
 
 Quasi-static motion does not depend on time, so a step is a displacement of the hand; `pushjax.simulation.step` has the
-scheme of a step. The only state is the pose of the pushed slider.
+scheme of a step. The state is the pose of the pushed slider, with two exceptions (`rollout`).
 
 If no motion satisfies every contact, the hand has jammed, and it stops there for good. A step in which the hand stays
 changes nothing.
@@ -128,7 +128,8 @@ def rollout(
     """Push the slider along a path of hand configurations.
 
     There is no state besides the slider's pose: a push continues with `rollout(..., rest_of_path, pose=push.pose[-1])`.
-    The exception is a failed last step: within one rollout, the step after a failed one is not divided.
+    There are two exceptions. Within one rollout, the step after a failed one is not divided. And where several motions
+    satisfy all contacts, a rollout goes on with the motion that continues.
 
     The result is differentiable, in forward and reverse mode, in slider, hand, path, pose, friction and table. Use
     `vmap` for batches.
@@ -141,7 +142,7 @@ def rollout(
         pose: Pose of the slider at the start, (3,), world, m and rad.
         friction: Coefficient of friction mu between fingers and slider, a scalar or (fingers,).
         solver: Solver of contact problems. The default suits every hand. Where several motions satisfy all contacts,
-            `Exhaustive()` gives the one of largest power, which the default need not do.
+            the default takes the one that continues, if one does. `Exhaustive()` takes the one of largest power.
         table: A table whose friction depends on direction or place; None for uniform friction.
         fixtures: Walls (`Wall`) and convex bodies (`Fixture`) that stay where they are, and that the slider may touch.
             Their contacts come after those of the fingers.
@@ -182,10 +183,8 @@ def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_st
 
 
 def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
-    """Roll out a path that is filled up to one of a few lengths, so that paths of many lengths share a program.
-
-    The path ends with copies of its last configuration, which are not simulated. Compiling takes seconds.
-    """
+    """Roll out a path that is filled up to one of a few lengths, so that paths of many lengths share a program."""
+    # Compiling takes seconds. The path ends with copies of its last configuration, which are not simulated.
     steps, size = len(path) - 1, MIN_SIZE
     while size < steps:
         size *= SIZE_RATIO
@@ -196,7 +195,7 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
 
 @partial(jax.jit, static_argnums=1)
 def _first_steps(push: Trajectory, steps: int) -> Trajectory:
-    """The first steps of a push."""
+    """Return the first steps of a push."""
     extra = {"pose": 1, "configuration": 1}  # these have one row more than there are steps, the start
     return Trajectory(
         **{name: getattr(push, name)[: steps + extra.get(name, 0)] for name in Trajectory.__dataclass_fields__}
@@ -209,17 +208,10 @@ FrictionAt = Callable[[Array, Vec3], tuple[Form, Array]]
 
 
 def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionAt:
-    """Return the friction on a table, given the friction that would hold if the table were uniform.
-
-    If the table has a value that is not valid, the coefficients of friction are NaN, so every step is INVALID.
-
-    Args:
-        table: The table; None for a uniform one.
-        friction_at: Limit surface and friction on a uniform table.
-    """
+    """Return the friction on a table (None for a uniform one), given the friction on a uniform table."""
     if table is None:
         return friction_at
-    valid = table.is_valid()
+    valid = table.is_valid()  # if False, the coefficients of friction are NaN, so every step is INVALID
     known = jax.tree.map(lambda leaf: jnp.where(valid, leaf, 0.0), table)
 
     def friction_at_table(step: Array, pose: Vec3) -> tuple[Form, Array]:
@@ -232,26 +224,14 @@ def friction_on_table(table: Table | None, friction_at: FrictionAt) -> FrictionA
 def simulate(
     shape: Shape,
     hand: Hand,
-    path: Array,
-    pose: Array,
+    path: Array,  # (steps + 1, dof), world
+    pose: Array,  # at the start, (3,), world
     solver: ContactSolver | StickingSolver | None,
-    friction_at: FrictionAt,
+    friction_at: FrictionAt,  # all of its surfaces must have the same length
     fixtures: Fixtures = (),
-    num_steps: Array | None = None,
+    num_steps: Array | None = None,  # steps to simulate; None for all. The rest of the result has no meaning
 ) -> Trajectory:
-    """Roll out a path, with arguments that have been checked. `rollout` is the public function.
-
-    Args:
-        shape: Outline of the slider.
-        hand: The hand.
-        path: Configurations of the hand, (steps + 1, dof).
-        pose: Pose of the slider at the start, (3,), world.
-        solver: Solver of contact problems; None for the default.
-        friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
-            All surfaces must have the same length.
-        fixtures: Walls and bodies that the slider may touch.
-        num_steps: Number of steps to simulate; None for all. The rest of the result has no meaning.
-    """
+    """Roll out a path, with arguments that have been checked. `rollout` is the public function."""
     push, first_pose = divided_push(shape, hand, path, pose, solver, friction_at, fixtures)
     push, start, steps = push._replace(num_steps=num_steps), Vec3.of(first_pose), len(path) - 1
     if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
@@ -283,11 +263,7 @@ def divided_push(
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
 ) -> tuple[DividedPush, Array]:
-    """Prepare a push whose steps can be divided into parts (`substeps`). Arguments as in `simulate`.
-
-    Returns:
-        The push, and the pose at the start, (3,). Both have numbers that can be computed with (`domain`).
-    """
+    """Return a push whose steps can be divided, and its first pose, (3,), both without invalid numbers (`domain`)."""
     length = friction_at(jnp.zeros((), jnp.int32), Vec3.of(jnp.zeros_like(pose)))[0].length
     shape_valid, hand_valid, fixtures_valid, pose_valid = (
         are_valid((shape,), length),
@@ -320,17 +296,16 @@ def divided_push(
 
 
 def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
-    """Return the records of all steps of a hand with one contact: a round finger on a convex outline, a pad on a disk.
-
-    Such a step is not divided. If it is too long, it is NOT_CONVERGED. Arguments as in `simulate_in_substeps`.
-    """
+    """Return the records of all steps of a hand with one contact."""
+    # This is a round finger on a convex outline, or a pad on a disk. Such a step is not divided. If it is too long, it
+    # is NOT_CONVERGED.
 
     def body(before: tuple[Vec3, Array], step: Array):
         pose, depth = before
         form, mu = push.friction_at(step, pose)
         motions = push.motions_at(step, mu)
         # one contact holds nothing
-        record, _ = step_in_scalars(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
+        record, *_ = step_in_scalars(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
         allowed = jnp.maximum(depth, allowed_penetration(max_displacement(motions), form.length))
         depth = max_penetration(push.outline, motions, record.pose, 1.0)
         is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)

@@ -20,8 +20,8 @@ flat and straight.
 If the hand has more contacts than are solved together (`working_set`), the most urgent ones are solved.
 
 All this holds for contacts that were detected before the step, and for rotations that are small compared with the
-angles of the outline's corners. Whether the result is valid is judged afterwards, by the depth of every finger in the
-slider (`max_penetration`), which is computed from the whole outline. `substeps` divides a step that is too long.
+angles of the outline's corners. `max_penetration` checks the result: it computes the depth of every finger in the
+slider from the whole outline. `substeps` divides a step that is too long.
 """
 
 import functools
@@ -35,8 +35,8 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._internal.xla import compute_once, decide, map_items, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
-from pushjax.contact.problem import solve_in_scalars
-from pushjax.contact.scaled_problem import ContactSolver, ScalarSolution
+from pushjax.contact.problem import ScalarSolution, solve_in_scalars
+from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
@@ -56,128 +56,73 @@ MAX_ROTATION_PER_STEP, MAX_SLIP_PER_STEP = 0.5, 1.0
 
 
 class ScalarStep(NamedTuple):
-    """Result of a step in scalars, which the scan stacks; fields as in `Step`.
+    """Result of a step in scalars, which the scan stacks; fields as in `Step`."""
 
-    Attributes:
-        pose: Pose of the slider after the step, world.
-        twist: Twist of the slider over the step, body frame.
-        wrench: Wrench on the slider, normalized, body frame.
-        force: Force of each contact along normal and tangent, N.
-        contact_point: Point of each contact, body frame, m; an array, because nothing computes with it.
-        contact_normal: Inward unit normal of each contact, body frame; an array, too.
-        mode: `ContactMode` of each contact.
-        status: `Status` of the step.
-        overlap: Depth of the deepest finger at the end of the step, m; zero until it has been judged.
-    """
-
-    pose: Vec3
-    twist: Vec3
-    wrench: Vec3
-    force: tuple[Vec2, ...]
-    contact_point: Float[Array, "contacts 2"]
-    contact_normal: Float[Array, "contacts 2"]
-    mode: tuple[Int[Array, ""], ...]
-    status: Int[Array, ""]
-    overlap: Scalar
+    pose: Vec3  # of the slider after the step, world
+    twist: Vec3  # body frame
+    wrench: Vec3  # normalized, body frame
+    force: tuple[Vec2, ...]  # of each contact along normal and tangent, N
+    contact_point: Float[Array, "contacts 2"]  # body frame, m; an array, because nothing computes with it
+    contact_normal: Float[Array, "contacts 2"]  # inward, of unit length, body frame
+    mode: tuple[Int[Array, ""], ...]  # `ContactMode` of each contact
+    status: Int[Array, ""]  # `Status`
+    overlap: Scalar  # depth of the deepest finger at the end, m; zero until it is computed
 
 
 class Stage(NamedTuple):
-    """What the predictor passes to the corrector, and what the corrector leaves.
+    """What the predictor passes to the corrector, and what the corrector leaves."""
 
-    Attributes:
-        twist: Twist of the slider over the step.
-        point: Point of the slider that moves in a straight line, body frame, m.
-        angle: Unit vector of the angle of the frame in which the twist is given.
-        status: `Status` so far.
-        at_start: For each finger, its contacts as they were at the start of the step.
-        chosen: For each finger, the index of each of its contacts among its candidates.
-        holds: Whether there are several fingers, every one is near enough to hold a jammed slider, and no fixture is.
-        urgency: Urgency by which contacts are selected (see `working_set`); None without fixtures, and if all contacts
-            are solved together.
-    """
-
-    twist: Vec3
-    point: Vec2
-    angle: Vec2
-    status: Int[Array, ""]
-    at_start: tuple[tuple[Candidate, ...], ...]
-    chosen: tuple[tuple[Int[Array, ""] | int, ...], ...]
-    holds: Bool[Array, ""]
-    urgency: Urgency | None
+    twist: Vec3  # of the slider over the step
+    point: Vec2  # of the slider that moves in a straight line, body frame, m
+    angle: Vec2  # unit vector of the angle of the frame in which the twist is given
+    status: Int[Array, ""]  # `Status` so far
+    at_start: tuple[tuple[Candidate, ...], ...]  # for each finger, its contacts at the start of the step
+    chosen: tuple[tuple[Int[Array, ""] | int, ...], ...]  # index of each finger's contacts among its candidates
+    holds: Bool[Array, ""]  # whether all of several fingers, and no fixture, are near enough to hold a jammed slider
+    urgency: Urgency | None  # None without fixtures, and if all contacts are solved together
+    guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
 
     @staticmethod
-    def before(start: BodyFrame, counts: list[int], urgency: Urgency | None) -> "Stage":
-        """What the predictor starts from: no motion yet, and no contacts selected.
-
-        Args:
-            start: Pose of the slider at the start.
-            counts: Number of contacts of each finger and fixture.
-            urgency: Urgency of each contact.
-        """
+    def before(start: BodyFrame, counts: list[int], urgency: Urgency | None, guess: EdgeSet | None) -> "Stage":
+        """Return what the predictor starts from: no motion yet, and no contacts selected."""
         zero = jnp.zeros_like(start.pose.x)
         still, nowhere = Vec3(zero, zero, zero), Candidate(zero, Vec2(zero, zero), Vec2(zero, zero))
         none = tuple((jnp.zeros((), jnp.int32),) * n for n in counts)
         at_start = tuple((nowhere,) * n for n in counts)
         moving, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)  # MOVING is 0
-        return Stage(still, Vec2(zero, zero), start.angle, moving, at_start, none, no, urgency)
+        return Stage(still, Vec2(zero, zero), start.angle, moving, at_start, none, no, urgency, guess)
 
 
 class FingerContacts(NamedTuple):
-    """The contacts of one finger in a stage.
+    """The contacts of one finger in a stage."""
 
-    Attributes:
-        contacts: The contacts as they are now, with the gaps of the start of the step.
-        chosen: Index of each among the candidates of the finger.
-        at_start: Each as it was at the start of the step.
-        is_near: Whether one of them is near enough to hold a jammed slider.
-    """
-
-    contacts: tuple[Contact, ...]
-    chosen: tuple[Int[Array, ""], ...]
-    at_start: tuple[Candidate, ...]
-    is_near: Bool[Array, ""]
+    contacts: tuple[Contact, ...]  # as they are now, with the gaps of the start of the step
+    chosen: tuple[Int[Array, ""], ...]  # index of each among the candidates
+    at_start: tuple[Candidate, ...]  # as they were at the start of the step
+    is_near: Bool[Array, ""]  # whether one is near enough to hold a jammed slider
 
 
 class PushingPart(NamedTuple):
-    """The part of a step in which the fingers push, after the free motion.
-
-    Attributes:
-        outline: The slider's outline.
-        length: Characteristic length of the limit surface, m.
-        start: Pose of the slider at the start.
-        begin: Fraction of the step after which a finger first touches.
-        rest: Fraction of the step that is left then.
-        reach: Distance within which a finger holds a jammed slider, m.
-    """
+    """The part of a step in which the fingers push, after the free motion."""
 
     outline: Outline
-    length: Scalar
-    start: BodyFrame
-    begin: Scalar
-    rest: Scalar
-    reach: Scalar
+    length: Scalar  # of the limit surface, m
+    start: BodyFrame  # pose of the slider at the start
+    begin: Scalar  # fraction of the step after which a finger first touches
+    rest: Scalar  # fraction of the step that is left then
+    reach: Scalar  # distance within which a finger holds a jammed slider, m
 
     def contacts_of(
         self,
-        frame: BodyFrame,
-        fraction: Scalar,
+        frame: BodyFrame,  # pose of the slider in this stage
+        fraction: Scalar,  # of the pushing part that is done in this stage
         in_predictor: Bool[Array, ""],
         is_fixture: bool,
         finger_motion: FingerMotion,
-        chosen: tuple[Int[Array, ""] | int, ...],
-        at_start: tuple[Candidate, ...],
+        chosen: tuple[Int[Array, ""] | int, ...],  # among the candidates; not used in the predictor
+        at_start: tuple[Candidate, ...],  # not used in the predictor
     ) -> FingerContacts:
-        """Contacts of one finger, or of one fixture, in a stage.
-
-        Args:
-            frame: Pose of the slider in this stage.
-            fraction: Fraction of the pushing part that is done in this stage.
-            in_predictor: True in the predictor.
-            is_fixture: Whether `finger_motion` is that of a fixture.
-            finger_motion: Motion of the finger over the step.
-            chosen: Index of each contact among the candidates of the finger; not used in the predictor.
-            at_start: The contacts as they were at the start of the step; not used in the predictor.
-        """
+        """Return the contacts of one finger, or of one fixture, in a stage."""
         x = self.start.pose.x
         finger_pose = compute_once(finger_motion.pose_in_slider(frame, self.begin + self.rest * fraction), x)
 
@@ -211,39 +156,23 @@ def step_in_scalars(
     outline: Outline,
     motions: tuple[FingerMotion, ...],
     solver: ContactSolver | StickingSolver | None,
-    pose: Vec3,
-    overlap_before: Scalar,
-    reach: Scalar,
-    urgency: Urgency | None = None,
-    ongoing: Bool[Array, ""] | bool = True,
-    fixtures: tuple[FingerMotion, ...] = (),
-    is_first_try: Bool[Array, ""] | bool = True,
-) -> tuple[ScalarStep, Urgency | None]:
-    """Compute one step of all fingers, or a part of one; see the header of this module for the scheme.
-
-    Args:
-        form: Limit surface in scalars.
-        outline: The slider's outline.
-        motions: Motion of each finger over the step.
-        solver: Solver of contact problems; None for the default.
-        pose: Pose of the slider at the start, world.
-        overlap_before: Depth of the deepest finger at the start, m.
-        reach: Distance within which a finger holds a jammed slider, m.
-        urgency: Urgency of each contact (see `working_set`); None if all are solved together.
-        ongoing: False where no result is needed; no contact problem is solved then.
-        fixtures: Fixtures as fingers that stay where they are.
-        is_first_try: True where `urgency` says nothing yet. With fixtures, contacts are then selected by how far the
-            step would press them into a slider at rest.
-
-    Returns:
-        The record of the step, and the urgency of each contact after it (None if `urgency` is None).
-    """
+    pose: Vec3,  # of the slider at the start, world
+    overlap_before: Scalar,  # depth of the deepest finger at the start, m
+    reach: Scalar,  # distance within which a finger holds a jammed slider, m
+    urgency: Urgency | None = None,  # of each contact (`working_set`); None if all are solved together
+    ongoing: Bool[Array, ""] | bool = True,  # where False, no contact problem is solved, and the result has no meaning
+    fixtures: tuple[FingerMotion, ...] = (),  # as fingers that stay where they are
+    is_first_try: Bool[Array, ""] | bool = True,  # True where `urgency` has no meaning yet
+    guess: EdgeSet | None = None,  # cone edges that carried the force last, which are tried first
+) -> tuple[ScalarStep, Urgency | None, EdgeSet | None]:
+    """Compute one step of all fingers, or a part of one: its record, the urgency after it, and the next guess."""
     start = BodyFrame.at(pose)
     begin = _first_contact(motions, outline, start, form.length)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
     counts = [num_contacts(motion.finger, outline) for motion in motions + fixtures]
     given_set = WorkingSet.most_urgent(urgency, num_solved_together(counts))
-    active = (jnp.asarray(ongoing),) * num_solved_together(counts)
+    size = num_solved_together(counts)
+    active = (jnp.asarray(ongoing),) * size
 
     def stage(carry: Stage, fraction: Scalar):
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
@@ -262,41 +191,41 @@ def step_in_scalars(
             holds &= is_near if k < len(motions) else ~is_near
         used_urgency = carry.urgency
         if used_urgency is not None:
+            # in the first try, contacts are selected by how far the step would press them into a slider at rest
             pressed = jax.lax.stop_gradient(jnp.stack([contact.approach().x for contact in contacts]))
             used_urgency = jnp.where(in_predictor & is_first_try, pressed, used_urgency)
-        working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, len(active))
-        solution = solve_in_scalars(form, working.select(contacts), active, solver, margin=False)
+        working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, size)
+        local_guess = None if carry.guess is None else working.local(carry.guess)
+        solution = solve_in_scalars(form, working.select(contacts), active, solver, local_guess)
+        guess_after = carry.guess
+        if solution.best is not None:
+            spread = working.spread_edges(solution.best)
+            guess_after = tree_where(spread.exists(), spread, carry.guess)
         solution = working.spread(solution, len(contacts))
         urgency_after = None if urgency is None else violations(contacts, solution.twist, solution.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
         status = jnp.where(carry.status <= Status.FREE, solution.status, jnp.maximum(carry.status, solution.status))
         straight_point = _force_weighted_point(contacts, solution.force)
-        next_stage = Stage(solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency)
+        next_stage = Stage(
+            solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency, guess_after
+        )
         is_long = _turns_or_slips_too_far(motions + fixtures, by_finger, solution, form.length)
         return next_stage, (solution, _points_and_normals(contacts), urgency_after, is_long)
 
-    before = Stage.before(start, counts, urgency if fixtures else None)
+    before = Stage.before(start, counts, urgency if fixtures else None, guess)
     carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
     is_long = jnp.any(outputs[-1])
     solution, points_and_normals, urgency_after, _ = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
     moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
     status = _status(carry, moves, is_long, overlap_before, form.length)
-    return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after
+    return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after, carry.guess
 
 
 def _status(
     last_stage: Stage, moves: Bool[Array, ""], is_long: Bool[Array, ""], depth: Scalar, length: Scalar
 ) -> Int[Array, ""]:
-    """Status of a step.
-
-    Args:
-        last_stage: What the corrector left.
-        moves: Whether the hand moves.
-        is_long: Whether the slider turns or slips too far for one step.
-        depth: Depth of the deepest finger at the start of the step, m.
-        length: Characteristic length of the limit surface, m.
-    """
+    """Status of a step, given the depth of the deepest finger at its start, m."""
     status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
     status = jnp.where((status <= Status.FREE) & is_long, Status.NOT_CONVERGED, status)
     # a hand that rests changes nothing, and proves nothing
@@ -311,7 +240,7 @@ def _turns_or_slips_too_far(
     solution: ScalarSolution,
     length: Scalar,
 ) -> Bool[Array, ""]:
-    """Whether a motion turns the slider, or slips at a contact with a finger or a fixture, too far for one step."""
+    """Return whether the slider turns, or slips at a contact with a finger or a fixture, too far for one step."""
     by_finger, twist, length = jax.lax.stop_gradient((by_finger, solution.twist, length))
     squares = []
     for motion, contacts in zip(motions, by_finger, strict=True):
@@ -334,16 +263,14 @@ def _first_contact(motions: tuple[FingerMotion, ...], outline: Outline, start: B
 
 
 def _gap(distance: Scalar, roundoff: Scalar) -> Scalar:
-    """Gap of a contact, m: zero where a body touches within roundoff.
-
-    Otherwise the roundoff would move a slider on which nothing pushes, and would jam what a turning hand holds.
-    """
+    """Gap of a contact, m: zero where a body touches within roundoff."""
+    # The roundoff would move a slider on which nothing pushes, and would jam what a turning hand holds.
     rests = (distance < 0) & (distance > -roundoff)
     return distance + jax.lax.stop_gradient(jnp.where(rests, -distance, 0.0))
 
 
 def _points_and_normals(contacts: tuple[Contact, ...]) -> tuple[Array, Array]:
-    """Points and inward normals of contacts, both (contacts, 2), body frame. Not differentiated."""
+    """Points, m, and inward normals of contacts, both (contacts, 2), body frame, without derivatives."""
     point = jnp.stack([contact.point.array() for contact in contacts])
     normal = jnp.stack([contact.normal.array() for contact in contacts])
     return jax.lax.stop_gradient((point, normal))
@@ -366,10 +293,8 @@ def _keep_pose_unless_moving(
     pose: Vec3,
     status: Int[Array, ""],
 ) -> ScalarStep:
-    """Return the record of a step, in which a slider that does not move keeps its pose bit for bit.
-
-    A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
-    """
+    """Return the record of a step; a slider that does not move keeps its pose bit for bit."""
+    # A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
     finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
     moves = decide((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)

@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Int
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.xla import compute_once, decide, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
-from pushjax.contact.scaled_problem import ContactSolver
+from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
@@ -66,65 +66,40 @@ MISSED_FRACTION = 0.01
 
 
 class PushState(NamedTuple):
-    """State of a push between two trials, and what is tried next.
+    """State of a push between two trials, and what is tried next."""
 
-    Attributes:
-        pose: Current pose of the slider, world.
-        origin: Pose of the slider at the start of the step, world.
-        step: Index of the step; past the last one once the push has ended.
-        done: Fraction of the step that is done.
-        part: Fraction of the step that is tried next.
-        halved: Whether the part has its size because a part of twice that size failed.
-        whole_step_jams: Whether the step as a whole jams.
-        urgency: Urgency of each contact; None if all are solved together.
-        braced: Whether the smallest part has failed, and is tried with more friction.
-        swaps: How often the working set of this part has changed.
-        overlap: Current depth of the deepest finger, m.
-        stop_status: Status that stopped the hand, or zero.
-        abandon_status: Status of a step that is given up, or zero.
-        failed: Whether the previous step failed.
-        accepted_parts: One record for the parts of the step that are done. Its twist is the sum of their twists, and
-            its pose and overlap are the present ones. The rest is that of the last part in which the slider moved.
-    """
-
-    pose: Vec3
-    origin: Vec3
-    step: Int[Array, ""]
-    done: Scalar
-    part: Scalar
-    halved: Bool[Array, ""]
-    whole_step_jams: Bool[Array, ""]
-    urgency: Urgency | None
-    braced: Bool[Array, ""]
-    swaps: Int[Array, ""]
-    overlap: Scalar
-    stop_status: Int[Array, ""]
-    abandon_status: Int[Array, ""]
-    failed: Bool[Array, ""]
+    pose: Vec3  # of the slider now, world
+    origin: Vec3  # pose of the slider at the start of the step, world
+    step: Int[Array, ""]  # index; past the last step once the push has ended
+    done: Scalar  # fraction of the step that is done
+    part: Scalar  # fraction of the step that is tried next
+    halved: Bool[Array, ""]  # whether a part of twice the size failed
+    whole_step_jams: Bool[Array, ""]  # whether the step as a whole jams
+    urgency: Urgency | None  # of each contact; None if all are solved together
+    braced: Bool[Array, ""]  # whether the smallest part has failed, and is tried with more friction
+    swaps: Int[Array, ""]  # changes of this part's working set
+    overlap: Scalar  # depth of the deepest finger now, m
+    stop_status: Int[Array, ""]  # status that stopped the hand, or zero
+    abandon_status: Int[Array, ""]  # status of a step that is given up, or zero
+    failed: Bool[Array, ""]  # whether the previous step failed
+    # One record for the parts of the step that are done. Its twist is the sum over these parts, and its pose and
+    # overlap are the present ones. The rest belongs to the last part in which the slider moved.
     accepted_parts: ScalarStep
+    guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
 
 
 class DividedPush(NamedTuple):
-    """A push whose steps can be divided: everything that stays the same from trial to trial.
-
-    Attributes:
-        outline: The slider's outline.
-        steps: Number of steps of the path, with those that only fill it up.
-        motions_at: Function that gives the motion of the fingers over a step, from its index and the friction of each
-            finger.
-        solver: Solver of contact problems; None for the default.
-        friction_at: Function that gives limit surface and friction of a step, from its index and the pose before it.
-        fixtures: Fixtures as fingers that stay where they are.
-        num_steps: Number of steps to simulate; None for all.
-    """
+    """A push whose steps can be divided: everything that stays the same from trial to trial."""
 
     outline: Outline
-    steps: int
+    steps: int  # of the path, with those that only fill it up
+    # motion of the fingers over a step, from its index and the friction of each finger
     motions_at: Callable[[Int[Array, ""], Array], tuple[FingerMotion, ...]]
     solver: ContactSolver | StickingSolver | None
+    # limit surface and friction of a step, from its index and the pose before it
     friction_at: Callable[[Int[Array, ""], Vec3], tuple[Form, Array]]
-    fixtures: tuple[FingerMotion, ...] = ()
-    num_steps: Int[Array, ""] | None = None
+    fixtures: tuple[FingerMotion, ...] = ()  # as fingers that stay where they are
+    num_steps: Int[Array, ""] | None = None  # steps to simulate; None for all
 
     @property
     def end(self) -> Int[Array, ""] | int:
@@ -145,14 +120,13 @@ class DividedPush(NamedTuple):
         status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
         urgency, idle = initial_urgency(counts, pose.x), _idle_record(pose, sum(counts))
-        return PushState(pose, pose, first, zero, one, no, no, urgency, no, status, overlap, status, status, no, idle)
+        guess = EdgeSet.none(zero) if sum(counts) > 1 else None
+        return PushState(
+            pose, pose, first, zero, one, no, no, urgency, no, status, overlap, status, status, no, idle, guess
+        )
 
     def trial(self, state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
-        """Try the next part of a step.
-
-        Returns:
-            The state after it; and of the step the record, whether it ended, and its index.
-        """
+        """Try the next part of a step: the state after it, the step's record, whether the step ended, and its index."""
         form, mu = self.friction_at(state.step, state.origin)
         motions = self.motions_at(state.step, mu)
         displacement = max_displacement(motions)
@@ -163,7 +137,7 @@ class DividedPush(NamedTuple):
         extra = jnp.where(jnp.all(mu >= 0), jnp.where(state.braced, BRACING, 0.0), jnp.nan)
         bodies = tuple(motion._replace(friction=motion.friction + extra) for motion in part + self.fixtures)
         part, fixtures = bodies[: len(part)], bodies[len(part) :]
-        record, urgency_after = step_in_scalars(
+        record, urgency_after, guess = step_in_scalars(
             form,
             self.outline,
             part,
@@ -175,13 +149,14 @@ class DividedPush(NamedTuple):
             state.step < self.end,
             fixtures,
             state.swaps == 0,
+            state.guess,
         )
         is_smallest = state.part < 2 * SMALLEST_PART
         speed = judge_speed(
             record.twist, record.force, record.contact_point, state.part * displacement, form.length, is_smallest
         )
         next_state, end_of_step = _next_state(
-            state, record, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.end
+            state, record, guess, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.end
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
@@ -189,20 +164,12 @@ class DividedPush(NamedTuple):
         return next_state, end_of_step
 
     def _counts(self, motions: tuple[FingerMotion, ...]) -> list[int]:
-        """Number of contacts of each finger and fixture."""
+        """Return the number of contacts of each finger and fixture."""
         return [num_contacts(motion.finger, self.outline) for motion in motions + self.fixtures]
 
 
 def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Scalar]:
-    """Roll out a path, dividing steps where necessary.
-
-    Args:
-        push: The push.
-        pose: Pose of the slider at the start, world.
-
-    Returns:
-        The stacked records of all steps; and, if the hand was stopped, the fraction of its last step that it did.
-    """
+    """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
     initial_state = push.first_state(pose)
     idle_record = initial_state.accepted_parts
 
@@ -232,7 +199,7 @@ def _records_of_steps(
     last: PushState,
     idle_record: ScalarStep,
 ) -> ScalarStep:
-    """For each step, the record of the round that ended it, or what the last round left if no round ended it."""
+    """Return for each step the record of the round that ended it, or what the last round left if none did."""
     rounds = len(ended)
     round_of_step = jnp.full(steps, rounds).at[jnp.where(ended, step, steps)].set(jnp.arange(rounds), mode="drop")
     status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
@@ -241,45 +208,26 @@ def _records_of_steps(
 
 
 class Decision(NamedTuple):
-    """What follows from a trial: one of these, or else a smaller part is tried next.
+    """What follows from a trial: one of these, or else a smaller part is tried next."""
 
-    Attributes:
-        accepted: The part is done.
-        joins: A contact that the result violates joins the contact problem, and the same part is tried again.
-        braces: The smallest part is tried again with more friction.
-        stops: The hand stops where the part began.
-        abandons: The step is given up. The next trial is of the whole step, to find the overlap of a slider that stays.
-        fails: The step ends with the status `reason`.
-        reason: Status of a step that fails or is given up.
-    """
-
-    accepted: Bool[Array, ""]
-    joins: Bool[Array, ""]
-    braces: Bool[Array, ""]
-    stops: Bool[Array, ""]
-    abandons: Bool[Array, ""]
-    fails: Bool[Array, ""]
-    reason: Int[Array, ""]
+    accepted: Bool[Array, ""]  # the part is done
+    joins: Bool[Array, ""]  # a contact that the result violates joins the problem, and the part is tried again
+    braces: Bool[Array, ""]  # the smallest part is tried again with more friction
+    stops: Bool[Array, ""]  # the hand stops where the part began
+    abandons: Bool[Array, ""]  # the step is given up, and tried as a whole for the overlap of a slider that stays
+    fails: Bool[Array, ""]  # the step ends with the status `reason`
+    reason: Int[Array, ""]  # status of a step that fails or is given up
 
 
 def _decide(
-    state: PushState,
-    record: ScalarStep,
+    state: PushState,  # before the trial
+    record: ScalarStep,  # of the trial
     urgency_after: Urgency | None,
-    depth: Scalar,
-    tolerance: Scalar,
+    depth: Scalar,  # of the deepest finger after the trial, m
+    tolerance: Scalar,  # how much deeper a finger may be after a whole step, m
     speed: SpeedJudgment,
 ) -> Decision:
-    """Decide what follows from a trial.
-
-    Args:
-        state: The state before the trial.
-        record: Result of the trial.
-        urgency_after: Urgency of each contact after the trial; None if all are solved together.
-        depth: Depth of the deepest finger after the trial, m.
-        tolerance: How much deeper a finger may be after a whole step, m.
-        speed: Whether the slider moved no farther than it may.
-    """
+    """Decide what follows from a trial."""
     fails = state.abandon_status != 0
     is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
     # overlaps do not accumulate, because the next part pushes them out: so the smallest part may leave as much as a
@@ -315,25 +263,15 @@ def _decide(
 def _next_state(
     state: PushState,
     record: ScalarStep,
+    guess: EdgeSet | None,
     urgency_after: Urgency | None,
     outline: Outline,
-    part: tuple[FingerMotion, ...],
+    part: tuple[FingerMotion, ...],  # motions over the tried part of the step, and fixtures
     tolerance: Scalar,
     speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
 ):
-    """Return the state after a trial; and of the trial's step the record, whether it ended, and the index.
-
-    Args:
-        state: The state before the trial.
-        record: Result of the trial.
-        urgency_after: Urgency of each contact after the trial; None if all are solved together.
-        outline: The slider's outline.
-        part: Motion of each finger over the part of the step that was tried, and the fixtures.
-        tolerance: How much deeper a finger may be after a whole step, m.
-        speed: Whether the slider moved no farther than it may.
-        steps: Number of steps to simulate.
-    """
+    """Return the state after a trial; and of the trial's step the record, whether it ended, and the index."""
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
@@ -375,13 +313,14 @@ def _next_state(
         accepted_parts=tree_where(
             ends, resting(record, end_record.pose), tree_where(continues, accepted_parts, state.accepted_parts)
         ),
+        guess=None if guess is None else tree_where(accepted & moves, guess, state.guess),
     )
     next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
     return next_state, (end_record, ends, state.step)
 
 
 def hand_stops(status: Array) -> Bool[Array, "..."]:
-    """Whether a step of this status stops the hand for good."""
+    """Return whether a step of this status stops the hand for good."""
     return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 

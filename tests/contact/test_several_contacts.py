@@ -7,12 +7,10 @@ import pytest
 from contact_batches import flat_push, square
 
 import pushjax as pj
-from pushjax._math.vec import Vec2
-from pushjax.contact.contact_plane import Contact
-from pushjax.contact.edge_segment import cubic_root as root_of
-from pushjax.contact.edge_segment import monotone_intervals
-from pushjax.contact.jam_certificate import squeeze_power
-from pushjax.contact.scaled_problem import nondimensionalize
+from pushjax.contact.cubic import Roots
+from pushjax.contact.jam_certificate import search_squeeze
+from pushjax.contact.scaled_problem import ContactArrays, nondimensionalize
+from pushjax.friction.polynomial import Polynomial
 
 solve = pj.solve_contacts
 
@@ -57,15 +55,15 @@ def test_a_squeeze_does_not_depend_on_the_order_of_the_contacts(rng):
     normal = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     point = np.stack([-0.03 * normal, 0.03 * normal], axis=1)
     arrays = point, np.stack([normal, -normal], axis=1), rng.normal(size=(n, 2, 2)), np.stack([0 * mu, mu], axis=1)
-    form = pj.Ellipsoid(np.eye(3, dtype=np.float32), np.float32(0.02)).form()
+    surface = Polynomial.of(pj.Ellipsoid(np.eye(3, dtype=np.float32), np.float32(0.02)).form().table()[..., None])
 
-    def tight(*arrays):
-        rows = zip(*(tuple(array) for array in arrays), strict=True)
-        contacts = tuple(Contact(Vec2(*p), Vec2(*n), Vec2(*d), mu, 0 * mu) for p, n, d, mu in rows)
-        return squeeze_power(nondimensionalize(form, contacts, (jnp.asarray(True),) * 2, margin=True), True)
+    @jax.jit
+    def tight(point, normal, displacement, mu):
+        vectors = (jnp.moveaxis(array, 0, -1).swapaxes(0, 1) for array in (point, normal, displacement))
+        length, active = jnp.full(n, 0.02, jnp.float32), jnp.ones((2, n), bool)
+        return search_squeeze(nondimensionalize(ContactArrays(surface, length, *vectors, 0 * mu.T, mu.T, active)))
 
-    program = jax.jit(jax.vmap(tight))
-    found, other = (program(*(jnp.asarray(a[:, order], jnp.float32) for a in arrays)) for order in ([0, 1], [1, 0]))
+    found, other = (tight(*(jnp.asarray(a[:, order], jnp.float32) for a in arrays)) for order in ([0, 1], [1, 0]))
     exists = np.isfinite(found.power)
     assert np.mean(exists) > 0.95
     np.testing.assert_array_equal(exists, np.isfinite(other.power))
@@ -90,12 +88,12 @@ def test_roots_of_very_different_sizes_are_found(rng):
     cubic = [-b * root[2], b - a * root[2], a - root[2], np.ones(n)]
     low = -rng.uniform(0, 1, n)
 
+    @jax.jit
     def roots(c, low):
-        return jnp.stack(
-            [jnp.where(has, root_of(c, piece), jnp.inf) for piece, has in monotone_intervals(c, low, low + 1)]
-        )
+        found = Roots.of(c, low, low + 1)
+        return jnp.where(found.exist(), found.all(), jnp.inf)
 
-    found = np.asarray(jax.jit(jax.vmap(roots, out_axes=1))(tuple(map(jnp.asarray, cubic)), jnp.asarray(low)))
+    found = np.asarray(roots(jnp.stack([jnp.asarray(c) for c in cubic]), jnp.asarray(low)))
     for k in range(3):
         apart = np.min([np.abs(root[k] - root[j]) for j in range(3) if j != k], axis=0)
         wanted = (root[k] > low) & (root[k] < low + 1) & ((apart > 1e-2 * np.abs(root[k])) | (single & (k == 2)))

@@ -13,8 +13,9 @@ import pytest
 import pushjax as pj
 from pushjax import Ellipsoid, LimitSurface, Quartic
 from pushjax._math.vec import Vec3
-from pushjax.friction.inverse_map import aligned_wrench
+from pushjax.friction.inverse_map import aligned_wrenches
 from pushjax.friction.limit_surface import angle_between
+from pushjax.friction.polynomial import Polynomial
 from pushjax.friction.quartic import CONVEXITY_TOLERANCE, MAX_NEWTON_ROUNDS, MONOMIALS, least_curvature
 from pushjax.testing.problems import random_surface
 
@@ -513,9 +514,9 @@ def test_aligned_wrench_of_every_twist_on_a_nearly_flat_surface():
     twist = jax.random.normal(first, (20_000, 3))
     stretched = twist * jnp.exp(jax.random.uniform(second, twist.shape, minval=-4.0, maxval=0.0))
     twist = jnp.where(jnp.arange(len(twist))[:, None] % 2 == 0, twist, stretched)
-    solve = jax.jit(jax.vmap(lambda v: aligned_wrench(form, Vec3.of(v), jnp.ones((), bool), 1e-9)))
-    wrench, aligned = solve(twist)
+    surface = Polynomial.of(form.table()[..., None])
+    wrench, aligned = jax.jit(lambda v: aligned_wrenches(surface, v, jnp.ones(v.shape[1], bool), 1e-9))(twist.T)
     assert aligned.all()
-    along = np.stack(jax.jit(jax.vmap(form.gradient))(wrench), axis=-1)
+    along = np.array(jax.jit(surface.gradient)(wrench)).T
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
     np.testing.assert_allclose(along, twist / np.linalg.norm(twist, axis=-1, keepdims=True), atol=2e-9)

@@ -44,7 +44,6 @@ def test_form_is_of_one_polynomial(kind):
     assert len(c) == form.degree + 1
     for s in (-1.3, 0.4, 2.0):
         np.testing.assert_allclose(sum(each * s**k for k, each in enumerate(c)), value(f + s * b), rtol=1e-12)
-    np.testing.assert_allclose(form.scaled(jnp.asarray(2.0)).value(Vec3.of(f)), 2 * value(f), rtol=1e-12)
 
 
 def test_rising_friction_moves_the_pressure():

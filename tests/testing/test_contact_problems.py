@@ -12,7 +12,8 @@ import pytest
 from pushjax import ContactMode, Contacts, Ellipsoid, HessianIteration, Quartic, Status, solve_contacts
 from pushjax._math.vec import Vec2, Vec3
 from pushjax.contact.contact_plane import Contact, LimitCurve
-from pushjax.contact.sticking import ScalarRoot, hessian_round
+from pushjax.contact.paper import hessian_round
+from pushjax.contact.sticking import ScalarRoot
 from pushjax.friction.quartic import QuarticForm
 from pushjax.testing.problems import random_contact_problem, random_surface, squared_quadratics
 

@@ -1,0 +1,127 @@
+"""The door from functions of single examples to functions of whole batches, whose arrays have the batch last."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from pushjax._internal.compaction import tile_size
+
+# Examples that are computed together on a CPU by a program of many small kernels, most of whose time is that of their
+# start, and examples that are searched together, whose data are many times as large.
+TILE, SEARCH_TILE = 256, 128
+
+# Function of the number of examples of a second attempt, or zero in the first, and of pytrees of arrays with a last
+# axis for the batch; of an array that all examples share it has length one. It returns the results, and which examples
+# want a second attempt. The examples of a second attempt come first in the batch; the rest is padding.
+Attempt = Callable[..., tuple[Any, Bool[Array, " batch"]]]
+
+
+def batch_last(attempt: Attempt, needed: Bool[Array, ""], *args: Any) -> Any:
+    """Return the results of `attempt` for one example, or for a batch under any nesting of `vmap`; zeros if not needed.
+
+    The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
+    attempt are gathered into tiles of their own, which follow. One program serves both. It cannot be differentiated.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def single(needed, args):
+        results = _in_tiles(attempt, needed[None], jax.tree.map(lambda _: False, args), args)
+        return jax.tree.map(lambda x: x[0], results)
+
+    @single.def_vmap
+    def _(size, batched, needed, args):
+        needed = needed if batched[0] else jnp.broadcast_to(needed, (size,))
+        return _batching_rule(attempt, size, batched[1], needed, args)
+
+    return single(needed, args)
+
+
+def _batching_rule(attempt: Attempt, size: int, batched: Any, needed: Array, args: Any) -> tuple[Any, Any]:
+    """Batching rule of `batch_last`: the results, and which leaves are batched (all)."""
+
+    @jax.custom_batching.custom_vmap
+    def batch(needed, args):
+        return _in_tiles(attempt, needed, batched, args)
+
+    @batch.def_vmap
+    def _(outer_size, outer_batched, needed, args):
+        # a batch of batches is one longer batch
+        def flat(x, has_inner, has_outer):
+            if not has_inner:
+                return jnp.repeat(x, size, axis=0) if has_outer else x
+            x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))
+            return x.reshape(outer_size * size, *x.shape[2:])
+
+        needed_has_outer, args_have_outer = outer_batched
+        either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
+        flat_args = jax.tree.map(flat, args, batched, args_have_outer)
+        flat_needed = flat(needed, True, needed_has_outer)
+        results, all_batched = _batching_rule(attempt, outer_size * size, either, flat_needed, flat_args)
+        return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_batched
+
+    results = batch(needed, args)
+    return results, jax.tree.map(lambda _: True, results)
+
+
+def _in_tiles(attempt: Attempt, needed: Bool[Array, " size"], batched: Any, args: Any) -> Any:
+    """The results of a batch, with the batch first, tile by tile."""
+    size = needed.shape[0]
+    tile = max(min(tile_size(TILE), size), 1)
+
+    def attempt_at(again: Int[Array, ""], rows: Array) -> tuple[Any, Array]:
+        last = jax.tree.map(lambda x, b: jnp.moveaxis(x[rows], 0, -1) if b else x[..., None], args, batched)
+        results, unfinished = attempt(again, *last)
+        broadcast = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], tile)), (results, unfinished))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), broadcast)
+
+    shapes = jax.eval_shape(attempt_at, jnp.zeros((), jnp.int32), jnp.zeros(tile, jnp.int32))[0]
+    blank = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), shapes)
+
+    def next_tile(state):
+        k, end, again, queue, unfinished, results = state
+        rows = jax.lax.dynamic_slice(queue, (k * tile,), (tile,))
+        count = jnp.where(again, jnp.sum(rows < size, dtype=jnp.int32), 0)
+        new, left = attempt_at(count, jnp.minimum(rows, size - 1))
+        results = jax.tree.map(lambda old, x: old.at[rows].set(x, mode="drop"), results, new)
+        unfinished = unfinished.at[rows].set(left, mode="drop")
+        # after the last tile of the first attempt, queue the examples that want a second one
+        starts_again = (k + 1 == end) & ~again
+        end, queue = jax.lax.cond(starts_again, lambda: _queued(unfinished, tile), lambda: (end, queue))
+        return jnp.where(starts_again, 0, k + 1), end, again | starts_again, queue, unfinished, results
+
+    if not size:
+        return blank
+    end, queue = _queued(needed, tile)
+    initial = jnp.zeros((), jnp.int32), end, jnp.zeros((), bool), queue, jnp.zeros(size, bool), blank
+    return jax.lax.while_loop(lambda state: state[0] < state[1], next_tile, initial)[-1]
+
+
+def _queued(wanted: Bool[Array, " size"], tile: int) -> tuple[Array, Array]:
+    """The number of tiles, and the indices of the examples in them, then padding."""
+    size = wanted.shape[0]
+    queue = jnp.nonzero(wanted, size=size + tile, fill_value=size)[0].astype(jnp.int32)
+    return -(-jnp.sum(wanted, dtype=jnp.int32) // tile), queue
+
+
+def in_search_tiles(search: Callable[[Any], Any], count: Int[Array, ""], problem: Any, blank: Any) -> Any:
+    """Return `search(problem)` for the first `count` examples of a batch; those after the tile of the last are `blank`.
+
+    All have the batch last; of an array that all examples share it has length one.
+    """
+    size = jax.tree.leaves(blank)[0].shape[-1]
+    tile = min(tile_size(SEARCH_TILE), size)
+
+    def next_tile(state: tuple[Array, Any]) -> tuple[Array, Any]:
+        k, results = state  # slices that would end beyond the batch begin earlier
+        part = jax.tree.map(
+            lambda x: x if x.shape[-1] == 1 else jax.lax.dynamic_slice_in_dim(x, k * tile, tile, axis=-1), problem
+        )
+        new = jax.tree.map(
+            lambda old, x: jax.lax.dynamic_update_slice_in_dim(old, x, k * tile, axis=-1), results, search(part)
+        )
+        return k + 1, new
+
+    return jax.lax.while_loop(lambda state: state[0] * tile < count, next_tile, (jnp.zeros((), jnp.int32), blank))[1]

@@ -1,0 +1,71 @@
+"""The motion as a function that JAX can differentiate, near a solution that is known.
+
+What was found and decided is constant: the cone edges that carry the force, and who is loaded. The weights solve
+R grad H(F) = b, where F is a combination of the edges (`finish`). Their derivatives follow from one linear system, by
+the implicit function theorem, whatever found the solution. The unknowns are the components of F along orthonormal axes
+of the edges, because edges that press against each other are nearly dependent.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from pushjax._math.arrays import combined, dot, products
+from pushjax.contact.finish import Equations, Solution, System, in_units
+from pushjax.contact.force_distribution import of_chosen, shared_weights
+from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem
+
+
+def differentiable_solution(
+    problem: ScaledProblem,
+    best: EdgeSet,
+    solved: Bool[Array, "*batch"],
+    loaded: Bool[Array, "edges *batch"],
+    indeterminate: Bool[Array, "*batch"],
+    twist: Float[Array, "3 *batch"],
+) -> Solution:
+    """The solution whose cone edges and twist (m, m, rad) are known; its values are right to roundoff."""
+    equations = Equations.of(problem, best, solved)
+    fixed, constant = jax.lax.stop_gradient((problem, equations))
+    _, basis, axes = constant.bases()
+    into_edges = jnp.where(constant.used[:, None], jnp.sum(basis[:, None] * axes[None], axis=2), 0.0)  # (edge, axis)
+    moving_axes = jnp.sum(equations.edges[:, None] * into_edges[:, :, None], axis=0)
+    system = System(problem.surface, moving_axes, equations.rows, equations.b, ~constant.used)
+    # the wrench of the size at which grad H is the twist
+    wrench = combined(constant.edges, best.weight)
+    motion, length = fixed.surface.gradient(wrench), jnp.ones_like(fixed.length)
+    squared = dot(motion, motion)
+    along = dot(motion, twist * jnp.stack([length, length, fixed.length])) / fixed.unit
+    factor = jnp.where(solved & (along > 0) & (squared > 0), along / jnp.where(squared > 0, squared, 1.0), 1.0)
+    if problem.surface.degree == 4:
+        factor = jnp.cbrt(factor)
+    beta = _implicit(system, jax.lax.stop_gradient(products(axes, wrench) * factor[None]))
+    wrench = jnp.where(
+        solved[None], combined(moving_axes, beta), jnp.asarray([1.0, 0, 0])[(...,) + (None,) * (beta.ndim - 1)]
+    )
+    own = of_chosen(problem.edges, best.edges, jnp.sum(into_edges * beta[None], axis=1))
+    shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench)
+    weights = jnp.where(indeterminate[None], shared, own)
+    return in_units(problem, solved, problem.surface.gradient(wrench), wrench, weights)
+
+
+@eqx.filter_custom_jvp
+def _implicit(system: System, beta: Float[Array, "3 *batch"]) -> Float[Array, "3 *batch"]:
+    """The solution `beta` of the system, with its derivatives by the implicit function theorem."""
+    return beta
+
+
+@_implicit.def_jvp
+def _implicit_jvp(primals, tangents):
+    system, beta = primals
+    beta = _implicit(system, beta)
+    # Equinox gives None as the tangent of what is not perturbed.
+    changes = jax.tree.map(
+        lambda d, x: jnp.zeros_like(x) if d is None and eqx.is_inexact_array(x) else d,
+        tangents[0],
+        system,
+        is_leaf=lambda d: d is None,
+    )
+    (hessian, _, _), (_, _, change) = eqx.filter_jvp(lambda s: s.evaluate(beta), (system,), (changes,))
+    return beta, system.newton_step(hessian, change)

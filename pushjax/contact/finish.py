@@ -1,0 +1,233 @@
+"""The motion under the forces along a given set of cone edges, to the last digit; it is not differentiated.
+
+A search (`exhaustive`, `projected`) or the stage of a rollout before gives the set. Its wrench F = Q beta and its
+conditions R V = b make a square system R grad H(Q beta) = b in three slots, one for each edge that a set can have. A
+slot without an edge has zero axis, row and right-hand side, and a one on the Jacobian's diagonal. Newton's method
+solves the system; then every condition of the problem is checked. For a guess, this is the only check.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from pushjax._internal.xla import tree_where
+from pushjax._math.arrays import combined, cross, dot, dual, products, solve, times, unit
+from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem, selected, violation_per_weight
+from pushjax.contact.status import ContactMode
+from pushjax.contact.tolerances import (
+    ill_conditioned_tolerance,
+    is_slow,
+    kinematic_tolerance,
+    relative_tolerance,
+    zero_wrench_tolerance,
+)
+from pushjax.friction.polynomial import Polynomial
+
+NEWTON_ITERATIONS = {4: 3, 8: 4}  # by the bytes of a float; each is kept only if it makes the residual smaller
+
+
+class Decided(NamedTuple):
+    """Whether a set solves the problem, and who may carry force."""
+
+    solved: Bool[Array, "*batch"]  # whether every condition holds
+    admissible: Bool[Array, "edges *batch"]  # whether a cone edge may carry force under the motion
+    mode: Int[Array, "contacts *batch"]  # `ContactMode`
+
+
+class Refined(NamedTuple):
+    """The solution of a set's equations, dimensionless."""
+
+    twist: Float[Array, "3 *batch"]
+    gradient: Float[Array, "3 *batch"]  # grad H of the wrench, before the twist was corrected
+    wrench: Float[Array, "3 *batch"]
+    weight: Float[Array, "3 *batch"]  # of the set's edges
+    start: Float[Array, "3 *batch"]  # the shortest y whose products with the edges are their weights
+    h: Float[Array, "*batch"]  # H of the wrench
+    is_wrench: Bool[Array, "*batch"]  # whether the weights make up the wrench, and it is more than roundoff
+
+
+class System(NamedTuple):
+    """The square system R grad H(Q beta) = b of a set; vectors are (slot, component, batch)."""
+
+    surface: Polynomial
+    axes: Float[Array, "3 3 *batch"]  # Q: orthonormal axes of the first edge, of the plane of two, of space
+    rows: Float[Array, "3 3 *batch"]  # R
+    b: Float[Array, "3 *batch"]
+    unused: Bool[Array, "3 *batch"]
+
+    def evaluate(self, beta: Array) -> tuple[Array, Array, Array]:
+        """The Hessian and grad H at Q beta, and the residual R grad H - b."""
+        f = combined(self.axes, beta)
+        hessian = self.surface.hessian(f)
+        gradient = times(hessian, f) / (self.surface.degree - 1)
+        return hessian, gradient, products(self.rows, gradient) - self.b
+
+    def newton_step(self, hessian: Array, residual: Array) -> Array:
+        """Newton step -J^-1 residual with J = R hess H Q; zero where J is singular."""
+        moved = times(hessian[:, :, None], jnp.moveaxis(self.axes, 1, 0))  # (component, axis, batch)
+        jacobian = jnp.sum(jnp.moveaxis(self.rows, 1, 0)[:, None] * moved[:, :, None], axis=0)  # (axis, row, batch)
+        diagonal = jnp.eye(3, dtype=bool).reshape(3, 3, *(1,) * (residual.ndim - 1)) & self.unused[None]
+        jacobian = jnp.where(diagonal, 1.0, jacobian)
+        sizes = jnp.sum(jacobian * jacobian, axis=1)
+        least = jnp.finfo(residual.dtype).eps * 1e-2 * jnp.sqrt(sizes[0] * sizes[1] * sizes[2])
+        return products(dual(jacobian, least)[0], -residual)
+
+
+def _root(system: System, beta: Array) -> Array:
+    """Solve the system by Newton's method from beta."""
+
+    def iterate(_, state):
+        beta, (hessian, gradient, residual) = state
+        candidate = beta + system.newton_step(hessian, residual)
+        new = system.evaluate(candidate)
+        better = (dot(new[2], new[2]) < dot(residual, residual))[None]
+        return jnp.where(better, candidate, beta), tree_where(better, new, (hessian, gradient, residual))
+
+    return jax.lax.fori_loop(0, NEWTON_ITERATIONS[beta.dtype.itemsize], iterate, (beta, system.evaluate(beta)))[0]
+
+
+class Equations(NamedTuple):
+    """The equations of a set of cone edges; vectors are (slot, component, batch)."""
+
+    used: Bool[Array, "3 *batch"]  # whether the slot has an edge
+    edges: Float[Array, "3 3 *batch"]
+    conditioned: Bool[Array, "3 *batch"]  # whether the slot has a condition
+    rows: Float[Array, "3 3 *batch"]
+    b: Float[Array, "3 *batch"]
+
+    @staticmethod
+    def of(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> "Equations":
+        """The equations of a set, none where not `moves`."""
+        used, conditioned = moves[None] & (chosen.edges >= 0), moves[None] & (chosen.contacts >= 0)
+        contacts = jnp.where(conditioned, chosen.contacts, -1)
+        sticks = (chosen.contacts[0] == chosen.contacts[1]) & used[1]
+        is_tangential = jnp.stack([jnp.zeros_like(sticks), sticks, jnp.zeros_like(sticks)])
+        rows, goal = selected(problem.normal, contacts), selected(problem.goal, contacts)
+        rows = jnp.where(is_tangential[None], selected(problem.tangent, contacts), rows)
+        edges = selected(problem.edges, jnp.where(used, chosen.edges, -1))
+        edges, rows = jnp.moveaxis(edges, 1, 0), jnp.moveaxis(rows, 1, 0)
+        return Equations(used, edges, conditioned, rows, jnp.where(is_tangential, goal[1], goal[0]))
+
+    def bases(self) -> tuple[Array, Array, Array]:
+        """The edges completed to a basis, its dual basis, and orthonormal axes of one, two and three edges."""
+        full, basis = completed(self.edges, self.used, 0.01 * float(jnp.finfo(self.b.dtype).eps))
+        q1, q3 = unit(full[0]), unit(cross(full[0], full[1]))
+        return full, basis, jnp.where(self.used[:, None], jnp.stack([q1, cross(q3, q1), q3]), 0.0)
+
+
+def refine(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> Refined:
+    """Solve the equations of a set of cone edges. Where not `moves`, the numbers have no meaning, but are finite."""
+    equations = Equations.of(problem, chosen, moves)
+    used, edges, conditioned, rows, b = equations
+    full_edges, edge_basis, axes = equations.bases()
+    # the rows' residual is roundoff, which nearly dependent rows would magnify
+    _, row_basis = completed(rows, conditioned, float(jnp.finfo(b.dtype).eps) ** 0.5)
+    system = System(problem.surface, axes, rows, b, ~used)
+    beta = _root(system, _rescaled(system, products(axes, combined(edges, chosen.weight))))
+    f = combined(axes, beta)
+    # With three edges, correct the wrench so that grad H is the motion that the conditions alone fix: nearly dependent
+    # rows magnify roundoff, so Newton's method stalls short of it. Corrections that are not small are not made.
+    hessian, gradient, residual = system.evaluate(beta)
+    step = solve(hessian, combined(row_basis, -residual))
+    small = used[2] & (dot(step, step) < 1e-8 * dot(f, f))
+    f = f + jnp.where(small[None], step, 0.0)
+
+    weight = products(edge_basis, f)
+    weight = weight + products(edge_basis, f - combined(full_edges, weight))
+    gradient = problem.surface.gradient(f)
+    # the twist nearest to grad H that satisfies the conditions, so that a sticking contact has no slip
+    twist = gradient
+    for _ in range(2):  # the second pass is for nearly dependent rows
+        twist = twist + combined(row_basis, b - products(rows, twist))
+    weight = jnp.where(used, weight, 0.0)  # directions orthogonal to the edges get none
+    total, left = jnp.sum(jnp.abs(weight), axis=0), f - combined(edges, weight)
+    is_wrench = dot(left, left) <= (64 * jnp.finfo(f.dtype).eps * total) ** 2
+    is_wrench &= dot(f, f) > (zero_wrench_tolerance(f.dtype) * total) ** 2
+    h = dot(f, gradient) / problem.surface.degree
+    return Refined(twist, gradient, f, weight, combined(edge_basis, weight), h, is_wrench)
+
+
+def completed(vectors: Array, used: Bool[Array, "3 *batch"], relative: float) -> tuple[Array, Array]:
+    """Three vectors, the unused ones replaced by directions orthogonal to those in use; and the dual basis.
+
+    The dual basis is zero where |det| is at most `relative` times the product of the lengths.
+    """
+    zero = jnp.zeros_like(vectors[0, 0])
+    v1 = jnp.where(used[:1], vectors[0], jnp.stack([zero + 1, zero, zero]))
+    sideways = jnp.stack([-v1[1], v1[0], zero]), jnp.stack([zero, -v1[2], v1[1]])
+    v2 = jnp.where(used[1:2], vectors[1], jnp.where((jnp.abs(v1[0]) > jnp.abs(v1[1]))[None], *sideways))
+    full = jnp.stack([v1, v2, jnp.where(used[2:], vectors[2], cross(v1, v2))])
+    sizes = jnp.sum(full * full, axis=1)
+    return full, dual(full, relative * jnp.sqrt(sizes[0] * sizes[1] * sizes[2]))[0]
+
+
+def _rescaled(system: System, beta: Array) -> Array:
+    """Scale beta so that grad H is as long as the conditions require, by least squares."""
+    motion = products(system.rows, system.evaluate(beta)[1])
+    squared = dot(motion, motion)
+    factor = jnp.maximum(dot(motion, system.b) / jnp.where(squared > 0, squared, 1.0), 0)
+    return beta * (factor if system.surface.degree == 2 else jnp.exp(jnp.log(factor) / 3))[None]  # faster than cbrt
+
+
+def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"], refined: Refined) -> Decided:
+    """Check every condition of the problem.
+
+    No contact is violated, the forces are inside their cones and on the side of the slip, the twist is along grad H and
+    not too fast. A search has checked these conditions before the refinement, which changes its numbers by roundoff
+    only. So the tolerances here are somewhat wider.
+    """
+    dtype, twist, weight = refined.twist.dtype, refined.twist, refined.weight
+    slip_n, slip_t = problem.slips(twist)
+    tolerance = kinematic_tolerance(twist)[None]
+    touches = problem.active & (jnp.abs(slip_n) <= tolerance)
+    numbers = jnp.arange(2 * problem.count).reshape(1, -1, *(1,) * (twist.ndim - 1))
+    in_set = jnp.any(chosen.edges[:, None] == numbers, axis=0).reshape(problem.count, 2, *twist.shape[1:])
+    sides = jnp.stack([slip_t, -slip_t], axis=1)  # below zero where the slip fits the edge
+    admissible = (touches[:, None] & (sides <= tolerance[:, None])) | in_set
+
+    wide, relative = 1.25 * tolerance, 1.25 * relative_tolerance(dtype)
+    passes = jnp.all((slip_n >= -wide) | ~problem.active, axis=0)
+    fits = (sides <= wide[:, None]) & (problem.active & (slip_n <= wide))[:, None]
+    passes &= jnp.all(fits | ~in_set, axis=(0, 1))
+    per_weight = selected(violation_per_weight(problem.friction)[None], chosen.edges // 2)[0]
+    total = jnp.sum(jnp.abs(weight), axis=0)
+    passes &= jnp.all((per_weight * weight >= -relative / 2 * total[None]) | (chosen.edges < 0), axis=0)
+    # In a wedge the rows are nearly dependent. They then determine grad H only up to this tolerance.
+    direction = 1.25 * ill_conditioned_tolerance(dtype)
+    difference, squared = twist - refined.gradient, dot(twist, twist)
+    passes &= (dot(difference, difference) <= direction**2 * squared) & is_slow(squared, 1.25)
+    solved = moves & (refined.h > 0) & refined.is_wrench & passes
+
+    slides = jnp.where(slip_t < 0, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT)
+    mode = jnp.where(jnp.abs(slip_t) <= tolerance, ContactMode.STICKING, slides)
+    # from the motion alone, because modes must not depend on which of several force distributions is returned
+    mode = jnp.where(solved[None] & problem.active & (slip_n <= tolerance), mode, ContactMode.SEPARATED)
+    admissible = admissible.reshape(2 * problem.count, *twist.shape[1:])
+    return Decided(solved, admissible, mode.astype(jnp.int8))
+
+
+class Solution(NamedTuple):
+    """The answer to a contact problem, in physical units."""
+
+    twist: Float[Array, "3 *batch"]  # m, m, rad
+    wrench: Float[Array, "3 *batch"]  # normalized, on H = 1
+    force: Float[Array, "2 contacts *batch"]  # along (normal, tangent), N
+
+
+def in_units(
+    problem: ScaledProblem, solved: Bool[Array, "*batch"], twist: Array, wrench: Array, weights: Array
+) -> Solution:
+    """The motion with its forces, given the weights of all edges; zero where not `solved`."""
+    h = problem.surface.value(wrench)
+    h = jnp.where(solved & (h > 0), h, 1.0)
+    scale = 1 / (problem.surface.root(h) * problem.surface.root(problem.surface_scale))  # puts the wrench on H = 1
+    left, right = weights[::2], weights[1::2]
+    force = jnp.stack([left + right, problem.friction * (left - right)]) * scale[None, None]
+    length = jnp.ones_like(problem.length)
+    return Solution(
+        jnp.where(solved[None], twist * (problem.unit[None] / jnp.stack([length, length, problem.length])), 0.0),
+        jnp.where(solved[None], wrench * scale[None], 0.0),
+        jnp.where(solved[None, None], force, 0.0),
+    )

@@ -1,0 +1,205 @@
+"""The answer to a problem of several contacts: a guess or a search for the edges that carry the force, then the finish.
+
+In a rollout, one contact alone is tried first (`single_first`). Where it does not suffice, the cone edges that carried
+the force in the stage before mostly carry it again: their equations are solved and every condition is checked
+(`finish`). A search follows where they do not solve the problem. In a batch, each of these is done only for the
+examples that need it (`batch_last`). Where there are several motions, the one that continues is then the answer,
+although another may have larger power, which `solve_contacts` gives.
+
+Derivatives are those of the solution (`derivative`), whatever found it.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from pushjax._internal.autodiff import without_derivatives
+from pushjax._internal.batch_last import batch_last, in_search_tiles
+from pushjax._internal.xla import compute_once, tree_where
+from pushjax.contact.contact_plane import Contact
+from pushjax.contact.derivative import differentiable_solution
+from pushjax.contact.exhaustive import Continuing
+from pushjax.contact.finish import Solution, check, in_units, refine
+from pushjax.contact.force_distribution import distribute_force
+from pushjax.contact.jam_certificate import Squeeze, search_squeeze, squeeze_power
+from pushjax.contact.scaled_problem import (
+    NO_EDGE,
+    ContactArrays,
+    ContactSolver,
+    EdgeSet,
+    Found,
+    ScaledProblem,
+    nondimensionalize,
+)
+from pushjax.contact.single_first import solve_most_pressed
+from pushjax.contact.status import ContactMode, Status
+from pushjax.friction.limit_surface import Form
+from pushjax.friction.polynomial import Polynomial
+
+
+class Answer(NamedTuple):
+    """The answer to a contact problem."""
+
+    solution: Solution
+    mode: Int[Array, "contacts *batch"]  # `ContactMode`
+    status: Int[Array, "*batch"]  # `Status`
+    margin: Float[Array, "*batch"]  # minus the hand's squeeze power, m, as in `Motion`
+    unique: Bool[Array, "*batch"]  # False where the search found another twist that satisfies every condition
+    best: EdgeSet  # the cone edges that carry the force; the guess where there is no motion
+    loaded: Bool[Array, "edges *batch"]  # which edges carry force
+    indeterminate: Bool[Array, "*batch"]  # whether more edges share the force than the wrench determines
+    squeeze_edges: Int[Array, "4 *batch"]  # edges of the equilibrium of the largest squeeze power
+
+
+# H, the contacts, and whether each takes part.
+Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
+
+
+def solve(problem: Problem, guess: EdgeSet | None, solver: ContactSolver, *, margin: bool) -> Answer:
+    """Solve a problem of several contacts, of one example.
+
+    `Continuing` tries one contact alone and then the guess. Without `margin`, the margin is infinite where there is a
+    motion, which saves time.
+    """
+    return _solve((problem, guess), (solver, margin))
+
+
+@eqx.filter_custom_jvp
+def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSolver, bool]) -> Answer:
+    (problem, guess), (solver, _) = arguments, settings
+    form, contacts, active = problem
+    attempt, arrays = partial(_attempt, *settings), _arrays(problem)
+    if not isinstance(solver, Continuing) or guess is None:
+        return batch_last(attempt, jnp.ones((), bool), arrays, None)
+    contacts = tuple(contact.where(a) for contact, a in zip(contacts, active, strict=True))
+    suffices, one, is_main = solve_most_pressed(form, contacts)
+    together = batch_last(attempt, ~suffices, arrays, guess)
+    # computed once, or each entry of the answer would compute all of it again
+    modes = tuple(one.mode == kind for kind in (ContactMode.STICKING, ContactMode.SLIDING_LEFT))
+    floats = one.twist, one.wrench, one.force
+    (twist, wrench, force), is_main, modes = compute_once((floats, is_main, modes), contacts[0].gap)
+    is_own, mu = jnp.stack(is_main), jnp.stack([contact.friction for contact in contacts])
+    sticks, slides_left = modes
+    own = _edges_of_one(is_own, sticks, slides_left, force.array(), jnp.sum(jnp.where(is_own, mu, 0.0)))
+    moves = one.status == Status.MOVING
+    alone = together._replace(
+        solution=Solution(twist.array(), wrench.array(), jnp.where(is_own[None], force.array()[:, None], 0.0)),
+        mode=jnp.where(is_own, one.mode, ContactMode.SEPARATED).astype(jnp.int8),
+        status=one.status,
+        margin=jnp.full_like(together.margin, jnp.inf),
+        unique=one.unique,
+        best=tree_where(moves, own, guess),
+        loaded=jnp.any((own.edges[:, None] == jnp.arange(2 * len(contacts))[None]) & moves, axis=0),
+        indeterminate=jnp.zeros((), bool),
+    )
+    return tree_where(suffices, alone, together)
+
+
+@_solve.def_jvp
+def _solve_jvp(primals, tangents):
+    arguments, settings = primals
+    answer = without_derivatives(lambda *args: _solve(args, settings), *arguments)
+    return eqx.filter_jvp(partial(_with_derivatives, answer, settings), (arguments[0],), (tangents[0][0],))
+
+
+def _with_derivatives(answer: Answer, settings: tuple[ContactSolver, bool], problem: Problem) -> Answer:
+    """The answer, whose derivatives are those of `derivative`."""
+    scaled = nondimensionalize(_arrays(problem))
+    solved, twist = answer.status == Status.MOVING, answer.solution.twist
+    near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, twist)
+    solution = jax.tree.map(_with_derivatives_of, answer.solution, near)
+    margin = answer.margin
+    if settings[1] and scaled.count > 1:
+        power = squeeze_power(scaled, answer.squeeze_edges) * scaled.unit
+        margin = _with_derivatives_of(margin, jnp.where(jnp.isfinite(margin), -power, 0.0))
+    return answer._replace(solution=solution, margin=margin)
+
+
+def _with_derivatives_of(value: Array, near: Array) -> Array:
+    """A value that is known, with the derivatives of another computation of it."""
+    return value + jnp.where(jnp.isfinite(near), near - jax.lax.stop_gradient(near), 0.0)
+
+
+def _arrays(problem: Problem) -> ContactArrays:
+    """The contacts of one example in arrays."""
+    form, contacts, active = problem
+    point, normal, displacement = (
+        jnp.stack([jnp.stack(rows) for rows in zip(*vectors, strict=True)])
+        for vectors in zip(*(contact[:3] for contact in contacts), strict=True)
+    )
+    gap, friction = (jnp.stack([getattr(contact, name) for contact in contacts]) for name in ("gap", "friction"))
+    surface = Polynomial.of(form.table())
+    arrays = ContactArrays(surface, form.length, point, normal, displacement, gap, friction, jnp.stack(active))
+    dtype = jnp.result_type(*jax.tree.leaves(arrays[:-1]))
+    return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), arrays)
+
+
+def _edges_of_one(
+    is_own: Bool[Array, "contacts"], sticks: Array, slides_left: Array, force: Array, mu: Array
+) -> EdgeSet:
+    """The cone edges of the one contact that carries the force."""
+    contact = jnp.argmax(is_own).astype(jnp.int32)
+    sticks &= mu > 0  # without friction, both edges are the same
+    first = 2 * contact + jnp.where(sticks | slides_left | (mu <= 0), 0, 1).astype(jnp.int32)
+    none = jnp.full((), NO_EDGE, jnp.int32)
+    tangential = force[1] / jnp.where(mu > 0, mu, 1.0)
+    left, right = (force[0] + tangential) / 2, (force[0] - tangential) / 2
+    weight = jnp.stack([jnp.where(sticks, left, force[0]), jnp.where(sticks, right, 0.0), jnp.zeros_like(left)])
+    contacts = jnp.stack([contact, jnp.where(sticks, contact, NO_EDGE), none])
+    return EdgeSet(jnp.stack([first, jnp.where(sticks, 2 * contact + 1, NO_EDGE), none]), contacts, weight)
+
+
+def _attempt(
+    solver: ContactSolver, margin: bool, again: Int[Array, ""], given: ContactArrays, guess: EdgeSet | None
+) -> tuple[Answer, Bool[Array, " batch"]]:
+    """Solve a batch of problems by the guess; or by the search, if there is none or this is the second attempt."""
+    if guess is not None:  # a batch of guesses alone is a batch, too
+        batch = jnp.broadcast_shapes(given.length.shape, guess.weight.shape[1:])
+        given = given._replace(length=jnp.broadcast_to(given.length, batch))
+    problem = nondimensionalize(given)
+    like, size = problem.unit, problem.unit.shape[0]
+    nothing = EdgeSet.none(like) if guess is None else jax.tree.map(lambda x: jnp.broadcast_to(x, (3, size)), guess)
+    count = again if guess is not None else jnp.asarray(size, jnp.int32)
+    blank = Found.guessed(nothing), Squeeze.none(like)
+    found, squeeze = in_search_tiles(partial(_search, solver, margin), count, problem, blank)
+    best, searched = found.best, jnp.arange(size) < count
+    moves = best.exists() & problem.pushes
+    refined = refine(problem, best, moves)
+    decided = check(problem, best, moves, refined)
+    solved = decided.solved
+    weights, indeterminate = distribute_force(
+        problem.edges, decided.admissible & solved[None], best.edges, refined.weight, refined.wrench, refined.start
+    )
+    # If the search found a set that the check then rejects, this is no proof of a jam. The same holds if the search
+    # found a twist that is too fast to be represented.
+    unsolved = problem.pushes & ~best.exists() & ~found.too_fast & searched
+    unmoved = jnp.where(solver.proves_jams & squeeze.presses & unsolved, Status.JAMMED, Status.NOT_CONVERGED)
+    status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, unmoved), Status.FREE)
+    status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
+    # If nothing pushes, the answer is that the slider stays. Any set found is then a second solution, in which a pusher
+    # drags the slider along.
+    unique = ~jnp.where(problem.pushes, found.second_found & solved, best.exists() & searched)
+    known = best._replace(weight=refined.weight)
+    answer = Answer(
+        in_units(problem, solved, refined.twist, refined.wrench, weights),
+        decided.mode,
+        status,
+        jnp.where(unsolved | margin, -squeeze.power * problem.unit, jnp.inf),
+        unique,
+        jax.tree.map(lambda new, old: jnp.where(solved[None], new, old), known, nothing),
+        weights > 0,
+        indeterminate & solved,
+        squeeze.edges,
+    )
+    return answer, problem.pushes & ~solved & (guess is not None)
+
+
+def _search(solver: ContactSolver, margin: bool, problem: ScaledProblem) -> tuple[Found, Squeeze]:
+    """Search the cone edges that carry the force, and the squeeze power where there are none or where it is wanted."""
+    found, none = solver.search(problem), Squeeze.none(problem.unit)
+    wanted = margin | (problem.pushes & ~found.best.exists() & ~found.too_fast)
+    return found, jax.lax.cond(jnp.any(wanted), search_squeeze, lambda _: none, problem)
