@@ -69,7 +69,10 @@ def _batching_rule(attempt: Attempt, size: int, batched: Any, needed: Array, arg
 def _in_tiles(attempt: Attempt, needed: Bool[Array, " size"], batched: Any, args: Any) -> Any:
     """The results of a batch, with the batch first, tile by tile."""
     size = needed.shape[0]
-    tile = max(min(tile_size(TILE), size), 1)
+    if not size:
+        one = jax.tree.map(lambda x, b: jnp.zeros((1, *x.shape[1:]), x.dtype) if b else x, args, batched)
+        return jax.tree.map(lambda x: x[:0], _in_tiles(attempt, jnp.zeros(1, bool), batched, one))
+    tile = min(tile_size(TILE), size)
 
     def attempt_at(again: Int[Array, ""], rows: Array) -> tuple[Any, Array]:
         last = jax.tree.map(lambda x, b: jnp.moveaxis(x[rows], 0, -1) if b else x[..., None], args, batched)
@@ -92,8 +95,6 @@ def _in_tiles(attempt: Attempt, needed: Bool[Array, " size"], batched: Any, args
         end, queue = jax.lax.cond(starts_again, lambda: _queued(unfinished, tile), lambda: (end, queue))
         return jnp.where(starts_again, 0, k + 1), end, again | starts_again, queue, unfinished, results
 
-    if not size:
-        return blank
     end, queue = _queued(needed, tile)
     initial = jnp.zeros((), jnp.int32), end, jnp.zeros((), bool), queue, jnp.zeros(size, bool), blank
     return jax.lax.while_loop(lambda state: state[0] < state[1], next_tile, initial)[-1]

@@ -41,9 +41,8 @@ def differentiable_solution(
     if problem.surface.degree == 4:
         factor = jnp.cbrt(factor)
     beta = _implicit(system, jax.lax.stop_gradient(products(axes, wrench) * factor[None]))
-    wrench = jnp.where(
-        solved[None], combined(moving_axes, beta), jnp.asarray([1.0, 0, 0])[(...,) + (None,) * (beta.ndim - 1)]
-    )
+    placeholder = jnp.zeros_like(beta).at[0].set(1)
+    wrench = jnp.where(solved[None], combined(moving_axes, beta), placeholder)
     own = of_chosen(problem.edges, best.edges, jnp.sum(into_edges * beta[None], axis=1))
     shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench)
     weights = jnp.where(indeterminate[None], shared, own)

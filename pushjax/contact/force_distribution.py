@@ -84,8 +84,9 @@ def shared_weights(edges: Float[Array, "3 edges *batch"], loaded: Bool[Array, "e
     usable = jnp.where(loaded[None], edges, 0.0)
     hessian = jax.lax.stop_gradient(_dual_hessian(usable, loaded))
     y = jax.lax.stop_gradient(_solve_regularized(hessian, f))
-    # Each iteration makes one more order of derivative exact, with the Hessian held fixed.
-    for _ in range(2):
+    # Each iteration makes one more order of derivative exact, with the Hessian held fixed. It also reduces the error by
+    # what was added to the diagonal, a hundredfold for a contact with a friction of 1e-7.
+    for _ in range(4):
         y = y + _solve_regularized(hessian, f - _total(usable, _products(usable, y)))
     return _products(usable, y)
 

@@ -110,3 +110,75 @@ def test_a_coarse_grasp_stops_where_a_fine_one_does(grasps):
     apart = np.abs(grasps(100)[1] - grasps(1600)[1])
     assert np.median(apart) < step / 16
     assert np.quantile(apart, 0.9) < step / 8
+
+
+def pair(displacement, friction):
+    """A disk between two fingers: the contacts, on its left and right."""
+    point, normal = jnp.array([[-0.03, 0.0], [0.03, 0.0]]), jnp.array([[1.0, 0.0], [-1.0, 0.0]])
+    return pj.Contacts(point, normal, displacement, friction)
+
+
+def test_a_guess_whose_edges_cancel_is_not_taken():
+    """Two frictionless fingers that move together leave no wrench of their own, whatever motion fits both."""
+    disk = pj.Ellipsoid(np.eye(3), 0.02)
+    numbers = (jnp.array(x, jnp.int32) for x in ([0, 3, -1], [0, 1, -1]))
+    both = EdgeSet(*numbers, jnp.array([1.0, 1.0, 0.0]))
+
+    def motion(off, guess):
+        contacts = pair(jnp.array([[0.001, 0.0], [0.001 - off, 0.0002]]), jnp.zeros(2))
+        form, mu = to_scalars(disk, contacts.friction)
+        active = unstack(contacts.active)
+        return solve_in_scalars(form, contacts_in_scalars(contacts, mu), active, None, guess)
+
+    for off in (0.0, 1e-15, 1e-14):
+        wanted, found = (motion(jnp.asarray(off), guess) for guess in (EdgeSet.none(jnp.zeros(())), both))
+        assert found.status == wanted.status
+        np.testing.assert_allclose(found.twist.array(), wanted.twist.array(), atol=1e-9)
+
+
+def test_a_central_push_without_friction_has_its_derivatives():
+    """Both cone edges are the normal there, and the contact does not slip: derivatives must not divide by zero."""
+    disk = pj.Ellipsoid(np.eye(3), 0.02)
+    form, mu = to_scalars(disk, jnp.zeros(2))
+
+    def answer(displacement):
+        contacts = pair(jnp.stack([displacement, jnp.array([0.002, 0.0])]), mu)  # the other finger moves away
+        scalars, active = contacts_in_scalars(contacts, mu), unstack(contacts.active)
+        found = solve_in_scalars(form, scalars, active, None, EdgeSet.none(jnp.zeros(())))
+        return jnp.concatenate([found.twist.array(), found.wrench.array(), found.force[0].array()])
+
+    at = jnp.array([0.001, 0.0])
+    value, slope = jax.jvp(answer, (at,), (jnp.array([1.0, 0.0]),))
+    np.testing.assert_allclose(value, answer(at), rtol=1e-12)
+    np.testing.assert_allclose(value[:3], [0.001, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(slope[:3], [1.0, 0, 0], atol=1e-12)
+    assert np.all(np.isfinite(jax.jacrev(answer)(at)))
+
+
+def test_second_derivatives():
+    """Two fingers push a face at different depths, so that it turns: the curvature of the motion by both."""
+    problem = random_contacts_problem(jax.random.key(11), contacts=2, degree=4)
+    given, size = problem.contacts, jnp.max(jnp.abs(problem.contacts.displacement))
+
+    def value(x):
+        contacts = pj.Contacts(given.point + x, given.normal, given.displacement, given.friction, given.gap)
+        twist = pj.solve_contacts(problem.surface, contacts).twist
+        return jnp.sum(twist * jnp.array([1.0, 0.7, 0.01])) / size
+
+    x, h = jnp.zeros((1, 2)), 1e-5 * float(problem.surface.length)
+    slope = jax.jit(jax.grad(value))
+    curvature = np.asarray(jax.jit(jax.hessian(value))(x)).reshape(2, 2)
+    steps = jnp.eye(2).reshape(2, 1, 2) * h
+    differences = np.stack([np.asarray(slope(x + step) - slope(x - step)).reshape(2) / (2 * h) for step in steps])
+    assert np.abs(curvature).max() > 1
+    np.testing.assert_allclose(curvature, differences, atol=1e-5 * np.abs(curvature).max())
+
+
+def test_empty_batches_and_mixed_dtypes():
+    disk, empty = pj.Ellipsoid(np.eye(3), 0.02), jnp.zeros((0, 2, 2))
+    solve = jax.vmap(lambda displacement: pj.solve_contacts(disk, pair(displacement, jnp.ones(2))).twist)
+    assert solve(empty).shape == (0, 3)
+    contacts = pj.Contacts(
+        *(np.float32(x) for x in ([[-0.03, 0], [0.03, 0]], [[1, 0], [-1, 0]], [[1e-3, 0], [0, 0]], 0.3))
+    )
+    assert pj.solve_contacts(disk, contacts).status == pj.Status.JAMMED

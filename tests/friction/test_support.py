@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pushjax import Disk, Ellipse, Polygon, Support
-from pushjax.friction.support import _distances
+from pushjax.friction.support_grid import _distances
 
 ROUNDINGS = 200  # sums over some hundred points
 DTYPES = [np.float32, np.float64]
