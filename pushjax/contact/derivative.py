@@ -23,6 +23,7 @@ def differentiable_solution(
     solved: Bool[Array, "*batch"],
     loaded: Bool[Array, "edges *batch"],
     indeterminate: Bool[Array, "*batch"],
+    dual: Float[Array, "3 *batch"],
     twist: Float[Array, "3 *batch"],
 ) -> Solution:
     """The solution whose cone edges and twist (m, m, rad) are known; its values are right to roundoff."""
@@ -44,7 +45,7 @@ def differentiable_solution(
     placeholder = jnp.zeros_like(beta).at[0].set(1)
     wrench = jnp.where(solved[None], combined(moving_axes, beta), placeholder)
     own = of_chosen(problem.edges, best.edges, jnp.sum(into_edges * beta[None], axis=1))
-    shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench)
+    shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench, dual)
     weights = jnp.where(indeterminate[None], shared, own)
     return in_units(problem, solved, problem.surface.gradient(wrench), wrench, weights)
 

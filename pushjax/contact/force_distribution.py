@@ -35,8 +35,8 @@ def distribute_force(
     chosen_weights: Vector,
     f: Vector,
     start: Vector,
-) -> tuple[Weights, Bool[Array, "*batch"]]:
-    """Compute the weight of every cone edge in the wrench f, and whether more than the chosen edges share it.
+) -> tuple[Weights, Bool[Array, "*batch"], Vector]:
+    """Compute the weight of every cone edge in the wrench f, whether more than the chosen edges share it, and then y.
 
     Where no more edges are admissible under the motion than were chosen, these are the chosen edges' own weights.
     `start` is the shortest y that gives the chosen edges their weights. This is not differentiated.
@@ -46,14 +46,14 @@ def distribute_force(
     # If just three edges are admissible and they are coplanar, the weights are indeterminate too. If they are
     # independent, the search finds the chosen edges' own weights.
     needs_search = (num_admissible > num_chosen) | (num_admissible > 2)
-    shared, reproduced = jax.lax.cond(
+    shared, reproduced, y = jax.lax.cond(
         jnp.any(needs_search),
         _shared,
-        lambda *_: (own_weights, jnp.zeros_like(needs_search)),
+        lambda *_: (own_weights, jnp.zeros_like(needs_search), jnp.zeros_like(start)),
         *(edges, admissible, needs_search, f, start),
     )
     indeterminate = needs_search & reproduced
-    return jnp.where(indeterminate[None], shared, own_weights), indeterminate
+    return jnp.where(indeterminate[None], shared, own_weights), indeterminate, y
 
 
 def of_chosen(edges: Float[Array, "3 edges *batch"], chosen: Int[Array, "3 *batch"], weights: Vector) -> Weights:
@@ -64,30 +64,32 @@ def of_chosen(edges: Float[Array, "3 edges *batch"], chosen: Int[Array, "3 *batc
 
 def _shared(
     edges: Array, admissible: Array, needs_search: Array, f: Vector, start: Vector
-) -> tuple[Weights, Bool[Array, "*batch"]]:
-    """The weights with the least sum of squares, and whether they make up the wrench."""
+) -> tuple[Weights, Bool[Array, "*batch"], Vector]:
+    """The weights with the least sum of squares, whether they make up the wrench, and y."""
     squared = dot(f, f)
     unit = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
     target, usable = f / unit[None], jnp.where(admissible[None], edges, 0.0)
-    y = _minimize_dual(usable, start / unit[None], target, needs_search)
-    hessian = _dual_hessian(usable, _weights(usable, y) > 0)
-    y = y + _solve_regularized(hessian, target - _total(usable, _weights(usable, y)))
+    least = _minimize_dual(usable, start / unit[None], target, needs_search)
+    hessian = _dual_hessian(usable, _weights(usable, least) > 0)
+    y = least + _solve_regularized(hessian, target - _total(usable, _weights(usable, least)))
     weights = _weights(usable, y)
     correction = _products(usable, _solve_regularized(hessian, target - _total(usable, weights)))
     # only edges that carry force: others would get a weight that is the step's roundoff
     weights = jnp.where(weights > 0, jnp.maximum(weights + correction, 0), 0.0)
-    return weights * unit[None], _reproduces(usable, weights, target, 64)
+    return weights * unit[None], _reproduces(usable, weights, target, 64), least * unit[None]
 
 
-def shared_weights(edges: Float[Array, "3 edges *batch"], loaded: Bool[Array, "edges *batch"], f: Vector) -> Weights:
-    """The weights of the loaded edges in f with the least sum of squares, as a function that JAX can differentiate."""
+def shared_weights(
+    edges: Float[Array, "3 edges *batch"], loaded: Bool[Array, "edges *batch"], f: Vector, y: Vector
+) -> Weights:
+    """The weights of the loaded edges in f with the least sum of squares, for derivatives: y is known."""
     usable = jnp.where(loaded[None], edges, 0.0)
     hessian = jax.lax.stop_gradient(_dual_hessian(usable, loaded))
-    y = jax.lax.stop_gradient(_solve_regularized(hessian, f))
-    # Each iteration makes one more order of derivative exact, with the Hessian held fixed. It also reduces the error by
-    # what was added to the diagonal, a hundredfold for a contact with a friction of 1e-7.
-    for _ in range(4):
-        y = y + _solve_regularized(hessian, f - _total(usable, _products(usable, y)))
+    # Each iteration makes one more order of derivative exact, with the Hessian held fixed. Its value is not added: it
+    # is roundoff, which the small pivots of coplanar edges magnify.
+    for _ in range(3):
+        step = _solve_regularized(hessian, f - _total(usable, _products(usable, y)))
+        y = y + (step - jax.lax.stop_gradient(step))
     return _products(usable, y)
 
 

@@ -52,6 +52,7 @@ class Answer(NamedTuple):
     best: EdgeSet  # the cone edges that carry the force; the guess where there is no motion
     loaded: Bool[Array, "edges *batch"]  # which edges carry force
     indeterminate: Bool[Array, "*batch"]  # whether more edges share the force than the wrench determines
+    dual: Float[Array, "3 *batch"]  # y of `force_distribution`, where they do
     squeeze_edges: Int[Array, "4 *batch"]  # edges of the equilibrium of the largest squeeze power
 
 
@@ -110,7 +111,7 @@ def _with_derivatives(answer: Answer, settings: tuple[ContactSolver, bool], prob
     """The answer, whose derivatives are those of `derivative`."""
     scaled = nondimensionalize(_arrays(problem))
     solved, twist = answer.status == Status.MOVING, answer.solution.twist
-    near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, twist)
+    near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, answer.dual, twist)
     solution = jax.tree.map(_with_derivatives_of, answer.solution, near)
     margin = answer.margin
     if settings[1] and scaled.count > 1:
@@ -171,7 +172,7 @@ def _attempt(
     refined = refine(problem, best, moves)
     decided = check(problem, best, moves, refined)
     solved = decided.solved
-    weights, indeterminate = distribute_force(
+    weights, indeterminate, dual = distribute_force(
         problem.edges, decided.admissible & solved[None], best.edges, refined.weight, refined.wrench, refined.start
     )
     # If the search found a set that the check then rejects, this is no proof of a jam. The same holds if the search
@@ -193,6 +194,7 @@ def _attempt(
         jax.tree.map(lambda new, old: jnp.where(solved[None], new, old), known, nothing),
         weights > 0,
         indeterminate & solved,
+        dual,
         squeeze.edges,
     )
     return answer, problem.pushes & ~solved & (guess is not None)
