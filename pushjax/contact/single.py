@@ -49,8 +49,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     size = jax.lax.stop_gradient(curve.c[0] + curve.c[-1])
     size = jnp.where(size > 0, size, 1.0)
     curve, size = compute_once((LimitCurve(tuple(c / size for c in curve.c)), size), contact.approach().x)
-    mu = contact.friction
-    v = contact.approach()
+    mu, v = contact.friction, contact.approach()
     valid = usable & jnp.isfinite(sum(curve.c))
     pushes = decide(valid & (v.x > 0), v.x)
     v = tree_where(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # placeholder where nothing pushes
