@@ -150,6 +150,24 @@ class PushingPart(NamedTuple):
             originals.append(original)
         return FingerContacts(tuple(contacts), indices, tuple(originals), is_near)
 
+    def contacts_of_all(
+        self,
+        frame: BodyFrame,
+        fraction: Scalar,
+        carry: Stage,
+        motions: tuple[FingerMotion, ...],
+        fixtures: tuple[FingerMotion, ...],
+    ) -> tuple[FingerContacts, ...]:
+        """Return the contacts of each finger and fixture in a stage."""
+        known = tuple(zip(carry.chosen, carry.at_start, strict=True))
+        found = ()
+        for bodies, is_fixture in ((motions, False), (fixtures, True)):
+            items = tuple((body, *known[len(found) + k]) for k, body in enumerate(bodies))
+            contacts_of = partial(self.contacts_of, frame, fraction, fraction == 0, is_fixture)
+            if items:
+                found += map_items(lambda item, contacts_of=contacts_of: contacts_of(*item), items)
+        return found
+
 
 def step_in_scalars(
     form: Form,
@@ -170,22 +188,16 @@ def step_in_scalars(
     begin = _first_contact(motions, outline, start, form.length)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
     counts = [num_contacts(motion.finger, outline) for motion in motions + fixtures]
-    given_set = WorkingSet.most_urgent(urgency, num_solved_together(counts))
-    size = num_solved_together(counts)
-    active = (jnp.asarray(ongoing),) * size
+    size, active = num_solved_together(counts), jnp.asarray(ongoing)
+    given_set = WorkingSet.most_urgent(urgency, size)
 
     def stage(carry: Stage, fraction: Scalar):
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
         frame = start.moved(carry.point, carry.twist.scale(fraction), carry.angle)
         in_predictor = fraction == 0
-        known = tuple(zip(carry.chosen, carry.at_start, strict=True))
-        found = ()
-        for bodies, is_fixture in ((motions, False), (fixtures, True)):
-            items = tuple((body, *known[len(found) + k]) for k, body in enumerate(bodies))
-            contacts_of = partial(part.contacts_of, frame, fraction, in_predictor, is_fixture)
-            if items:
-                found += map_items(lambda item, contacts_of=contacts_of: contacts_of(*item), items)
-        by_finger, chosen, at_start, near = zip(*found, strict=True)
+        by_finger, chosen, at_start, near = zip(
+            *part.contacts_of_all(frame, fraction, carry, motions, fixtures), strict=True
+        )
         contacts, holds = sum(by_finger, ()), jnp.asarray(len(motions) > 1)
         for k, is_near in enumerate(near):
             holds &= is_near if k < len(motions) else ~is_near
@@ -195,30 +207,28 @@ def step_in_scalars(
             pressed = jax.lax.stop_gradient(jnp.stack([contact.approach().x for contact in contacts]))
             used_urgency = jnp.where(in_predictor & is_first_try, pressed, used_urgency)
         working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, size)
-        local_guess = None if carry.guess is None else working.local(carry.guess)
-        solution = solve_in_scalars(form, working.select(contacts), active, solver, local_guess)
-        guess_after = carry.guess
-        if solution.best is not None:
-            spread = working.spread_edges(solution.best)
-            guess_after = tree_where(spread.exists(), spread, carry.guess)
+        guess = None if carry.guess is None else working.local(carry.guess)
+        solution = solve_in_scalars(form, working.select(contacts), (active,) * size, solver, guess)
         solution = working.spread(solution, len(contacts))
+        best = (
+            solution.best if solution.best is None else tree_where(solution.best.exists(), solution.best, carry.guess)
+        )
         urgency_after = None if urgency is None else violations(contacts, solution.twist, solution.force)
         # a failed predictor must show in the status, whatever the corrector makes of it
         status = jnp.where(carry.status <= Status.FREE, solution.status, jnp.maximum(carry.status, solution.status))
         straight_point = _force_weighted_point(contacts, solution.force)
         next_stage = Stage(
-            solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency, guess_after
+            solution.twist, straight_point, frame.angle, status, at_start, chosen, holds, used_urgency, best
         )
         is_long = _turns_or_slips_too_far(motions + fixtures, by_finger, solution, form.length)
         return next_stage, (solution, _points_and_normals(contacts), urgency_after, is_long)
 
     before = Stage.before(start, counts, urgency if fixtures else None, guess)
     carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
-    is_long = jnp.any(outputs[-1])
     solution, points_and_normals, urgency_after, _ = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
     moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
-    status = _status(carry, moves, is_long, overlap_before, form.length)
+    status = _status(carry, moves, jnp.any(outputs[-1]), overlap_before, form.length)
     return _keep_pose_unless_moving(solution, points_and_normals, moved_pose, pose, status), urgency_after, carry.guess
 
 

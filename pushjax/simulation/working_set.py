@@ -106,7 +106,8 @@ class WorkingSet(NamedTuple):
                     jnp.where(mark[k], contact_force.x, 0.0), jnp.where(mark[k], contact_force.y, 0.0)
                 )
                 mode[k] = jnp.where(mark[k], contact_mode, mode[k])
-        return solution._replace(force=tuple(force), mode=tuple(mode))
+        best = None if solution.best is None else self.spread_edges(solution.best)
+        return solution._replace(force=tuple(force), mode=tuple(mode), best=best)
 
 
 def violations(contacts: tuple[Contact, ...], twist: Vec3, force: tuple[Vec2, ...]) -> Urgency:
