@@ -1,13 +1,14 @@
 """The door from functions of single examples to functions of whole batches, whose arrays have the batch last."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._internal.compaction import tile_size
+from pushjax._internal.compaction import flat_batch, tile_size
 
 # Examples that are computed together on a CPU by a program of many small kernels, most of whose time is that of their
 # start, and examples that are searched together, whose data are many times as large.
@@ -48,13 +49,7 @@ def _batching_rule(attempt: Attempt, size: int, batched: Any, needed: Array, arg
 
     @batch.def_vmap
     def _(outer_size, outer_batched, needed, args):
-        # a batch of batches is one longer batch
-        def flat(x, has_inner, has_outer):
-            if not has_inner:
-                return jnp.repeat(x, size, axis=0) if has_outer else x
-            x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))
-            return x.reshape(outer_size * size, *x.shape[2:])
-
+        flat = partial(flat_batch, size, outer_size)
         needed_has_outer, args_have_outer = outer_batched
         either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
         flat_args = jax.tree.map(flat, args, batched, args_have_outer)

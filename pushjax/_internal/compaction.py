@@ -9,6 +9,7 @@ has ended gives its place in the tile to the next one, so the cost grows with th
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -51,6 +52,14 @@ class Rounds(NamedTuple):
 def tile_size(on_cpu: int = TILE) -> int:
     """Return the number of examples that are computed together on the default backend."""
     return on_cpu if jax.default_backend() == "cpu" else ACCELERATOR_TILE
+
+
+def flat_batch(size: int, outer_size: int, x: Array, has_inner: bool, has_outer: bool) -> Array:
+    """Return an array of a batch of batches as that of one longer batch, given which of the two axes it has."""
+    if not has_inner:
+        return jnp.repeat(x, size, axis=0) if has_outer else x
+    x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))
+    return x.reshape(outer_size * size, *x.shape[2:])
 
 
 def where_needed_without_derivatives(
@@ -117,14 +126,7 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
 
     @batch.def_vmap
     def _(outer_size, batched, needed, otherwise, args):
-        # A batch of batches is flattened into one longer batch. `has_inner` is whether an array has the axis of the
-        # inner `vmap`, `has_outer` whether it has that of the outer one.
-        def flattened(x, has_inner, has_outer):
-            if not has_inner:
-                return jnp.repeat(x, size, axis=0) if has_outer else x
-            x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))
-            return x.reshape(outer_size * size, *x.shape[2:])
-
+        flattened = partial(flat_batch, size, outer_size)
         all_inner = jax.tree.map(lambda _: True, otherwise)
         flat_args_batched = jax.tree.map(lambda has_inner, has_outer: has_inner or has_outer, args_batched, batched[2])
         results, _ = _batching_rule(

@@ -6,7 +6,6 @@ and to arrays. The problem of several contacts (`pushjax.contact`) uses arrays w
 (`pushjax._math.arrays`). They are as fast and compile faster, but such code has to be written for a batch.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import jax
@@ -91,11 +90,6 @@ class Vec3(NamedTuple):
             self.x * other.y - self.y * other.x,
         )
 
-    def unit(self) -> "Vec3":
-        """Return the vector scaled to length one; zero stays zero."""
-        squared = self.dot(self)
-        return self.scale(jnp.where(squared > 0, jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0)), 0.0))
-
     @staticmethod
     def of(array: Float[Array, "3"]) -> "Vec3":
         return Vec3(*unstack(array))
@@ -109,14 +103,6 @@ def unstack(array: Array) -> tuple[Array, ...]:
     # Reverse mode then concatenates the cotangents. With indexing it would add up as many arrays that are zero but for
     # one entry.
     return tuple(part.reshape(array.shape[1:]) for part in jax.lax.split(array, (1,) * array.shape[0]))
-
-
-def linear_combination(vectors: Iterable[Vec3], weights: Iterable[Scalar]) -> Vec3:
-    """Return the sum of weight_i vector_i, added from left to right; there must be at least one vector."""
-    first, *others = (v.scale(weight) for v, weight in zip(vectors, weights, strict=True))
-    for v in others:
-        first = first + v
-    return first
 
 
 def cos_sin(angle: Scalar) -> Vec2:

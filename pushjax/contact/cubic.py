@@ -11,17 +11,11 @@ ITERATIONS = {4: 7, 8: 8}
 
 
 class Roots(NamedTuple):
-    """The intervals between turning points of c0 + c1 u + c2 u^2 + c3 u^3, or of c0 + c1 u, where it is monotone.
+    """The intervals between turning points of c0 + c1 u + c2 u^2 + c3 u^3, or of c0 + c1 u, where it is monotone."""
 
-    Attributes:
-        c: Coefficients, the constant first, (4 or 2, ...).
-        ends: Ends of the intervals, (4 or 2, ...).
-        values: Values at the ends, (4 or 2, ...).
-    """
-
-    c: Float[Array, "terms *rest"]
-    ends: Float[Array, "ends *rest"]
-    values: Float[Array, "ends *rest"]
+    c: Float[Array, "terms *rest"]  # coefficients, the constant first: four or two
+    ends: Float[Array, "ends *rest"]  # of the intervals: four or two
+    values: Float[Array, "ends *rest"]  # at the ends
 
     @staticmethod
     def of(c: Float[Array, "terms *rest"], low: Float[Array, "*rest"], high: Float[Array, "*rest"]) -> "Roots":
@@ -45,7 +39,7 @@ class Roots(NamedTuple):
         changes_sign = ((value_low <= 0) & (value_high >= 0)) | ((value_low >= 0) & (value_high <= 0))
         return changes_sign & (high > low) & (value_low != value_high)
 
-    def all(self) -> Float[Array, "intervals *rest"]:
+    def find(self) -> Float[Array, "intervals *rest"]:
         """The root in each interval, where it exists."""
         if len(self.c) == 2:
             return jnp.clip(-self.c[0] / jnp.where(self.c[1] != 0, self.c[1], 1.0), *self.ends)[None]
@@ -65,20 +59,13 @@ class _Search(NamedTuple):
 
     Newton's method is not used: from afar each step reduces the distance by a third only, and near two complex roots a
     step leads far away again.
-
-    Attributes:
-        u: Estimate of the root, between `near` and `far`.
-        near: One end of the bracket; at first `origin`.
-        far: Other end of the bracket.
-        origin: Where the search began: the point where the cubic is smallest, an end of the interval or zero.
-        sign: Sign of the cubic at `far`.
     """
 
-    u: Array
-    near: Array
+    u: Array  # estimate of the root, between `near` and `far`
+    near: Array  # one end of the bracket; at first `origin`
     far: Array
-    origin: Array
-    sign: Array
+    origin: Array  # where the search began: where the cubic is smallest, an end of the interval or zero
+    sign: Array  # of the cubic at `far`
 
     @staticmethod
     def of(c: Array, low: Array, high: Array, value_low: Array, value_high: Array) -> "_Search":

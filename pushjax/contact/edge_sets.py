@@ -73,7 +73,7 @@ def at(x: Array, index: Numbers) -> Array:
     return along(x, index.reshape((1,) * (x.ndim - 2) + index.shape), -2)
 
 
-def own(x: Array, index: Numbers) -> Array:
+def flag_at(x: Array, index: Numbers) -> Array:
     """The entries (sets, batch) of one edge of each set, from those of every edge, (edges, sets, batch)."""
     numbers = jnp.arange(len(x)).reshape(-1, 1, 1)
     return jnp.any(x & (numbers == with_batch(index[None])), axis=0)
@@ -93,10 +93,10 @@ def _motions(problem: ScaledProblem, twist: Float[Array, "3 sets batch"]) -> tup
 def is_kinematic(problem: ScaledProblem, twist: Float[Array, "3 sets batch"], sets: Sets) -> Bool[Array, "sets batch"]:
     """Whether no contact is violated, and those of the set touch and slip to the side of their edge, or not at all."""
     edges, contacts = (with_batch(x)[:, None] for x in sets)
-    own = contacts == jnp.arange(problem.count)[None, :, None, None]  # (3, contacts, sets, batch)
+    is_own = contacts == jnp.arange(problem.count)[None, :, None, None]  # (3, contacts, sets, batch)
     is_one = contacts[0] == contacts[1]  # both edges are of one contact, which sticks
-    touches, sticks = jnp.any(own, axis=0), own[0] & is_one
-    side = jnp.sum(jnp.where(own & ~is_one[None], 1 - 2 * (edges % 2), 0), axis=0).astype(twist.dtype)
+    touches, sticks = jnp.any(is_own, axis=0), is_own[0] & is_one
+    side = jnp.sum(jnp.where(is_own & ~is_one[None], 1 - 2 * (edges % 2), 0), axis=0).astype(twist.dtype)
     normal, slip = _motions(problem, twist)
     violation = jnp.maximum(-normal, jnp.where(touches, jnp.abs(normal), 0.0))
     violation = jnp.maximum(violation, jnp.maximum(jnp.where(sticks, jnp.abs(slip), 0.0), side * slip))
@@ -184,7 +184,7 @@ def solve_two(problem: ScaledProblem, sets: Sets) -> Solutions:
         return jnp.concatenate([x] * intervals, axis=-2)
 
     exists = (roots.exist() & independent[None]).reshape(-1, independent.shape[1])
-    u = roots.all().reshape(exists.shape)
+    u = roots.find().reshape(exists.shape)
     segment, all_sets = jax.tree.map(repeated, segment), Sets(*(repeated(with_batch(x)) for x in sets))
     motion = segment.motion_at(u)
     along_rows = products(segment.rows, motion)
@@ -226,7 +226,7 @@ def solve_three(problem: ScaledProblem, contacts: Numbers) -> Solutions:
     touches = active & (jnp.abs(normal) <= tolerance)
     feasible = regular & jnp.all(~active | (normal >= -tolerance), axis=0)
     for numbers in contacts:
-        feasible &= own(touches, numbers)
+        feasible &= flag_at(touches, numbers)
     # whether an edge may carry force: both edges may where the contact sticks
     may_carry = jnp.stack([touches & (slip <= tolerance), touches & (slip >= -tolerance)], axis=1)
     may_carry = may_carry.reshape(2 * problem.count, *feasible.shape)
@@ -237,7 +237,7 @@ def solve_three(problem: ScaledProblem, contacts: Numbers) -> Solutions:
         edges = jnp.stack([at(problem.edges, k) for k in numbers])
         weight, inside, share = _cone_coordinates(f, edges, jnp.stack([at(per_weight, k) for k in numbers]))
         for k in numbers:
-            inside &= own(may_carry, k)
+            inside &= flag_at(may_carry, k)
         better = inside & (share > best[0])  # of several sets, the one with f farthest inside
         numbers = with_batch(numbers)
         return (

@@ -63,7 +63,7 @@ class Exhaustive(ContactSolver):
             problem: Dimensionless contact problems, with an axis for the batch.
 
         Returns:
-            The best set of cone edges of each problem, and its solution.
+            The best set of cone edges of each problem.
         """
         return best_of_sets(problem, *_all_sets(problem.count))
 
@@ -88,8 +88,7 @@ def best_of_sets(problem: ScaledProblem, one: Sets, two: Sets, three: Numbers) -
     smallest twist. Twists that differ by roundoff are the same motion. The set with fewer edges, which comes first, is
     better conditioned.
     """
-    solutions = [solve_one(problem, one)]
-    solutions += [solve_two(problem, two)] if two.edges.shape[1] else []
+    solutions = [solve_one(problem, one), solve_two(problem, two)]
     solutions += [solve_three(problem, three)] if three.shape[1] else []
     return _best(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *solutions))
 
@@ -113,8 +112,7 @@ def _best(solutions: Solutions) -> Found:
     edges, contacts = (jnp.where(found[None], x, NO_EDGE) for x in (best.edges, best.contacts))
     chosen = EdgeSet(edges, contacts, best.weight)
     second_found = jnp.any(accepted & (dot(difference, difference) > far), axis=0) & found
-    power, twist = jnp.where(found, best.power, 0.0), jnp.where(found[None], best.twist, 0.0)
-    return Found(chosen, twist, power, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
+    return Found(chosen, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
 
 
 def _of_set(x: Array, index: Int[Array, " batch"]) -> Array:

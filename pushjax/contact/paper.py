@@ -190,7 +190,7 @@ class Projected(ContactSolver):
             problem: Dimensionless contact problems, with an axis for the batch.
 
         Returns:
-            The best set of cone edges of each problem, and its solution.
+            The best set of cone edges of each problem.
         """
         return best_of_sets(problem, *_heaviest_sets(problem, self.iterate(problem)))
 

@@ -182,10 +182,6 @@ def solve_contacts(
     check_type("surface", surface, LimitSurface)
     check_type("contacts", contacts, Contacts)
     check_solver(solver)
-    count = contacts.point.shape[0]
-    _check_num_contacts(count)
-    if isinstance(solver, StickingSolver) and count != 1:
-        raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
     return _solved(surface, contacts, solver)
 
 
@@ -193,12 +189,6 @@ def check_solver(solver: Any) -> None:
     """Raise TypeError unless `solver` is a solver of contact problems or None."""
     if solver is not None:
         check_type("solver", solver, ContactSolver, StickingSolver)
-
-
-def _check_num_contacts(contacts: int) -> None:
-    """Raise ValueError for a number of contacts that is not supported."""
-    if not 1 <= contacts <= MAX_CONTACTS:
-        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {contacts}")
 
 
 @quick_jit
@@ -251,7 +241,8 @@ def solve_in_scalars(
         ValueError: For more than eight contacts, or for more than one with a solver of one contact.
     """
     count = len(contacts)
-    _check_num_contacts(count)
+    if not 1 <= count <= MAX_CONTACTS:
+        raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {count}")
     if solver is None:
         solver = ScalarRoot() if count == 1 else Continuing()
     if isinstance(solver, StickingSolver):

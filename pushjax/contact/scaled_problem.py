@@ -86,11 +86,9 @@ class EdgeSet(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The best set of cone edges that a search found, and its solution."""
+    """The best set of cone edges that a search found."""
 
     best: EdgeSet
-    twist: Float[Array, "3 *batch"]  # dimensionless
-    power: Float[Array, "*batch"]  # F . V with the wrench F scaled to H = 1; of several solutions, the largest is kept
     second_found: Bool[Array, "*batch"]  # whether a set with a different twist passed too
     # Whether a set passed whose twist exceeds `max_twist_ratio` by a factor of at most `TOO_FAST`. Such a twist is not
     # accepted as an answer. But it shows that the problem is not a jam.
@@ -99,8 +97,8 @@ class Found(NamedTuple):
     @staticmethod
     def guessed(best: EdgeSet) -> "Found":
         """A set whose solution is not known yet."""
-        none = jnp.zeros_like(best.weight[0])
-        return Found(best, jnp.zeros_like(best.weight), none, none > 0, none > 0)
+        no = jnp.zeros(best.weight.shape[1:], bool)
+        return Found(best, no, no)
 
 
 class ContactSolver(eqx.Module):
@@ -120,7 +118,7 @@ class ContactSolver(eqx.Module):
             problem: Dimensionless contact problems, with an axis for the batch.
 
         Returns:
-            The best set of cone edges of each problem, and its solution.
+            The best set of cone edges of each problem.
         """
 
 

@@ -207,8 +207,8 @@ def step_in_scalars(
             pressed = jax.lax.stop_gradient(jnp.stack([contact.approach().x for contact in contacts]))
             used_urgency = jnp.where(in_predictor & is_first_try, pressed, used_urgency)
         working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, size)
-        guess = None if carry.guess is None else working.local(carry.guess)
-        solution = solve_in_scalars(form, working.select(contacts), (active,) * size, solver, guess)
+        tried = None if carry.guess is None else working.local(carry.guess)
+        solution = solve_in_scalars(form, working.select(contacts), (active,) * size, solver, tried)
         solution = working.spread(solution, len(contacts))
         best = (
             solution.best if solution.best is None else tree_where(solution.best.exists(), solution.best, carry.guess)

@@ -91,7 +91,7 @@ def test_roots_of_very_different_sizes_are_found(rng):
     @jax.jit
     def roots(c, low):
         found = Roots.of(c, low, low + 1)
-        return jnp.where(found.exist(), found.all(), jnp.inf)
+        return jnp.where(found.exist(), found.find(), jnp.inf)
 
     found = np.asarray(roots(jnp.stack([jnp.asarray(c) for c in cubic]), jnp.asarray(low)))
     for k in range(3):
