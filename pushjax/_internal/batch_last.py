@@ -20,53 +20,55 @@ TILE, SEARCH_TILE = 256, 128
 Attempt = Callable[..., tuple[Any, Bool[Array, " batch"]]]
 
 
-def batch_last(attempt: Attempt, needed: Bool[Array, ""], *args: Any) -> Any:
+def batch_last(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any) -> Any:
     """Return the results of `attempt` for one example, or for a batch under any nesting of `vmap`; zeros if not needed.
 
     The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
-    attempt are gathered into tiles of their own, which follow. One program serves both. It cannot be differentiated.
+    attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
+    cannot be differentiated.
     """
+    wanted = jnp.stack([needed & has_first, needed & ~has_first])
 
     @jax.custom_batching.custom_vmap
-    def single(needed, args):
-        results = _in_tiles(attempt, needed[None], jax.tree.map(lambda _: False, args), args)
+    def single(wanted, args):
+        results = _in_tiles(attempt, wanted[None], jax.tree.map(lambda _: False, args), args)
         return jax.tree.map(lambda x: x[0], results)
 
     @single.def_vmap
-    def _(size, batched, needed, args):
-        needed = needed if batched[0] else jnp.broadcast_to(needed, (size,))
-        return _batching_rule(attempt, size, batched[1], needed, args)
+    def _(size, batched, wanted, args):
+        wanted = wanted if batched[0] else jnp.broadcast_to(wanted, (size, 2))
+        return _batching_rule(attempt, size, batched[1], wanted, args)
 
-    return single(needed, args)
+    return single(wanted, args)
 
 
-def _batching_rule(attempt: Attempt, size: int, batched: Any, needed: Array, args: Any) -> tuple[Any, Any]:
+def _batching_rule(attempt: Attempt, size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
     """Batching rule of `batch_last`: the results, and which leaves are batched (all)."""
 
     @jax.custom_batching.custom_vmap
-    def batch(needed, args):
-        return _in_tiles(attempt, needed, batched, args)
+    def batch(wanted, args):
+        return _in_tiles(attempt, wanted, batched, args)
 
     @batch.def_vmap
-    def _(outer_size, outer_batched, needed, args):
+    def _(outer_size, outer_batched, wanted, args):
         flat = partial(flat_batch, size, outer_size)
-        needed_has_outer, args_have_outer = outer_batched
+        wanted_has_outer, args_have_outer = outer_batched
         either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
         flat_args = jax.tree.map(flat, args, batched, args_have_outer)
-        flat_needed = flat(needed, True, needed_has_outer)
-        results, all_batched = _batching_rule(attempt, outer_size * size, either, flat_needed, flat_args)
+        flat_wanted = flat(wanted, True, wanted_has_outer)
+        results, all_batched = _batching_rule(attempt, outer_size * size, either, flat_wanted, flat_args)
         return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_batched
 
-    results = batch(needed, args)
+    results = batch(wanted, args)
     return results, jax.tree.map(lambda _: True, results)
 
 
-def _in_tiles(attempt: Attempt, needed: Bool[Array, " size"], batched: Any, args: Any) -> Any:
-    """The results of a batch, with the batch first, tile by tile."""
-    size = needed.shape[0]
+def _in_tiles(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any) -> Any:
+    """The results of a batch, with the batch first, tile by tile; `wanted` has the first and the second attempt."""
+    size = wanted.shape[0]
     if not size:
         one = jax.tree.map(lambda x, b: jnp.zeros((1, *x.shape[1:]), x.dtype) if b else x, args, batched)
-        return jax.tree.map(lambda x: x[:0], _in_tiles(attempt, jnp.zeros(1, bool), batched, one))
+        return jax.tree.map(lambda x: x[:0], _in_tiles(attempt, jnp.zeros((1, 2), bool), batched, one))
     tile = min(tile_size(TILE), size)
 
     def attempt_at(again: Int[Array, ""], rows: Array) -> tuple[Any, Array]:
@@ -90,8 +92,10 @@ def _in_tiles(attempt: Attempt, needed: Bool[Array, " size"], batched: Any, args
         end, queue = jax.lax.cond(starts_again, lambda: _queued(unfinished, tile), lambda: (end, queue))
         return jnp.where(starts_again, 0, k + 1), end, again | starts_again, queue, unfinished, results
 
-    end, queue = _queued(needed, tile)
-    initial = jnp.zeros((), jnp.int32), end, jnp.zeros((), bool), queue, jnp.zeros(size, bool), blank
+    first, unfinished = wanted[:, 0], wanted[:, 1]
+    again = ~jnp.any(first)
+    end, queue = _queued(jnp.where(again, unfinished, first), tile)
+    initial = jnp.zeros((), jnp.int32), end, again, queue, unfinished, blank
     return jax.lax.while_loop(lambda state: state[0] < state[1], next_tile, initial)[-1]
 
 

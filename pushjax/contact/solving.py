@@ -24,7 +24,8 @@ from pushjax.contact.contact_plane import Contact
 from pushjax.contact.derivative import differentiable_solution
 from pushjax.contact.exhaustive import Continuing
 from pushjax.contact.finish import Solution, check, in_units, refine
-from pushjax.contact.force_distribution import distribute_force
+from pushjax.contact.force_distribution import distribute_force, of_chosen
+from pushjax.contact.frictionless import Frictionless, least_violation
 from pushjax.contact.jam_certificate import Squeeze, search_squeeze, squeeze_power
 from pushjax.contact.scaled_problem import (
     NO_EDGE,
@@ -73,12 +74,13 @@ def solve(problem: Problem, guess: EdgeSet | None, solver: ContactSolver, *, mar
 def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSolver, bool]) -> Answer:
     (problem, guess), (solver, _) = arguments, settings
     form, contacts, active = problem
-    attempt, arrays = partial(_attempt, *settings), _arrays(problem)
+    attempt = _without_friction if isinstance(solver, Frictionless) else partial(_attempt, *settings)
+    arrays = _arrays(problem)
     if not isinstance(solver, Continuing) or guess is None:
-        return batch_last(attempt, jnp.ones((), bool), arrays, None)
+        return batch_last(attempt, jnp.ones((), bool), jnp.zeros((), bool), arrays, None)
     contacts = tuple(contact.where(a) for contact, a in zip(contacts, active, strict=True))
     suffices, one, is_main = solve_most_pressed(form, contacts)
-    together = batch_last(attempt, ~suffices, arrays, guess)
+    together = batch_last(attempt, ~suffices, guess.exists(), arrays, guess)
     # computed once, or each entry of the answer would compute all of it again
     modes = tuple(one.mode == kind for kind in (ContactMode.STICKING, ContactMode.SLIDING_LEFT))
     floats = one.twist, one.wrench, one.force
@@ -157,17 +159,16 @@ def _edges_of_one(
 def _attempt(
     solver: ContactSolver, margin: bool, again: Int[Array, ""], given: ContactArrays, guess: EdgeSet | None
 ) -> tuple[Answer, Bool[Array, " batch"]]:
-    """Solve a batch of problems by the guess; or by the search, if there is none or this is the second attempt."""
+    """Solve a batch of problems by the guess, or in the second attempt by the search."""
     if guess is not None:  # a batch of guesses alone is a batch, too
         batch = jnp.broadcast_shapes(given.length.shape, guess.weight.shape[1:])
         given = given._replace(length=jnp.broadcast_to(given.length, batch))
     problem = nondimensionalize(given)
     like, size = problem.unit, problem.unit.shape[0]
     nothing = EdgeSet.none(like) if guess is None else jax.tree.map(lambda x: jnp.broadcast_to(x, (3, size)), guess)
-    count = again if guess is not None else jnp.asarray(size, jnp.int32)
     blank = Found.guessed(nothing), Squeeze.none(like)
-    found, squeeze = in_search_tiles(partial(_search, solver, margin), count, problem, blank)
-    best, searched = found.best, jnp.arange(size) < count
+    found, squeeze = in_search_tiles(partial(_search, solver, margin), again, problem, blank)
+    best, searched = found.best, jnp.arange(size) < again
     moves = best.exists() & problem.pushes
     refined = refine(problem, best, moves)
     decided = check(problem, best, moves, refined)
@@ -197,7 +198,33 @@ def _attempt(
         dual,
         squeeze.edges,
     )
-    return answer, problem.pushes & ~solved & (guess is not None)
+    return answer, problem.pushes & ~solved
+
+
+def _without_friction(again: Array, given: ContactArrays, guess: None) -> tuple[Answer, Bool[Array, " batch"]]:
+    """Solve a batch of problems without friction, in closed form. A contact without force is SEPARATED."""
+    problem = nondimensionalize(given)
+    problem, none = problem._replace(friction=jnp.zeros_like(problem.friction)), jnp.zeros(problem.unit.shape, bool)
+    best, twist, solved = least_violation(problem)
+    weights = of_chosen(problem.edges, best.edges, best.weight)
+    status = jnp.where(problem.pushes, jnp.where(solved, Status.MOVING, Status.JAMMED), Status.FREE)
+    status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
+    loaded = solved[None] & (weights[::2] > 0)
+    slides = jnp.where(problem.slips(twist)[1] < 0, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT)
+    wrench, squeeze = jnp.sum(problem.normal * weights[None, ::2], axis=1), Squeeze.none(problem.unit)
+    answer = Answer(
+        in_units(problem, solved, twist, wrench, weights),
+        jnp.where(loaded, slides, ContactMode.SEPARATED).astype(jnp.int8),
+        status,
+        jnp.full_like(problem.unit, jnp.inf),
+        ~none,
+        best,
+        weights > 0,
+        none,
+        jnp.zeros_like(wrench),
+        squeeze.edges,
+    )
+    return answer, none
 
 
 def _search(solver: ContactSolver, margin: bool, problem: ScaledProblem) -> tuple[Found, Squeeze]:

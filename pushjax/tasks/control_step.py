@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.compaction import Rounds, where_needed
 from pushjax._math.vec import Scalar, Vec2, Vec3
+from pushjax.contact.frictionless import Frictionless
 from pushjax.contact.problem import to_scalars
 from pushjax.contact.status import Status
 from pushjax.friction.limit_surface import LimitSurface
@@ -77,7 +78,8 @@ def control_step(
     Args:
         polygon: Outline of the slider.
         surface: Its limit surface.
-        friction: Coefficient of friction between fingers and slider; None if there is none.
+        friction: Coefficient of friction between fingers and slider. None if there is none, and the surface is an
+            ellipsoid: programs are then smaller and faster.
         hand: The hand.
         walls: Walls, which the slider cannot pass.
         path: Configurations of the hand, world, m and rad.
@@ -108,14 +110,17 @@ def _is_finger(hand: Hand) -> bool:
 
 def _simulated(shape, surface, friction, hand, walls, path, pose) -> Trajectory:
     """The push along the path. Arguments as in `control_step`."""
-    return simulate(shape, hand, path, pose, None, _friction_at(surface, friction, hand, path), walls)
+    solver, friction_at = _contact_model(shape, surface, friction, hand, path)
+    return simulate(shape, hand, path, pose, solver, friction_at, walls)
 
 
-def _friction_at(surface, friction, hand, path) -> FrictionAt:
-    """Limit surface and friction of a step. Arguments as in `control_step`."""
+def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless | None, FrictionAt]:
+    """The solver of contact problems, and limit surface and friction of a step. Arguments as in `control_step`."""
     mu = jnp.zeros_like(path[0, 0]) if friction is None else friction
     form = to_scalars(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
-    return lambda step, pose: form
+    # None: the default solver. It has a closed form for one contact, so `Frictionless` would not be faster there.
+    solver = Frictionless() if friction is None and not isinstance(shape, _TouchedOnce) else None
+    return solver, lambda step, pose: form
 
 
 def _is_valid(
@@ -171,7 +176,8 @@ class _Progress(NamedTuple):
 
 def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[DividedPush, Array]:
     """The push with all contacts, and the pose at its start."""
-    return divided_push(polygon, hand, path, pose, None, _friction_at(surface, friction, hand, path), walls)
+    solver, friction_at = _contact_model(polygon, surface, friction, hand, path)
+    return divided_push(polygon, hand, path, pose, solver, friction_at, walls)
 
 
 @jax.jit

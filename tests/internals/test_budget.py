@@ -48,7 +48,7 @@ PROGRAMS = {
     "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 936, 25804),
     "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 975, 29585),
     "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1325, 41209),
-    "PushT step": (step_of_task, 1675, 38161),
+    "PushT step": (step_of_task, 1171, 28289),
 }
 
 
