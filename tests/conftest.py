@@ -92,7 +92,6 @@ SLOW_CASES = {
     "test_recorded_pushes": ("ellipsoid",),
     "test_samples_are_convex_around_their_mean": ("gram-float32",),
     "test_solvers_agree": ("quartic",),
-    "test_sweep_is_that_of_marching": ("waisted", "oval-0.0-float32"),
 }
 
 

@@ -28,26 +28,32 @@ def batch_last(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array,
     cannot be differentiated.
     """
     wanted = jnp.stack([needed & has_first, needed & ~has_first])
+    structure = jax.tree.structure(args)
+
+    # `vmap` asks for a batch several times. As a function of its own, it is traced for the first time only.
+    @partial(jax.jit, static_argnums=0)
+    def in_tiles(batched: tuple[bool, ...], wanted: Array, args: Any) -> Any:
+        return _in_tiles(attempt, wanted, jax.tree.unflatten(structure, batched), args)
 
     @jax.custom_batching.custom_vmap
     def single(wanted, args):
-        results = _in_tiles(attempt, wanted[None], jax.tree.map(lambda _: False, args), args)
+        results = in_tiles((False,) * structure.num_leaves, wanted[None], args)
         return jax.tree.map(lambda x: x[0], results)
 
     @single.def_vmap
     def _(size, batched, wanted, args):
         wanted = wanted if batched[0] else jnp.broadcast_to(wanted, (size, 2))
-        return _batching_rule(attempt, size, batched[1], wanted, args)
+        return _batching_rule(in_tiles, size, batched[1], wanted, args)
 
     return single(wanted, args)
 
 
-def _batching_rule(attempt: Attempt, size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
+def _batching_rule(in_tiles: Callable[..., Any], size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
     """Batching rule of `batch_last`: the results, and which leaves are batched (all)."""
 
     @jax.custom_batching.custom_vmap
     def batch(wanted, args):
-        return _in_tiles(attempt, wanted, batched, args)
+        return in_tiles(tuple(jax.tree.leaves(batched)), wanted, args)
 
     @batch.def_vmap
     def _(outer_size, outer_batched, wanted, args):
@@ -56,7 +62,7 @@ def _batching_rule(attempt: Attempt, size: int, batched: Any, wanted: Array, arg
         either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
         flat_args = jax.tree.map(flat, args, batched, args_have_outer)
         flat_wanted = flat(wanted, True, wanted_has_outer)
-        results, all_batched = _batching_rule(attempt, outer_size * size, either, flat_wanted, flat_args)
+        results, all_batched = _batching_rule(in_tiles, outer_size * size, either, flat_wanted, flat_args)
         return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_batched
 
     results = batch(wanted, args)
@@ -71,6 +77,7 @@ def _in_tiles(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, arg
         return jax.tree.map(lambda x: x[:0], _in_tiles(attempt, jnp.zeros((1, 2), bool), batched, one))
     tile = min(tile_size(TILE), size)
 
+    @jax.jit  # traced once, for the shapes and for the loop
     def attempt_at(again: Int[Array, ""], rows: Array) -> tuple[Any, Array]:
         last = jax.tree.map(lambda x, b: jnp.moveaxis(x[rows], 0, -1) if b else x[..., None], args, batched)
         results, unfinished = attempt(again, *last)

@@ -68,6 +68,15 @@ def where_needed_without_derivatives(
     """Return `compute(*args)` where `needed` holds, else `otherwise`; it cannot be differentiated."""
     # It handles one example, or a batch under any number of nested `vmap`. In a batch, `compute` (which may be
     # `Rounds`) runs only for the examples that need it. It must not close over anything that is batched.
+    structure = jax.tree.structure(args)
+
+    # `vmap` asks for a batch several times. As a function of its own, it is traced for the first time only.
+    @partial(jax.jit, static_argnums=0)
+    def in_tiles(args_batched: tuple[bool, ...], needed, otherwise, args):
+        batched = jax.tree.unflatten(structure, args_batched)
+        if isinstance(compute, Rounds):
+            return _compute_in_rounds(compute, batched, needed, otherwise, args)
+        return _compute_in_tiles(compute, batched, needed, otherwise, args)
 
     @jax.custom_batching.custom_vmap
     def chosen(needed, otherwise, args):
@@ -75,7 +84,7 @@ def where_needed_without_derivatives(
 
     @chosen.def_vmap
     def _(size, batched, needed, otherwise, args):
-        return _batching_rule(compute, size, batched, needed, otherwise, args)
+        return _batching_rule(in_tiles, size, batched, needed, otherwise, args)
 
     return chosen(needed, otherwise, args)
 
@@ -104,7 +113,7 @@ def where_needed(
     return chosen(needed, otherwise, args)
 
 
-def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed, otherwise, args):
+def _batching_rule(in_tiles: Callable[..., Any], size: int, batched: Any, needed, otherwise, args):
     """Batching rule of `where_needed_without_derivatives`: the results, and which leaves are batched (all)."""
     # `batched` has, for each of `needed`, `otherwise` and `args`, which leaves have a batch axis.
 
@@ -120,9 +129,7 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
 
     @jax.custom_batching.custom_vmap
     def batch(needed, otherwise, args):
-        if isinstance(compute, Rounds):
-            return _compute_in_rounds(compute, args_batched, needed, otherwise, args)
-        return _compute_in_tiles(compute, args_batched, needed, otherwise, args)
+        return in_tiles(tuple(jax.tree.leaves(args_batched)), needed, otherwise, args)
 
     @batch.def_vmap
     def _(outer_size, batched, needed, otherwise, args):
@@ -130,7 +137,7 @@ def _batching_rule(compute: Callable[..., Any], size: int, batched: Any, needed,
         all_inner = jax.tree.map(lambda _: True, otherwise)
         flat_args_batched = jax.tree.map(lambda has_inner, has_outer: has_inner or has_outer, args_batched, batched[2])
         results, _ = _batching_rule(
-            compute,
+            in_tiles,
             outer_size * size,
             (True, all_inner, flat_args_batched),
             flattened(needed, True, batched[0]),

@@ -2,14 +2,15 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape, check_type, common_dtype
 from pushjax._internal.jit import quick_jit
-from pushjax.contact.contact_plane import LimitCurve
-from pushjax.contact.problem import Contacts, contacts_in_scalars
+from pushjax.contact.contact_plane import Contact, LimitCurve
+from pushjax.contact.problem import Contacts, contacts_in_columns
 from pushjax.friction.limit_surface import LimitSurface
 
 
@@ -32,10 +33,15 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
     return _force_edges(_checked_contacts(np.zeros(2), normal, friction, common_dtype(normal, friction)))
 
 
+def _first(contacts: Contacts) -> Contact:
+    """Return the first contact."""
+    return jax.tree.map(lambda column: column[0], contacts_in_columns(contacts, contacts.friction))
+
+
 @quick_jit
 def _force_edges(contacts: Contacts) -> Float[Array, "2 2"]:
     """Return the edges of the friction cone of the first contact."""
-    contact = contacts_in_scalars(contacts, contacts.friction)[0]
+    contact = _first(contacts)
     n, mu = contact.normal, contact.friction
     edges = jnp.stack([(n + n.perp().scale(ratio)).array() for ratio in (mu, -mu)])
     return edges / jnp.sqrt(jnp.sum(edges**2, axis=1, keepdims=True))
@@ -79,7 +85,7 @@ def motion_cone(surface: LimitSurface, point: ArrayLike, normal: ArrayLike, fric
 @quick_jit
 def _motion_edges(surface: LimitSurface, contacts: Contacts) -> Float[Array, "2 2"]:
     """Return the edges of the motion cone of the first contact."""
-    contact = contacts_in_scalars(contacts, contacts.friction)[0]
+    contact = _first(contacts)
     curve = LimitCurve.of(surface.form(), contact)
     edges = []
     for ratio in (contact.friction, -contact.friction):

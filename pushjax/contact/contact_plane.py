@@ -33,7 +33,7 @@ from pushjax.friction.limit_surface import Form
 
 
 class Contact(NamedTuple):
-    """One contact in the body frame, in scalars."""
+    """One contact in the body frame, in scalars; or several, as arrays with one axis."""
 
     point: Vec2  # m
     normal: Vec2  # of unit length, into the slider

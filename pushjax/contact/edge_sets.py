@@ -39,7 +39,7 @@ class Sets(NamedTuple):
         """Sets of one edge or of two, (1 or 2, sets) or (1 or 2, sets, batch)."""
         xp = np if isinstance(edges, np.ndarray) else jnp
         none = xp.full((3 - len(edges), *edges.shape[1:]), NO_EDGE, np.int32)
-        return Sets(xp.concatenate([edges, none]), xp.concatenate([edges // 2, none]))
+        return Sets(xp.concatenate([edges, none]), xp.concatenate([edges >> 1, none]))
 
 
 class Solutions(NamedTuple):
@@ -96,7 +96,7 @@ def is_kinematic(problem: ScaledProblem, twist: Float[Array, "3 sets batch"], se
     is_own = contacts == jnp.arange(problem.count)[None, :, None, None]  # (3, contacts, sets, batch)
     is_one = contacts[0] == contacts[1]  # both edges are of one contact, which sticks
     touches, sticks = jnp.any(is_own, axis=0), is_own[0] & is_one
-    side = jnp.sum(jnp.where(is_own & ~is_one[None], 1 - 2 * (edges % 2), 0), axis=0).astype(twist.dtype)
+    side = jnp.sum(jnp.where(is_own & ~is_one[None], 1 - 2 * (edges & 1), 0), axis=0).astype(twist.dtype)
     normal, slip = _motions(problem, twist)
     violation = jnp.maximum(-normal, jnp.where(touches, jnp.abs(normal), 0.0))
     violation = jnp.maximum(violation, jnp.maximum(jnp.where(sticks, jnp.abs(slip), 0.0), side * slip))

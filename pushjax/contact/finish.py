@@ -191,7 +191,7 @@ def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"],
     passes = jnp.all((slip_n >= -wide) | ~problem.active, axis=0)
     fits = (sides <= wide[:, None]) & (problem.active & (slip_n <= wide))[:, None]
     passes &= jnp.all(fits | ~in_set, axis=(0, 1))
-    per_weight = selected(violation_per_weight(problem.friction)[None], chosen.edges // 2)[0]
+    per_weight = selected(violation_per_weight(problem.friction)[None], chosen.edges >> 1)[0]
     total = jnp.sum(jnp.abs(weight), axis=0)
     passes &= jnp.all((per_weight * weight >= -relative / 2 * total[None]) | (chosen.edges < 0), axis=0)
     # In a wedge the rows are nearly dependent. They then determine grad H only up to this tolerance.

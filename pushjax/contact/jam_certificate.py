@@ -20,7 +20,7 @@ roundoff.
 """
 
 from itertools import combinations, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,18 +88,21 @@ class _Rows(NamedTuple):
         rows = jnp.concatenate([rows, jnp.broadcast_to(dummies, (9, 2, *mu.shape[1:]))], axis=1)
         return _Rows(rows[:3], rows[3:])
 
-    def four(self, numbers: Array, values: Float[Array, "9 4 *rest"]) -> _Four:
-        """The sets of four edges with these numbers, (4, ...), given the rows of their edges."""
-        first, second, third, fourth = numbers
-        moment = self.wrench.shape[1] - 2
-        has_across = fourth == moment + 1
-        kinds = first // 2 == second // 2, (third // 2 == fourth // 2) & ~has_across, has_across, third == moment
+    def four(self, values: Float[Array, "9 4 *rest"], kinds: Bool[Array, "4 *rest"]) -> _Four:
+        """Sets of four edges, given the rows of their edges and their kinds (`_kinds`)."""
         wrench, power, friction, edge_cross, active = values[:3], values[3], values[4], values[5:8], values[8]
         return _Four(wrench, power, jnp.all(active > 0, axis=0), friction[::2], edge_cross[:, ::2], *kinds)
 
     def stacked(self) -> Float[Array, "9 edges *batch"]:
         """All rows in one array."""
         return jnp.concatenate([self.wrench, self.numbers])
+
+
+def _kinds(numbers: Any, num_edges: int) -> tuple[Any, Any, Any, Any]:
+    """The last four fields of `_Four` for sets of four edges with these numbers, (4, ...)."""
+    first, second, third, fourth = numbers
+    has_across = fourth == num_edges + 1
+    return first >> 1 == second >> 1, (third >> 1 == fourth >> 1) & ~has_across, has_across, third == num_edges
 
 
 def search_squeeze(problem: ScaledProblem) -> Squeeze:
@@ -110,9 +113,10 @@ def search_squeeze(problem: ScaledProblem) -> Squeeze:
     rows, table = _Rows.of(problem), _sets(2 * problem.count)
     stacked = rows.stacked()
 
-    def try_sets(best: Squeeze, numbers: Int[Array, "4 sets"]):
+    def try_sets(best: Squeeze, sets: tuple[Int[Array, "4 sets"], Bool[Array, "4 sets"]]):
+        numbers, kinds = sets
         values = jnp.take(stacked, numbers.reshape(-1), axis=1, mode="clip").reshape(9, *numbers.shape, -1)
-        found = _equilibrium(rows.four(numbers[..., None], values))
+        found = _equilibrium(rows.four(values, kinds[..., None]))
         power = jnp.where(found.exists, found.power, -jnp.inf)
         index = jnp.argmax(power, axis=0)
         largest = jnp.max(power, axis=0)
@@ -121,7 +125,9 @@ def search_squeeze(problem: ScaledProblem) -> Squeeze:
         edges = jnp.where(better[None], jnp.take(numbers, index, axis=1), best.edges)
         return Squeeze(jnp.where(better, largest, best.power), presses, edges), None
 
-    return jax.lax.scan(try_sets, start, jnp.asarray(table))[0]
+    # from the static table: the compiler would compute them again for every example
+    kinds = np.stack([np.stack(_kinds(numbers, 2 * problem.count)) for numbers in table])
+    return jax.lax.scan(try_sets, start, (jnp.asarray(table), jnp.asarray(kinds)))[0]
 
 
 def squeeze_power(problem: ScaledProblem, edges: Int[Array, "4 *batch"]) -> Float[Array, "*batch"]:
@@ -130,7 +136,8 @@ def squeeze_power(problem: ScaledProblem, edges: Int[Array, "4 *batch"]) -> Floa
     Whether it exists is not decided again, because with other roundoff the answer could be no.
     """
     rows = _Rows.of(problem)
-    return _equilibrium(rows.four(edges, selected(rows.stacked(), edges))).power
+    kinds = jnp.stack(_kinds(edges, 2 * problem.count))
+    return _equilibrium(rows.four(selected(rows.stacked(), edges), kinds)).power
 
 
 def _sets(num_edges: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from pushjax._internal.checks import (
     concrete,
 )
 from pushjax._internal.jit import quick_jit
-from pushjax._math.vec import Scalar, Vec2, Vec3, unstack
+from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.exhaustive import Continuing, Exhaustive
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
@@ -194,53 +194,46 @@ def check_solver(solver: Any) -> None:
 @quick_jit
 def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | StickingSolver | None) -> Motion:
     """`solve_contacts`, compiled."""
-    form, friction = to_scalars(surface, contacts.friction)
+    form, friction = form_and_friction(surface, contacts.friction)
     friction = jnp.where(_is_unit(contacts.normal), friction, jnp.nan)  # `Contacts` could not check a traced normal
-    scalars, active = contacts_in_scalars(contacts, friction), unstack(contacts.active)
     solver = solver or (ScalarRoot() if len(friction) == 1 else Exhaustive())
-    result = solve_in_scalars(form, scalars, active, solver, None, margin=True)
+    result = solve_problem(form, contacts_in_columns(contacts, friction), contacts.active, solver, None, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
-        twist=result.twist.array(),
-        wrench=wrench.array(),
-        force=jnp.stack([f.array() for f in result.force]),
-        mode=jnp.stack(result.mode),
-        status=result.status,
-        margin=result.margin,
-        unique=result.unique,
+        result.twist.array(), wrench.array(), result.force, result.mode, result.status, result.margin, result.unique
     )
 
 
-class ScalarSolution(NamedTuple):
-    """The answer to a contact problem, in scalars."""
+class ContactSolution(NamedTuple):
+    """The answer to a contact problem."""
 
     twist: Vec3  # m, m, rad
     wrench: Vec3  # normalized, on H = 1
-    force: tuple[Vec2, ...]  # along (normal, tangent), N
-    mode: tuple[Int[Array, ""], ...]  # `ContactMode`
+    force: Float[Array, "contacts 2"]  # along (normal, tangent), N
+    mode: Int[Array, "contacts"]  # `ContactMode`
     status: Int[Array, ""]  # `Status`
     margin: Scalar  # minus the hand's squeeze power, m, as in `Motion`
     unique: Bool[Array, ""]  # False where the solver found another twist that satisfies every condition
     best: EdgeSet | None  # the cone edges that carry the force, or else the guess; None without a guess
 
 
-def solve_in_scalars(
+def solve_problem(
     form: Form,
-    contacts: tuple[Contact, ...],
-    active: tuple[Bool[Array, ""], ...],
+    contacts: Contact,  # with an axis for the contacts
+    active: Bool[Array, "contacts"],
     solver: ContactSolver | StickingSolver | None,
     guess: EdgeSet | None,
     *,
     margin: bool = False,
-) -> ScalarSolution:
-    """Solve a contact problem whose contacts are scalars.
+) -> ContactSolution:
+    """Solve a contact problem.
 
     `guess` may be the cone edges that carried the force before; the default solver tries them first.
 
     Raises:
         ValueError: For more than eight contacts, or for more than one with a solver of one contact.
     """
-    count = len(contacts)
+    count = len(active)
     if not 1 <= count <= MAX_CONTACTS:
         raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {count}")
     if solver is None:
@@ -248,20 +241,20 @@ def solve_in_scalars(
     if isinstance(solver, StickingSolver):
         if count != 1:
             raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
-        one = solve_single(form, contacts[0].where(active[0]), solver)
+        one = solve_single(form, jax.tree.map(lambda column: column[0], contacts.where(active)), solver)
         infinite = jnp.full_like(one.twist.x, jnp.inf)
-        return ScalarSolution(one.twist, one.wrench, (one.force,), (one.mode,), one.status, infinite, one.unique, guess)
+        force = one.force.array()[None]
+        return ContactSolution(one.twist, one.wrench, force, one.mode[None], one.status, infinite, one.unique, guess)
     answer = solve((form, contacts, active), guess, solver, margin=margin)
     twist, wrench, force = answer.solution
-    forces, modes = tuple(Vec2(*unstack(f)) for f in force.T), tuple(unstack(answer.mode))
     best = None if guess is None else answer.best
-    return ScalarSolution(
-        Vec3.of(twist), Vec3.of(wrench), forces, modes, answer.status, answer.margin, answer.unique, best
+    return ContactSolution(
+        Vec3.of(twist), Vec3.of(wrench), force.T, answer.mode, answer.status, answer.margin, answer.unique, best
     )
 
 
-def to_scalars(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
-    """The limit surface in scalars, and the friction of the contacts, (contacts,)."""
+def form_and_friction(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
+    """H of the limit surface, and the friction of the contacts, (contacts,)."""
     form = surface.form()
     # A surface with numbers that cannot be computed with is replaced by one with all numbers one, which keeps NaN out.
     # The friction is then NaN, which makes every contact invalid.
@@ -274,11 +267,7 @@ def _is_unit(normal: Float[Array, "contacts 2"]) -> Bool[Array, "contacts"]:
     return jnp.abs(jnp.sum(normal**2, axis=1) - 1) <= 2 * UNIT_TOLERANCE
 
 
-def contacts_in_scalars(contacts: Contacts, friction: Array) -> tuple[Contact, ...]:
-    """The contacts in scalars. A contact that is not active is out of reach, whatever its numbers are."""
-    vectors = (contacts.point, contacts.normal, contacts.displacement)
-    rows = zip(*(unstack(array) for array in (*vectors, friction, contacts.gap, contacts.active)), strict=True)
-    return tuple(
-        Contact(Vec2.of(point), Vec2.of(normal), Vec2.of(displacement), mu, gap).where(active)
-        for point, normal, displacement, mu, gap, active in rows
-    )
+def contacts_in_columns(contacts: Contacts, friction: Array) -> Contact:
+    """The contacts with one axis. A contact that is not active is out of reach, whatever its numbers are."""
+    point, normal, displacement = (Vec2.of(rows.T) for rows in (contacts.point, contacts.normal, contacts.displacement))
+    return Contact(point, normal, displacement, friction, contacts.gap).where(contacts.active)

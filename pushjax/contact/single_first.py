@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import decide, tree_where
+from pushjax._internal.xla import decide
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.single import SingleSolution, solve_single
 from pushjax.contact.status import Status
@@ -21,32 +21,25 @@ CLEARANCE = 4
 
 
 def solve_most_pressed(
-    form: Form, contacts: tuple[Contact, ...]
-) -> tuple[Bool[Array, ""], SingleSolution, tuple[Bool[Array, ""], ...]]:
+    form: Form, contacts: Contact
+) -> tuple[Bool[Array, ""], SingleSolution, Bool[Array, "contacts"]]:
     """Solve the contact that is pressed most, as if it were alone.
 
     Returns:
         Whether the motion is an answer: it moves the slider away from all other contacts, or no contact is pressed.
         Then the motion, and for each contact whether it is the one.
     """
-    approaches = tuple(contact.approach().x for contact in contacts)
-    main, deepest = contacts[0], approaches[0]
-    is_main = (jnp.ones((), bool),)
-    for contact, approach in zip(contacts[1:], approaches[1:], strict=True):
-        deeper = decide(approach > deepest, form.length)
-        main, deepest = tree_where(deeper, contact, main), jnp.where(deeper, approach, deepest)
-        is_main = (*(is_own & ~deeper for is_own in is_main), deeper)
-    one = solve_single(form, main, ScalarRoot())
-    twist, length, constant_contacts = jax.lax.stop_gradient((one.twist, form.length, contacts))
+    approach = contacts.approach().x
+    is_main = jnp.arange(approach.size) == jnp.argmax(approach)
+    one = solve_single(
+        form, jax.tree.map(lambda column: jnp.sum(jnp.where(is_main, column, 0.0)), contacts), ScalarRoot()
+    )
+    twist, length, contacts, approach = jax.lax.stop_gradient((one.twist, form.length, contacts, approach))
+    displacement = jnp.abs(contacts.displacement.x) + jnp.abs(contacts.displacement.y)
     size = jnp.abs(twist.x) + jnp.abs(twist.y) + length * jnp.abs(twist.z)
-    for contact in constant_contacts:
-        displacement = jnp.abs(contact.displacement.x) + jnp.abs(contact.displacement.y)
-        size = jnp.maximum(size, jnp.maximum(displacement, -contact.gap))
-    all_clear, none_pressed, valid = (jnp.ones((), bool),) * 3
-    for contact, approach, is_own in zip(constant_contacts, approaches, is_main, strict=True):
-        normal_motion = contact.normal.dot(twist.xy + contact.point.perp().scale(twist.z))
-        all_clear &= (normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size) | is_own
-        none_pressed &= approach <= 0
-        valid &= contact.friction >= 0
-    suffices = valid & ((all_clear & (one.status == Status.MOVING)) | none_pressed)
-    return decide(suffices, contacts[0].gap), one, is_main
+    size = jnp.maximum(size, jnp.max(jnp.maximum(displacement, -contacts.gap)))
+    normal_motion = contacts.normal.dot(twist.xy + contacts.point.perp().scale(twist.z))
+    clear = normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size
+    answers = jnp.all(clear | is_main) & (one.status == Status.MOVING)
+    suffices = jnp.all(contacts.friction >= 0) & (answers | jnp.all(approach <= 0))
+    return decide(suffices, contacts.gap[0]), one, is_main

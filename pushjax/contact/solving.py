@@ -57,8 +57,8 @@ class Answer(NamedTuple):
     squeeze_edges: Int[Array, "4 *batch"]  # edges of the equilibrium of the largest squeeze power
 
 
-# H, the contacts, and whether each takes part.
-Problem = tuple[Form, tuple[Contact, ...], tuple[Bool[Array, ""], ...]]
+# H, the contacts, with one axis, and whether each takes part.
+Problem = tuple[Form, Contact, Bool[Array, "contacts"]]
 
 
 def solve(problem: Problem, guess: EdgeSet | None, solver: ContactSolver, *, margin: bool) -> Answer:
@@ -78,16 +78,15 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
     arrays = _arrays(problem)
     if not isinstance(solver, Continuing) or guess is None:
         return batch_last(attempt, jnp.ones((), bool), jnp.zeros((), bool), arrays, None)
-    contacts = tuple(contact.where(a) for contact, a in zip(contacts, active, strict=True))
-    suffices, one, is_main = solve_most_pressed(form, contacts)
+    contacts = contacts.where(active)
+    suffices, one, is_own = solve_most_pressed(form, contacts)
     together = batch_last(attempt, ~suffices, guess.exists(), arrays, guess)
     # computed once, or each entry of the answer would compute all of it again
-    modes = tuple(one.mode == kind for kind in (ContactMode.STICKING, ContactMode.SLIDING_LEFT))
+    modes = one.mode == ContactMode.STICKING, one.mode == ContactMode.SLIDING_LEFT
     floats = one.twist, one.wrench, one.force
-    (twist, wrench, force), is_main, modes = compute_once((floats, is_main, modes), contacts[0].gap)
-    is_own, mu = jnp.stack(is_main), jnp.stack([contact.friction for contact in contacts])
-    sticks, slides_left = modes
-    own = _edges_of_one(is_own, sticks, slides_left, force.array(), jnp.sum(jnp.where(is_own, mu, 0.0)))
+    (twist, wrench, force), (sticks, slides_left) = compute_once((floats, modes), contacts.gap[0])
+    own_friction = jnp.sum(jnp.where(is_own, contacts.friction, 0.0))
+    own = _edges_of_one(is_own, sticks, slides_left, force.array(), own_friction)
     moves = one.status == Status.MOVING
     alone = together._replace(
         solution=Solution(twist.array(), wrench.array(), jnp.where(is_own[None], force.array()[:, None], 0.0)),
@@ -96,7 +95,7 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
         margin=jnp.full_like(together.margin, jnp.inf),
         unique=one.unique,
         best=tree_where(moves, own, guess),
-        loaded=jnp.any((own.edges[:, None] == jnp.arange(2 * len(contacts))[None]) & moves, axis=0),
+        loaded=jnp.any((own.edges[:, None] == jnp.arange(2 * active.size)[None]) & moves, axis=0),
         indeterminate=jnp.zeros((), bool),
     )
     return tree_where(suffices, alone, together)
@@ -130,13 +129,9 @@ def _with_derivatives_of(value: Array, near: Array) -> Array:
 def _arrays(problem: Problem) -> ContactArrays:
     """The contacts of one example in arrays."""
     form, contacts, active = problem
-    point, normal, displacement = (
-        jnp.stack([jnp.stack(rows) for rows in zip(*vectors, strict=True)])
-        for vectors in zip(*(contact[:3] for contact in contacts), strict=True)
-    )
-    gap, friction = (jnp.stack([getattr(contact, name) for contact in contacts]) for name in ("gap", "friction"))
-    surface = Polynomial.of(form.table())
-    arrays = ContactArrays(surface, form.length, point, normal, displacement, gap, friction, jnp.stack(active))
+    point, normal, displacement = contacts.point.array(), contacts.normal.array(), contacts.displacement.array()
+    surface, friction = Polynomial.of(form.table()), contacts.friction
+    arrays = ContactArrays(surface, form.length, point, normal, displacement, contacts.gap, friction, active)
     dtype = jnp.result_type(*jax.tree.leaves(arrays[:-1]))
     return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), arrays)
 

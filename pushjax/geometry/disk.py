@@ -1,4 +1,4 @@
-"""Disks: closest point and sweep in closed form."""
+"""Disks."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, ray_circle_intersection
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape
 
 
 class DiskOutline(Outline):
@@ -15,6 +15,14 @@ class DiskOutline(Outline):
 
     center: Vec2
     radius: Scalar
+
+    @property
+    def is_convex(self) -> bool:
+        return True
+
+    @property
+    def num_facing(self) -> int:
+        return 1
 
     def closest(self, x: Vec2) -> ClosestPoint:
         offset = x - self.center
@@ -30,9 +38,6 @@ class DiskOutline(Outline):
     def facing(self, direction: Vec2) -> FacingPoints:
         point = self.center + direction.scale(self.radius)
         return FacingPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
-
-    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        return ray_circle_intersection(x - self.center, path, self.radius + radius)
 
 
 class Disk(Shape):

@@ -1,8 +1,8 @@
-"""Ellipses: closest point and sweep, each by one root on the outline.
+"""Ellipses, whose closest points are roots on the outline.
 
 The semi-axes are a along x and b along y; coordinates are relative to the center. The outline is parameterized by a
 unit vector q = (c, s) = (cos phi, sin phi). The point at q is p = (a c, b s), and the outward normal n is (b c, a s),
-normalized. Each query is one root in q. A fixed number of bracketed iterations, which JAX does not differentiate, finds
+normalized. A fixed number of bracketed iterations, which JAX does not differentiate, finds
 the root. One more, differentiable iteration then gives the root its derivatives. Derivatives are by phi, but angles
 appear only as small rotations of q.
 
@@ -10,13 +10,7 @@ Closest point to x: q is a critical point of the distance where f(q) = (a^2 - b^
 quadrant of (|x|, |y|), f falls through zero at exactly one q, and this is the closest point. The iterations use
 Halley's method for two reasons. It is of third order, so that second derivatives are also right after one iteration.
 And at the cusps of the evolute, where the root is threefold, it still halves the error in each iteration.
-
-Sweep: a disk of radius r touches the outline at q where x + t path = p(q) + r n(q), so g(q) = cross(path, p + r n - x)
-= 0. On the half of the outline that faces the path, g falls monotonically. So the values of g at the ends of this half
-decide whether there is a hit, and there is only one root to find.
 """
-
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -25,12 +19,11 @@ from jaxtyping import Array, Bool, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, equally_spaced, roundoff
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, equally_spaced
 
 # Most points reach roundoff in 6 iterations. Near the cusps of the evolute each iteration only halves the error, but
 # there f determines the angle of q only to a third of its digits.
 CLOSEST_ITERATIONS = {False: 8, True: 16}  # key: whether the type is float64
-SWEEP_ITERATIONS = 8
 # Number of intervals for the arc length. Its integrand is smooth between two nodes, down to axes of 1 : 100.
 ARC_NODES = 512
 
@@ -40,6 +33,14 @@ class EllipseOutline(Outline):
 
     center: Vec2
     semi: Vec2  # semi-axes along x and y
+
+    @property
+    def is_convex(self) -> bool:
+        return True
+
+    @property
+    def num_facing(self) -> int:
+        return 1
 
     def _evaluate(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
         """Return the point at `q` relative to the center, the outward unit normal, and the speed, m per rad."""
@@ -58,22 +59,6 @@ class EllipseOutline(Outline):
         height = jnp.sqrt(scaled_direction.dot(scaled_direction))
         point = self.center + Vec2(self.semi.x * scaled_direction.x, self.semi.y * scaled_direction.y).scale(1 / height)
         return FacingPoints(jax.tree.map(lambda entry: entry[None], point), jnp.ones(1, bool))
-
-    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        rel = x - self.center
-        fixed = jax.lax.stop_gradient((self.semi, rel, path, radius))
-        q, crosses = _contact_parameter(*fixed)
-        height, slope, *_ = _center_height(self.semi, rel, path, radius, q)
-        # This step makes q exact to first order. Below, q only selects the tangent line that is hit, so the fraction is
-        # exact to third order.
-        q = _rotated(q, -height / jnp.where(slope < 0, slope, -jnp.inf))
-        foot, normal, _ = self._evaluate(q)
-        gap = normal.dot(rel - foot) - radius
-        approach = -normal.dot(path)
-        size = jnp.abs(rel.x) + jnp.abs(rel.y) + radius + self.semi.x + self.semi.y
-        hits = crosses & (approach > 0) & (gap >= -roundoff(size)) & (gap <= approach)
-        fraction = gap / jnp.where(hits, approach, 1.0)
-        return jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf)
 
 
 def _unit(v: Vec2) -> Vec2:
@@ -177,36 +162,6 @@ def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi
         iterations,
         ax,
     )
-
-
-def _center_height(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar, q: Vec2) -> tuple[Scalar, Scalar, Scalar]:
-    """Return g(q), m^2, its derivative by the angle of q, and Newton's step to its root, in rad."""
-    # g is the height of the touching disk's center over the line of the path, times the path's length.
-    scaled_normal = Vec2(semi.y * q.x, semi.x * q.y)
-    squared = scaled_normal.dot(scaled_normal)
-    speed = jnp.sqrt(squared)
-    normal = scaled_normal.scale(1 / speed)
-    center = Vec2(semi.x * q.x, semi.y * q.y) + normal.scale(radius)
-    slope = path.dot(normal) * (speed + radius * semi.x * semi.y / squared)
-    value = path.cross(center - rel)
-    return value, slope, -value / jnp.where(slope < 0, slope, -jnp.inf)
-
-
-def _contact_parameter(semi: Vec2, rel: Vec2, path: Vec2, radius: Scalar) -> tuple[Vec2, Array]:
-    """Find q where a disk first touches on its path, and whether it touches anywhere on the line of the path."""
-    is_moving = path.dot(path) > 0
-    direction = tree_where(is_moving, path, Vec2(jnp.ones_like(path.x), jnp.zeros_like(path.x)))
-    end = _unit(Vec2(semi.x * direction.y, -semi.y * direction.x))  # where the tangent is parallel to the path
-    start_height, end_height = (_center_height(semi, rel, direction, radius, side)[0] for side in (-end, end))
-    (crosses,) = decide((is_moving & (start_height > 0) & (end_height < 0),), rel.x)
-    # Initial guess: between its ends, g is a cosine if the radius is zero. Else it is nearly a cosine, most closely at
-    # the ends.
-    cosine = jnp.clip((start_height + end_height) / jnp.where(crosses, start_height - end_height, 1.0), -1.0, 1.0)
-    guess = _unit(end.scale(cosine) - end.perp().scale(jnp.sqrt((1 - cosine) * (1 + cosine))))
-    size = jnp.abs(rel.x) + jnp.abs(rel.y) + semi.x + semi.y + radius
-    zero_tolerance = 0.5 * jnp.finfo(size.dtype).eps * size * jnp.sqrt(direction.dot(direction))
-    height = partial(_center_height, semi, rel, direction, radius)
-    return _falling_root_on_circle(height, guess, -end, end, zero_tolerance, SWEEP_ITERATIONS, rel.x), crosses
 
 
 class Ellipse(Shape):

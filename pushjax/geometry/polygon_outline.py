@@ -1,4 +1,4 @@
-"""Outlines of polygons, convex or not: closest points, second contacts (see `Outline.contact_candidates`) and sweep."""
+"""Outlines of polygons, convex or not: closest points, second contacts (see `Outline.contact_candidates`)."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import compute_once, entry_at, tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, Outline, ray_circle_intersection, roundoff
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, roundoff
 
 
 class Edge(NamedTuple):
@@ -55,7 +55,16 @@ class PolygonOutline(Outline):
     """Outline of a polygon that runs counterclockwise."""
 
     edges: Edge
-    convex: bool = eqx.field(static=True, default=False)  # False also if convexity is not known
+    convex: bool = eqx.field(static=True)  # False also if convexity is not known
+    touched_once: bool = eqx.field(static=True, default=False)  # whether only the nearest place counts
+
+    @property
+    def max_touches(self) -> int:
+        return 1 if self.touched_once else super().max_touches
+
+    @property
+    def is_convex(self) -> bool:
+        return self.convex
 
     def _nearest_edge(self, x: Vec2) -> Int[Array, ""]:
         """Return the index of the edge nearest to `x`."""
@@ -66,7 +75,7 @@ class PolygonOutline(Outline):
         return _closest_on_edge(entry_at(self.edges, self._nearest_edge(x)), x)
 
     def contact_candidates(self, x: Vec2) -> tuple[ClosestPoint, ...]:
-        if self.convex:
+        if self.max_touches == 1:
             return (self.closest(x),)
         nearest = self._nearest_edge(x)
         first = _closest_on_edge(entry_at(self.edges, nearest), x)
@@ -85,24 +94,21 @@ class PolygonOutline(Outline):
         normal = tree_where(found, tree_where(on_edge, other.normal, at_vertex.normal), first.normal)
         return first, ClosestPoint(distance, point, normal)
 
-    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        # computed once, because the derivative of a minimum compares it with each value
-        return jnp.min(compute_once(_first_touches(self.edges, x, path, radius), x.x))
+    def pieces(self, x: Vec2) -> tuple[Float[Array, "pieces"], Vec2 | None]:
+        if self.convex:
+            return super().pieces(x)
+        *_, from_edge = self.edges.foot(x)
+        squared = from_edge.dot(from_edge)
+        length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
+        inside = jnp.minimum(self.closest(x).distance, 0.0)
+        return jnp.where((squared > 0) & (inside >= 0), length, inside), from_edge.scale(1 / length)
 
+    @property
+    def num_facing(self) -> int:
+        return self.edges.length.size
 
-def _first_touches(edge: Edge, x: Vec2, path: Vec2, radius: Scalar) -> Float[Array, " edges"]:
-    """Return the fraction of `path` of first contact with each edge or its start vertex, or inf."""
-    rel = x - edge.start
-    approach = -edge.normal.dot(path)
-    gap = edge.normal.dot(rel) - radius
-    fraction = gap / jnp.where(approach > 0, approach, 1.0)
-    contact_position = rel.dot(edge.along) + fraction * path.dot(edge.along)
-    # The tolerance is for two cases that would be missed by roundoff: a disk that starts in contact, and a point that
-    # aims at a vertex.
-    tolerance = roundoff(jnp.abs(rel.x) + jnp.abs(rel.y) + radius + edge.length)
-    on_edge = (contact_position >= -tolerance) & (contact_position <= edge.length + tolerance)
-    hits = (approach > 0) & (gap >= -tolerance) & (fraction <= 1) & on_edge
-    return jnp.minimum(jnp.where(hits, jnp.maximum(fraction, 0), jnp.inf), ray_circle_intersection(rel, path, radius))
+    def facing(self, direction: Vec2) -> FacingPoints:
+        return FacingPoints(self.edges.start, jnp.ones(self.num_facing, bool))
 
 
 def _closest_on_edge(edge: Edge, x: Vec2) -> ClosestPoint:

@@ -40,6 +40,21 @@ class Outline(eqx.Module):
     # Its methods take and return `Vec2` instead of arrays; `pushjax._math.vec` gives the reason. Whatever does not
     # depend on the query point is computed once, when `Shape.outline` creates the outline.
 
+    @property
+    @abstractmethod
+    def is_convex(self) -> bool:
+        """Whether the outline is known to be convex."""
+
+    @property
+    def max_touches(self) -> int:
+        """Number of places in which a round finger may touch at the same time, as `contact_candidates` finds them."""
+        return 1 if self.is_convex else 2
+
+    @property
+    @abstractmethod
+    def num_facing(self) -> int:
+        """Number of points that `facing` returns."""
+
     @abstractmethod
     def closest(self, x: Vec2) -> ClosestPoint:
         """Return the signed distance, closest point and outward normal for the query point `x`, m, body frame."""
@@ -53,16 +68,16 @@ class Outline(eqx.Module):
         # the perimeter, which is out of reach of any finger.
         return (self.closest(x),)
 
-    @abstractmethod
-    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        """Return the fraction of `path`, from 0 to 1, after which a disk first touches, or inf if it never does."""
-        # The result is exact for any length of the path, so a fast disk cannot tunnel through the outline. The disk
-        # starts at `x`, outside or in contact up to roundoff. If it starts in contact and approaches, the result is 0.
+    def pieces(self, x: Vec2) -> tuple[Float[Array, "pieces"], Vec2 | None]:
+        """Return the distances of `x` from convex pieces of the shape, m, and the unit vectors to `x` from there."""
+        # The pieces together have the boundary of the shape. If none are known, there is one, and no unit vectors.
+        found = self.closest(x)
+        return found.distance[None], jax.tree.map(lambda n: n[None], found.normal) if self.is_convex else None
 
+    @abstractmethod
     def facing(self, direction: Vec2) -> FacingPoints:
-        """Return the locally convex points of a smooth outline whose outward normal is the unit vector `direction`."""
+        """Return the corners, or the locally convex points whose outward normal is the unit vector `direction`."""
         # A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
-        raise NotImplementedError(f"{type(self).__name__} has corners, at which the outward normal is not unique")
 
 
 class Shape(eqx.Module):
@@ -152,24 +167,6 @@ class Shape(eqx.Module):
             ValueError: If `point` has another shape, or is NaN or infinite.
         """
         return self.signed_distance(point) <= 0
-
-
-def ray_circle_intersection(x: Vec2, path: Vec2, reach: Scalar) -> Scalar:
-    """Return the fraction of `path` at which a point that starts at `x` comes within `reach` of the origin, or inf."""
-    # This is the smaller root of |x + t path|^2 = reach^2, in a form without cancellation. It is valid only for a point
-    # that approaches and starts outside, or inside by no more than roundoff.
-    a = path.dot(path)
-    b = x.dot(path)
-    squared = x.dot(x)
-    c = squared - reach * reach
-    # The discriminant is b^2 - a c. In that form it would be a small difference of large numbers for a distant
-    # start. So it is computed as a reach^2 - (x cross path)^2, which is equal.
-    cross = x.cross(path)
-    discriminant = a * reach * reach - cross * cross
-    hits = (b < 0) & (c >= -roundoff(16 * squared)) & (discriminant > 0)
-    root = jnp.sqrt(jnp.where(hits, discriminant, 1.0))
-    fraction = jnp.maximum(c / jnp.where(hits, root - b, 1.0), 0)
-    return jnp.where(hits & (fraction <= 1), fraction, jnp.inf)
 
 
 def roundoff(size: Scalar) -> Scalar:

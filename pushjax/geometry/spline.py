@@ -20,7 +20,6 @@ from pushjax._math.roots import Proposal, bracketed_root
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline
 from pushjax.geometry.spline_segment import SplineSegment, outward_normal
-from pushjax.geometry.spline_sweep import first_contact
 
 SAMPLES = 4  # nodes per segment
 # How far past its ends a segment, or an interval between two nodes, accepts a root; as a fraction of its width.
@@ -52,6 +51,10 @@ class SplineOutline(Outline):
     velocity: Vec2  # derivatives of the outline's point with respect to the index of the node, m
     perimeter: Scalar  # m
     convex: bool = eqx.field(static=True)
+
+    @property
+    def is_convex(self) -> bool:
+        return self.convex
 
     def _local_minima(self, x: Vec2) -> Minima:
         """Return the local minima of phi for the query point `x`, from the cubics between the nodes."""
@@ -131,8 +134,9 @@ class SplineOutline(Outline):
         none = ClosestPoint(first.distance + self.perimeter, first.point, first.normal)
         return first, tree_where(found, second, none)
 
-    def sweep(self, x: Vec2, path: Vec2, radius: Scalar) -> Scalar:
-        return first_contact(self.segments, x, path, radius, convex=self.convex)
+    @property
+    def num_facing(self) -> int:
+        return self.segments.c0.x.size
 
     def facing(self, direction: Vec2) -> FacingPoints:
         """Return the points on which a straight edge on the side of `direction` can rest; see `Outline.facing`."""

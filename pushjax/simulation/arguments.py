@@ -24,9 +24,9 @@ from pushjax.friction.friction_model import warn_about_percent
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
-from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
+from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.path import checked_path
 from pushjax.simulation.slider import Slider, fixture_overlaps, overlaps
 

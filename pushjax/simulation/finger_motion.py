@@ -11,7 +11,7 @@ from pushjax._internal.xla import compute_once, map_items
 from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin, sinc, wrap_to_pi
 from pushjax.geometry.shape import Outline
 from pushjax.simulation.candidate import FingerPose
-from pushjax.simulation.detection import penetration_depth
+from pushjax.simulation.detection import pair_of
 from pushjax.simulation.fixtures import Fixtures, Wall
 from pushjax.simulation.hand import Finger, Hand, Pad, RoundFinger
 
@@ -72,7 +72,7 @@ class FingerMotion(NamedTuple):
         if isinstance(self.finger, Wall):
             return FingerPose(center, Vec2.of(self.finger.normal).unrotate(slider.angle))
         if not isinstance(self.finger, Pad):  # a disk looks the same at any angle
-            return FingerPose(center, None)
+            return FingerPose(center, Vec2(jnp.ones_like(center.x), jnp.zeros_like(center.x)))
         if self.angle is None or self.turning is None:
             raise ValueError("hand: pads need kinematics that give poses (x, y, theta), not centers")
         return FingerPose(
@@ -180,11 +180,18 @@ def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: V
     frame = BodyFrame.at(pose)
 
     def depth_of(motion: FingerMotion) -> Scalar:
-        return penetration_depth(
-            motion.finger, outline, compute_once(motion.pose_in_slider(frame, jnp.full_like(pose.x, fraction)), pose.x)
-        )
+        where = compute_once(motion.pose_in_slider(frame, jnp.full_like(pose.x, fraction)), pose.x)
+        return -pair_of(motion.finger, outline).distance(motion.finger, outline, where)[0]
 
     return functools.reduce(jnp.maximum, map_items(depth_of, motions))
+
+
+def overlap_and_gap(
+    outline: Outline, motions: tuple[FingerMotion, ...], fixtures: tuple[FingerMotion, ...], pose: Vec3, fraction: float
+) -> tuple[Scalar, Scalar]:
+    """Return the depth of the deepest finger or fixture, and how far the nearest finger is from the slider, m."""
+    depth = max_penetration(outline, motions, pose, fraction)
+    return (jnp.maximum(depth, max_penetration(outline, fixtures, pose, fraction)) if fixtures else depth), -depth
 
 
 def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:

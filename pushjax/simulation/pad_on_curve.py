@@ -1,51 +1,86 @@
-"""Contact detection for a pad against a smooth outline: contact candidates and penetration depth.
+"""Contacts and distance of a pad and a smooth outline.
 
-An edge of the pad touches where the outward normal of the outline is opposite to the normal of the edge. These support
-points (`Outline.facing`) depend on the direction only. A corner of the pad touches at the point of the outline nearest
-to it. Past the end of an edge the first kind of contact becomes the second, so no contact is missed and none jumps.
+An edge of the pad touches where the outward normal of the outline is opposite to the normal of the edge. These points
+(`Outline.facing`) depend on the direction only. A corner of the pad touches at the point of the outline nearest to it.
+Past the end of an edge the first kind of contact becomes the second, so no contact is missed and none jumps.
+
+The first number of a contact's features is that of the corner or of the edge. The second is that of the point among
+those that face the edge, or -1 for a corner.
 """
-
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import largest
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.polygon_outline import Edge, PolygonOutline
+from pushjax.geometry.polygon_outline import Edge
 from pushjax.geometry.shape import Outline
+from pushjax.simulation.candidate import Candidates, FingerPose, Touches, joined, pick
+from pushjax.simulation.pad_on_polygon import END_TOLERANCE, TILT_TOLERANCE, Corner
+from pushjax.simulation.pair import MAX_PENETRATION, Pair
+
+CORNER = -1
 
 
-class EdgeSupport(NamedTuple):
-    """Points of an outline that face the edges of a pad (support points), as arrays over the points of all edges."""
+class PadOnCurve(Pair):
+    """A pad and a smooth outline that is no disk."""
 
-    valid: Bool[Array, "points"]  # whether the point exists
-    point: Vec2  # in the outline's frame, m
-    normal: Vec2  # outward unit normal of the pad's edge, in the outline's frame
-    local: Vec2  # the point in the pad's frame, m
-    along: Scalar  # coordinate of the point along the edge, m
-    length: Scalar  # of the edge, m
-    height: Scalar  # of the point above the edge, m
+    def count(self, outline):
+        return 2
+
+    def distance(self, finger, outline, pose):
+        pad = finger.shape.outline()
+        at_corners = jax.vmap(outline.closest)(pose.center + pad.edges.start.rotate(pose.angle))
+        places, local, _ = jax.vmap(lambda edge: _places_on_edge(edge, outline, pose))(pad.edges)
+        at_edges = jax.vmap(jax.vmap(pad.closest))(local)
+        of_edges = jax.tree.map(jnp.ravel, (at_edges.distance, -at_edges.normal.rotate(pose.angle)))
+        valid = jnp.concatenate([jnp.ones(at_corners.distance.shape, bool), places.exists.ravel()])
+        distance, normal = joined((at_corners.distance, at_corners.normal), of_edges)
+        return pick((distance, normal), jnp.argmin(jnp.where(valid, distance, jnp.inf)))
+
+    def candidates(self, finger, outline, pose, displacement_at, length):
+        pad, too_deep = finger.shape.outline(), -2 * MAX_PENETRATION * length
+        corner = Corner.of(pad).turned(pose.angle, pose.center)
+        closest = jax.vmap(outline.closest)(corner.point)
+        faces = (corner.onward.dot(closest.normal) >= -TILT_TOLERANCE) & (
+            corner.back.dot(closest.normal) >= -TILT_TOLERANCE
+        )
+        at_corners = Touches(closest.distance, closest.point, -closest.normal, faces & (closest.distance > too_deep))
+        places, _, along = jax.vmap(lambda edge: _places_on_edge(edge, outline, pose))(pad.edges)
+        # A point past the end of an edge touches its corner.
+        length_of_edge = pad.edges.length[:, None]
+        tolerance = END_TOLERANCE[length_of_edge.dtype.itemsize] * length_of_edge
+        within = (along >= -tolerance) & (along <= length_of_edge + tolerance) & (places.distance > too_deep)
+        at_edges = places._replace(exists=places.exists & within)
+        number, (edge, point) = jnp.arange(len(pad.edges.length)), jnp.indices(along.shape)
+        of_edges = Candidates(at_edges, edge, point)
+        candidates = joined(
+            Candidates(at_corners, number, jnp.full_like(number, CORNER)), jax.tree.map(jnp.ravel, of_edges)
+        )
+        return Candidates(candidates.touches, *(n.astype(jnp.int32) for n in candidates[1:]))
+
+    def touches(self, finger, outline, pose, features):
+        pad = finger.shape.outline()
+
+        def touch(first, second) -> Touches:
+            edge = pick(pad.edges, first)
+            closest = outline.closest(pose.center + edge.start.rotate(pose.angle))
+            at_corner = Touches(closest.distance, closest.point, -closest.normal, jnp.ones((), bool))
+            at_edge = pick(_places_on_edge(edge, outline, pose)[0], second)
+            return jax.tree.map(lambda a, b: jnp.where(second == CORNER, a, b), at_corner, at_edge)
+
+        places = jax.vmap(touch)(features.first, features.second)
+        return places._replace(exists=places.exists & features.present)
 
 
-def edge_support_points(edges: Edge, outline: Outline, center: Vec2, angle: Vec2) -> EdgeSupport:
-    """Return the points of a smooth outline that face each edge of a pad, which is at `center`, m, and `angle`."""
-
-    def supports_of_edge(edge: Edge) -> EdgeSupport:
-        normal = edge.normal.rotate(angle)
-        facing = outline.facing(-normal)
-        local = (facing.point - center).unrotate(angle)
-        relative = local - edge.start
-        height = edge.normal.dot(relative)
-        normal, length = jax.tree.map(lambda entry: jnp.full_like(height, entry), (normal, edge.length))
-        return EdgeSupport(facing.valid, facing.point, normal, local, relative.dot(edge.along), length, height)
-
-    return jax.tree.map(jnp.ravel, jax.vmap(supports_of_edge)(edges))
-
-
-def penetration_depth(pad: PolygonOutline, supports: EdgeSupport, outline: Outline, corners: Vec2) -> Scalar:
-    """Return the depth of the deepest corner in the outline or support point in the pad, m; negative if apart."""
-    corner_depths = -jax.vmap(outline.closest)(corners).distance
-    support_depths = jnp.where(supports.valid, -jax.vmap(pad.closest)(supports.local).distance, -jnp.inf)
-    return largest(jnp.concatenate([corner_depths, support_depths]))
+def _places_on_edge(edge: Edge, outline: Outline, pose: FingerPose) -> tuple[Touches, Vec2, Scalar]:
+    """Return where a smooth outline may touch an edge of a pad, there in the pad's frame, and along the edge, m."""
+    normal = edge.normal.rotate(pose.angle)
+    point, exists = outline.facing(-normal)
+    local = (point - pose.center).unrotate(pose.angle)
+    relative = local - edge.start
+    height = edge.normal.dot(relative)
+    return (
+        Touches(height, point, jax.tree.map(lambda n: jnp.full_like(height, n), normal), exists),
+        local,
+        relative.dot(edge.along),
+    )

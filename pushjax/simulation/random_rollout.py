@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, check_key, check_type
 from pushjax._internal.jit import quick_jit
-from pushjax.contact.problem import check_solver, to_scalars
+from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.friction_model import FrictionModel
@@ -84,7 +84,7 @@ def rollout_under_draws(
 ) -> Trajectory:
     """Return a push under friction that was sampled before."""
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
-    surfaces_and_frictions = jax.vmap(to_scalars)(draws.surface, friction.astype(pose.dtype))
+    surfaces_and_frictions = jax.vmap(form_and_friction)(draws.surface, friction.astype(pose.dtype))
 
     def draw_at(index):
         return jax.tree.map(lambda leaf: leaf[index], surfaces_and_frictions)

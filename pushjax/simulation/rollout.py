@@ -21,7 +21,7 @@ from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_sh
 from pushjax._internal.jit import outside_trace, quick_jit
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Vec3
-from pushjax.contact.problem import check_solver, to_scalars
+from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.status import Status
 from pushjax.contact.sticking import StickingSolver
@@ -50,7 +50,7 @@ from pushjax.simulation.finger_motion import (
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
-from pushjax.simulation.step import ScalarStep, step_in_scalars
+from pushjax.simulation.step import StepRecord, compute_step
 from pushjax.simulation.substeps import DividedPush, hand_stops, resting, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 
@@ -107,7 +107,7 @@ def step(
 
 @quick_jit
 def _step(slider, hand, q0, q1, pose, friction, solver, table, fixtures) -> Step:
-    uniform = to_scalars(slider.surface, friction)
+    uniform = form_and_friction(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
     push = simulate(slider.shape, hand, jnp.stack([q0, q1]), pose, solver, friction_at, fixtures)
     fields = {name: getattr(push, name)[-1] for name in Step.__dataclass_fields__}
@@ -177,7 +177,7 @@ def rollout(
 
 @quick_jit
 def _rollout(slider, hand, path, pose, friction, solver, table, fixtures, num_steps=None) -> Trajectory:
-    uniform = to_scalars(slider.surface, friction)
+    uniform = form_and_friction(slider.surface, friction)
     friction_at = friction_on_table(table, lambda step, pose: uniform)
     return simulate(slider.shape, hand, path, pose, solver, friction_at, fixtures, num_steps)
 
@@ -295,7 +295,7 @@ def divided_push(
     return push, jnp.where(pose_valid, pose, 0.0)
 
 
-def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
+def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
     """Return the records of all steps of a hand with one contact."""
     # This is a round finger on a convex outline, or a pad on a disk. Such a step is not divided. If it is too long, it
     # is NOT_CONVERGED.
@@ -305,7 +305,7 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> ScalarStep:
         form, mu = push.friction_at(step, pose)
         motions = push.motions_at(step, mu)
         # one contact holds nothing
-        record, *_ = step_in_scalars(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
+        record, *_ = compute_step(form, push.outline, motions, push.solver, pose, depth, -depth, jnp.zeros_like(pose.x))
         allowed = jnp.maximum(depth, allowed_penetration(max_displacement(motions), form.length))
         depth = max_penetration(push.outline, motions, record.pose, 1.0)
         is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)

@@ -29,7 +29,7 @@ class SpeedJudgment(NamedTuple):
 
 def judge_speed(
     twist: Vec3,
-    force: tuple[Vec2, ...],
+    force: Float[Array, "contacts 2"],
     contact_point: Float[Array, "contacts 2"],
     displacement: Scalar,  # largest displacement of a finger in this part, m
     length: Scalar,
@@ -37,7 +37,7 @@ def judge_speed(
 ) -> SpeedJudgment:
     """Return whether a slider moved no farther in a part of a step than it may."""
     twist, force, length = jax.lax.stop_gradient((twist, force, length))
-    weight = jnp.stack([contact_force.x for contact_force in force])
+    weight = force[:, 0]
     total = jnp.sum(weight)
     middle = Vec2.of(weight @ contact_point / jnp.where(total > 0, total, 1.0))
     at_middle = twist.xy + middle.perp().scale(twist.z)

@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.xla import compute_once, decide, tree_where
-from pushjax._math.vec import Scalar, Vec2, Vec3
+from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import ContactMode, Status
 from pushjax.contact.sticking import StickingSolver
@@ -45,10 +45,10 @@ from pushjax.simulation.finger_motion import (
     allowed_penetration,
     holding_distance,
     max_displacement,
-    max_penetration,
+    overlap_and_gap,
 )
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
-from pushjax.simulation.step import ScalarStep, step_in_scalars
+from pushjax.simulation.step import StepRecord, compute_step
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
@@ -78,13 +78,14 @@ class PushState(NamedTuple):
     urgency: Urgency | None  # of each contact; None if all are solved together
     braced: Bool[Array, ""]  # whether the smallest part has failed, and is tried with more friction
     swaps: Int[Array, ""]  # changes of this part's working set
-    overlap: Scalar  # depth of the deepest finger now, m
+    overlap: Scalar  # depth of the deepest finger or fixture now, m
+    gap: Scalar  # how far the nearest finger is from the slider now, m
     stop_status: Int[Array, ""]  # status that stopped the hand, or zero
     abandon_status: Int[Array, ""]  # status of a step that is given up, or zero
     failed: Bool[Array, ""]  # whether the previous step failed
     # One record for the parts of the step that are done. Its twist is the sum over these parts, and its pose and
     # overlap are the present ones. The rest belongs to the last part in which the slider moved.
-    accepted_parts: ScalarStep
+    accepted_parts: StepRecord
     guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
 
 
@@ -115,17 +116,18 @@ class DividedPush(NamedTuple):
         """Return the state before the first trial, with the slider at `pose`, world."""
         first = jnp.zeros((), jnp.int32)
         motions = self.motions_at(first, self.friction_at(first, pose)[1])
-        overlap = max_penetration(self.outline, motions + self.fixtures, pose, 0.0)
+        overlap, gap = overlap_and_gap(self.outline, motions, self.fixtures, pose, 0.0)
         zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
         status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
         urgency, idle = initial_urgency(counts, pose.x), _idle_record(pose, sum(counts))
         guess = EdgeSet.none(zero) if sum(counts) > 1 else None
         return PushState(
-            pose, pose, first, zero, one, no, no, urgency, no, status, overlap, status, status, no, idle, guess
+            *(pose, pose, first, zero, one, no, no, urgency, no, status),
+            *(overlap, gap, status, status, no, idle, guess),
         )
 
-    def trial(self, state: PushState) -> tuple[PushState, tuple[ScalarStep, Bool[Array, ""], Int[Array, ""]]]:
+    def trial(self, state: PushState) -> tuple[PushState, tuple[StepRecord, Bool[Array, ""], Int[Array, ""]]]:
         """Try the next part of a step: the state after it, the step's record, whether the step ended, and its index."""
         form, mu = self.friction_at(state.step, state.origin)
         motions = self.motions_at(state.step, mu)
@@ -137,13 +139,14 @@ class DividedPush(NamedTuple):
         extra = jnp.where(jnp.all(mu >= 0), jnp.where(state.braced, BRACING, 0.0), jnp.nan)
         bodies = tuple(motion._replace(friction=motion.friction + extra) for motion in part + self.fixtures)
         part, fixtures = bodies[: len(part)], bodies[len(part) :]
-        record, urgency_after, guess = step_in_scalars(
+        record, urgency_after, guess = compute_step(
             form,
             self.outline,
             part,
             self.solver,
             state.pose,
             state.overlap,
+            state.gap,
             reach,
             state.urgency,
             state.step < self.end,
@@ -156,7 +159,7 @@ class DividedPush(NamedTuple):
             record.twist, record.force, record.contact_point, state.part * displacement, form.length, is_smallest
         )
         next_state, end_of_step = _next_state(
-            state, record, guess, urgency_after, self.outline, part + self.fixtures, tolerance, speed, self.end
+            state, record, guess, urgency_after, self.outline, part, fixtures, tolerance, speed, self.end
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
@@ -168,7 +171,7 @@ class DividedPush(NamedTuple):
         return [num_contacts(motion.finger, self.outline) for motion in motions + self.fixtures]
 
 
-def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Scalar]:
+def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
     """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
     initial_state = push.first_state(pose)
     idle_record = initial_state.accepted_parts
@@ -192,13 +195,13 @@ def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[ScalarStep, Sca
 
 
 def _records_of_steps(
-    records: ScalarStep,
+    records: StepRecord,
     ended: Bool[Array, " rounds"],
     step: Int[Array, " rounds"],
     steps: int,
     last: PushState,
-    idle_record: ScalarStep,
-) -> ScalarStep:
+    idle_record: StepRecord,
+) -> StepRecord:
     """Return for each step the record of the round that ended it, or what the last round left if none did."""
     rounds = len(ended)
     round_of_step = jnp.full(steps, rounds).at[jnp.where(ended, step, steps)].set(jnp.arange(rounds), mode="drop")
@@ -221,7 +224,7 @@ class Decision(NamedTuple):
 
 def _decide(
     state: PushState,  # before the trial
-    record: ScalarStep,  # of the trial
+    record: StepRecord,  # of the trial
     urgency_after: Urgency | None,
     depth: Scalar,  # of the deepest finger after the trial, m
     tolerance: Scalar,  # how much deeper a finger may be after a whole step, m
@@ -262,11 +265,12 @@ def _decide(
 
 def _next_state(
     state: PushState,
-    record: ScalarStep,
+    record: StepRecord,
     guess: EdgeSet | None,
     urgency_after: Urgency | None,
     outline: Outline,
-    part: tuple[FingerMotion, ...],  # motions over the tried part of the step, and fixtures
+    part: tuple[FingerMotion, ...],  # motions over the tried part of the step
+    fixtures: tuple[FingerMotion, ...],
     tolerance: Scalar,
     speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
@@ -274,7 +278,7 @@ def _next_state(
     """Return the state after a trial; and of the trial's step the record, whether it ended, and the index."""
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
-    depth = max_penetration(outline, part, pose, 1.0)
+    depth, gap = overlap_and_gap(outline, part, fixtures, pose, 1.0)
     decision = _decide(state, record, urgency_after, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
@@ -306,7 +310,8 @@ def _next_state(
         urgency=state.urgency,
         braced=decision.braces | (state.braced & decision.joins),
         swaps=jnp.where(decision.joins, state.swaps + 1, 0).astype(jnp.int8),
-        overlap=jnp.where(ends, end_record.overlap, jnp.where(accepted, depth, state.overlap)),
+        overlap=jnp.where(accepted | (ends & ~stops), depth, state.overlap),
+        gap=jnp.where(accepted | (ends & ~stops), gap, state.gap),
         stop_status=jnp.where(stops, record.status, state.stop_status).astype(jnp.int8),
         abandon_status=jnp.where(decision.abandons, decision.reason, 0).astype(jnp.int8),
         failed=jnp.where(ends, fails, state.failed),
@@ -324,16 +329,15 @@ def hand_stops(status: Array) -> Bool[Array, "..."]:
     return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
-def resting(record: ScalarStep, pose: Vec3) -> ScalarStep:
+def resting(record: StepRecord, pose: Vec3) -> StepRecord:
     """Record of a slider that stays at `pose` while nothing pushes."""
     blank = jax.tree.map(jnp.zeros_like, record)
     return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
 
 
-def _idle_record(pose: Vec3, contacts: int) -> ScalarStep:
+def _idle_record(pose: Vec3, contacts: int) -> StepRecord:
     """Record of a step in which nothing pushes."""
     zero = jnp.zeros_like(pose.x)
     still, no_points = Vec3(zero, zero, zero), jnp.zeros((contacts, 2), zero.dtype)
-    mode, status = (jnp.full((), value, jnp.int8) for value in (ContactMode.SEPARATED, Status.FREE))
-    forces, modes = (Vec2(zero, zero),) * contacts, (mode,) * contacts
-    return ScalarStep(pose, still, still, forces, no_points, no_points, modes, status, zero)
+    mode, status = jnp.full(contacts, ContactMode.SEPARATED, jnp.int8), jnp.full((), Status.FREE, jnp.int8)
+    return StepRecord(pose, still, still, no_points, no_points, no_points, mode, status, zero)

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._math.vec import Scalar
 from pushjax.contact.status import Status
-from pushjax.simulation.step import ScalarStep
+from pushjax.simulation.step import StepRecord
 from pushjax.simulation.substeps import hand_stops
 
 
@@ -21,7 +21,7 @@ class Step(eqx.Module):
 
     Contacts are in the order of the fingers, and then of the fixtures. A round finger has one contact, or two on an
     outline that is not convex. A pad has two contacts in general, one on a disk, and three on a polygon that is not
-    convex. A wall has two contacts, or one on a disk. The contacts of one finger may change places from step to step.
+    convex. A wall has two contacts, or one on a disk or an ellipse. The contacts of one finger may change places from step to step.
 
     The contact point moves in a straight line, and the rest of the slider turns about it. The twist is one of chords:
     the slider turns by 2 asin(twist[2] / 2), and its pose after the step agrees with the exponential of the twist to
@@ -111,18 +111,9 @@ def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
     return jnp.where(jnp.any(mask, axis=-1), jnp.argmax(mask, axis=-1), -1)
 
 
-def to_arrays(record: ScalarStep, length: Scalar) -> Step:
-    """Return the record of one step as arrays, or a stacked record, whose scalars have an axis of steps."""
+def to_arrays(record: StepRecord, length: Scalar) -> Step:
+    """Return the record of one step as arrays, or a stacked record, whose entries have an axis of steps."""
     # the torque of the record is divided by the length of the limit surface
     wrench = (record.wrench.x, record.wrench.y, record.wrench.z * length)
-    return Step(
-        pose=jnp.stack(record.pose, axis=-1),
-        twist=jnp.stack(record.twist, axis=-1),
-        wrench=jnp.stack(wrench, axis=-1),
-        force=jnp.stack([jnp.stack(force, axis=-1) for force in record.force], axis=-2),
-        contact_point=record.contact_point,
-        contact_normal=record.contact_normal,
-        mode=jnp.stack(record.mode, axis=-1),
-        status=record.status,
-        overlap=record.overlap,
-    )
+    pose, twist, wrench = (jnp.stack(vector, axis=-1) for vector in (record.pose, record.twist, wrench))
+    return Step(**(record._asdict() | {"pose": pose, "twist": twist, "wrench": wrench}))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from pushjax._internal.compaction import Rounds, where_needed
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.frictionless import Frictionless
-from pushjax.contact.problem import to_scalars
+from pushjax.contact.problem import form_and_friction
 from pushjax.contact.status import Status
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.geometry.polygon import Polygon
@@ -58,7 +58,7 @@ class _TouchedOnce(Polygon):
         self.vertices, self.convex = polygon.vertices, polygon.convex
 
     def outline(self) -> PolygonOutline:
-        return PolygonOutline(super().outline().edges, convex=True)
+        return PolygonOutline(super().outline().edges, self.convex, touched_once=True)
 
 
 def control_step(
@@ -117,7 +117,7 @@ def _simulated(shape, surface, friction, hand, walls, path, pose) -> Trajectory:
 def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless | None, FrictionAt]:
     """The solver of contact problems, and limit surface and friction of a step. Arguments as in `control_step`."""
     mu = jnp.zeros_like(path[0, 0]) if friction is None else friction
-    form = to_scalars(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
+    form = form_and_friction(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
     # None: the default solver. It has a closed form for one contact, so `Frictionless` would not be faster there.
     solver = Frictionless() if friction is None and not isinstance(shape, _TouchedOnce) else None
     return solver, lambda step, pose: form

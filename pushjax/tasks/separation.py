@@ -16,9 +16,8 @@ from jaxtyping import Array, Float
 
 from pushjax._math.vec import Scalar, Vec2, Vec3, cos_sin
 from pushjax.geometry.polygon import Polygon
-from pushjax.simulation.candidate import FingerPose, take
+from pushjax.simulation.candidate import pick
 from pushjax.simulation.fixtures import Wall
-from pushjax.simulation.wall_contact import wall_candidates
 
 # In units of the surface's length. Deeper overlaps are treated here. It is two pixels in PushT, and 1.4 mm in the tasks
 # on a table, where the longest ordinary steps may leave overlaps up to this depth.
@@ -51,10 +50,10 @@ def overlap_of_finger(polygon: Polygon, radius: Scalar, center: Vec2, pose: Vec3
 def overlap_of_wall(polygon: Polygon, wall: Wall, pose: Vec3) -> Overlap:
     """Return the overlap of a wall and the slider, at the corner that is deepest behind the wall."""
     angle, normal = cos_sin(pose.z), Vec2.of(wall.normal)
-    wall_in_body = FingerPose((Vec2.of(wall.point) - pose.xy).unrotate(angle), normal.unrotate(angle))
-    corners = wall_candidates(polygon.outline(), wall_in_body)
-    deepest = take(corners, jnp.argmin(corners.distance))
-    return Overlap(-deepest.distance, deepest.point.rotate(angle), normal)
+    corner, local_normal = polygon.outline().edges.start, normal.unrotate(angle)
+    distance = local_normal.dot(corner - (Vec2.of(wall.point) - pose.xy).unrotate(angle))
+    deepest, point = pick((distance, corner), jnp.argmin(distance))
+    return Overlap(-deepest, point.rotate(angle), normal)
 
 
 def separate(

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax._math.vec import unstack
-from pushjax.contact.problem import contacts_in_scalars, solve_in_scalars, to_scalars
+from pushjax.contact.problem import contacts_in_columns, form_and_friction, solve_problem
 from pushjax.contact.scaled_problem import EdgeSet
 from pushjax.testing.problems import random_contacts_problem
 
 
 def solved(problem, solver, displacement, guess):
     """Solve as a rollout does: without a margin, with the cone edges that carried the force before."""
-    form, mu = to_scalars(problem.surface, problem.contacts.friction)
+    form, mu = form_and_friction(problem.surface, problem.contacts.friction)
     given = problem.contacts
     contacts = pj.Contacts(given.point, given.normal, displacement, given.friction, given.gap, given.active)
-    return solve_in_scalars(form, contacts_in_scalars(contacts, mu), unstack(contacts.active), solver, guess)
+    return solve_problem(form, contacts_in_columns(contacts, mu), contacts.active, solver, guess)
 
 
 @pytest.mark.slow
@@ -126,9 +125,8 @@ def test_a_guess_whose_edges_cancel_is_not_taken():
 
     def motion(off, guess):
         contacts = pair(jnp.array([[0.001, 0.0], [0.001 - off, 0.0002]]), jnp.zeros(2))
-        form, mu = to_scalars(disk, contacts.friction)
-        active = unstack(contacts.active)
-        return solve_in_scalars(form, contacts_in_scalars(contacts, mu), active, None, guess)
+        form, mu = form_and_friction(disk, contacts.friction)
+        return solve_problem(form, contacts_in_columns(contacts, mu), contacts.active, None, guess)
 
     for off in (0.0, 1e-15, 1e-14):
         wanted, found = (motion(jnp.asarray(off), guess) for guess in (EdgeSet.none(jnp.zeros(())), both))
@@ -139,13 +137,13 @@ def test_a_guess_whose_edges_cancel_is_not_taken():
 def test_a_central_push_without_friction_has_its_derivatives():
     """Both cone edges are the normal there, and the contact does not slip: derivatives must not divide by zero."""
     disk = pj.Ellipsoid(np.eye(3), 0.02)
-    form, mu = to_scalars(disk, jnp.zeros(2))
+    form, mu = form_and_friction(disk, jnp.zeros(2))
 
     def answer(displacement):
         contacts = pair(jnp.stack([displacement, jnp.array([0.002, 0.0])]), mu)  # the other finger moves away
-        scalars, active = contacts_in_scalars(contacts, mu), unstack(contacts.active)
-        found = solve_in_scalars(form, scalars, active, None, EdgeSet.none(jnp.zeros(())))
-        return jnp.concatenate([found.twist.array(), found.wrench.array(), found.force[0].array()])
+        columns, none = contacts_in_columns(contacts, mu), EdgeSet.none(jnp.zeros(()))
+        found = solve_problem(form, columns, contacts.active, None, none)
+        return jnp.concatenate([found.twist.array(), found.wrench.array(), found.force[0]])
 
     at = jnp.array([0.001, 0.0])
     value, slope = jax.jvp(answer, (at,), (jnp.array([1.0, 0.0]),))

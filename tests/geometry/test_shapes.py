@@ -1,4 +1,4 @@
-"""Outlines compared with brute force in complex numbers, which shares no code: distances, sweeps, gradients."""
+"""Outlines compared with brute force in complex numbers, which shares no code: distances, gradients."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ from jax.typing import ArrayLike
 from pushjax import Disk, Polygon
 from pushjax._internal.xla import compute_once, map_items, tree_where
 from pushjax._math.vec import Vec2, Vec3, cos_sin
-from pushjax.geometry.shape import ray_circle_intersection
 
 # Closed forms on lengths of order 0.1 m, in units of roundoff of the dtype.
 ROUNDINGS = 100
@@ -441,162 +440,6 @@ def test_contains():
     arrow = Polygon(POLYGONS["arrow"])
     inside = jax.vmap(arrow.contains)(np.array([(0, 0), (-0.03, 0), (0.06, 0), (0.07, 0)]))
     assert inside.tolist() == [True, False, True, False]
-
-
-# --- sweep ---
-
-sweeps = jax.jit(
-    jax.vmap(
-        lambda shape, x, path, radius: shape.outline().sweep(Vec2.of(x), Vec2.of(path), radius), (None, 0, 0, None)
-    )
-)
-ALONG = np.linspace(0, 1, 1001)
-
-
-def check_sweep(distance, shape, start, path, radius, dtype=np.float64) -> np.ndarray:
-    """At the time returned the shapes touch, and before it, or if there is none, no sample is nearer."""
-    start, path = start.astype(dtype), path.astype(dtype)
-    outside = distance(start) >= radius + lengths(dtype)
-    start, path = start[outside], path[outside]
-    found = sweeps(shape, start, path, dtype(radius))
-    assert found.dtype == dtype
-    found = np.asarray(found, np.float64)
-    hit = np.isfinite(found)
-    assert (found >= 0).all()
-    assert (found[hit] <= 1).all()
-    length = np.linalg.norm(path, axis=1)
-    # roundoff moves a grazing contact along the path by the square root of its depth, and across it by the depth
-    slack = lengths(dtype) * (1 + length / SIZE)
-    at = start + np.where(hit, found, 0)[:, None] * path
-    assert (np.abs(distance(at) - radius) <= slack)[hit].all()
-    free = ALONG[:, None] * np.where(hit, found, 1)
-    clearance = distance(start + free[..., None] * path) - radius
-    assert (clearance.min(axis=0) >= -slack).all()
-    return hit
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("radius", [0.0, 0.00475, 0.03])
-@pytest.mark.parametrize("name", ["triangle", "arrow", "L", "star of 14"])
-def test_sweep(name, radius, dtype):
-    polygon = Polygon(POLYGONS[name].astype(dtype))
-    v = np.asarray(polygon.vertices, np.float64)
-    rng = np.random.default_rng(6)
-    start = rng.uniform(-0.2, 0.2, (300, 2))
-    path = rng.normal(size=(300, 2)) * 10 ** rng.uniform(-3, 0.5, (300, 1))  # from 1 mm to 3 m: all the way through
-    hit = check_sweep(lambda x: brute_closest(v, x)[0], polygon, start, path, radius, dtype)
-    assert hit.any()
-    assert not hit.all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_sweep_of_a_disk(dtype):
-    disk = Disk(dtype(0.05), np.array([0.02, -0.01], dtype))
-    rng = np.random.default_rng(7)
-    start = rng.uniform(-0.2, 0.2, (300, 2))
-    path = rng.normal(size=(300, 2)) * 10 ** rng.uniform(-3, 0.5, (300, 1))
-    center = np.asarray(disk.center, np.float64)
-    hit = check_sweep(lambda x: np.linalg.norm(x - center, axis=-1) - 0.05, disk, start, path, 0.00475, dtype)
-    assert hit.any()
-    assert not hit.all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("radius", [0.0, 0.00475])
-@pytest.mark.parametrize("name", CORNERED)
-def test_nothing_slips_through_a_vertex(name, radius, dtype):
-    """A path that aims exactly at a vertex from within its sector hits it: there is no gap between two edges."""
-    polygon = Polygon(POLYGONS[name].astype(dtype))
-    vertex, direction, _ = sector_points(np.asarray(polygon.vertices, np.float64), 1000, seed=8)
-    start = (vertex + 0.3 * direction).astype(dtype)
-    path = (2 * (vertex - start)).astype(dtype)
-    found = np.asarray(sweeps(polygon, start, path, dtype(radius)))
-    assert np.isfinite(found).all()
-    # the rim of the disk meets the vertex, unless another part of the outline comes first
-    at_vertex, tolerance = 0.5 * (0.3 - radius) / 0.3, 1e-5 if dtype == np.float32 else 1e-9
-    assert found.max() <= at_vertex + tolerance
-    assert (found > at_vertex - tolerance).mean() > 0.3
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("radius", [0.0, 0.00475])
-def test_a_disc_that_starts_touching_does_not_pass(radius, dtype, vertices):
-    """A disk that starts in contact, up to roundoff, touches at once if pushed on, and never if pulled away."""
-    polygon = Polygon(vertices.astype(dtype))
-    v = np.asarray(polygon.vertices, np.float64)
-    edge = np.roll(v, -1, axis=0) - v
-    normal = np.stack([edge[:, 1], -edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    share = np.random.default_rng(9).uniform(0.1, 0.9, (40, 1, 1))
-    start = (v + share * edge + radius * normal).reshape(-1, 2)
-    outward = np.broadcast_to(normal, (40, *normal.shape)).reshape(-1, 2)
-    free = np.abs(brute_closest(v, start)[0] - radius) < 1e-6  # no other part is in the way
-    start, outward = start[free].astype(dtype), outward[free].astype(dtype)
-    pressed = np.asarray(sweeps(polygon, start, -0.02 * outward, dtype(radius)))
-    assert (pressed <= 1e-4).all()
-    assert (np.asarray(sweeps(polygon, start, dtype(1e-3) * outward, dtype(radius))) > 0.1).all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_a_disc_that_starts_touching_a_vertex_does_not_pass(dtype):
-    polygon = Polygon(POLYGONS["pentagon"].astype(dtype))
-    vertex, direction, _ = sector_points(np.asarray(polygon.vertices, np.float64), 500)
-    start = (vertex + 0.00475 * direction).astype(dtype)
-    path = (-0.01 * direction).astype(dtype)
-    assert (np.asarray(sweeps(polygon, start, path, dtype(0.00475))) <= 1e-4).all()
-
-
-def test_grazing():
-    """A path past a square's side at a distance slightly above or below the radius, and one past a corner."""
-    square, radius = Polygon(POLYGONS["square"]), 0.005
-    hair = 1e-9
-    start = np.array([(-0.2, 0.05 + hair), (-0.2, 0.05 - hair), (-0.2, 0.05 - hair)])
-    path = np.array([(0.4, 0.0), (0.4, 0.0), (0.0, 0.3)])
-    found = np.asarray(sweeps(square, start, path, radius))
-    assert not np.isfinite(found[[0, 2]]).any()
-    # the corner's circle is met where its height is 0.005 - hair
-    reach = 0.155 - np.sqrt(radius**2 - (radius - hair) ** 2)
-    np.testing.assert_allclose(found[1], reach / 0.4, atol=1e-8)
-
-
-def test_first_hit_far_away():
-    """In float32 and from a meter away, a miss by 0.5 um and a hit by 0.5 um are distinguished."""
-    x, path = Vec2(jnp.float32(-1), jnp.float32(0)), Vec2(jnp.float32(2), jnp.float32(0))
-    for off, hits in ((0.005 + 5e-7, False), (0.005 - 5e-7, True)):
-        found = jax.jit(ray_circle_intersection)(x._replace(y=jnp.float32(off)), path, jnp.float32(0.005))
-        assert bool(np.isfinite(found)) == hits
-
-
-def test_outlines_with_corners_have_no_facing_points():
-    outline = Polygon(POLYGONS[next(iter(POLYGONS))]).outline()
-    with pytest.raises(NotImplementedError, match="PolygonOutline has corners, at which the outward normal is not"):
-        outline.facing(Vec2(jnp.ones(()), jnp.zeros(())))
-
-
-def test_no_path_touches_nothing():
-    start = np.array([(0.2, 0.0), (0.045, 0.0), (0.045, 0.045)])
-    for shape in (Polygon(POLYGONS["square"]), Disk(0.045)):
-        assert np.isinf(sweeps(shape, start, np.zeros((3, 2)), 0.0)).all()
-
-
-@pytest.mark.parametrize("shape", [Polygon(POLYGONS["arrow"]), Polygon(POLYGONS["star of 14"]), Disk(0.05)])
-def test_gradient_of_the_sweep(shape):
-    rng = np.random.default_rng(10)
-    start = 0.15 * np.exp(1j * rng.uniform(0, 2 * np.pi, 100))
-    start = np.stack([start.real, start.imag], axis=1)
-    path = -2 * start + rng.normal(size=(100, 2)) * 0.02
-
-    def fraction(shape, x, p, radius):
-        return shape.outline().sweep(Vec2.of(x), Vec2.of(p), radius)
-
-    slope = jax.jit(jax.vmap(jax.grad(fraction, argnums=(0, 1, 2, 3)), (None, 0, 0, None)))(shape, start, path, 0.004)
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
-    shift = DIFFERENCE_STEP * np.eye(2)
-    for k in range(2):
-        ahead, behind = (sweeps(shape, start + s * shift[k], path, 0.004) for s in (1, -1))
-        with np.errstate(invalid="ignore"):
-            difference = (ahead - behind) / (2 * DIFFERENCE_STEP)
-        off = np.abs(slope[1][:, k] - difference) / (1 + np.abs(difference))
-        assert np.nanmean(off < DIFFERENCE_TOLERANCE) > 0.95  # except if it grazes or changes edges within the step
 
 
 # --- sizes ---

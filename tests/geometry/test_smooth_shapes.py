@@ -45,7 +45,6 @@ def batched(function, shared: int = 1, size: int = 500):
 closest = batched(lambda shape, x: shape.closest(x))
 distances = batched(lambda shape, x: shape.signed_distance(x), size=4000)
 candidates_at = batched(lambda shape, x: shape.outline().contact_candidates(Vec2.of(x)))
-sweep = batched(lambda shape, x, path, r: shape.outline().sweep(Vec2.of(x), Vec2.of(path), r))
 boundary = jax.jit(lambda shape: shape.boundary(2000))
 
 
@@ -191,8 +190,6 @@ def test_a_circle_is_a_disk():
     pair = Ellipse(0.05, 0.05, (0.01, 0.02)), Disk(0.05, (0.01, 0.02))
     for a, b in zip(*(closest(each, points) for each in pair), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-14)
-    path = -2 * points + 0.03
-    np.testing.assert_allclose(*(sweep(each, points, path, 0.005) for each in pair), atol=1e-12)
 
 
 def test_the_distance_is_one_lipschitz_and_changes_sign_across_the_outline(shape):
@@ -333,121 +330,6 @@ def test_a_finger_in_the_waist_touches_both_flanks():
         assert len(candidates_at(convex, np.array([(0.075, 0.0)]))) == 1
 
 
-# --- sweep ---
-
-
-def first_contact(shape, start: np.ndarray, path: np.ndarray, radius: float) -> np.ndarray:
-    """Return the first contact by marching, with steps no longer than the distance."""
-    at, time = np.zeros(len(start)), np.linspace(0, 1, 401)
-    gaps = np.asarray(distances(shape, (start[:, None] + time[:, None] * path[:, None]).reshape(-1, 2)))
-    gaps = gaps.reshape(len(start), -1) - radius
-    inside = gaps <= 0
-    first = np.where(inside.any(axis=1), inside.argmax(axis=1), 400)
-    low, high = time[np.maximum(first - 1, 0)], np.where(inside.any(axis=1), time[first], np.inf)
-    # between two samples it may come into contact and leave again: sample there more densely
-    closing = np.minimum(gaps[:, 1:], gaps[:, :-1]) < np.linalg.norm(path, axis=1)[:, None] / 400
-    for k in np.flatnonzero((closing & (np.arange(400) < first[:, None])).any(axis=1)):
-        parts = np.flatnonzero(closing[k] & (np.arange(400) < first[k]))
-        fine = (time[parts, None] + np.linspace(0, 1 / 400, 30)).ravel()
-        found = np.asarray(distances(shape, start[k] + fine[:, None] * path[k])) <= radius
-        if found.any():
-            low[k], high[k] = fine[max(found.argmax() - 1, 0)], fine[found.argmax()]
-    for _ in range(50):
-        at = (low + np.where(np.isfinite(high), high, low)) / 2
-        touching = np.asarray(distances(shape, start + at[:, None] * path)) <= radius
-        low, high = np.where(touching, low, at), np.where(touching & np.isfinite(high), at, high)
-    return high
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("radius", RADII)
-def test_sweep_is_that_of_marching(shape, radius, dtype):
-    """The sweep agrees with marching, on random paths and on paths along the outline at about the radius' distance."""
-    rng, count = np.random.default_rng(7), 60
-    start = rng.uniform(-0.25, 0.25, (count, 2))
-    path = rng.normal(size=(count, 2)) * 10 ** rng.uniform(-2.5, 0.3, (count, 1))
-    on = np.asarray(boundary(shape))[:: 2000 // count][:count]
-    normal = np.asarray(closest(shape, on)[2])
-    along = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
-    skim = on + normal * (radius + rng.choice([-1, 1], (count, 1)) * 10 ** rng.uniform(-6, -3, (count, 1)))
-    start = np.concatenate([start, skim - 0.2 * along]).astype(dtype)
-    path = np.concatenate([path, 0.4 * along]).astype(dtype)
-    outside = np.asarray(distances(shape, start.astype(float))) > radius + 1e-6
-    start, path = start[outside], path[outside]
-    single = jax.tree.map(lambda leaf: leaf.astype(dtype), shape)
-    found = np.asarray(sweep(single, start, path, dtype(radius)))
-    assert found.dtype == dtype
-    hit = np.isfinite(found)
-    assert 10 < hit.sum() < len(hit)
-    # Where a contact is reported there is one. For a path that only grazes, the uncertainty in float32 is the square
-    # root.
-    at = start + np.where(hit, found, 0)[:, None] * path.astype(float)
-    gap = np.asarray(distances(shape, at))[hit] - radius
-    assert np.abs(gap).max() < (1e-12 if dtype == np.float64 else 3e-5)
-    assert gap.min() > (-1e-14 if dtype == np.float64 else -2e-7)
-    if dtype == np.float64:  # and never earlier, except for contacts that marching misses between its samples
-        expected = first_contact(shape, start, path, radius)
-        assert not (np.isfinite(expected) & ~hit).any()
-        assert (found[hit] <= expected[hit] + 1e-9).all()
-        assert (found[hit] >= expected[hit] - 1e-9).mean() > 0.97
-
-
-@pytest.mark.slow
-def test_nothing_slips_into_a_hollow_that_is_too_tight_for_it():
-    """A disk of 10 mm does not enter notches of down to 2 mm: dense paths across the whole outline."""
-    shape = Curve(wavy(24, 9) * (1 + 0.4 * (np.arange(24) % 2))[:, None])
-    x = np.linspace(-0.1, 0.1, 1001)
-    start, path = np.stack([x, np.full(1001, 0.2)], axis=1), np.broadcast_to([0.0, -0.4], (1001, 2))
-    hit = np.asarray(sweep(shape, start, path, 0.01))
-    top = np.asarray(boundary(shape))
-    heights = np.where(np.abs(top[None, :, 0] - x[:, None]) < 0.01, top[None, :, 1], -np.inf)
-    reach = heights + np.sqrt(np.maximum(0.01**2 - (top[None, :, 0] - x[:, None]) ** 2, 0))
-    expected = (0.2 - reach.max(axis=1)) / 0.4
-    assert (np.isfinite(hit) == np.isfinite(expected)).mean() > 0.995
-    both = np.isfinite(hit) & np.isfinite(expected)
-    assert (np.abs(hit[both] - expected[both]) < 2e-4).mean() > 0.99  # samples of the outline are 0.3 mm apart
-    assert (hit[both] <= expected[both] + 1e-9).all()
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_a_disc_that_starts_touching_does_not_pass(shape, dtype):
-    on = np.asarray(boundary(shape))[::40]
-    _, _, normal = closest(shape, on)
-    start = on + 0.00475 * np.asarray(normal)
-    free = np.asarray(distances(shape, start)) > 0.00475 - 1e-9
-    start, normal = start[free].astype(dtype), np.asarray(normal)[free].astype(dtype)
-    single = jax.tree.map(lambda leaf: leaf.astype(dtype), shape)
-    pressed = np.asarray(sweep(single, start, dtype(-0.02) * normal, dtype(0.00475)))
-    assert (pressed <= 1e-4).all()
-    assert (np.asarray(sweep(single, start, dtype(1e-3) * normal, dtype(0.00475))) > 0.1).all()
-    assert np.isinf(sweep(single, start, 0 * normal, dtype(0.00475))).all()
-
-
-@pytest.mark.parametrize("name", ["ellipse", pytest.param("waisted", marks=pytest.mark.long)])
-def test_derivatives_of_the_sweep(name):
-    shape, rng = SHAPES[name], np.random.default_rng(10)
-    angle = rng.uniform(0, 2 * np.pi, 60)
-    start = 0.15 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    path = -2 * start + rng.normal(size=(60, 2)) * 0.02
-    flat, back = parameters(shape)
-
-    def fraction(v):
-        return back(v[:-5]).outline().sweep(Vec2.of(v[-5:-3]), Vec2.of(v[-3:-1]), v[-1])
-
-    at = np.concatenate([np.broadcast_to(flat, (60, flat.size)), start, path, np.full((60, 1), 0.004)], axis=1)
-    along = rng.normal(size=at.shape)
-    ahead, behind = at + DIFFERENCE_STEP * along, at - DIFFERENCE_STEP * along
-    values = jax.jit(jax.vmap(fraction))
-    hit = np.isfinite(values(at))
-    assert hit.mean() > 0.8
-    slope = np.asarray(jax.jit(jax.vmap(jax.grad(fraction)))(at))
-    assert np.isfinite(slope).all()
-    with np.errstate(invalid="ignore"):
-        difference = np.asarray(values(ahead) - values(behind)) / (2 * DIFFERENCE_STEP)
-    off = np.abs(np.sum(slope * along, axis=1) - difference)[hit] / (1 + np.abs(difference[hit]))
-    assert (off < DIFFERENCE_TOLERANCE).mean() > 0.95  # except those that graze
-
-
 # --- sizes ---
 
 
@@ -584,7 +466,6 @@ def test_dtype_is_the_input_s():
             shape.closest([0.3, 0.2]),
             shape.closest(point),
             outline.contact_candidates(x),
-            outline.sweep(x, x, x.x),
         )
 
     for shape in (

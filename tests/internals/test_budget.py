@@ -43,12 +43,12 @@ FINGER, JAW = pj.Hand.finger(0.005), pj.Hand.parallel_jaw(0.027, 0.01)
 one = push(RECTANGLE, FINGER, (-0.06, 0.0), (-0.02, 0.0))
 # kernels and instructions of each program
 PROGRAMS = {
-    "push": (one, 295, 13383),
-    "gradient": (lambda pose, mu: jax.grad(lambda p, m: one(p, m).sum(), argnums=(0, 1))(pose, mu), 741, 27204),
-    "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 936, 25804),
-    "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 975, 29585),
-    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1325, 41209),
-    "PushT step": (step_of_task, 1171, 28289),
+    "push": (one, 300, 13609),
+    "gradient": (lambda pose, mu: jax.grad(lambda p, m: one(p, m).sum(), argnums=(0, 1))(pose, mu), 750, 27405),
+    "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 906, 25305),
+    "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 955, 28216),
+    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1184, 35687),
+    "PushT step": (step_of_task, 1121, 25127),
 }
 
 

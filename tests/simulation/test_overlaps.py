@@ -13,8 +13,8 @@ import pushjax as pj
 from pushjax import plot
 from pushjax._math.vec import Vec2, Vec3, cos_sin
 from pushjax.plot.style import RED
-from pushjax.simulation.candidate import OUT_OF_REACH, FingerPose
-from pushjax.simulation.detection import contact_candidates, penetration_depth
+from pushjax.simulation.candidate import FingerPose
+from pushjax.simulation.detection import pair_of
 from pushjax.simulation.finger_motion import finger_motions, max_penetration
 from pushjax.simulation.hand import Pad, RoundFinger
 
@@ -75,7 +75,7 @@ def test_depth_is_shapelys(rng):
     def depth(vertices, at, angle):
         outline = pj.Polygon(vertices).outline()
         there = FingerPose(Vec2.of(at), cos_sin(angle))
-        return penetration_depth(finger, outline, there), penetration_depth(pad, outline, there)
+        return tuple(-pair_of(body, outline).distance(body, outline, there)[0] for body in (finger, pad))
 
     of_finger, of_pad = (np.asarray(each) for each in depth(vertices, at, angle))
     kinds = set()
@@ -110,6 +110,12 @@ L8 = np.insert(L, [1, 6], [(L[0] + L[1]) / 2, (L[5] + L[0]) / 2], axis=0)
 JAW = pj.Hand.parallel_jaw(width=0.05, thickness=0.01)
 
 
+def candidates(pad, outline, pose, displacement, length=0.04):
+    """Return where a pad and an outline may touch, with a pad that moves as a whole."""
+    found = pair_of(pad, outline).candidates(pad, outline, pose, lambda _: displacement, jnp.asarray(length))
+    return found.touches
+
+
 def surface(length: float = 0.04) -> pj.Ellipsoid:
     return pj.Ellipsoid(np.eye(3), length)
 
@@ -121,10 +127,10 @@ def test_an_inner_corner_touches_no_pad():
     lower = FingerPose(Vec2(jnp.asarray(0.02), jnp.asarray(0.016)), cos_sin(jnp.asarray(-0.11)))
     pad = JAW.fingers[0]
     still = Vec2(jnp.zeros(()), jnp.zeros(()))
-    touches = contact_candidates(pad, outline, lower, lambda point: still, jnp.asarray(0.04))
+    touches = candidates(pad, outline, lower, still)
     inner = 4 + 3  # after the four corners of the pad, the fourth of the outline
     np.testing.assert_allclose([touches.point.x[inner], touches.point.y[inner]], (-0.01, 0.01))
-    assert touches.distance[inner] > OUT_OF_REACH / 2
+    assert not touches.exists[inner]
     slider = pj.Slider(pj.Polygon(L), surface())
     path = pj.line((0, 0, 0, 0.18), (0, 0, 0, 0.03), 300)
     push = pj.rollout(slider, JAW, path, pose=(0, 0.005, np.radians(20)), friction=0.3)
@@ -171,10 +177,8 @@ def test_a_corner_beside_two_edges_of_an_arm_touches_one():
     end = np.max(np.asarray(survey.shape_of("U").vertices), axis=0)
     for inside in (1e-4, 1e-9, 0.0, -1e-9):
         at = FingerPose(Vec2(*jnp.asarray(end - [0.030, inside - 0.005])), cos_sin(jnp.asarray(0.0)))
-        touches = contact_candidates(
-            pad, outline, at, lambda point: Vec2(jnp.zeros(()), -jnp.ones(())), jnp.asarray(0.04)
-        )
-        near = np.asarray(touches.distance) < 1e-3
+        touches = candidates(pad, outline, at, Vec2(jnp.zeros(()), -jnp.ones(())))
+        near = np.asarray(touches.exists) & (np.asarray(touches.distance) < 1e-3)
         assert near.any()
         np.testing.assert_allclose(np.asarray(touches.distance)[near], -inside, atol=1e-12)
         np.testing.assert_allclose(np.asarray(touches.normal.y)[near], -1)
@@ -199,8 +203,8 @@ def test_a_corner_that_is_past_the_other_side_touches_no_side(shape, past):
         away = there._replace(
             center=there.center + Vec2(*jnp.asarray([-far, 0.0] if shape == "rectangle" else [0.0, far]))
         )
-        touches = contact_candidates(pad, outline, away, lambda point: Vec2(*jnp.zeros(2)), jnp.asarray(0.1))
-        near = np.asarray(touches.distance) < 1e-3
+        touches = candidates(pad, outline, away, Vec2(*jnp.zeros(2)), 0.1)
+        near = np.asarray(touches.exists) & (np.asarray(touches.distance) < 1e-3)
         assert near.any()
         np.testing.assert_allclose(np.asarray(touches.distance)[near], far, atol=1e-12)
 

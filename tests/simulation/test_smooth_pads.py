@@ -8,8 +8,8 @@ import pytest
 import pushjax as pj
 from pushjax._math.vec import Vec2, Vec3
 from pushjax.experiments.grasps.sliders import butterfly
-from pushjax.simulation.candidate import OUT_OF_REACH, FingerPose
-from pushjax.simulation.detection import contact_candidates, penetration_depth
+from pushjax.simulation.candidate import FingerPose
+from pushjax.simulation.detection import pair_of
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
 from pushjax.simulation.hand import Pad
 from pushjax.simulation.impact import time_of_impact
@@ -71,6 +71,16 @@ def pad() -> Pad:
     return pj.Hand.parallel_jaw(0.027, 0.010).fingers[0]
 
 
+def depth_of(finger, outline, pose):
+    return -pair_of(finger, outline).distance(finger, outline, pose)[0]
+
+
+def candidates(finger, outline, pose, displacement):
+    """Return where a pad and an outline may touch, with a pad that moves as a whole."""
+    found = pair_of(finger, outline).candidates(finger, outline, pose, lambda _: displacement, jnp.asarray(LENGTH))
+    return found.touches
+
+
 def inside(points: np.ndarray, bounds, center, turn: float) -> float:
     """Return the deepest overlap by brute force: outline points in the pad, from `bounds`, about `center`."""
     cos, sin = np.cos(turn), np.sin(turn)
@@ -89,12 +99,11 @@ def test_meets_where_brute_force_does(name, rng):
     resting, zero = BodyFrame.at(Vec3(*jnp.zeros(3))), jnp.zeros(())
 
     def met_at(center, angle, path):
-        return time_of_impact(
-            FingerMotion(finger, zero, center, path, angle, zero), outline, resting, jnp.asarray(LENGTH)
-        )
+        motion = FingerMotion(finger, zero, center, path, angle, zero)
+        return time_of_impact((motion,), outline, resting, jnp.asarray(LENGTH), jnp.asarray(jnp.inf))
 
     met = jax.jit(met_at)
-    deep = jax.jit(lambda at: penetration_depth(finger, outline, at))
+    deep = jax.jit(lambda at: depth_of(finger, outline, at))
     hits = 0
     for _ in range(25):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
@@ -117,19 +126,19 @@ def test_places_are_at_their_distance(name):
     """With a pad over the outline, contacts lie on it, at their stated distance from the pad along the normal."""
     shape, finger = shapes()[name], pad()
     still = Vec2(jnp.zeros(()), jnp.zeros(()))
-    seen = jax.jit(lambda at: contact_candidates(finger, shape.outline(), at, lambda point: still, jnp.asarray(LENGTH)))
-    deep = jax.jit(lambda at: penetration_depth(finger, shape.outline(), at))
+    seen = jax.jit(lambda at: candidates(finger, shape.outline(), at, still))
+    deep = jax.jit(lambda at: depth_of(finger, shape.outline(), at))
     for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
         at = placed(aside, 0.025, turn)
         touches = seen(at)
-        near = np.flatnonzero(np.asarray(touches.distance) < OUT_OF_REACH / 2)
+        near = np.flatnonzero(touches.exists)
         assert near.size
         points = dense(shape)
         for k in near:
             point = np.array([float(touches.point.x[k]), float(touches.point.y[k])])
             assert np.linalg.norm(points - point, axis=1).min() < 1e-5
             assert np.hypot(float(touches.normal.x[k]), float(touches.normal.y[k])) == pytest.approx(1)
-        assert min(float(d) for d in touches.distance) == pytest.approx(-float(deep(at)), abs=1e-9)
+        assert float(np.min(np.asarray(touches.distance)[near])) == pytest.approx(-float(deep(at)), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["ellipse", "butterfly", "disk", "square", "star"])
@@ -142,7 +151,7 @@ def test_the_gradient_of_an_overlap_has_length_one(name, rng):
 
     def depth(center, turn):
         pose = FingerPose(Vec2.of(center), Vec2(jnp.cos(turn), jnp.sin(turn)))
-        return penetration_depth(pad(), outline, pose)
+        return depth_of(pad(), outline, pose)
 
     centers, turns = rng.uniform(-0.035, 0.035, (400, 2)), rng.uniform(-3, 3, 400)
     depths, slopes = jax.jit(jax.vmap(jax.value_and_grad(depth)))(centers, turns)
@@ -161,8 +170,9 @@ def test_a_corner_on_a_vertex_touches_the_edge_that_it_is_pressed_against(shift)
     pose = placed(0.12 - corner[0], -corner[1], 0.0)
     for push, normal in (((0.0, 1e-3), (0, 1)), ((-1e-3, 0.0), (-1, 0))):
         displacement, of_pad = Vec2.of(jnp.asarray(push)), len(pad().shape.vertices)
-        found = contact_candidates(pad(), outline, pose, lambda _, d=displacement: d, jnp.asarray(LENGTH))
-        touching = int(np.argmin(np.abs(np.asarray(found.distance)[:of_pad])))
+        found = candidates(pad(), outline, pose, displacement)
+        near = np.where(found.exists, np.abs(found.distance), np.inf)
+        touching = int(np.argmin(near[:of_pad]))
         np.testing.assert_allclose(found.distance[touching], 0, atol=1e-12)
         np.testing.assert_allclose([found.normal.x[touching], found.normal.y[touching]], normal, atol=1e-12)
 

@@ -25,7 +25,7 @@ from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.pace import Pace
 from pushjax.planning.transits.roadmap import Roadmap, ShortestTransits, Transit, run_ups
 from pushjax.planning.workspace import Extent, Workspace
-from pushjax.simulation.detection import MAX_PENETRATION
+from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.slider import Slider
 
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length

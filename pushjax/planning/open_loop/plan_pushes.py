@@ -38,9 +38,9 @@ from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
 from pushjax.planning.transits.between_pushes import TIGHT, transits_between
 from pushjax.planning.transits.roadmap import Transit, TransitStatus
 from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
-from pushjax.simulation.detection import MAX_PENETRATION
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
+from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.slider import Slider, fixture_overlaps
 
 UNSEEN_SAMPLES = 256  # samples of the predicted outcomes

@@ -1,9 +1,9 @@
 """Parameters of pushes: from a few numbers to the path of a hand.
 
 A push is a line in the slider's body frame: a direction, and a signed distance from the body origin. The hand comes
-along that line from outside. Where it first touches the outline is found exactly (`Outline.sweep`), and the push goes
-on from there by a length. So contact point, direction and length are free, for any outline, without a border between
-its edges. With bends the path is a Bezier curve whose ends are those of the line.
+along that line from outside. Where it first touches the outline is found (`pushjax.simulation.impact`), and the push
+goes on from there by a length. So contact point, direction and length are free, for any outline, without a border
+between its edges. With bends the path is a Bezier curve whose ends are those of the line.
 """
 
 from math import comb
@@ -15,9 +15,11 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_positive, check_shape
-from pushjax._math.vec import Vec2
+from pushjax._math.vec import Vec2, Vec3
 from pushjax.geometry import se2
+from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
 from pushjax.simulation.hand import Hand, RoundFinger
+from pushjax.simulation.impact import time_of_impact
 from pushjax.simulation.slider import Slider
 
 
@@ -148,13 +150,15 @@ class PushSequence(eqx.Module):
         centers = hand.poses(jnp.concatenate([line, rest]))[:, :2]
         # far enough for every finger to start outside; `radius` is that of points on the outline, not of its corners
         reach = 2 * radius + jnp.max(hand.radius + jnp.max(jnp.abs(centers - line[None]), axis=1) * 2**0.5)
-        outline, way = slider.shape.outline(), Vec2.of(2 * reach * ahead)
-        fractions = [
-            outline.sweep(Vec2.of(center - reach * ahead), way, finger.radius)  # pyright: ignore[reportAttributeAccessIssue]
-            for center, finger in zip(centers, hand.fingers, strict=True)
-        ]
-        first = jnp.min(jnp.stack(fractions))
-        return jnp.where(jnp.isfinite(first), (2 * jnp.where(jnp.isfinite(first), first, 0.5) - 1) * reach, 0.0)
+        zero, outline = jnp.zeros_like(reach), slider.shape.outline()
+        start, way = Vec2.of(-reach * ahead), Vec2.of(2 * reach * ahead)
+        fingers = tuple(
+            FingerMotion(finger, zero, Vec2.of(center) + start, way, None, None)
+            for finger, center in zip(hand.fingers, centers, strict=True)
+        )
+        at_rest = BodyFrame.at(Vec3(zero, zero, zero))
+        first = time_of_impact(fingers, outline, at_rest, slider.surface.length, jnp.full_like(reach, jnp.inf))
+        return jnp.where(first < 1, (2 * first - 1) * reach, 0.0)
 
 
 def _bernstein(degree: int, steps: int) -> np.ndarray:
