@@ -4,7 +4,6 @@ For a batch of 6 x 6 matrices, the factorizations of `jax.numpy.linalg` call LAP
 arithmetic on scalars becomes arithmetic on whole batches under `vmap`, and takes a fiftieth of the time (see `vec`).
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -30,18 +29,6 @@ class Symmetric3(NamedTuple):
             self.xy * v.x + self.yy * v.y + self.yz * v.z,
             self.xz * v.x + self.yz * v.y + self.zz * v.z,
         )
-
-    def trace(self) -> Scalar:
-        """Sum of the diagonal entries."""
-        return self.xx + self.yy + self.zz
-
-    def least_minor(self) -> Scalar:
-        """Least principal minor, where the trace is scaled to one: negative unless positive semi-definite."""
-        size = self.trace()
-        xx, yy, zz, xy, xz, yz = (entry / jnp.where(size > 0, size, 1.0) for entry in self)
-        pairs = xx * yy - xy * xy, xx * zz - xz * xz, yy * zz - yz * yz
-        det = zz * pairs[0] - yz * (xx * yz - xy * xz) + xz * (xy * yz - yy * xz)
-        return functools.reduce(jnp.minimum, (xx, yy, zz, *pairs, det))
 
     def solve(self, v: Vec3) -> Vec3:
         """Return u with self u = v, by the adjugate; zero where |det| <= eps^2 |trace|^3."""

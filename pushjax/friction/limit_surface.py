@@ -16,12 +16,15 @@ from typing import Any, NamedTuple, Protocol, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, concrete
 from pushjax._internal.files import load_json, save_json, to_list
+from pushjax._math.arrays import cross, dot
 from pushjax._math.linalg import Symmetric3
 from pushjax._math.vec import Scalar, Vec3
+from pushjax.friction.polynomial import Polynomial
 
 # Kinds of surfaces in files. Their modules are named like them. They are imported when needed, because a user who loads
 # a surface may not have imported them.
@@ -99,14 +102,18 @@ class LimitSurface(eqx.Module):
         """Return whether a surface that was made of traced numbers can be computed with."""
         # An ellipsoid must be convex. A quartic must be convex at three wrenches only, because more takes too long.
         form = jax.lax.stop_gradient(self.form())
-        hessians = [form.hessian(Vec3(*axis)) for axis in jnp.eye(3, dtype=self.length.dtype)]
-        sizes = jnp.stack([matrix.trace() for matrix in hessians])
+        hessians = Polynomial.of(form.table()).hessian(jnp.eye(3, dtype=self.length.dtype))  # (3, 3, wrench)
+        sizes = hessians[0, 0] + hessians[1, 1] + hessians[2, 2]
         largest, roundoff = MAX_SCALE[sizes.dtype.itemsize], CONVEX_ROUNDOFF[sizes.dtype.itemsize]
         valid = jnp.isfinite(sum(jax.tree.leaves(form))) & jnp.all((sizes >= 1 / largest) & (sizes <= largest))
-        for matrix in hessians:
-            valid &= matrix.least_minor() >= -roundoff
-        diagonal = jnp.stack([hessians[0].xx, hessians[1].yy, hessians[2].zz])
-        valid &= jnp.min(diagonal) > jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
+        # all principal minors, with the traces scaled to one
+        scaled = hessians / jnp.where(sizes > 0, sizes, 1.0)[None, None]
+        diagonal, crosses = scaled[np.arange(3), np.arange(3)], cross(scaled[1], scaled[2])
+        pairs = [diagonal[i] * diagonal[j] - scaled[i, j] ** 2 for i, j in ((0, 1), (0, 2), (1, 2))]
+        minors = jnp.concatenate([diagonal, jnp.stack(pairs), dot(scaled[0], crosses)[None]])
+        curvature = hessians[np.arange(3), np.arange(3), np.arange(3)]
+        valid &= jnp.all(minors >= -roundoff)
+        valid &= jnp.min(curvature) > jnp.finfo(curvature.dtype).eps * jnp.max(curvature)
         return valid & (self.length >= 1 / MAX_LENGTH) & (self.length <= MAX_LENGTH)
 
     @abstractmethod

@@ -21,7 +21,8 @@ class Step(eqx.Module):
 
     Contacts are in the order of the fingers, and then of the fixtures. A round finger has one contact, or two on an
     outline that is not convex. A pad has two contacts in general, one on a disk, and three on a polygon that is not
-    convex. A wall has two contacts, or one on a disk or an ellipse. The contacts of one finger may change places from step to step.
+    convex. A wall has two contacts, or one on a disk or an ellipse. The contacts of one finger may change places from
+    step to step.
 
     The contact point moves in a straight line, and the rest of the slider turns about it. The twist is one of chords:
     the slider turns by 2 asin(twist[2] / 2), and its pose after the step agrees with the exponential of the twist to
