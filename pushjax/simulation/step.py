@@ -197,14 +197,13 @@ def compute_step(
             used_urgency = jnp.where((fraction == 0) & is_first_try, pressed, used_urgency)
         working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, size)
         tried = None if carry.guess is None else working.local(carry.guess)
-        solution = solve_problem(form, *working.select(contacts, active & ongoing), solver, tried)
+        works = carry.status <= Status.FREE  # else the step has failed, and the corrector has nothing to solve
+        solution = solve_problem(form, *working.select(contacts, active & ongoing & works), solver, tried)
         solution = working.spread(solution)
         best = solution.best
         best = None if best is None else tree_where(best.exists(), best, carry.guess)
         urgency_after = None if urgency is None else violations(contacts, active, solution)
-        # a failed predictor must show in the status, whatever the corrector makes of it
-        status = jnp.where(carry.status <= Status.FREE, solution.status, jnp.maximum(carry.status, solution.status))
-        point = _force_weighted_point(contacts, solution.force)
+        status, point = jnp.where(works, solution.status, carry.status), _force_weighted_point(contacts, solution.force)
         next_stage = Stage(solution.twist, point, frame.angle, status, at_start, holds, used_urgency, best)
         is_long = _turns_or_slips_too_far(contacts, active & has_end, solution, form.length)
         # points and normals have no derivatives, because nothing computes with them
