@@ -100,8 +100,13 @@ class PolygonOutline(Outline):
         *_, from_edge = self.edges.foot(x)
         squared = from_edge.dot(from_edge)
         length = jnp.sqrt(jnp.where(squared > 0, squared, 1.0))
-        inside = jnp.minimum(self.closest(x).distance, 0.0)
-        return jnp.where((squared > 0) & (inside >= 0), length, inside), from_edge.scale(1 / length)
+        distance = jnp.where(squared > 0, length, 0.0)
+        # the nearest edges may be behind `x`, or so near that the vector from them is roundoff
+        closest = self.closest(x)
+        tolerance = roundoff(jnp.abs(x.x) + jnp.abs(x.y) + self.edges.length)
+        is_nearest = distance <= jnp.abs(closest.distance) + tolerance
+        normal = tree_where(is_nearest, closest.normal, from_edge.scale(1 / length))
+        return jnp.where(is_nearest, closest.distance, distance), normal
 
     @property
     def num_facing(self) -> int:

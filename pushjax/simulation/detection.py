@@ -8,9 +8,12 @@ three. The selection is new in each step and stays the same within the step.
 The way to find them depends on the kinds of the two bodies, which `PAIRS` lists.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
+from pushjax._math.vec import Vec2
 from pushjax.geometry.disk import DiskOutline
 from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.geometry.shape import ClosestPoint, Outline
@@ -39,8 +42,28 @@ class RoundFingerPair(Pair):
     def touches(self, finger, outline, pose, features):
         places = outline.contact_candidates(pose.center)
         all_places: ClosestPoint = jax.tree.map(lambda *entries: jnp.stack(entries), *places)
-        distance = all_places.distance - finger.radius
-        return Touches(distance, all_places.point, -all_places.normal, features.present)
+        distance, point, normal = all_places.distance - finger.radius, all_places.point, -all_places.normal
+        # a second place that does not exist repeats the first
+        differs = [entry != entry[:1] for entry in (point.x, point.y, normal.x, normal.y)]
+        exists = functools.reduce(jnp.logical_or, differs).at[0].set(True)
+        return Touches(distance, point, normal, exists)
+
+    def matched(self, touches, at_start):
+        if len(touches.exists) == 1:
+            return touches
+        # the nearest place is the first, and another one may be nearest now
+        squares = [
+            [
+                (p := Vec2(touches.point.x[i] - at_start.point.x[j], touches.point.y[i] - at_start.point.y[j])).dot(p)
+                for j in range(2)
+            ]
+            for i in range(2)
+        ]
+        has_second, had_second = touches.exists[1], at_start.exists[1]
+        second = jnp.where(has_second, squares[1][0] - jnp.where(had_second, squares[1][1], squares[0][0]), 0.0)
+        first = jnp.where(had_second, squares[0][1] - squares[0][0], 0.0)
+        swaps = jax.lax.stop_gradient((first + second < 0) & (has_second | had_second))
+        return jax.tree.map(lambda entry: jnp.where(swaps, entry[::-1], entry), touches)
 
 
 class PadOnDisk(Pair):

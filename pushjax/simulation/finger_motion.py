@@ -186,14 +186,6 @@ def max_penetration(outline: Outline, motions: tuple[FingerMotion, ...], pose: V
     return functools.reduce(jnp.maximum, map_items(depth_of, motions))
 
 
-def overlap_and_gap(
-    outline: Outline, motions: tuple[FingerMotion, ...], fixtures: tuple[FingerMotion, ...], pose: Vec3, fraction: float
-) -> tuple[Scalar, Scalar]:
-    """Return the depth of the deepest finger or fixture, and how far the nearest finger is from the slider, m."""
-    depth = max_penetration(outline, motions, pose, fraction)
-    return (jnp.maximum(depth, max_penetration(outline, fixtures, pose, fraction)) if fixtures else depth), -depth
-
-
 def max_displacement(motions: tuple[FingerMotion, ...]) -> Scalar:
     """Return the largest displacement of a point of a finger in the step, m, not differentiated."""
     motions = jax.lax.stop_gradient(motions)

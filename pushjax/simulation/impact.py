@@ -30,42 +30,35 @@ LEAST_APPROACH = 1e-2
 
 
 @eqx.filter_custom_jvp
-def time_of_impact(
-    motions: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar, gap: Scalar
-) -> Scalar:
-    """Return the fraction of a step after which a finger first touches the slider, or one if none does.
+def time_of_impact(motions: tuple[FingerMotion, ...], outline: Outline, start: BodyFrame, length: Scalar) -> Scalar:
+    """Return the fraction of a step after which a finger first presses on the slider, or one if none does."""
 
-    `gap` is how far the nearest finger is from the slider at the start, m.
-    """
-    touches = TOUCHING[gap.dtype.itemsize] * length  # a finger that touches begins to push at once
-
-    def is_apart(state):
-        _, apart, rounds = state
-        return apart & (rounds < MAX_ROUNDS)
+    def is_free(state):
+        _, free, rounds = state
+        return free & (rounds < MAX_ROUNDS)
 
     def advance(state):
         fraction, _, rounds = state
-        found = map_items(lambda motion: _gap_and_free(motion, outline, start, fraction), motions)
-        gap, free = (jnp.min(jnp.stack(values)) for values in zip(*found, strict=True))
-        after = jnp.where(gap > touches, jnp.minimum(fraction + free, 1.0), fraction)
-        return after, (gap > touches) & (after < 1), rounds + 1
+        found = map_items(lambda motion: _free_fraction(motion, outline, start, fraction, length), motions)
+        after = jnp.minimum(fraction + jnp.min(jnp.stack(found)), 1.0)
+        return after, (after > fraction) & (after < 1), rounds + 1
 
-    state = jnp.zeros_like(gap), gap > touches, jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(is_apart, advance, state)[0]
+    state = jnp.zeros_like(length), jnp.ones((), bool), jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(is_free, advance, state)[0]
 
 
 @time_of_impact.def_jvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     # the implicit function theorem: where the gap closes, the instant depends on everything that the gap depends on
     fraction = time_of_impact(*primals)
-    motions, outline, start, length, _ = primals
+    motions, outline, start, length = primals
     gaps, changes = eqx.filter_jvp(lambda *scene: _gaps(scene[0], scene[1], scene[2], fraction), primals, tangents)
     if changes is None:  # nothing that the gaps depend on is differentiated
         return fraction, jnp.zeros_like(fraction)
     _, rates = jax.jvp(lambda f: _gaps(motions, outline, start, f), (fraction,), (jnp.ones_like(fraction),))
     speeds = jnp.stack([motion.arc_length() for motion in motions])
     gap, change, rate, speed = pick((gaps, changes, rates, speeds), jnp.argmin(gaps))
-    is_near = gap <= TOUCHING[4] * length
+    is_near = gap <= 4 * TOUCHING[4] * length
     closes = (fraction > 0) & (fraction < 1) & is_near & (-rate > LEAST_APPROACH * speed)
     return fraction, jnp.where(closes, -change / jnp.where(closes, rate, 1.0), 0.0)
 
@@ -82,23 +75,27 @@ def _gaps(
     return jnp.stack(map_items(gap_of, motions))
 
 
-def _gap_and_free(motion: FingerMotion, outline: Outline, start: BodyFrame, fraction: Scalar) -> tuple[Scalar, Scalar]:
-    """Return how far a finger is from the slider, m, and by which further fraction it can move without touching it."""
+def _free_fraction(
+    motion: FingerMotion, outline: Outline, start: BodyFrame, fraction: Scalar, length: Scalar
+) -> Scalar:
+    """Return the further fraction by which a finger can move without pressing on the slider; zero if it presses."""
     pose, velocity = jax.jvp(lambda f: motion.pose_in_slider(start, f), (fraction,), (jnp.ones_like(fraction),))
     gaps, normals = pair_of(motion.finger, outline).pieces(motion.finger, outline, pose)
     fastest = motion.arc_length()
-    if normals is None:
-        speed, acceleration = jnp.broadcast_to(fastest, gaps.shape), None
-    else:
-        speed, acceleration = -normals.dot(velocity.center), None
+    speed, acceleration = jnp.broadcast_to(fastest, gaps.shape), None
+    if normals is not None:
+        speed = -normals.dot(velocity.center)
         if motion.turning is not None:
             acceleration = fastest * jnp.abs(motion.turning)
             if isinstance(motion.finger, Pad):
                 corner = Vec2.of(motion.finger.shape.vertices.T).rotate(pose.angle)
                 lever = jax.tree.map(lambda n: n[:, None], normals).dot(jax.tree.map(lambda n: n[None], corner.perp()))
                 speed = jnp.max(speed[:, None] - lever * motion.turning, axis=1)
-        speed = jnp.maximum(speed, 0.0)
+    # a finger that touches a piece presses on it, unless it moves away
+    leaves = speed + (0.0 if acceleration is None else acceleration) <= jnp.minimum(gaps, 0.0)
+    touches = gaps <= TOUCHING[length.dtype.itemsize] * length
     # gap = speed t + acceleration t^2 / 2
+    speed, gaps = jnp.maximum(speed, 0.0), jnp.maximum(gaps, 0.0)
     closing = 2 * speed if acceleration is None else speed + jnp.sqrt(speed**2 + 2 * acceleration * gaps)
     free = jnp.where(closing > 0, 2 * gaps / jnp.where(closing > 0, closing, 1.0), 1.0)
-    return jnp.min(gaps), jnp.min(free)
+    return jnp.min(jnp.where(touches, jnp.where(leaves, 1.0, 0.0), free))

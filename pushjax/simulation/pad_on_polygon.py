@@ -87,13 +87,22 @@ class PadOnPolygon(Pair):
         pad, own = finger.shape.outline(), outline.edges
         starts = pose.center + pad.edges.start.rotate(pose.angle)
         edges = joined((own.start, own.normal), (starts, pad.edges.normal.rotate(pose.angle)))
-        start, normal = pick(edges, features.first)
-        corner = pick(joined(starts, own.start), features.second)
-        height = normal.dot(corner - start)
+        (start, normal), (begin, end) = pick((edges, joined(_ends(own), _ends(pad.edges))), features.first)
+        relative = pick(joined(starts, own.start), features.second) - start
+        corner, height, along = start + relative, normal.dot(relative), normal.cross(relative)
         on_slider = features.first < own.length.size
         foot = corner - normal.scale(height)
         point = Vec2(jnp.where(on_slider, foot.x, corner.x), jnp.where(on_slider, foot.y, corner.y))
-        return Touches(height, point, normal.scale(jnp.where(on_slider, -1.0, 1.0)), features.present)
+        exists = features.present & (along >= begin) & (along <= end)
+        return Touches(height, point, normal.scale(jnp.where(on_slider, -1.0, 1.0)), exists)
+
+
+def _ends(edge: Edge) -> tuple[Scalar, Scalar]:
+    """Return between which coordinates along its edge a corner that touched it still does, m."""
+    # somewhat wider than in `_vertex_edge_candidates`; what is past an inner corner is inside the slider
+    slack = 2 * END_TOLERANCE[edge.length.dtype.itemsize] * edge.length
+    begin, end = jnp.where(edge.turn_a < 0, jnp.inf, slack), jnp.where(edge.turn_b < 0, jnp.inf, slack)
+    return jax.lax.stop_gradient((-begin, edge.length + end))
 
 
 def _vertex_edge_candidates(

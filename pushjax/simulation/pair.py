@@ -53,6 +53,10 @@ class Pair(ABC):
         displacement = displacement_at(candidates.touches.point)
         return select_contacts(candidates, count, outline, length, displacement)
 
+    def matched(self, touches: Touches, at_start: Touches) -> Touches:
+        """Return contacts in the order of those at the start of the step."""
+        return touches
+
     @abstractmethod
     def touches(self, finger: Any, outline: Any, pose: FingerPose, features: Features) -> Touches:
         """Return the contacts of these features."""

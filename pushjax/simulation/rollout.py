@@ -305,7 +305,7 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
         form, mu = push.friction_at(step, pose)
         motions = push.motions_at(step, mu)
         # one contact holds nothing
-        record, *_ = compute_step(form, push.outline, motions, push.solver, pose, depth, -depth, jnp.zeros_like(pose.x))
+        record, *_ = compute_step(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
         allowed = jnp.maximum(depth, allowed_penetration(max_displacement(motions), form.length))
         depth = max_penetration(push.outline, motions, record.pose, 1.0)
         is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)

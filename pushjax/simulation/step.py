@@ -134,8 +134,11 @@ class PushingPart(NamedTuple):
         """Return the contacts of one finger, or of one fixture, in a stage."""
         x, in_predictor = self.start.pose.x, fraction == 0
         pose = compute_once(body.pose_in_slider(frame, self.begin + self.rest * fraction), x)
-        touches = compute_once(pair_of(body.finger, self.outline).touches(body.finger, self.outline, pose, features), x)
+        pair = pair_of(body.finger, self.outline)
+        touches = compute_once(pair.touches(body.finger, self.outline, pose, features), x)
         at_start = tree_where(in_predictor, touches, at_start)
+        # what touches nothing any more keeps its contact from the start of the step
+        touches = pair.matched(touches, at_start)
         touches = tree_where(touches.exists, touches, at_start)
         # both stages use the gap from the start of the step, so that position errors of the rule do not accumulate
         gap = _gap(at_start.distance, (DEPTH_FLOOR if is_fixture else TOUCHING[x.dtype.itemsize]) * self.length)
@@ -164,7 +167,6 @@ def compute_step(
     solver: ContactSolver | StickingSolver | None,
     pose: Vec3,  # of the slider at the start, world
     overlap_before: Scalar,  # depth of the deepest finger or fixture at the start, m
-    gap_before: Scalar,  # how far the nearest finger is from the slider at the start, m
     reach: Scalar,  # distance within which a finger holds a jammed slider, m
     urgency: Urgency | None = None,  # of each contact (`working_set`); None if all are solved together
     ongoing: Bool[Array, ""] | bool = True,  # where False, no contact problem is solved, and the result has no meaning
@@ -174,7 +176,7 @@ def compute_step(
 ) -> tuple[StepRecord, Urgency | None, EdgeSet | None]:
     """Compute one step of all fingers, or a part of one: its record, the urgency after it, and the next guess."""
     start = BodyFrame.at(pose)
-    begin = compute_once(time_of_impact(motions, outline, start, form.length, gap_before), pose.x)
+    begin = compute_once(time_of_impact(motions, outline, start, form.length), pose.x)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
     counts = [num_contacts(body.finger, outline) for body in motions + fixtures]
     size, has_end = num_solved_together(counts), _has_end(motions + fixtures, counts)
@@ -214,18 +216,26 @@ def compute_step(
     carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
     solution, places, urgency_after, _ = jax.tree.map(lambda leaf: leaf[-1], outputs)
     moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
-    moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
-    status = _status(carry, moves, jnp.any(outputs[-1]), overlap_before, form.length)
+    status = _status(carry, motions, fixtures, jnp.any(outputs[-1]), overlap_before, form.length)
     return _keep_pose_unless_moving(solution, places, moved_pose, pose, status), urgency_after, carry.guess
 
 
 def _status(
-    last_stage: Stage, moves: Bool[Array, ""], is_long: Bool[Array, ""], depth: Scalar, length: Scalar
+    last_stage: Stage,
+    motions: tuple[FingerMotion, ...],
+    fixtures: tuple[FingerMotion, ...],
+    is_long: Bool[Array, ""],
+    depth: Scalar,
+    length: Scalar,
 ) -> Int[Array, ""]:
     """Status of a step, given the depth of the deepest finger at its start, m."""
     status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
     status = jnp.where((status <= Status.FREE) & is_long, Status.NOT_CONVERGED, status)
+    # friction that is not valid counts also where a body has no contact
+    valid = jnp.all(jnp.stack([body.friction >= 0 for body in motions + fixtures]))
+    status = jnp.where(valid, status, Status.INVALID)
     # a hand that rests changes nothing, and proves nothing
+    moves = jax.tree.reduce(jnp.logical_or, [motion.moves() for motion in motions])
     status = jnp.where(moves | (status == Status.INVALID), status, Status.FREE)
     overlapping = (depth > MAX_PENETRATION * length) & (status != Status.INVALID)
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)

@@ -45,7 +45,7 @@ from pushjax.simulation.finger_motion import (
     allowed_penetration,
     holding_distance,
     max_displacement,
-    overlap_and_gap,
+    max_penetration,
 )
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
 from pushjax.simulation.step import StepRecord, compute_step
@@ -79,7 +79,6 @@ class PushState(NamedTuple):
     braced: Bool[Array, ""]  # whether the smallest part has failed, and is tried with more friction
     swaps: Int[Array, ""]  # changes of this part's working set
     overlap: Scalar  # depth of the deepest finger or fixture now, m
-    gap: Scalar  # how far the nearest finger is from the slider now, m
     stop_status: Int[Array, ""]  # status that stopped the hand, or zero
     abandon_status: Int[Array, ""]  # status of a step that is given up, or zero
     failed: Bool[Array, ""]  # whether the previous step failed
@@ -116,7 +115,7 @@ class DividedPush(NamedTuple):
         """Return the state before the first trial, with the slider at `pose`, world."""
         first = jnp.zeros((), jnp.int32)
         motions = self.motions_at(first, self.friction_at(first, pose)[1])
-        overlap, gap = overlap_and_gap(self.outline, motions, self.fixtures, pose, 0.0)
+        overlap = max_penetration(self.outline, motions + self.fixtures, pose, 0.0)
         zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
         status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
@@ -124,7 +123,7 @@ class DividedPush(NamedTuple):
         guess = EdgeSet.none(zero) if sum(counts) > 1 else None
         return PushState(
             *(pose, pose, first, zero, one, no, no, urgency, no, status),
-            *(overlap, gap, status, status, no, idle, guess),
+            *(overlap, status, status, no, idle, guess),
         )
 
     def trial(self, state: PushState) -> tuple[PushState, tuple[StepRecord, Bool[Array, ""], Int[Array, ""]]]:
@@ -146,7 +145,6 @@ class DividedPush(NamedTuple):
             self.solver,
             state.pose,
             state.overlap,
-            state.gap,
             reach,
             state.urgency,
             state.step < self.end,
@@ -159,7 +157,7 @@ class DividedPush(NamedTuple):
             record.twist, record.force, record.contact_point, state.part * displacement, form.length, is_smallest
         )
         next_state, end_of_step = _next_state(
-            state, record, guess, urgency_after, self.outline, part, fixtures, tolerance, speed, self.end
+            state, record, guess, urgency_after, self.outline, part + fixtures, tolerance, speed, self.end
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
         if urgency_after is not None and urgency is not None:
@@ -269,8 +267,7 @@ def _next_state(
     guess: EdgeSet | None,
     urgency_after: Urgency | None,
     outline: Outline,
-    part: tuple[FingerMotion, ...],  # motions over the tried part of the step
-    fixtures: tuple[FingerMotion, ...],
+    part: tuple[FingerMotion, ...],  # motions over the tried part of the step, and fixtures
     tolerance: Scalar,
     speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
@@ -278,7 +275,7 @@ def _next_state(
     """Return the state after a trial; and of the trial's step the record, whether it ended, and the index."""
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
-    depth, gap = overlap_and_gap(outline, part, fixtures, pose, 1.0)
+    depth = max_penetration(outline, part, pose, 1.0)
     decision = _decide(state, record, urgency_after, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
@@ -311,7 +308,6 @@ def _next_state(
         braced=decision.braces | (state.braced & decision.joins),
         swaps=jnp.where(decision.joins, state.swaps + 1, 0).astype(jnp.int8),
         overlap=jnp.where(accepted | (ends & ~stops), depth, state.overlap),
-        gap=jnp.where(accepted | (ends & ~stops), gap, state.gap),
         stop_status=jnp.where(stops, record.status, state.stop_status).astype(jnp.int8),
         abandon_status=jnp.where(decision.abandons, decision.reason, 0).astype(jnp.int8),
         failed=jnp.where(ends, fails, state.failed),

@@ -8,7 +8,6 @@ import shapely
 
 import pushjax as pj
 from pushjax._math.vec import Vec2, Vec3
-from pushjax.simulation.detection import pair_of
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
 from pushjax.simulation.hand import Pad, RoundFinger
 from pushjax.simulation.impact import time_of_impact
@@ -40,8 +39,7 @@ def fraction(shape, finger, start, path, angle=None, turning=None):
     zero = jnp.zeros_like(start[0])
     motion = FingerMotion(finger, zero, Vec2.of(start), Vec2.of(path), angle, turning)
     outline, frame = shape.outline(), BodyFrame.at(Vec3(zero, zero, zero))
-    gap = pair_of(finger, outline).distance(finger, outline, motion.pose_in_slider(frame, zero))[0]
-    return time_of_impact((motion,), outline, frame, jnp.full_like(zero, LENGTH), gap)
+    return time_of_impact((motion,), outline, frame, jnp.full_like(zero, LENGTH))
 
 
 fractions = jax.jit(jax.vmap(fraction, (None, None, 0, 0)))
@@ -143,3 +141,23 @@ def test_a_finger_that_touches_begins_at_once(name):
     still = fractions(shape, RoundFinger(radius), on + 2 * radius * normal, 0 * normal)
     np.testing.assert_array_equal(still[np.asarray(still) > 0], 1)
     assert np.mean(np.asarray(still) == 1) > 0.7
+
+
+def test_a_finger_that_touches_may_leave_and_cross_a_hollow(rng):
+    """It then pushes the other side from where it meets it; the one that it leaves does not matter."""
+    arms = [(-50, -50), (50, -50), (50, 50), (25, 50), (25, -20), (-25, -20), (-25, 50), (-50, 50)]
+    slider = pj.Slider(pj.Polygon(np.array(arms) * 1e-3), pj.Ellipsoid(np.eye(3), 0.04))
+    gap = np.repeat([0.0, 1e-12, -1e-6, 1e-4], 6)
+    start = np.stack([-0.019 + gap, rng.uniform(0, 0.04, 24)], axis=1)
+    end = start + np.stack([rng.uniform(0.0385, 0.0405, 24), rng.uniform(-2e-3, 2e-3, 24)], axis=1)
+
+    @jax.jit
+    @jax.vmap
+    def poses(start, end):
+        paths = (start[None] + (end - start)[None] * jnp.linspace(0, 1, n + 1)[:, None] for n in (1, 64))
+        hand = pj.Hand.finger(0.006)
+        return [pj.rollout(slider, hand, path, pose=(0.0, 0.0, 0.0), friction=0.3).pose[-1] for path in paths]
+
+    coarse, fine = poses(start, end)
+    np.testing.assert_allclose(coarse, fine, atol=2e-4)
+    assert np.max(np.abs(fine)) > 1e-3

@@ -98,3 +98,13 @@ def test_forward_mode_and_debug_nans():
             assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
             assert not np.asarray(slope["path"][:, 3]).any()
             assert np.asarray(slope["path"][:, 5]).any()
+
+
+def test_friction_that_is_not_valid_counts_also_without_a_contact():
+    """A pad that is far from the slider, or beside it, has no contact that could carry its friction."""
+    pad = pj.Hand((pj.Polygon.rectangle(0.02, 0.05),), lambda q: q[None], 3)
+    slider = pj.Slider(pj.Polygon(SIDE, convex=True), pj.Ellipsoid(GOOD["A"], length=0.03))
+    path = jnp.array([[-0.3, 0.4, 0.7], [-0.29, 0.4, 0.7]])
+    status = jax.vmap(lambda mu: pj.rollout(slider, pad, path, pose=jnp.zeros(3), friction=mu).status[0])
+    found = status(jnp.array([0.3, -1.0, jnp.nan]))
+    np.testing.assert_array_equal(found, [pj.Status.FREE, pj.Status.INVALID, pj.Status.INVALID])

@@ -100,7 +100,7 @@ def test_meets_where_brute_force_does(name, rng):
 
     def met_at(center, angle, path):
         motion = FingerMotion(finger, zero, center, path, angle, zero)
-        return time_of_impact((motion,), outline, resting, jnp.asarray(LENGTH), jnp.asarray(jnp.inf))
+        return time_of_impact((motion,), outline, resting, jnp.asarray(LENGTH))
 
     met = jax.jit(met_at)
     deep = jax.jit(lambda at: depth_of(finger, outline, at))

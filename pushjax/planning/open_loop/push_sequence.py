@@ -157,7 +157,7 @@ class PushSequence(eqx.Module):
             for finger, center in zip(hand.fingers, centers, strict=True)
         )
         at_rest = BodyFrame.at(Vec3(zero, zero, zero))
-        first = time_of_impact(fingers, outline, at_rest, slider.surface.length, jnp.full_like(reach, jnp.inf))
+        first = time_of_impact(fingers, outline, at_rest, slider.surface.length)
         return jnp.where(first < 1, (2 * first - 1) * reach, 0.0)
 
 
