@@ -7,22 +7,14 @@ from jaxtyping import Array, Bool, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, OvalOutline, Shape
 
 
-class DiskOutline(Outline):
+class DiskOutline(OvalOutline):
     """Outline of a disk, in m in the body frame."""
 
     center: Vec2
     radius: Scalar
-
-    @property
-    def is_convex(self) -> bool:
-        return True
-
-    @property
-    def num_facing(self) -> int:
-        return 1
 
     def closest(self, x: Vec2) -> ClosestPoint:
         offset = x - self.center

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Scalar, Vec2
-from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline, Shape, equally_spaced
+from pushjax.geometry.shape import ClosestPoint, FacingPoints, OvalOutline, Shape, equally_spaced
 
 # Most points reach roundoff in 6 iterations. Near the cusps of the evolute each iteration only halves the error, but
 # there f determines the angle of q only to a third of its digits.
@@ -28,19 +28,11 @@ CLOSEST_ITERATIONS = {False: 8, True: 16}  # key: whether the type is float64
 ARC_NODES = 512
 
 
-class EllipseOutline(Outline):
+class EllipseOutline(OvalOutline):
     """Outline of an ellipse with its axes along the body axes, in m."""
 
     center: Vec2
     semi: Vec2  # semi-axes along x and y
-
-    @property
-    def is_convex(self) -> bool:
-        return True
-
-    @property
-    def num_facing(self) -> int:
-        return 1
 
     def _evaluate(self, q: Vec2) -> tuple[Vec2, Vec2, Scalar]:
         """Return the point at `q` relative to the center, the outward unit normal, and the speed, m per rad."""

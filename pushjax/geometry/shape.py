@@ -80,6 +80,18 @@ class Outline(eqx.Module):
         # A straight edge that is orthogonal to `direction` and lies outside the outline can rest on these points.
 
 
+class OvalOutline(Outline):
+    """A smooth convex outline, which faces each direction in one point."""
+
+    @property
+    def is_convex(self) -> bool:
+        return True
+
+    @property
+    def num_facing(self) -> int:
+        return 1
+
+
 class Shape(eqx.Module):
     """Base class for the shape of a rigid planar slider, in its body frame, in m."""
 

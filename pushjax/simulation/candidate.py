@@ -33,10 +33,10 @@ class Features(NamedTuple):
     present: Bool[Array, "contacts"]  # False for a contact that the finger does not have
 
     @staticmethod
-    def none(contacts: int) -> "Features":
-        """No contacts."""
+    def without_numbers(contacts: int) -> "Features":
+        """Return contacts that are all there is, so that nothing has to be selected."""
         numbers = jnp.zeros(contacts, jnp.int32)
-        return Features(numbers, numbers, jnp.zeros(contacts, bool))
+        return Features(numbers, numbers, jnp.ones(contacts, bool))
 
 
 class Candidates(NamedTuple):

@@ -93,7 +93,7 @@ def _free_fraction(
                 speed = jnp.max(speed[:, None] - lever * motion.turning, axis=1)
     # a finger that touches a piece presses on it, unless it moves away
     leaves = speed + (0.0 if acceleration is None else acceleration) <= jnp.minimum(gaps, 0.0)
-    touches = gaps <= TOUCHING[length.dtype.itemsize] * length
+    touches = ~(gaps > TOUCHING[length.dtype.itemsize] * length)  # also where a number is NaN, which ends the search
     # gap = speed t + acceleration t^2 / 2
     speed, gaps = jnp.maximum(speed, 0.0), jnp.maximum(gaps, 0.0)
     closing = 2 * speed if acceleration is None else speed + jnp.sqrt(speed**2 + 2 * acceleration * gaps)

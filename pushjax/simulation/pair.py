@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from pushjax._math.vec import Scalar, Vec2
@@ -49,7 +48,7 @@ class Pair(ABC):
         arguments = jax.lax.stop_gradient((finger, outline, pose))
         candidates, count = self.candidates(*arguments, displacement_at, length), self.count(outline)
         if candidates is None:
-            return Features.none(count)._replace(present=jnp.ones(count, bool))
+            return Features.without_numbers(count)
         displacement = displacement_at(candidates.touches.point)
         return select_contacts(candidates, count, outline, length, displacement)
 

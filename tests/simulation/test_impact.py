@@ -143,6 +143,15 @@ def test_a_finger_that_touches_begins_at_once(name):
     assert np.mean(np.asarray(still) == 1) > 0.7
 
 
+@pytest.mark.parametrize("name", ["square", "L", "ellipse", "wavy"])
+def test_a_path_that_is_nan_begins_at_once(name):
+    """The fraction itself is a number; what follows makes the step INVALID."""
+    start, path = np.array([[0.2, 0.0], [0.2, 0.0]]), np.array([[np.nan, 0.0], [-0.3, 0.0]])
+    found = np.asarray(fractions(SHAPES[name], RoundFinger(0.005), start, path))
+    assert found[0] == 0
+    assert 0 < found[1] < 1
+
+
 def test_a_finger_that_touches_may_leave_and_cross_a_hollow(rng):
     """It then pushes the other side from where it meets it; the one that it leaves does not matter."""
     arms = [(-50, -50), (50, -50), (50, 50), (25, 50), (25, -20), (-25, -20), (-25, 50), (-50, 50)]
