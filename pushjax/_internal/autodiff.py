@@ -27,7 +27,12 @@ def without_derivatives(search: Callable, *args) -> Any:
         zeros = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, out)
         return out, zeros
 
-    return checkpoint_name(jax.lax.stop_gradient(opaque(args)), SEARCH_RESULT)
+    return search_result(jax.lax.stop_gradient(opaque(args)))
+
+
+def search_result(values: Any) -> Any:
+    """Return values that `save_search_results` saves."""
+    return checkpoint_name(values, SEARCH_RESULT)
 
 
 # Policy for `jax.checkpoint`: only the results of searches are saved, so that the backward pass recomputes everything

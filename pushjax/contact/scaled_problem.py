@@ -133,7 +133,8 @@ def nondimensionalize(given: ContactArrays) -> ScaledProblem:
     # NaN that is only masked afterwards comes back in the gradient.
     neutral = jnp.asarray([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0], vectors.dtype)
     vectors = jnp.where(active[None], vectors, neutral.reshape(8, *(1,) * active.ndim))
-    point, normal, displacement, (gap, friction) = vectors[:2], vectors[2:4], vectors[4:6], vectors[6:]
+    # a split, because reverse mode would add up arrays that are zero but for one slice
+    point, normal, displacement, (gap, friction) = jax.lax.split(vectors, (2, 2, 2, 2))
     unit = _displacement_unit(displacement, jnp.where(active, -gap, 0.0))
     scale = jax.lax.stop_gradient(given.surface.scale())
 

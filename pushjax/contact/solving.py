@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.autodiff import without_derivatives
+from pushjax._internal.autodiff import search_result
 from pushjax._internal.batch_last import batch_last, in_search_tiles
+from pushjax._internal.trailing_batch import with_batch_last
 from pushjax._internal.xla import compute_once, tree_where
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.derivative import differentiable_solution
@@ -103,27 +104,29 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
 
 @_solve.def_jvp
 def _solve_jvp(primals, tangents):
-    arguments, settings = primals
-    answer = without_derivatives(lambda *args: _solve(args, settings), *arguments)
-    return eqx.filter_jvp(partial(_with_derivatives, answer, settings), (arguments[0],), (tangents[0][0],))
+    (arguments, settings), change = primals, tangents[0][0]
+    answer = search_result(_solve(arguments, settings))
+    wants_margin = settings[1] and len(answer.mode) > 1
+    known = jax.lax.stop_gradient(answer)
+    _, (solution, margin) = eqx.filter_jvp(
+        lambda problem: with_batch_last(partial(_near, wants_margin), _arrays(problem), known),
+        (arguments[0],),
+        (change,),
+    )
+    unchanged = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, answer)
+    return answer, unchanged._replace(solution=solution, margin=margin)
 
 
-def _with_derivatives(answer: Answer, settings: tuple[ContactSolver, bool], problem: Problem) -> Answer:
-    """The answer, whose derivatives are those of `derivative`."""
-    scaled = nondimensionalize(_arrays(problem))
+def _near(wants_margin: bool, given: ContactArrays, answer: Answer) -> tuple[Solution, Array]:
+    """The solution and the margin as functions that JAX can differentiate; their values are right to roundoff."""
+    scaled = nondimensionalize(given)
     solved, twist = answer.status == Status.MOVING, answer.solution.twist
     near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, answer.dual, twist)
-    solution = jax.tree.map(_with_derivatives_of, answer.solution, near)
-    margin = answer.margin
-    if settings[1] and scaled.count > 1:
+    margin = jnp.zeros_like(scaled.unit)
+    if wants_margin:
         power = squeeze_power(scaled, answer.squeeze_edges) * scaled.unit
-        margin = _with_derivatives_of(margin, jnp.where(jnp.isfinite(margin), -power, 0.0))
-    return answer._replace(solution=solution, margin=margin)
-
-
-def _with_derivatives_of(value: Array, near: Array) -> Array:
-    """A value that is known, with the derivatives of another computation of it."""
-    return value + jnp.where(jnp.isfinite(near), near - jax.lax.stop_gradient(near), 0.0)
+        margin = jnp.where(jnp.isfinite(answer.margin), -power, margin)
+    return jax.tree.map(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), (near, margin))
 
 
 def _arrays(problem: Problem) -> ContactArrays:
