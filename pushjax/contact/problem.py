@@ -200,7 +200,8 @@ def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | S
     result = solve_problem(form, contacts_in_columns(contacts, friction), contacts.active, solver, None, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     return Motion(
-        result.twist.array(), wrench.array(), result.force, result.mode, result.status, result.margin, result.unique
+        *(result.twist.array(), wrench.array(), result.force.array().T, result.mode),
+        *(result.status, result.margin, result.unique),
     )
 
 
@@ -209,7 +210,7 @@ class ContactSolution(NamedTuple):
 
     twist: Vec3  # m, m, rad
     wrench: Vec3  # normalized, on H = 1
-    force: Float[Array, "contacts 2"]  # along (normal, tangent), N
+    force: Vec2  # along (normal, tangent), (contacts,) each, N
     mode: Int[Array, "contacts"]  # `ContactMode`
     status: Int[Array, ""]  # `Status`
     margin: Scalar  # minus the hand's squeeze power, m, as in `Motion`
@@ -243,13 +244,13 @@ def solve_problem(
             raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
         one = solve_single(form, jax.tree.map(lambda column: column[0], contacts.where(active)), solver)
         infinite = jnp.full_like(one.twist.x, jnp.inf)
-        force = one.force.array()[None]
+        force = Vec2(one.force.x[None], one.force.y[None])
         return ContactSolution(one.twist, one.wrench, force, one.mode[None], one.status, infinite, one.unique, guess)
     answer = solve((form, contacts, active), guess, solver, margin=margin)
     twist, wrench, force = answer.solution
     best = None if guess is None else answer.best
     return ContactSolution(
-        Vec3.of(twist), Vec3.of(wrench), force.T, answer.mode, answer.status, answer.margin, answer.unique, best
+        Vec3.of(twist), Vec3.of(wrench), Vec2.of(force), answer.mode, answer.status, answer.margin, answer.unique, best
     )
 
 

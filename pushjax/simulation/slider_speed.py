@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from pushjax._math.vec import Scalar, Vec2, Vec3
 
@@ -29,17 +29,13 @@ class SpeedJudgment(NamedTuple):
 
 def judge_speed(
     twist: Vec3,
-    force: Float[Array, "contacts 2"],
-    contact_point: Float[Array, "contacts 2"],
+    middle: Vec2,  # of the slider, where the forces act in the mean, m
     displacement: Scalar,  # largest displacement of a finger in this part, m
     length: Scalar,
     is_smallest: Bool[Array, ""],  # whether the part cannot be divided any more
 ) -> SpeedJudgment:
     """Return whether a slider moved no farther in a part of a step than it may."""
-    twist, force, length = jax.lax.stop_gradient((twist, force, length))
-    weight = force[:, 0]
-    total = jnp.sum(weight)
-    middle = Vec2.of(weight @ contact_point / jnp.where(total > 0, total, 1.0))
+    twist, middle, length = jax.lax.stop_gradient((twist, middle, length))
     at_middle = twist.xy + middle.perp().scale(twist.z)
     # how far the slider moved where forces act on it, and how far it turned; the limit surface's length, m, makes the
     # angle a distance

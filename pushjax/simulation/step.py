@@ -30,7 +30,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.xla import compute_once, decide, map_items, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
@@ -61,9 +61,9 @@ class StepRecord(NamedTuple):
     pose: Vec3  # of the slider after the step, world
     twist: Vec3  # body frame
     wrench: Vec3  # normalized, body frame
-    force: Float[Array, "contacts 2"]  # of each contact along normal and tangent, N
-    contact_point: Float[Array, "contacts 2"]  # body frame, m
-    contact_normal: Float[Array, "contacts 2"]  # inward, of unit length, body frame
+    force: Vec2  # of each contact along normal and tangent, N
+    contact_point: Vec2  # of each contact, body frame, m
+    contact_normal: Vec2  # of each contact, inward, of unit length, body frame
     mode: Int[Array, "contacts"]  # `ContactMode` of each contact
     status: Int[Array, ""]  # `Status`
     overlap: Scalar  # depth of the deepest finger at the end, m; zero until it is computed
@@ -72,23 +72,30 @@ class StepRecord(NamedTuple):
 class Stage(NamedTuple):
     """What the predictor passes to the corrector, and what the corrector leaves."""
 
-    twist: Vec3  # of the slider over the step
-    point: Vec2  # of the slider that moves in a straight line, body frame, m
-    angle: Vec2  # unit vector of the angle of the frame in which the twist is given
-    status: Int[Array, ""]  # `Status` so far
+    solution: ContactSolution
+    middle: Vec2  # point of the slider that moves in a straight line, body frame, m
+    angle: Vec2  # unit vector of the angle of the frame in which the solution is given
+    point: Vec2  # of each contact, body frame, m; like the normals without derivatives
+    normal: Vec2  # of each contact
     at_start: tuple[Touches, ...]  # for each finger, its contacts at the start of the step
     holds: Bool[Array, ""]  # whether all of several fingers, and no fixture, are near enough to hold a jammed slider
-    urgency: Urgency | None  # None without fixtures, and if all contacts are solved together
-    guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
+    is_long: Bool[Array, ""]  # whether a stage turned the slider, or let a finger slip, too far for one step
+    urgency: Urgency | None  # by which contacts are selected; None if all are solved together
+    urgency_after: Urgency | None
 
     @staticmethod
     def before(start: BodyFrame, counts: list[int], urgency: Urgency | None, guess: EdgeSet | None) -> "Stage":
         """Return what the predictor starts from: no motion yet, and no contacts found."""
-        zero = jnp.zeros_like(start.pose.x)
-        still, moving, no = Vec3(zero, zero, zero), jnp.zeros((), jnp.int8), jnp.zeros((), bool)  # MOVING is 0
+        zero, no = jnp.zeros_like(start.pose.x), jnp.zeros((), bool)
         rows = [jnp.zeros(count, zero.dtype) for count in counts]
         nowhere = tuple(Touches(row, Vec2(row, row), Vec2(row, row), row > 0) for row in rows)
-        return Stage(still, Vec2(zero, zero), start.angle, moving, nowhere, no, urgency, guess)
+        all_rows = jnp.concatenate(rows)
+        still, columns = Vec3(zero, zero, zero), Vec2(all_rows, all_rows)
+        mode, moving = jnp.zeros(all_rows.size, jnp.int8), jnp.zeros((), jnp.int8)  # SEPARATED and MOVING are 0
+        solution = ContactSolution(still, still, columns, mode, moving, zero, no, guess)
+        return Stage(
+            *(solution, Vec2(zero, zero), start.angle, columns, columns, nowhere, no, no, urgency, urgency),
+        )
 
 
 class BodyContacts(NamedTuple):
@@ -173,8 +180,8 @@ def compute_step(
     fixtures: tuple[FingerMotion, ...] = (),  # as fingers that stay where they are
     is_first_try: Bool[Array, ""] | bool = True,  # True where `urgency` has no meaning yet
     guess: EdgeSet | None = None,  # cone edges that carried the force last, which are tried first
-) -> tuple[StepRecord, Urgency | None, EdgeSet | None]:
-    """Compute one step of all fingers, or a part of one: its record, the urgency after it, and the next guess."""
+) -> tuple[StepRecord, Stage]:
+    """Compute one step of all fingers, or a part of one: its record, and the last stage."""
     start = BodyFrame.at(pose)
     begin = compute_once(time_of_impact(motions, outline, start, form.length), pose.x)
     part = PushingPart(outline, form.length, start, begin, 1 - begin, reach)
@@ -183,54 +190,58 @@ def compute_step(
     given_set = WorkingSet.most_urgent(urgency, size)
     features = _map_bodies(lambda _, body: part.features_of(body), motions, fixtures)
 
-    def stage(carry: Stage, fraction: Scalar):
+    def stage(before: Stage, fraction: Scalar) -> tuple[Stage, None]:
         """Solve the contacts as they are after `fraction` of the previous stage's motion: 0 predicts, 0.5 corrects."""
-        frame = start.moved(carry.point, carry.twist.scale(fraction), carry.angle)
-        found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, carry.at_start)
+        frame = start.moved(before.middle, before.solution.twist.scale(fraction), before.angle)
+        found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, before.at_start)
         contacts, active, at_start, near = zip(*found, strict=True)
         contacts, active = joined(*contacts), jnp.concatenate(active)
         holds = jnp.asarray(len(motions) > 1)
         for k, is_near in enumerate(near):
             holds &= is_near if k < len(motions) else ~is_near
-        used_urgency = carry.urgency
-        if used_urgency is not None:
+        used_urgency, working, guess = before.urgency, given_set, before.solution.best
+        if fixtures and used_urgency is not None:
             # in the first try, contacts are selected by how far the step would press them into a slider at rest
             pressed = jax.lax.stop_gradient(jnp.where(active, contacts.approach().x, -LOADED))
             used_urgency = jnp.where((fraction == 0) & is_first_try, pressed, used_urgency)
-        working = given_set if used_urgency is None else WorkingSet.most_urgent(used_urgency, size)
-        tried = None if carry.guess is None else working.local(carry.guess)
-        works = carry.status <= Status.FREE  # else the step has failed, and the corrector has nothing to solve
+            working = WorkingSet.most_urgent(used_urgency, size)
+        works = before.solution.status <= Status.FREE  # else the step has failed, and the corrector solves nothing
+        tried = None if guess is None else working.local(guess)
         solution = solve_problem(form, *working.select(contacts, active & ongoing & works), solver, tried)
         solution = working.spread(solution)
-        best = solution.best
-        best = None if best is None else tree_where(best.exists(), best, carry.guess)
-        urgency_after = None if urgency is None else violations(contacts, active, solution)
-        status, point = jnp.where(works, solution.status, carry.status), _force_weighted_point(contacts, solution.force)
-        next_stage = Stage(solution.twist, point, frame.angle, status, at_start, holds, used_urgency, best)
-        is_long = _turns_or_slips_too_far(contacts, active & has_end, solution, form.length)
-        # points and normals have no derivatives, because nothing computes with them
-        places = jax.lax.stop_gradient((jnp.stack(contacts.point, axis=1), jnp.stack(contacts.normal, axis=1)))
-        return next_stage, (solution, places, urgency_after, is_long)
+        if guess is not None and solution.best is not None:
+            solution = solution._replace(best=tree_where(solution.best.exists(), solution.best, guess))
+        is_long = before.is_long | _turns_or_slips_too_far(contacts, active & has_end, solution, form.length)
+        return Stage(
+            solution._replace(status=jnp.where(works, solution.status, before.solution.status)),
+            _force_weighted_point(contacts, solution.force),
+            frame.angle,
+            *jax.lax.stop_gradient((contacts.point, contacts.normal)),
+            at_start,
+            holds,
+            is_long,
+            used_urgency,
+            None if urgency is None else violations(contacts, active, solution),
+        ), None
 
-    before = Stage.before(start, counts, urgency if fixtures else None, guess)
-    carry, outputs = jax.lax.scan(stage, before, jnp.array([0.0, 0.5], pose.x.dtype))
-    solution, places, urgency_after, _ = jax.tree.map(lambda leaf: leaf[-1], outputs)
-    moved_pose = start.moved(carry.point, carry.twist, carry.angle).pose
-    status = _status(carry, motions, fixtures, jnp.any(outputs[-1]), overlap_before, form.length)
-    return _keep_pose_unless_moving(solution, places, moved_pose, pose, status), urgency_after, carry.guess
+    fractions = jnp.array([0.0, 0.5], pose.x.dtype)
+    last, _ = jax.lax.scan(stage, Stage.before(start, counts, urgency, guess), fractions)
+    moved_pose = start.moved(last.middle, last.solution.twist, last.angle).pose
+    status = _status(last, motions, fixtures, overlap_before, form.length)
+    return _keep_pose_unless_moving(last, moved_pose, pose, status), last
 
 
 def _status(
-    last_stage: Stage,
+    last: Stage,
     motions: tuple[FingerMotion, ...],
     fixtures: tuple[FingerMotion, ...],
-    is_long: Bool[Array, ""],
     depth: Scalar,
     length: Scalar,
 ) -> Int[Array, ""]:
     """Status of a step, given the depth of the deepest finger at its start, m."""
-    status = jnp.where((last_stage.status == Status.JAMMED) & last_stage.holds, Status.GRASPED, last_stage.status)
-    status = jnp.where((status <= Status.FREE) & is_long, Status.NOT_CONVERGED, status)
+    status = last.solution.status
+    status = jnp.where((status == Status.JAMMED) & last.holds, Status.GRASPED, status)
+    status = jnp.where((status <= Status.FREE) & last.is_long, Status.NOT_CONVERGED, status)
     # friction that is not valid counts also where a body has no contact
     valid = jnp.all(jnp.stack([body.friction >= 0 for body in motions + fixtures]))
     status = jnp.where(valid, status, Status.INVALID)
@@ -265,26 +276,23 @@ def _gap(distance: Scalar, roundoff: Scalar) -> Scalar:
     return distance + jax.lax.stop_gradient(jnp.where(rests, -distance, 0.0))
 
 
-def _force_weighted_point(contacts: Contact, force: Float[Array, "contacts 2"]) -> Vec2:
+def _force_weighted_point(contacts: Contact, force: Vec2) -> Vec2:
     """Mean of the contact points, weighted by normal force: the point of the slider that moves in a straight line."""
-    if len(force) == 1:
+    if force.x.size == 1:
         return Vec2(contacts.point.x[0], contacts.point.y[0])
-    weight = force[:, 0]
-    total = jnp.sum(weight)
-    share = weight / jnp.where(total > 0, total, 1.0)
+    total = jnp.sum(force.x)
+    share = force.x / jnp.where(total > 0, total, 1.0)
     return Vec2(jnp.sum(share * contacts.point.x), jnp.sum(share * contacts.point.y))
 
 
-def _keep_pose_unless_moving(
-    solution: ContactSolution, places: tuple[Array, Array], moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]
-) -> StepRecord:
+def _keep_pose_unless_moving(last: Stage, moved_pose: Vec3, pose: Vec3, status: Int[Array, ""]) -> StepRecord:
     """Return the record of a step; a slider that does not move keeps its pose bit for bit."""
     # A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
     finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
     moves = decide((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
-    pose = tree_where(moves, moved_pose, pose)
-    vectors = solution.twist, solution.wrench, solution.force, *places
-    twist, wrench, force, point, normal = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), vectors)
+    pose, solution = tree_where(moves, moved_pose, pose), last.solution
+    vectors = solution.twist, solution.wrench, solution.force, last.point, last.normal
+    vectors = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), vectors)
     mode = jnp.where(moves, solution.mode, ContactMode.SEPARATED).astype(jnp.int8)
-    return StepRecord(pose, twist, wrench, force, point, normal, mode, status, jnp.zeros_like(pose.x))
+    return StepRecord(pose, *vectors, mode, status, jnp.zeros_like(pose.x))

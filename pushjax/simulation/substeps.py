@@ -24,7 +24,7 @@ added to every friction. If it jams then, so does the push.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox.internal as eqxi
 import jax
@@ -35,7 +35,7 @@ from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.xla import compute_once, decide, tree_where
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
-from pushjax.contact.status import ContactMode, Status
+from pushjax.contact.status import Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.geometry.shape import Outline
@@ -48,7 +48,7 @@ from pushjax.simulation.finger_motion import (
     max_penetration,
 )
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
-from pushjax.simulation.step import StepRecord, compute_step
+from pushjax.simulation.step import Stage, StepRecord, compute_step
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
@@ -60,6 +60,7 @@ TRIALS_PER_STEP, EXTRA_TRIALS = 4, 64
 # Added to all coefficients of friction where the smallest part fails. What jams with it could only move some ten times
 # as fast as the hand without it.
 BRACING = 0.1
+NO_TRIAL = -1  # the number of a trial that is not there
 MAX_SWAPS = 3  # changes of the working set before a part is divided
 # A contact that is not in the contact problem may be violated by this fraction of the allowed penetration.
 MISSED_FRACTION = 0.01
@@ -82,10 +83,23 @@ class PushState(NamedTuple):
     stop_status: Int[Array, ""]  # status that stopped the hand, or zero
     abandon_status: Int[Array, ""]  # status of a step that is given up, or zero
     failed: Bool[Array, ""]  # whether the previous step failed
-    # One record for the parts of the step that are done. Its twist is the sum over these parts, and its pose and
-    # overlap are the present ones. The rest belongs to the last part in which the slider moved.
-    accepted_parts: StepRecord
+    twist: Vec3  # of the slider, the sum over the parts of the step that are done, body frame
+    source: Int[Array, ""]  # number of the trial of the last part in which the slider moved in this step, or -1
     guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
+
+
+class StepEnd(NamedTuple):
+    """How a step ended, if a trial ended one."""
+
+    ended: Bool[Array, ""]
+    step: Int[Array, ""]  # index
+    pose: Vec3  # of the slider after the step, world
+    twist: Vec3  # over the step, body frame
+    status: Int[Array, ""]
+    overlap: Scalar  # as in `StepRecord`
+    source: Int[
+        Array, ""
+    ]  # number of the trial whose wrench, forces and contacts are those of the step, or -1 for none
 
 
 class DividedPush(NamedTuple):
@@ -119,15 +133,15 @@ class DividedPush(NamedTuple):
         zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
         status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
-        urgency, idle = initial_urgency(counts, pose.x), _idle_record(pose, sum(counts))
-        guess = EdgeSet.none(zero) if sum(counts) > 1 else None
+        urgency = initial_urgency(counts, pose.x)
+        guess, source = EdgeSet.none(zero) if sum(counts) > 1 else None, jnp.full((), NO_TRIAL, jnp.int32)
         return PushState(
             *(pose, pose, first, zero, one, no, no, urgency, no, status),
-            *(overlap, status, status, no, idle, guess),
+            *(overlap, status, status, no, Vec3(zero, zero, zero), source, guess),
         )
 
-    def trial(self, state: PushState) -> tuple[PushState, tuple[StepRecord, Bool[Array, ""], Int[Array, ""]]]:
-        """Try the next part of a step: the state after it, the step's record, whether the step ended, and its index."""
+    def trial(self, state: PushState, number: Int[Array, ""]) -> tuple[PushState, tuple[StepRecord, StepEnd]]:
+        """Try the next part of a step: the state after it, the record of the part, and how the step ended."""
         form, mu = self.friction_at(state.step, state.origin)
         motions = self.motions_at(state.step, mu)
         displacement = max_displacement(motions)
@@ -138,7 +152,7 @@ class DividedPush(NamedTuple):
         extra = jnp.where(jnp.all(mu >= 0), jnp.where(state.braced, BRACING, 0.0), jnp.nan)
         bodies = tuple(motion._replace(friction=motion.friction + extra) for motion in part + self.fixtures)
         part, fixtures = bodies[: len(part)], bodies[len(part) :]
-        record, urgency_after, guess = compute_step(
+        record, last_stage = compute_step(
             form,
             self.outline,
             part,
@@ -153,16 +167,14 @@ class DividedPush(NamedTuple):
             state.guess,
         )
         is_smallest = state.part < 2 * SMALLEST_PART
-        speed = judge_speed(
-            record.twist, record.force, record.contact_point, state.part * displacement, form.length, is_smallest
-        )
-        next_state, end_of_step = _next_state(
-            state, record, guess, urgency_after, self.outline, part + fixtures, tolerance, speed, self.end
+        speed = judge_speed(record.twist, last_stage.middle, state.part * displacement, form.length, is_smallest)
+        next_state, end = _next_state(
+            state, record, number, last_stage, self.outline, part + fixtures, tolerance, speed, self.end
         )
         urgency = initial_urgency(self._counts(motions), state.pose.x)
-        if urgency_after is not None and urgency is not None:
-            next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, urgency_after, urgency))
-        return next_state, end_of_step
+        if last_stage.urgency_after is not None and urgency is not None:
+            next_state = next_state._replace(urgency=jnp.where(next_state.swaps > 0, last_stage.urgency_after, urgency))
+        return next_state, (record, end)
 
     def _counts(self, motions: tuple[FingerMotion, ...]) -> list[int]:
         """Return the number of contacts of each finger and fixture."""
@@ -171,41 +183,45 @@ class DividedPush(NamedTuple):
 
 def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
     """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
-    initial_state = push.first_state(pose)
-    idle_record = initial_state.accepted_parts
+    initial_state, numbers = push.first_state(pose), jnp.arange(push.max_trials, dtype=jnp.int32)
+    trial = jax.jit(push.trial)  # traced once, for the shapes and for the loop
+    shapes = jax.eval_shape(trial, initial_state, numbers[0])[1]
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    def skipped(state: PushState):
-        return state, (idle_record, jnp.zeros((), bool), state.step)
-
-    def trial_of_batch(state: PushState, trials: Int[Array, ""] | None):
+    def trial_of_batch(state: PushState, number: Int[Array, ""]):
         is_ongoing = state.step < push.end
-        if trials is not None and push.num_steps is not None:
-            is_ongoing &= trials < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
-        any_ongoing = eqxi.unvmap_any(is_ongoing)
-        return jax.lax.cond(any_ongoing, push.trial, skipped, state)
+        if push.num_steps is not None:
+            is_ongoing &= number < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
+        return jax.lax.cond(eqxi.unvmap_any(is_ongoing), trial, lambda state, _: (state, blank), state, number)
 
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
     trial_of_batch = jax.checkpoint(trial_of_batch, prevent_cse=False, policy=save_search_results)
-    trials = None if push.num_steps is None else jnp.arange(push.max_trials)
-    last, (records, ends, step) = jax.lax.scan(trial_of_batch, initial_state, trials, length=push.max_trials)
-    return _records_of_steps(records, ends, step, push.steps, last, idle_record), last.done
+    last, (records, ends) = jax.lax.scan(trial_of_batch, initial_state, numbers)
+    return _records_of_steps(records, ends, push.steps, last), last.done
 
 
-def _records_of_steps(
-    records: StepRecord,
-    ended: Bool[Array, " rounds"],
-    step: Int[Array, " rounds"],
-    steps: int,
-    last: PushState,
-    idle_record: StepRecord,
-) -> StepRecord:
-    """Return for each step the record of the round that ended it, or what the last round left if none did."""
-    rounds = len(ended)
-    round_of_step = jnp.full(steps, rounds).at[jnp.where(ended, step, steps)].set(jnp.arange(rounds), mode="drop")
-    status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
-    unfinished = idle_record._replace(pose=last.pose, status=status, overlap=last.overlap)
-    return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]])[round_of_step], records, unfinished)
+def _records_of_steps(records: StepRecord, ends: StepEnd, steps: int, last: PushState) -> StepRecord:
+    """Return for each step how the trial that ended it left it, or what the last trial left if none did."""
+    numbers = jnp.arange(len(ends.ended), dtype=jnp.int32)
+    step = jnp.where(ends.ended, ends.step, steps)
+    trial_of_step = jnp.full(steps, NO_TRIAL).at[step].set(numbers, mode="drop")
+    stop_status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
+    zero = jax.tree.map(jnp.zeros_like, last.twist)
+    unfinished = last.pose, zero, stop_status, last.overlap, jnp.full_like(last.source, NO_TRIAL)
+
+    def at(number: Int[Array, "steps"], rows: Any, otherwise: Any) -> Any:
+        """Return the rows of these trials; another value where there is none."""
+
+        def of(rows: Array, otherwise: Any) -> Array:
+            is_known = (number >= 0).reshape(-1, *(1,) * (rows.ndim - 1))
+            return jnp.where(is_known, rows[jnp.maximum(number, 0)], otherwise)
+
+        return jax.tree.map(of, rows, otherwise)
+
+    pose, twist, status, overlap, source = at(trial_of_step, ends[2:], unfinished)
+    records = at(source, records, jax.tree.map(lambda _: 0, records))
+    return records._replace(pose=pose, twist=twist, status=status, overlap=overlap)
 
 
 class Decision(NamedTuple):
@@ -249,7 +265,7 @@ def _decide(
     accepted, stops, joins = compute_once((accepted, stops, joins), state.pose.x)
     is_bad, is_smallest = record.status >= Status.OVERLAPPING, state.part / 2 < SMALLEST_PART
     hopeless = (is_smallest | state.failed | is_bad) & ~accepted & ~stops & ~fails & ~joins
-    braces = hopeless & is_smallest & ~is_bad & ~state.braced & (len(record.force) > 1)
+    braces = hopeless & is_smallest & ~is_bad & ~state.braced & (record.force.x.size > 1)
     abandons = hopeless & ~braces
     # If nothing moved and the trial took the hand to the end of the step, its overlap is known and no further trial is
     # needed.
@@ -264,30 +280,31 @@ def _decide(
 def _next_state(
     state: PushState,
     record: StepRecord,
-    guess: EdgeSet | None,
-    urgency_after: Urgency | None,
+    number: Int[Array, ""],  # of the trial
+    last_stage: Stage,
     outline: Outline,
     part: tuple[FingerMotion, ...],  # motions over the tried part of the step, and fixtures
     tolerance: Scalar,
     speed: SpeedJudgment,
     steps: Int[Array, ""] | int,
-):
-    """Return the state after a trial; and of the trial's step the record, whether it ended, and the index."""
+) -> tuple[PushState, StepEnd]:
+    """Return the state after a trial, and how its step ended."""
     ongoing = state.step < steps
     pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
-    decision = _decide(state, record, urgency_after, depth, tolerance, speed)
+    decision = _decide(state, record, last_stage.urgency_after, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
     moves = decide(record.status == Status.MOVING, pose.x)
-    accepted_parts = tree_where(moves, record, state.accepted_parts)
-    accepted_parts = accepted_parts._replace(twist=state.accepted_parts.twist + record.twist, pose=pose, overlap=depth)
-    accepted_parts = accepted_parts._replace(status=jnp.where(moves, record.status, state.accepted_parts.status))
+    twist, source = state.twist + record.twist, jnp.where(moves, number, state.source)
     done = state.done + state.part
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
-    failed_record = resting(record, state.origin)._replace(status=decision.reason, overlap=depth)
-    stopped_record = state.accepted_parts._replace(pose=state.pose, status=record.status, overlap=state.overlap)
-    end_record = tree_where(stops, stopped_record, tree_where(accepted, accepted_parts, failed_record))
+    status = jnp.where(source >= 0, Status.MOVING, Status.FREE)
+    still, none = jax.tree.map(jnp.zeros_like, twist), jnp.full_like(source, NO_TRIAL)
+    passed = pose, twist, status.astype(jnp.int8), depth, source
+    failed = state.origin, still, decision.reason, depth, none
+    stopped = state.pose, state.twist, record.status, state.overlap, state.source
+    end = StepEnd(ends, state.step, *tree_where(stops, stopped, tree_where(accepted, passed, failed)))
 
     # the next trial: where it starts, and how large its part is
     continues = decide(accepted & ~ends, pose.x)
@@ -297,8 +314,8 @@ def _next_state(
     smaller = jnp.where(again, state.part, jnp.where(jams, JAM_PART, state.part / 2))
     larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
     next_state = PushState(
-        pose=tree_where(ends, end_record.pose, tree_where(continues, pose, state.pose)),
-        origin=tree_where(ends, end_record.pose, state.origin),
+        pose=tree_where(ends, end.pose, tree_where(continues, pose, state.pose)),
+        origin=tree_where(ends, end.pose, state.origin),
         step=jnp.where(ends, jnp.where(stops, steps, state.step + 1), state.step),
         done=jnp.where(restarts, 0.0, jnp.where(accepted, done, state.done)),
         part=jnp.where(restarts, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
@@ -311,13 +328,11 @@ def _next_state(
         stop_status=jnp.where(stops, record.status, state.stop_status).astype(jnp.int8),
         abandon_status=jnp.where(decision.abandons, decision.reason, 0).astype(jnp.int8),
         failed=jnp.where(ends, fails, state.failed),
-        accepted_parts=tree_where(
-            ends, resting(record, end_record.pose), tree_where(continues, accepted_parts, state.accepted_parts)
-        ),
-        guess=None if guess is None else tree_where(accepted & moves, guess, state.guess),
+        twist=tree_where(ends, still, tree_where(continues, twist, state.twist)),
+        source=jnp.where(ends, NO_TRIAL, jnp.where(continues, source, state.source)),
+        guess=None if state.guess is None else tree_where(accepted & moves, last_stage.solution.best, state.guess),
     )
-    next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
-    return next_state, (end_record, ends, state.step)
+    return jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state), end
 
 
 def hand_stops(status: Array) -> Bool[Array, "..."]:
@@ -329,11 +344,3 @@ def resting(record: StepRecord, pose: Vec3) -> StepRecord:
     """Record of a slider that stays at `pose` while nothing pushes."""
     blank = jax.tree.map(jnp.zeros_like, record)
     return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
-
-
-def _idle_record(pose: Vec3, contacts: int) -> StepRecord:
-    """Record of a step in which nothing pushes."""
-    zero = jnp.zeros_like(pose.x)
-    still, no_points = Vec3(zero, zero, zero), jnp.zeros((contacts, 2), zero.dtype)
-    mode, status = jnp.full(contacts, ContactMode.SEPARATED, jnp.int8), jnp.full((), Status.FREE, jnp.int8)
-    return StepRecord(pose, still, still, no_points, no_points, no_points, mode, status, zero)

@@ -115,6 +115,8 @@ def first_true(mask: Bool[Array, "... steps"]) -> Int[Array, "..."]:
 def to_arrays(record: StepRecord, length: Scalar) -> Step:
     """Return the record of one step as arrays, or a stacked record, whose entries have an axis of steps."""
     # the torque of the record is divided by the length of the limit surface
-    wrench = (record.wrench.x, record.wrench.y, record.wrench.z * length)
-    pose, twist, wrench = (jnp.stack(vector, axis=-1) for vector in (record.pose, record.twist, wrench))
-    return Step(**(record._asdict() | {"pose": pose, "twist": twist, "wrench": wrench}))
+    record = record._replace(wrench=record.wrench._replace(z=record.wrench.z * length))
+    fields = record._asdict()
+    return Step(
+        **{name: jnp.stack(entry, axis=-1) if isinstance(entry, tuple) else entry for name, entry in fields.items()}
+    )

@@ -97,7 +97,8 @@ class WorkingSet(NamedTuple):
         """Extend the motion to all contacts; force and mode are zero outside the set."""
         if self.masks is None:
             return solution
-        force = jnp.sum(jnp.where(self.masks[:, :, None], solution.force[:, None], 0.0), axis=0)
+        masks = self.masks
+        force = jax.tree.map(lambda f: jnp.sum(jnp.where(masks, f[:, None], 0.0), axis=0), solution.force)
         mode = jnp.sum(jnp.where(self.masks, solution.mode[:, None], 0), axis=0, dtype=solution.mode.dtype)
         best = None if solution.best is None else self.spread_edges(solution.best)
         return solution._replace(force=force, mode=mode, best=best)
@@ -108,5 +109,5 @@ def violations(contacts: Contact, active: Bool[Array, "contacts"], solution: Con
     twist = solution.twist
     relative_motion = twist.xy + contacts.point.perp().scale(twist.z) - contacts.displacement
     violation = -(contacts.gap + contacts.normal.dot(relative_motion))
-    loaded = jnp.where(solution.force[:, 0] > 0, LOADED, jnp.where(active, violation, -LOADED))
+    loaded = jnp.where(solution.force.x > 0, LOADED, jnp.where(active, violation, -LOADED))
     return jax.lax.stop_gradient(loaded)
