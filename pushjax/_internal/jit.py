@@ -13,6 +13,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 try:
     from jax.extend.core import get_opaque_trace_state
@@ -36,6 +37,11 @@ with ThreadPoolExecutor(1) as thread:  # this module may be imported within a tr
 def outside_trace() -> bool:
     """Return whether the caller is not inside `jit`, `grad` or `vmap`."""
     return get_opaque_trace_state() == NO_TRACE
+
+
+def is_compiling() -> bool:
+    """Return whether the caller is part of a program that is compiled as a whole, inside `jit` or a loop of JAX."""
+    return isinstance(jnp.zeros(()), jax.core.Tracer)
 
 
 def eager_context() -> AbstractContextManager[Any]:

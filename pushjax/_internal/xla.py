@@ -6,6 +6,7 @@ The results are those of plain JAX. The helpers only decide what is computed onc
 from collections.abc import Callable
 from typing import Any
 
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -55,6 +56,19 @@ def update_if(condition: Bool[Array, ""], update: Callable, state):
         return loop_state[0] & False, update(loop_state[1])
 
     return jax.lax.while_loop(lambda loop_state: loop_state[0], run_update, (condition, state))[1]
+
+
+def skipped_unless(is_needed: Callable[..., Bool[Array, ""]], body: Callable, state: Any, x: Any) -> Callable:
+    """Return the body of a scan that leaves the state, and gives zeros, where it is not needed by any of a batch."""
+    traced_once = jax.jit(body)  # for the shapes and for the loop
+    shapes = jax.eval_shape(traced_once, state, x)[1]
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def skippable(state: Any, x: Any) -> Any:
+        needed = eqxi.unvmap_any(is_needed(state, x))
+        return jax.lax.cond(needed, traced_once, lambda state, _: (state, blank), state, x)
+
+    return skippable
 
 
 def tree_where(condition, yes, no):

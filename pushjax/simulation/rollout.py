@@ -18,8 +18,8 @@ from jaxtyping import Array
 
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
-from pushjax._internal.jit import outside_trace, quick_jit
-from pushjax._internal.xla import decide, tree_where
+from pushjax._internal.jit import is_compiling, quick_jit
+from pushjax._internal.xla import decide, skipped_unless, tree_where
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
@@ -172,7 +172,7 @@ def rollout(
     fixed = checked_fixtures(fixtures, start.dtype)
     check_start_among_fixtures(slider, fixed, start)
     checked = slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
-    return _rollout_with_padding(*checked) if outside_trace() else _rollout(*checked)
+    return _rollout(*checked) if is_compiling() else _rollout_with_padding(*checked)
 
 
 @quick_jit
@@ -188,8 +188,8 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
     steps, size = len(path) - 1, MIN_SIZE
     while size < steps:
         size *= SIZE_RATIO
-    padding = np.broadcast_to(path[-1], (size - steps, path.shape[1]))
-    padded = jnp.asarray(np.concatenate([path, padding]))
+    xp = jnp if isinstance(path, jax.core.Tracer) else np  # with NumPy nothing is compiled for the padding
+    padded = jnp.asarray(xp.concatenate([path, xp.broadcast_to(path[-1], (size - steps, path.shape[1]))]))
     return _first_steps(_rollout(slider, hand, padded, *rest, num_steps=jnp.asarray(steps)), steps)
 
 
@@ -316,11 +316,13 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
         pose, depth = tree_where(is_too_long, (pose, depth_at_rest), (record.pose, depth))
         return (pose, depth), (record._replace(pose=pose, overlap=depth), is_too_long)
 
-    body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
     first = jnp.zeros((), jnp.int32)
     motions = push.motions_at(first, push.friction_at(first, start)[1])
-    depth = max_penetration(push.outline, motions, start, 0.0)
-    _, (records, is_too_long) = jax.lax.scan(body, (start, depth), jnp.arange(push.steps))
+    before = start, max_penetration(push.outline, motions, start, 0.0)
+    if push.num_steps is not None:
+        body = skipped_unless(lambda _, step: step < push.num_steps, body, before, first)
+    body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
+    _, (records, is_too_long) = jax.lax.scan(body, before, jnp.arange(push.steps, dtype=jnp.int32))
     failed = resting(records, records.pose)._replace(overlap=records.overlap)
     failed = failed._replace(status=jnp.full_like(records.status, Status.NOT_CONVERGED))
     return jax.vmap(tree_where)(is_too_long, failed, records)

@@ -26,13 +26,12 @@ added to every friction. If it jams then, so does the push.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import save_search_results
-from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._internal.xla import compute_once, decide, skipped_unless, tree_where
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import Status
@@ -184,20 +183,18 @@ class DividedPush(NamedTuple):
 def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
     """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
     initial_state, numbers = push.first_state(pose), jnp.arange(push.max_trials, dtype=jnp.int32)
-    trial = jax.jit(push.trial)  # traced once, for the shapes and for the loop
-    shapes = jax.eval_shape(trial, initial_state, numbers[0])[1]
-    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    def trial_of_batch(state: PushState, number: Int[Array, ""]):
-        is_ongoing = state.step < push.end
+    def is_ongoing(state: PushState, number: Int[Array, ""]) -> Bool[Array, ""]:
+        ongoing = state.step < push.end
         if push.num_steps is not None:
-            is_ongoing &= number < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
-        return jax.lax.cond(eqxi.unvmap_any(is_ongoing), trial, lambda state, _: (state, blank), state, number)
+            ongoing &= number < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
+        return ongoing
 
+    trial = skipped_unless(is_ongoing, push.trial, initial_state, numbers[0])
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
-    trial_of_batch = jax.checkpoint(trial_of_batch, prevent_cse=False, policy=save_search_results)
-    last, (records, ends) = jax.lax.scan(trial_of_batch, initial_state, numbers)
+    trial = jax.checkpoint(trial, prevent_cse=False, policy=save_search_results)
+    last, (records, ends) = jax.lax.scan(trial, initial_state, numbers)
     return _records_of_steps(records, ends, push.steps, last), last.done
 
 

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pushjax as pj
+import pushjax.simulation.rollout as rollout_module
 from pushjax import ContactMode, Hand, Polygon, Quartic, Slider, Status, rollout
 from pushjax.testing.problems import random_surface
 
@@ -233,3 +235,30 @@ def test_singular_cases_are_what_they_are_called():
     assert np.isfinite(pose).all()
     status = jax.jit(lambda i: push(i).status)(jax.tree.map(jnp.asarray, CASES["deep inside"]))
     assert (status[:5] == Status.OVERLAPPING).all()
+
+
+def test_gradients_and_batches_along_paths_of_many_lengths_share_a_program(monkeypatch):
+    """As in a single push, whose path is filled up; a program that the user compiles has the path as it is."""
+    traced = []
+    simulate = rollout_module.simulate
+    monkeypatch.setattr(rollout_module, "simulate", lambda *args: traced.append(len(args[2])) or simulate(*args))
+    slider, hand = Slider(Polygon.rectangle(0.091, 0.06), pj.Ellipsoid(np.eye(3), LENGTH)), Hand.finger(RADIUS)
+
+    def turn(mu, path):
+        return rollout(slider, hand, path, pose=np.zeros(3), friction=mu).pose[-1, 2]
+
+    for steps in (5, 9, 31):
+        path = jnp.asarray(pj.line((-0.06, 0.01), (-0.02, 0.01), steps))
+        change, slope = jax.value_and_grad(turn)(0.1, path)
+        along = jax.grad(turn, argnums=1)(0.1, path)
+        batch = jax.vmap(turn, in_axes=(0, None))(jnp.array([0.1, 0.2]), path)
+        assert along.shape == path.shape
+        if steps == 5:
+            once = len(traced)
+            compiled = jax.jit(jax.value_and_grad(turn, argnums=(0, 1)))(0.1, path)
+            np.testing.assert_allclose([change, slope], [compiled[0], compiled[1][0]], rtol=1e-5)
+            np.testing.assert_allclose(along, compiled[1][1], rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(batch[0], change, rtol=1e-6)
+            del traced[once:]
+    assert len(traced) == once
+    assert set(traced) == {33}
