@@ -17,252 +17,222 @@ improve no eigenvalue, because the form does not change if z and F are exchanged
 The quartic H depends only on the 6 x 6 block G: H(F) = v' G v, where v holds the six products of two components of F.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.xla import compute_once, decide
-from pushjax._math.linalg import Cholesky, Column, Lower, add_scaled, congruence, entry
-from pushjax._math.vec import Scalar
+from pushjax._internal.batch_last import batch_last, in_search_tiles
+from pushjax._math.arrays import FULL
+from pushjax._math.linalg import cholesky
+from pushjax.friction.sum_of_squares import MONOMIAL_SUMS
 
-# The six products v are x², y², z², xy, xz, yz, with F = (x, y, z).
-# The matrix of <N, adj S> in their basis. For each entry of N (xx, yy, zz, xy, xz, yz): the places in the lower
-# triangle to which it contributes, and the factors.
-ADJUGATE_PLACES = (
-    {(2, 1): 0.5, (5, 5): -1.0},
-    {(2, 0): 0.5, (4, 4): -1.0},
-    {(1, 0): 0.5, (3, 3): -1.0},
-    {(5, 4): 1.0, (3, 2): -1.0},
-    {(5, 3): 1.0, (4, 1): -1.0},
-    {(4, 3): 1.0, (5, 0): -1.0},
-)
-# The same for the matrix N.
-ANTISYMMETRIC_PLACES = ({(0, 0): 1.0}, {(1, 1): 1.0}, {(2, 2): 1.0}, {(1, 0): 1.0}, {(2, 0): 1.0}, {(2, 1): 1.0})
-# The same for the matrix of T(S, S), for each of the 15 coefficients.
-COEFFICIENT_PLACES = (
-    {(0, 0): 1.0},
-    {(1, 1): 1.0},
-    {(2, 2): 1.0},
-    {(3, 0): 1 / 2},
-    {(4, 0): 1 / 2},
-    {(3, 1): 1 / 2},
-    {(5, 1): 1 / 2},
-    {(4, 2): 1 / 2},
-    {(5, 2): 1 / 2},
-    {(1, 0): 1 / 6, (3, 3): 2 / 3},
-    {(2, 0): 1 / 6, (4, 4): 2 / 3},
-    {(2, 1): 1 / 6, (5, 5): 2 / 3},
-    {(5, 0): 1 / 6, (4, 3): 1 / 3},
-    {(4, 1): 1 / 6, (5, 3): 1 / 3},
-    {(3, 2): 1 / 6, (5, 4): 1 / 3},
-)
+# All tables have the entries of N and of S, and the six products v, in the order xx, yy, zz, xy, xz, yz.
+UNITS = (np.arange(6)[:, None, None] == FULL).astype(float)  # the matrix N for each of its entries, (6, 3, 3)
+ALTERNATING = np.cross(np.eye(3)[:, None], np.eye(3))
+# The matrix of <N, adj S> for each entry of N, (6, 6, 6), and that of T(S, S) for each of the 15 coefficients.
+ADJUGATES = np.einsum("eij,ikm,jln,akl,bmn->eab", UNITS, ALTERNATING / 2, ALTERNATING, UNITS, UNITS, optimize=True)
+TENSORS = (MONOMIAL_SUMS / MONOMIAL_SUMS.sum(axis=1, keepdims=True)).reshape(15, 3, 3, 3, 3)
+COEFFICIENTS = np.einsum("cijkl,aij,bkl->cab", TENSORS, UNITS, UNITS)
+# In the norm that does not depend on the frame all of them are orthogonal. So a projection of G gives N.
+PROJECTIONS = ADJUGATES / np.outer(UNITS.sum(axis=(1, 2)), UNITS.sum(axis=(1, 2)))
+PROJECTIONS /= np.sum(ADJUGATES * PROJECTIONS, axis=(1, 2), keepdims=True)
+LOWER = np.zeros((7, 7), int)  # where the entries of a symmetric 7 x 7 matrix stand in its lower triangle
+LOWER[np.tril_indices(7)] = np.arange(28)
+LOWER = np.maximum(LOWER, LOWER.T)
+
 BARRIER_PARAMETER = 9  # of the logarithmic barrier: the number of rows of both blocks together
 MAX_ROUNDS = 60
 # Weight of the scale relative to the barrier: initial value, and factor after each centering
 BARRIER_WEIGHTS = (4.0, 16.0)
 STEP_LENGTHS = (1.0, 0.7, 0.4)  # step lengths that each Newton round tries
-# Candidates for the initial scale, in ascending order
-INITIAL_SCALES = (-1e6, -1e4, -100.0, -10.0, -3.0, -1.0, -0.3, -0.1, 0.0)
+INITIAL_SCALES = (0.0, -0.1, -0.3, -1.0, -3.0, -10.0, -100.0, -1e4, -1e6)  # the largest that is feasible
 
 
 class Gram(NamedTuple):
-    """The two blocks G and N of a 9 x 9 Gram matrix (see the header of this module), as lower triangles, 1/N^4."""
+    """The two blocks G and N of a 9 x 9 Gram matrix (see the header of this module), 1/N^4."""
 
-    symmetric: Lower  # G, 6 x 6, with v' G v = H
-    antisymmetric: Lower  # N, 3 x 3
-
-    @staticmethod
-    def of(coefficients: Column, n: Column) -> "Gram":
-        """Return the Gram matrix of a quartic for a block N with the entries `n` (xx, yy, zz, xy, xz, yz)."""
-        parts = (*zip(COEFFICIENT_PLACES, coefficients, strict=True), *zip(ADJUGATE_PLACES, n, strict=True))
-        return Gram(_weighted_sum(6, parts), _weighted_sum(3, tuple(zip(ANTISYMMETRIC_PLACES, n, strict=True))))
+    symmetric: Float[Array, "6 6 *batch"]  # G, with v' G v = H
+    antisymmetric: Float[Array, "3 3 *batch"]  # N
 
     @staticmethod
-    def identity(like: Scalar) -> "Gram":
-        """Return the 9 x 9 identity in these blocks, with the type of the scalar `like`."""
-        zero, one = 0 * like, 0 * like + 1
-        six, three = (one, one, one, 2 * one, 2 * one, 2 * one), (2 * one,) * 3
-        return Gram(*(tuple((zero,) * i + (d,) for i, d in enumerate(diagonal)) for diagonal in (six, three)))
+    def of(coefficients: Float[Array, "15"], n: Float[Array, "6"]) -> "Gram":
+        """Return the Gram matrix of a quartic for a block N with the entries `n`."""
+        matrices = jnp.asarray(np.concatenate([COEFFICIENTS, ADJUGATES]), n.dtype)
+        return Gram(jnp.sum(jnp.concatenate([coefficients, n])[:, None, None] * matrices, axis=0), n[FULL])
 
-    def plus(self, factor: Scalar, other: "Gram") -> "Gram":
+    @staticmethod
+    def ball(dtype) -> "Gram":
+        """Return a Gram matrix of |F|^4; no eigenvalue is below a third."""
+        return Gram.of(
+            jnp.array([1, 1, 1, 0, 0, 0, 0, 0, 0, 2, 2, 2, 0, 0, 0], dtype), jnp.repeat(jnp.array([2 / 3, 0], dtype), 3)
+        )
+
+    @staticmethod
+    def identity(dtype) -> "Gram":
+        """Return the 9 x 9 identity in these blocks. It is no Gram matrix of a quartic."""
+        return Gram(jnp.diag(jnp.array([1, 1, 1, 2, 2, 2], dtype)), 2 * jnp.eye(3, dtype=dtype))
+
+    def plus(self, factor: float | Array, other: "Gram") -> "Gram":
         """Return self + factor * other."""
-        return Gram(*(add_scaled(own, factor, others) for own, others in zip(self, other, strict=True)))
+        return jax.tree.map(lambda own, others: own + factor * others, self, other)
 
 
-def coefficients_of(symmetric: Lower) -> Column:
-    """Return the 15 coefficients of the quartic v' G v, for the 6 x 6 block G."""
-    return tuple(
-        sum(((1 if i == j else 2) * symmetric[i][j] for (i, j) in places), 0 * symmetric[0][0])
-        for places in COEFFICIENT_PLACES
-    )
+def coefficients_of(symmetric: Float[Array, "6 6"]) -> Float[Array, "15"]:
+    """Return the coefficients of the quartic v' G v."""
+    # the first nine coefficients have one entry each, the others two
+    _, i, j = np.nonzero(np.tril(COEFFICIENTS))
+    entries = symmetric[i, j] * jnp.asarray(np.where(i == j, 1, 2), symmetric.dtype)
+    return jnp.concatenate([entries[:9], entries[9::2] + entries[10::2]])
 
 
-def antisymmetric_of(symmetric: Lower) -> Column:
-    """Return the entries of the N for which `symmetric` is the 6 x 6 block of the Gram matrix of its quartic."""
-    found = []
-    for places in ADJUGATE_PLACES:
-        (above, a), (below, b) = ((symmetric[i][j], value) for (i, j), value in places.items())
-        found.append((4 * above - below) / 3 if b == -1.0 and a == 0.5 else (above - 2 * below) / 3)
-    return tuple(found)
+def antisymmetric_of(symmetric: Float[Array, "6 6"]) -> Float[Array, "3 3"]:
+    """Return the N for which `symmetric` is the block G of the Gram matrix of its quartic."""
+    return _Entries.of(PROJECTIONS).traces(symmetric)[FULL]
 
 
 class Certificate(NamedTuple):
     """The result of `max_feasible_scale`."""
 
-    scale: Scalar  # s; unless the search stopped at `enough`, no scale is larger by more than the tolerance
-    n: Column  # entries (xx, yy, zz, xy, xz, yz) of N; Gram(N) - s * reference is positive definite
+    scale: Float[Array, ""]  # s; unless the search stopped at `enough`, no scale is larger by more than the tolerance
+    change: Float[Array, "6"]  # of the entries of N; the Gram matrix with it, minus s * reference, is positive definite
     converged: Bool[Array, ""]  # whether the search ended within `MAX_ROUNDS`
 
 
-def max_feasible_scale(
-    coefficients: Column, n: Column, reference: Gram, *, enough: float, tolerance: float
-) -> Certificate:
+def max_feasible_scale(gram: Gram, reference: Gram, *, enough: float, tolerance: float) -> Certificate:
     """Find the largest scale s for which Gram(N) - s * reference is positive semi-definite for some N.
 
-    Gram(N) stands for `Gram.of(coefficients, N)`. If the quartic is convex, the largest s is not below zero. The search
+    Gram(N) are all Gram matrices of the quartic of `gram`. If it is convex, the largest s is not below zero. The search
     follows the central path: it applies Newton's method to the logarithmic barrier, and each round takes the best of a
     few step lengths. The result lies strictly inside the feasible set. So it is a proof, whatever the roundoff of the
-    search.
+    search. In a batch, only examples for which zero is not `enough` or not feasible are searched.
 
     Args:
-        coefficients: The 15 coefficients of the quartic, in the order of `Quartic`.
-        n: Entries (xx, yy, zz, xy, xz, yz) of the N at which the search starts.
+        gram: Gram matrix of the quartic at which the search starts.
         reference: Gram matrix to subtract.
         enough: The search stops once s is at least this.
         tolerance: The search stops once s is known to be within this of the largest.
 
     Returns:
-        The scale `scale`, the entries `n` of its N, and whether the search `converged`.
+        The scale `scale`, the `change` of the entries (xx, yy, zz, xy, xz, yz) of N, and whether the search
+        `converged`. Where not even the least of `INITIAL_SCALES` is feasible, the scale is minus infinity.
     """
-    start = _initial_scale(coefficients, n, reference)
-    zero = 0 * start
-    state = (start, n, zero + BARRIER_WEIGHTS[0], jnp.zeros((), jnp.int32), start >= enough)
+    attempt, yes = partial(_attempt, enough, tolerance), jnp.ones((), bool)
+    return batch_last(attempt, yes, yes & (enough < np.inf), gram, reference)
 
-    def newton_round(state):
-        s, n, weight, rounds, done = state
-        s_new, n_new, decrement = _newton_step(coefficients, n, s, reference, weight)
+
+class _Entries(NamedTuple):
+    """Six symmetric matrices E, by their entries on and below the diagonal; those on it are halved."""
+
+    i: Int[np.ndarray, "6 entries"]
+    j: Int[np.ndarray, "6 entries"]
+    value: Float[np.ndarray, "6 entries"]
+
+    @staticmethod
+    def of(matrices: Float[np.ndarray, "6 n n"]) -> "_Entries":
+        k, i, j = np.nonzero(np.tril(matrices))
+        value = matrices[k, i, j] * np.where(i == j, 0.5, 1.0)
+        return _Entries(i.reshape(6, -1), j.reshape(6, -1), value.reshape(6, -1))
+
+    def traces(self, x: Float[Array, "n n *batch"]) -> Float[Array, "6 *batch"]:
+        """Return trace(x E) for a symmetric x and every E."""
+        return jnp.sum(_like(2 * self.value, x[0]) * x[self.i, self.j], axis=1)
+
+    def double_traces(self, x: Float[Array, "n n *batch"]) -> Float[Array, "21 *batch"]:
+        """Return trace(x E x E') for a symmetric x and every pair of E and E', in the order of a lower triangle."""
+        first, second = np.tril_indices(6)
+        i, j, value = (each[first][:, :, None] for each in self)
+        k, l, others = (each[second][:, None] for each in self)
+        products = (x[i, k] * x[j, l] + x[i, l] * x[j, k]).reshape(21, -1, *x.shape[2:])
+        return jnp.sum(_like((2 * value * others).reshape(21, -1), x[0]) * products, axis=1)
+
+
+def _like(table: np.ndarray, x: Array) -> Array:
+    """Return a table with the type of x, and as many axes for the batch."""
+    return jnp.asarray(table, x.dtype).reshape(*table.shape, *(1,) * (x.ndim - 1))
+
+
+class _Problem(NamedTuple):
+    """The matrices of `max_feasible_scale`, for a batch; its unknowns x are the change of N, and then s."""
+
+    gram: Gram
+    reference: Gram
+
+    def at(self, x: Float[Array, "7 *batch"]) -> Gram:
+        """Return Gram(N) - s * reference."""
+        change = (jnp.sum(_like(m, x) * x[:6, None, None], axis=0) for m in (ADJUGATES, UNITS))
+        return self.gram.plus(1.0, Gram(*change)).plus(-x[None, None, 6], self.reference)
+
+    def barrier(self, x: Float[Array, "7 trials batch"]) -> tuple[Array, Bool[Array, "trials batch"]]:
+        """Return the log determinant of both blocks at several x each, and whether they are positive definite."""
+        six, three = (cholesky(block) for block in jax.tree.map(lambda m: m[:, :, None], self).at(x))
+        return six.logdet() + three.logdet(), six.positive & three.positive
+
+    def newton_step(self, x: Float[Array, "7 batch"], weight: Float[Array, " batch"]) -> tuple[Array, Array, Array]:
+        """Return the step toward the maximum of weight * s + logdet, the Newton decrement, and the value at x."""
+        value, gradient, hessian = weight * x[6], jnp.zeros_like(x).at[6].set(weight), jnp.zeros((), x.dtype)
+        for block, reference, matrices in zip(self.at(x), self.reference, (ADJUGATES, UNITS), strict=True):
+            factor, entries = cholesky(block, jnp.eye(len(block), dtype=x.dtype)[..., None]), _Entries.of(matrices)
+            inverse = jnp.sum(factor.solved[:, :, None] * factor.solved[:, None], axis=0)
+            product = jnp.sum(inverse[:, :, None] * reference[None], axis=1)
+            between = jnp.sum(product[:, :, None] * inverse[None], axis=1)
+            by_scale, twice_by_scale = (jnp.sum(m * reference, axis=(0, 1))[None] for m in (inverse, between))
+            value += factor.logdet()
+            gradient += jnp.concatenate([entries.traces(inverse), -by_scale])
+            hessian += jnp.concatenate([entries.double_traces(inverse), -entries.traces(between), twice_by_scale])
+        identity = jnp.broadcast_to(jnp.eye(7, dtype=x.dtype)[..., None], (7, *x.shape))
+        solved = cholesky(hessian[LOWER], jnp.concatenate([identity, gradient[:, None]], axis=1)).solved
+        return jnp.sum(solved[:, :7] * solved[:, 7:], axis=0), jnp.sqrt(jnp.sum(solved[:, 7] ** 2, axis=0)), value
+
+    def newton_round(self, x: Float[Array, "7 batch"], weight: Float[Array, " batch"]) -> tuple[Array, Array, Array]:
+        """Return x after a round, the Newton decrement, and whether the value has increased."""
+        step, decrement, value = self.newton_step(x, weight)
+        lengths = jnp.stack([*(jnp.full_like(weight, length) for length in STEP_LENGTHS), 1 / (1 + decrement)])
+        trials = x[:, None] + lengths[None] * step[:, None]
+        logdet, positive = self.barrier(trials)
+        values = jnp.where(positive, weight[None] * trials[6] + logdet, -jnp.inf)
+        length = jnp.zeros_like(value)
+        for k in range(len(lengths)):
+            better = values[k] > value
+            length, value = jnp.where(better, lengths[k], length), jnp.where(better, values[k], value)
+        return x + length[None] * step, decrement, length > 0
+
+
+def _attempt(
+    enough: float, tolerance: float, again: Int[Array, ""], gram: Gram, reference: Gram
+) -> tuple[Certificate, Bool[Array, " batch"]]:
+    """Find out whether the scale zero is enough, and in the second attempt search."""
+    problem, zero = _Problem(gram, reference), 0 * (gram.symmetric[0, 0] + reference.symmetric[0, 0])
+    known = problem.barrier(jnp.zeros((7, 1, zero.size), zero.dtype))[1][0] & (enough <= 0)
+    blank = Certificate(zero, jnp.zeros((6, zero.size), zero.dtype), known)
+    return in_search_tiles(partial(_search, enough, tolerance), again, problem, blank), ~known
+
+
+def _search(enough: float, tolerance: float, problem: _Problem) -> Certificate:
+    """Search the largest scales of a batch."""
+    like = problem.gram.symmetric[0, 0] + problem.reference.symmetric[0, 0]
+    scales = jnp.asarray(INITIAL_SCALES, like.dtype)[:, None]
+    at_scales = problem.barrier(jnp.zeros((7, len(scales), like.size), like.dtype).at[6].set(scales))
+    start = jnp.max(jnp.where(at_scales[1], scales, -jnp.inf), axis=0)
+    known = start >= enough
+
+    def next_round(state):
+        rounds, x, weight, going, converged = state
+        new, decrement, has_moved = problem.newton_round(x, weight)
         centered = decrement < 1
         # Close to the border of the feasible set, roundoff may make the result of a round NaN or infinite. Then the
         # search ends with the previous one.
-        is_invalid = ~jnp.isfinite(s_new + sum(n_new))
-        done_new = is_invalid | (s_new >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
-        weight_new = jnp.where(centered, BARRIER_WEIGHTS[1] * weight, weight)
+        is_invalid = ~jnp.isfinite(jnp.sum(new, axis=0))
+        done = is_invalid | (new[6] >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
+        weight = jnp.where(centered, BARRIER_WEIGHTS[1] * weight, weight)
+        x = jnp.where((going & ~is_invalid)[None], new, x)
+        # a round that changes nothing would be repeated for ever
+        return rounds + 1, x, weight, going & ~done & (centered | has_moved), converged | (going & done)
 
-        def keep_if(new, old, condition):  # `old` where the condition holds, else `new`
-            return jax.tree.map(lambda a, b: jnp.where(condition, b, a), new, old)
-
-        s_new, n_new = keep_if((s_new, n_new), (s, n), is_invalid)
-        return keep_if((s_new, n_new, weight_new, rounds + 1, done_new), state, done)
-
-    s, n, _, _, done = jax.lax.while_loop(lambda state: ~state[4] & (state[3] < MAX_ROUNDS), newton_round, state)
-    return Certificate(s, n, done)
-
-
-def _initial_scale(coefficients: Column, n: Column, reference: Gram) -> Scalar:
-    """Return the largest of `INITIAL_SCALES` for which Gram(n) - scale * reference is positive definite."""
-    gram = Gram.of(coefficients, n)
-
-    def keep_feasible(largest, scale):
-        return jnp.where(_barrier(gram.plus(-scale, reference)).positive, scale, largest), None
-
-    return jax.lax.scan(keep_feasible, 0 * n[0] + INITIAL_SCALES[0], jnp.asarray(INITIAL_SCALES, n[0].dtype))[0]
-
-
-class _Barrier(NamedTuple):
-    """The logarithmic barrier at a Gram matrix."""
-
-    logdet: Scalar  # sum of the log determinants of both blocks; it has no meaning unless `positive`
-    positive: Bool[Array, ""]  # whether both blocks are positive definite
-
-
-def _barrier(gram: Gram) -> _Barrier:
-    """Evaluate the logarithmic barrier."""
-    six, three = (Cholesky.of(block) for block in gram)
-    return _Barrier(six.logdet() + three.logdet(), six.positive & three.positive)
-
-
-def _newton_step(coefficients: Column, n: Column, s: Scalar, reference: Gram, weight: Scalar):
-    """Take a Newton step toward the maximum of weight * s + logdet; return s, N and the Newton decrement."""
-    gram = Gram.of(coefficients, n).plus(-s, reference)
-    # the unknowns are the six entries of N, then s
-    gradient = [0 * s] * 6 + [weight]
-    hessian = [[0 * s] * (i + 1) for i in range(7)]
-    value = weight * s
-    for block, reference_block, places in zip(gram, reference, (ADJUGATE_PLACES, ANTISYMMETRIC_PLACES), strict=True):
-        factor = Cholesky.of(block)
-        value = value + factor.logdet()
-        inverse = compute_once(factor.inverse(), s)
-        inverse_reference = compute_once(congruence(inverse, reference_block), s)
-        for i, places_i in enumerate(places):
-            gradient[i] = gradient[i] + _trace(inverse, places_i)
-            for j in range(i + 1):
-                hessian[i][j] = hessian[i][j] + _double_trace(inverse, places_i, places[j])
-            hessian[6][i] = hessian[6][i] - _trace(inverse_reference, places_i)
-        gradient[6] = gradient[6] - _product_trace(inverse, reference_block)
-        hessian[6][6] = hessian[6][6] + _product_trace(inverse_reference, reference_block)
-    gradient, hessian = compute_once((tuple(gradient), tuple(tuple(row) for row in hessian)), s)
-    step = compute_once(Cholesky.of(hessian).solve(gradient), s)
-    decrement_squared = sum((a * b for a, b in zip(gradient, step, strict=True)), 0 * s)
-    decrement = jnp.sqrt(jnp.maximum(decrement_squared, 0))
-    step_lengths = jnp.stack([*(0 * s + step_length for step_length in STEP_LENGTHS), 1 / (1 + decrement)])
-
-    def try_length(state, step_length):
-        best_length, best_value = state
-        trial_s, trial_n = _after_step(s, n, step, step_length)
-        trial = _barrier(Gram.of(coefficients, trial_n).plus(-trial_s, reference))
-        value = weight * trial_s + trial.logdet
-        better = decide(trial.positive & (value > best_value), s)
-        return (jnp.where(better, step_length, best_length), jnp.where(better, value, best_value)), None
-
-    best_length = jax.lax.scan(try_length, (0 * s, value), step_lengths)[0][0]
-    s, n = compute_once(_after_step(s, n, step, best_length), weight)
-    return s, n, decrement
-
-
-def _after_step(s: Scalar, n: Column, step: Column, step_length):
-    """Return s and N after a step of length `step_length`."""
-    return s + step_length * step[6], tuple(a + step_length * b for a, b in zip(n, step, strict=False))
-
-
-def _weighted_sum(size: int, parts) -> Lower:
-    """Return the lower triangle of a weighted sum of matrices, given as pairs of (entries by place, weight)."""
-    rows = [[None] * (i + 1) for i in range(size)]
-    zero = 0 * parts[0][1]
-    for places, weight in parts:
-        for (i, j), value in places.items():
-            term = weight if value == 1.0 else value * weight
-            rows[i][j] = term if rows[i][j] is None else rows[i][j] + term
-    return tuple(tuple(zero if e is None else e for e in row) for row in rows)
-
-
-def _symmetric_entries(places):
-    """Yield all entries (i, j, value) of the symmetric matrix whose lower triangle is `places`."""
-    for (i, j), value in places.items():
-        yield i, j, value
-        if i != j:
-            yield j, i, value
-
-
-def _trace(x: Lower, places) -> Scalar:
-    """Return trace(x E) for the symmetric matrix E whose lower triangle is `places`."""
-    return sum((value * entry(x, i, j) for i, j, value in _symmetric_entries(places)), 0 * x[0][0])
-
-
-def _double_trace(x: Lower, first, second) -> Scalar:
-    """Return trace(x E x E') for the symmetric matrices E and E' whose lower triangles are `first` and `second`."""
-    total = 0 * x[0][0]
-    for i, j, a in _symmetric_entries(first):
-        for k, l, b in _symmetric_entries(second):
-            total = total + a * b * entry(x, j, k) * entry(x, l, i)
-    return total
-
-
-def _product_trace(x: Lower, m: Lower) -> Scalar:
-    """Return trace(x m) of two symmetric matrices."""
-    total = 0 * x[0][0]
-    for i, row in enumerate(m):
-        for j, value in enumerate(row):
-            total = total + (1 if i == j else 2) * x[i][j] * value
-    return total
+    x = jnp.zeros((7, like.size), like.dtype).at[6].set(start)
+    state = jnp.zeros((), jnp.int32), x, jnp.full_like(like, BARRIER_WEIGHTS[0]), ~known & (start > -jnp.inf), known
+    state = jax.lax.while_loop(lambda state: (state[0] < MAX_ROUNDS) & jnp.any(state[3]), next_round, state)
+    return Certificate(state[1][6], state[1][:6], state[4])

@@ -43,8 +43,8 @@ from pushjax._internal.autodiff import without_derivatives
 from pushjax._internal.checks import concrete
 from pushjax._internal.jit import quick_jit
 from pushjax._math.directions import fibonacci_hemisphere
-from pushjax._math.linalg import Cholesky, Lower, add_scaled, entry
-from pushjax._math.wishart import sample_wishart, tril
+from pushjax._math.linalg import cholesky
+from pushjax._math.wishart import sample_wishart
 from pushjax.friction.convexity import Gram, antisymmetric_of, coefficients_of, max_feasible_scale
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
@@ -52,6 +52,7 @@ from pushjax.friction.quartic import Quartic
 from pushjax.friction.sum_of_squares import decompose, squared_quadratics
 
 LOADING = 0.01  # relative to the least eigenvalue of the mean's Gram matrix
+ROUNDOFF = 64  # times eps, the least eigenvalue to which the loading raises that matrix, relative to H
 DECOMPOSITION_TOLERANCE = 1e-3  # largest error of a sum of squares, relative to the largest coefficient
 NUM_RAYS = 200
 
@@ -103,28 +104,24 @@ class WishartEllipsoid(SurfaceDistribution):
     """Ellipsoids with A ~ W(A_mean, n) / n."""
 
     mean: Ellipsoid
-    factor: Lower  # L with L L' = A_mean
+    factor: Float[Array, "3 3"]  # L with L L' = A_mean
     dof: Float[Array, ""]
 
     @staticmethod
     def of(mean: Ellipsoid, dof: Array) -> "WishartEllipsoid":
         """Return the distribution around a mean; raise ValueError if A is singular up to roundoff."""
-        cholesky = Cholesky.of(tril(mean.A))
-        if concrete(cholesky.positive) is not None and not cholesky.positive:
+        found = cholesky(mean.A)
+        if concrete(found.positive) is not None and not found.positive:
             raise ValueError(
                 "surface: A is singular up to roundoff, so no surfaces can be sampled around it; use float64"
             )
-        # all samples of a traced singular A are NaN
-        factor = jax.tree.map(lambda entry: jnp.where(cholesky.positive, entry, jnp.nan), cholesky.lower)
-        return WishartEllipsoid(mean, factor, dof)
+        return WishartEllipsoid(mean, found.lower(), dof)  # NaN for a traced singular A
 
     def with_dof(self, dof: Array) -> "WishartEllipsoid":
         return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
-        drawn = sample_wishart(key, self.factor, self.dof)
-        rows = [[entry(drawn, i, j) for j in range(3)] for i in range(3)]
-        surface = eqx.tree_at(lambda s: s.A, self.mean, jnp.array(rows))
+        surface = eqx.tree_at(lambda s: s.A, self.mean, sample_wishart(key, self.factor, self.dof))
         return SurfaceSample(surface, jnp.zeros_like(self.dof))
 
 
@@ -134,57 +131,55 @@ class GramQuartic(SurfaceDistribution):
     # Only the 6 x 6 block of the 9 x 9 matrix is sampled. H depends on nothing else, and a block of a Wishart matrix is
     # a Wishart matrix too.
     mean: Quartic
-    gram: Gram
+    reference: Gram  # that of the mean, toward which samples are pulled
     loading: Float[Array, ""]  # multiple of the identity that is not random
-    factor: Lower  # L, where L L' is the 6 x 6 block of `gram` without the loading
+    factor: Float[Array, "6 6"]  # L, where L L' is the 6 x 6 block of the mean's Gram matrix without the loading
     dof: Float[Array, ""]
 
     @staticmethod
     @quick_jit
     def of(mean: Quartic, dof: Array) -> "GramQuartic":
-        form = mean.form()
-        scale = jax.lax.stop_gradient(form.c[0] + form.c[1] + form.c[2])
-        scaled = tuple(c / scale for c in form.c)
-        best = without_derivatives(_best_gram, scaled)
-        gram = Gram.of(form.c, tuple(scale * n for n in best.n))
-        least = best.scale
-        # For a mean on the border of convexity the least eigenvalue is zero, up to the tolerance of the search.
-        # Then the loading is zero or a very small negative number.
-        loading = scale * jnp.where(least > 0, LOADING * least, least)
-        unloaded = gram.plus(-loading, Gram.identity(loading)).symmetric
-        return GramQuartic(mean, gram, loading, Cholesky.of(unloaded).lower, dof)
+        c, identity = mean.coefficients, Gram.identity(dof.dtype)
+        scale = jax.lax.stop_gradient(c[0] + c[1] + c[2])
+        least, n = without_derivatives(_best_gram, c / scale)
+        gram = Gram.of(c, scale * n)
+        # For a mean on the border of convexity the least eigenvalue is zero, up to the tolerance of the search. Then
+        # the loading is a very small negative number, and the Gram matrix of the mean is not positive definite, so
+        # pulling a sample toward it does not help in every direction. Add a very small multiple of a ball to it, whose
+        # eigenvalues are a third or more. (The identity is no Gram matrix of a quartic: it would prove nothing.)
+        margin = ROUNDOFF * float(jnp.finfo(dof.dtype).eps)
+        loading = scale * jnp.where(least > margin, LOADING * least, least - margin)
+        reference = gram.plus(jnp.maximum(-6 * loading, 0), Gram.ball(dof.dtype))
+        # NaN for a traced mean that has no Gram matrix, up to any loading
+        return GramQuartic(mean, reference, loading, cholesky(gram.plus(-loading, identity).symmetric).lower(), dof)
 
     def with_dof(self, dof: Array) -> "GramQuartic":
         return eqx.tree_at(lambda s: s.dof, self, dof)
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
-        identity = Gram.identity(self.loading)
-        drawn = add_scaled(sample_wishart(key, self.factor, self.dof), self.loading, identity.symmetric)
-        coefficients = coefficients_of(drawn)
-        # The Gram matrix of a mean on the border of convexity is not positive definite, so pulling a sample toward it
-        # does not help in every direction. Add a very small multiple of the identity to it.
-        reference = self.gram.plus(jnp.maximum(-2 * self.loading, 0), identity)
-        mean = coefficients_of(reference.symmetric)
-        certificate = without_derivatives(_certify, coefficients, antisymmetric_of(drawn), reference)
-        shrinkage = jnp.where(certificate.scale < 0, -certificate.scale / (1 - certificate.scale), 0.0)
-        # Never observed: a search that ends at a scale that is not finite. The sample is then replaced by the mean.
-        shrinkage = jnp.where(jnp.isfinite(certificate.scale), shrinkage, 1.0)
-        repaired = [c + shrinkage * (m - c) for c, m in zip(coefficients, mean, strict=True)]
-        return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, jnp.stack(repaired)), shrinkage)
+        drawn = sample_wishart(key, self.factor, self.dof) + self.loading * Gram.identity(self.dof.dtype).symmetric
+        coefficients, mean = coefficients_of(drawn), coefficients_of(self.reference.symmetric)
+        scale = without_derivatives(_certified_scale, drawn, self.reference)
+        # A sample that is not within the range of the search is replaced by the mean.
+        shrinkage = jnp.where(jnp.isfinite(scale), jnp.maximum(-scale, 0) / (1 - jnp.minimum(scale, 0)), 1.0)
+        repaired = coefficients + shrinkage * (mean - coefficients)
+        return SurfaceSample(eqx.tree_at(lambda s: s.coefficients, self.mean, repaired), shrinkage)
 
 
-def _best_gram(coefficients):
-    """Find the Gram matrix of a quartic whose least eigenvalue is largest: that eigenvalue is `scale`."""
-    one = jnp.ones_like(coefficients[0])
-    start_n = (0.2 * one,) * 3 + (0 * one,) * 3
-    tolerance = 1e-6 if one.dtype == jnp.float64 else 1e-4
-    return max_feasible_scale(coefficients, start_n, Gram.identity(one), enough=np.inf, tolerance=tolerance)
+def _best_gram(coefficients: Float[Array, "15"]) -> tuple[Float[Array, ""], Float[Array, "6"]]:
+    """Find the Gram matrix of a quartic whose least eigenvalue is largest; return that eigenvalue, and N."""
+    dtype = coefficients.dtype
+    start = jnp.asarray([0.2, 0.2, 0.2, 0, 0, 0], dtype)
+    tolerance = 1e-6 if dtype == jnp.float64 else 1e-4
+    gram, identity = Gram.of(coefficients, start), Gram.identity(dtype)
+    found = max_feasible_scale(gram, identity, enough=np.inf, tolerance=tolerance)
+    return found.scale, start + found.change
 
 
-def _certify(coefficients, n, reference):
-    """Certify that a quartic is convex, or find how much of the Gram matrix `reference` makes it so."""
-    # `scale` is not negative if the quartic is convex. Otherwise -`scale` is the multiple of `reference` to add.
-    return max_feasible_scale(coefficients, n, reference, enough=0.0, tolerance=1e-3)
+def _certified_scale(symmetric: Float[Array, "6 6"], reference: Gram) -> Float[Array, ""]:
+    """Return a number that is not negative if a quartic is convex, else minus the multiple of `reference` to add."""
+    gram = Gram(symmetric, antisymmetric_of(symmetric))
+    return max_feasible_scale(gram, reference, enough=0.0, tolerance=1e-3).scale
 
 
 class SumOfSquaresQuartic(SurfaceDistribution):
@@ -231,11 +226,8 @@ class SumOfSquaresQuartic(SurfaceDistribution):
         return eqx.tree_at(lambda s: s.term_dof, self, dof_of_terms(self.factors, dof))
 
     def sample(self, key: PRNGKeyArray) -> SurfaceSample:
-        def term(factor: Array, key: PRNGKeyArray) -> Array:
-            drawn = sample_wishart(key, tril(factor), self.term_dof)
-            return jnp.array([[entry(drawn, i, j) for j in range(3)] for i in range(3)])
-
-        forms = jax.vmap(term)(self.factors, jax.random.split(key, self.factors.shape[0]))
+        keys = jax.random.split(key, len(self.factors))
+        forms = jax.vmap(sample_wishart, (0, 0, None))(keys, self.factors, self.term_dof)
         coefficients = squared_quadratics(forms) / (1 + 2 / self.term_dof)
         surface = eqx.tree_at(lambda s: s.coefficients, self.mean, coefficients)
         return SurfaceSample(surface, jnp.zeros_like(self.term_dof))

@@ -1,5 +1,6 @@
 """Random friction: moments, convexity and its certificate, derivatives, keys, bad input."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,10 +33,6 @@ def tripod():
     return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(0), 400), degree=4)
 
 
-def dense(lower):
-    return np.array([[np.asarray(lower[max(i, j)][min(i, j)]) for j in range(len(lower))] for i in range(len(lower))])
-
-
 def convex(coefficients: np.ndarray, loose: float = 1e-9) -> np.ndarray:
     """Check convexity by a sweep of the Hessian that does not use the certificate."""
     return np.array([least_curvature(c / np.abs(c).max()) >= -loose for c in coefficients])
@@ -57,8 +54,8 @@ def test_a_gram_matrix_is_one(quartic, rng):
     """A Gram matrix represents H, and z' hess H(F) z / 12, for any N; coefficients and N can be recovered from it."""
     c = np.asarray(quartic.coefficients)
     n = rng.normal(size=6)
-    gram = Gram.of(tuple(map(jnp.asarray, c)), tuple(map(jnp.asarray, n)))
-    six, three = (dense(block) for block in gram)
+    gram = Gram.of(jnp.asarray(c), jnp.asarray(n))
+    six, three = map(np.asarray, gram)
     for _ in range(5):
         f, z = rng.normal(size=(2, 3))
         products = np.array([f[0] ** 2, f[1] ** 2, f[2] ** 2, f[0] * f[1], f[0] * f[2], f[1] * f[2]])
@@ -70,7 +67,7 @@ def test_a_gram_matrix_is_one(quartic, rng):
             z @ np.asarray(quartic.form().hessian(Vec3(*f)).array()) @ z / 12
         )
     np.testing.assert_allclose(coefficients_of(gram.symmetric), c, rtol=1e-12)
-    np.testing.assert_allclose(antisymmetric_of(gram.symmetric), n, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(antisymmetric_of(gram.symmetric), three, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -269,19 +266,90 @@ def test_a_mean_that_is_singular_up_to_roundoff():
 
 def test_largest_share_of_itself(quartic):
     """All of a Gram matrix can be subtracted from itself, exactly; of the ball's, a positive multiple."""
-    c = tuple(map(jnp.asarray, np.asarray(quartic.coefficients) / float(quartic.coefficients[0])))
-    ball = (jnp.asarray(0.2),) * 3 + (jnp.asarray(0.0),) * 3
-    one = max_feasible_scale(c, ball, Gram.identity(c[0]), enough=np.inf, tolerance=1e-6)
+    c, ball = quartic.coefficients / quartic.coefficients[0], jnp.array([0.2, 0.2, 0.2, 0, 0, 0])
+    gram = Gram.of(c, ball)
+    one = max_feasible_scale(gram, Gram.identity(c.dtype), enough=np.inf, tolerance=1e-6)
     assert one.converged
     assert one.scale > 0
-    again = max_feasible_scale(c, ball, Gram.of(c, one.n), enough=np.inf, tolerance=1e-6)
+    again = max_feasible_scale(gram, Gram.of(c, ball + one.change), enough=np.inf, tolerance=1e-6)
     assert float(again.scale) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_largest_scale_is_that_of_an_eigenvalue(dtype, rng):
+    """It is proved by the Gram matrix, of one example and of batches in batches; minus infinity if there is none."""
+    c = np.array([1, 1, 1, 0, 0, 0, 0, 0, 0, 2, 2, 2, 0, 0, 0.0]) + 0.4 * rng.normal(size=(2, 150, 15))
+    c[0, 0] = 1e9 * c[0, 0] * (-1) ** np.arange(15)
+    c, ball = jnp.asarray(c, dtype), jnp.array([0.2, 0.2, 0.2, 0, 0, 0], dtype)
+    tolerance = 1e-6 if dtype == "float64" else 1e-3  # less is roundoff
+
+    def search(c, enough=np.inf):
+        return max_feasible_scale(Gram.of(c, ball), Gram.identity(dtype), enough=enough, tolerance=tolerance)
+
+    found = jax.jit(jax.vmap(jax.vmap(search)))(c)
+    assert found.scale.dtype == found.change.dtype == dtype
+    assert found.scale[0, 0] == -np.inf
+    assert not found.converged[0, 0]
+    scale, change = np.asarray(found.scale).ravel()[1:], np.asarray(found.change).reshape(-1, 6)[1:]
+    assert np.mean(np.asarray(found.converged)) > 0.99
+    assert 0.1 < np.mean(scale > 0) < 0.9
+    root = np.sqrt([1, 1, 1, 2, 2, 2])  # of the identity
+    for k in range(20):
+        gram = Gram.of(c.reshape(-1, 15)[1 + k], ball + change[k])
+        six, three = np.asarray(gram.symmetric) / np.outer(root, root), np.asarray(gram.antisymmetric) / 2
+        least = min(np.linalg.eigvalsh(six)[0], np.linalg.eigvalsh(three)[0])
+        assert scale[k] - 1e-6 < least < scale[k] + tolerance
+    one = jax.jit(search)(c[1, 3])
+    np.testing.assert_allclose(one.scale, found.scale[1, 3], atol=2 * tolerance)
+    # where zero is enough, the search stops at once or as soon as it is reached
+    stopped = jax.jit(jax.vmap(lambda c: search(c, 0.0)))(c[1])
+    np.testing.assert_array_equal(stopped.scale >= 0, found.scale[1] >= 0)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_samples_around_means_on_the_border_are_convex(dtype):
+    """They are pulled toward a quartic that is convex up to roundoff, although the mean has no curvature somewhere."""
+    for c in ([1.0, 1, 0], [1.0, 1, 1], [0, 0, 1.0]):
+        c = jnp.asarray([*c] + [0.0] * 12, dtype)
+        around = jax.jit(
+            lambda c: FrictionModel(dof=20, friction=0.3).around(pj.Quartic(c, np.asarray(0.03, c.dtype)))
+        )(c)
+        drawn = jax.jit(jax.vmap(around.sample))(jax.random.split(jax.random.key(0), 300))
+        assert np.all(np.isfinite(drawn.surface.coefficients))
+        assert np.all(drawn.shrinkage <= 1)
+        coefficients = np.asarray(drawn.surface.coefficients, float)
+        assert np.all(least_curvatures(coefficients) >= (-1e-9 if dtype == "float64" else -3e-7))
+
+
+def test_a_mean_without_a_gram_matrix_gives_invalid_steps(quartic):
+    """It can only be traced. No surface is sampled that is not convex without a sign of it."""
+    c = np.array([1e-9, 1e-9, 1e-9, 1.0, *np.zeros(11)])
+
+    @jax.jit
+    def sample(c):
+        return jax.vmap(FrictionModel(dof=20, friction=0.3).around(pj.Quartic(c, 0.03)).sample)(
+            jax.random.split(jax.random.key(0), 20)
+        )
+
+    for bad in (c, -np.asarray(quartic.coefficients), np.full(15, np.nan), 0 * c):
+        drawn = sample(bad).surface
+        assert np.all(np.isnan(drawn.coefficients))
+        assert not np.any(jax.vmap(lambda surface: surface.is_valid())(drawn))
+    assert np.all(np.isfinite(sample(quartic.coefficients).surface.coefficients))
+
+
+def test_a_sample_beyond_the_search_is_the_mean(quartic):
+    """A sample so far from convex that no candidate of the search is feasible is replaced, and says so."""
+    distribution = FrictionModel(dof=20, friction=0.3).around(quartic)
+    far = eqx.tree_at(lambda d: (d.factor, d.loading), distribution, (0 * distribution.factor, jnp.asarray(-1e9)))
+    drawn = jax.jit(lambda key: far.sample(key))(jax.random.key(0))
+    assert drawn.shrinkage == 1
+    np.testing.assert_allclose(drawn.surface.coefficients, quartic.coefficients, atol=1e-5)
 
 
 @pytest.mark.parametrize(("size", "few", "enough"), [(3, [-3.0, 0.0, 1.0, 2.0], [2.1, 20.0]), (6, [4.0, 5.0], [5.1])])
 def test_a_wishart_matrix_of_too_few_degrees_of_freedom_is_nan(size, few, enough):
-    factor = tuple(tuple(float(i == j) for j in range(i + 1)) for i in range(size))
-    drawn = jax.jit(jax.vmap(lambda dof: sample_wishart(jax.random.key(3), factor, dof)))
+    drawn = jax.jit(jax.vmap(lambda dof: sample_wishart(jax.random.key(3), jnp.eye(size), dof)))
     for row in drawn(jnp.array(few)):
         assert np.isnan(row).all()
     for row in drawn(jnp.array(enough)):
