@@ -18,11 +18,10 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from benchmarks import speed
-from pushjax._internal.cell_cache import CellCache
-from pushjax._internal.options import cli_option
-from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.progress_bar import progress_bar
-from pushjax._internal.record import write_json
+from pushjax._internal.progress import ProgressCallback, no_progress, progress_bar
+from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._cli_option import cli_option
+from pushjax.experiments._record import write_json
 
 TimedCase = Literal[
     "push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo", "outline"
@@ -176,8 +175,7 @@ def main(arguments: list[str]) -> None:
             write_json(so_far, json)
 
     try:
-        with progress_bar() as progress:
-            progress.say(f"running {program}")
+        with progress_bar(f"running {program}") as progress:
             callbacks = {"progress": progress, "keep": keep}
             takes = inspect.signature(run).parameters
             record = case(**{name: each for name, each in callbacks.items() if name in takes})

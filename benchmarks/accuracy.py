@@ -14,7 +14,7 @@ import numpy as np
 import pushjax as pj
 from benchmarks.timing import both_dtypes
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.geometry import se2
 
 TRAVEL, FRICTION, GAP, REFERENCE = 0.05, 0.25, 0.0005, 6400

@@ -21,7 +21,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.testing import ProblemBatch, search, squeeze_power, squeeze_power_enumerated, violations
 from pushjax.testing.problems import random_contacts_problem
 

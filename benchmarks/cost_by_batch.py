@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from benchmarks import cases
 from benchmarks.timing import alternate, compiled
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.plot.files import save
 from pushjax.plot.style import STYLE, curve_styles
 

@@ -38,7 +38,7 @@ from benchmarks._derivative_cases import (
 )
 from benchmarks.timing import Program, alternate, compiled
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 Part = Literal["cost", "memory", "agreement", "grasps", "random", "picture"]
 Row = dict[str, Any]

@@ -18,7 +18,7 @@ from jaxtyping import Array, PRNGKeyArray
 import pushjax as pj
 from benchmarks.timing import on_cpu
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.tasks import PushAlongWall, PushBox, PushT, PushTwoFingers, Squeeze, TaskState
 from pushjax.tasks.environment import Environment
 

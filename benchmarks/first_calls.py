@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal, get_args
 import tyro
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000  # STEPS as in `cases.MANY_STEPS`
 Program = Literal["push", "gradient", "t", "two_fingers", "jaw"]

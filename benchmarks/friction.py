@@ -14,7 +14,7 @@ import numpy as np
 import pushjax as pj
 from benchmarks.peers import fits
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.friction.quartic import MONOMIALS
 from pushjax.testing.convexity import least_curvatures
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.identification.model import Scene, predict_pushes
 from pushjax.identification.prior import Prior
 

@@ -25,7 +25,7 @@ import numpy as np
 import pushjax as pj
 from benchmarks.identification import HALF, RADIUS, random_pushes
 from benchmarks.peers import fits
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 PATH_STEPS, GRID, TEST = 20, np.linspace(0.05, 0.65, 21), 10
 POSE_NOISE, ANGLE_NOISE = 3e-4, np.radians(3.0)

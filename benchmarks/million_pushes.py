@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 
 def one_run(

@@ -24,9 +24,9 @@ import pushjax as pj
 from benchmarks.robot import DataFolder, Objects
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._record import result_record
 from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, load, padded_pushes
 from pushjax.experiments.table1.methods import TEST_SIZE, UNKNOWNS, ConditionData, fitted, without_padding
 from pushjax.experiments.table1.repeats import relative_motions

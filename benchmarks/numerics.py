@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks import tasks
 from benchmarks.timing import both_dtypes
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 PUSHES, CHUNK = 100_000, 5000
 MODELS = ("quartic", "ellipsoid")

@@ -30,7 +30,7 @@ from benchmarks.survey import (
     simulate,
 )
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.simulation.hand import RoundFinger
 
 Dtype = Literal["float64", "float32"]

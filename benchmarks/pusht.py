@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from benchmarks.environments import AHEAD, SCATTER, throughput
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.tasks import PushT, TaskState
 
 AT_ONCE = 64  # episodes in one program

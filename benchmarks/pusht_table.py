@@ -23,7 +23,7 @@ from scipy.stats import binomtest
 import pushjax as pj
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.experiments.pusht_mpc import setting
 from pushjax.experiments.pusht_mpc.player import cache_folder, library, planner
 from pushjax.planning import PushController, PushLibrary

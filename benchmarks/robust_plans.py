@@ -18,7 +18,7 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.planning import FinalPose, Goal, PushPlan, PushSequence, plan_pushes, push_outcomes
 from pushjax.plot.files import save
 

@@ -16,10 +16,10 @@ import numpy as np
 import pushjax as pj
 from benchmarks.timing import alternate, compiled
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax._math.vec import Vec2
 from pushjax.contact.contact_plane import Contact, LimitCurve
 from pushjax.contact.single import solve_single
+from pushjax.experiments._record import result_record
 from pushjax.testing.problems import ContactProblem, random_contact_problem, random_contacts_problem
 
 SEVERAL = {"Exhaustive": pj.Exhaustive(), "Projected": pj.Projected()}

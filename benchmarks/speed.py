@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks import cases, outlines
 from benchmarks.timing import Program, Timing, alternate, both_dtypes, called, ceiling, compiled, rates
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 Make = Callable[[str, int], cases.Work]
 CASES: dict[str, tuple[Make, ...]] = {

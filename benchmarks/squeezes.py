@@ -22,7 +22,7 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.planning import SqueezeOutcomes, SqueezePlan, Squeezes, plan_squeezes, squeeze_outcomes
 from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
 from pushjax.planning.squeezes.plan_squeezes import WIDTH

@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.planning import StableContact, StablePush, shortest_push, stable_contacts
 from pushjax.planning.friction_samples import draw_friction
 

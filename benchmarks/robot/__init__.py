@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from pushjax._internal.options import cli_option
+from pushjax.experiments._cli_option import cli_option
 
 DataFolder = Annotated[Path | None, cli_option("FOLDER")]
 Surfaces = Annotated[Sequence[str] | None, cli_option("{abs,plywood,delrin} …")]

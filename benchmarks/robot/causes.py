@@ -17,11 +17,11 @@ import numpy as np
 
 import pushjax as pj
 from benchmarks.robot import DataFolder, Objects, Surfaces
-from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._record import result_record
 from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, SIDES, checked_surfaces, load
 from pushjax.experiments.table1.experiment import deviation_mm
 from pushjax.experiments.table1.methods import (

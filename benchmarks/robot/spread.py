@@ -36,11 +36,11 @@ from benchmarks.robot.predicted import (
     reach,
     scored,
 )
-from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.cli.main import data_folder
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._record import result_record
 from pushjax.experiments.table1.conditions import NOT_IN_PAPER, OBJECTS, checked_surfaces, load, padded_pushes
 from pushjax.experiments.table1.methods import (
     TEST_SIZE,

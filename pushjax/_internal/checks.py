@@ -1,10 +1,12 @@
-"""Checks of arguments, and their conversion to arrays.
+"""Checks of arguments, their conversion to arrays, and warnings.
 
 A value is checked if it is known. Of a tracer (inside `jit`, `vmap` or `grad`) only the shape is checked, and a status
 reports an invalid value. Every message names the argument, the given value and the allowed values.
 """
 
 import functools
+import sys
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,6 +19,7 @@ from typing_extensions import TypeAliasType
 
 from pushjax._internal.jit import outside_trace
 
+OWN_PACKAGES = ("pushjax.", "equinox.")  # equinox makes the instances of our classes
 # Accepted in place of an array: also lists and tuples of numbers. `help` shows the name instead of a long union.
 ArrayLike = TypeAliasType("ArrayLike", SingleArrayLike | Sequence[Any])
 
@@ -136,12 +139,29 @@ def check_non_negative(name: str, value: Any) -> None:
         raise ValueError(f"{name} must not be negative; got {_describe(known)}")
 
 
+def checked_array(
+    name: str,
+    value: Any,
+    shape: tuple[int | str, ...],
+    dtype: Any = None,
+    *,
+    positive: bool = False,
+    non_negative: bool = False,
+) -> jax.Array:
+    """Return `value` as a floating array, after checks of its shape, of finite entries and of their sign."""
+    array = as_float(value, dtype, name)
+    check_shape(name, array, shape)
+    check_finite(name, array)
+    if positive:
+        check_positive(name, array)
+    if non_negative:
+        check_non_negative(name, array)
+    return array
+
+
 def checked_weights(weights: Any, count: int, dtype: Any) -> jax.Array:
     """Return `weights` (None: ones) as (count,) non-negative numbers, not all zero and not normalized."""
-    value = as_float(np.ones(count) if weights is None else weights, dtype, "weights")
-    check_shape("weights", value, (count,))
-    check_finite("weights", value)
-    check_non_negative("weights", value)
+    value = checked_array("weights", np.ones(count) if weights is None else weights, (count,), dtype, non_negative=True)
     known = concrete(value)
     if known is not None and not known.any():
         raise ValueError("weights must not all be zero")
@@ -156,3 +176,11 @@ def _describe(value: np.ndarray) -> str:
 def traced(tree: Any) -> bool:
     """Return whether any leaf of `tree` is a tracer."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def warn(message: str) -> None:
+    """Show a UserWarning at the line of code outside the package that made the call."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(OWN_PACKAGES):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, UserWarning, stacklevel=level)

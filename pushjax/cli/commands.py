@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Union
 
 import tyro
 
-from pushjax._internal.options import cli_option
+from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments.identify_logs.options import Options
 from pushjax.experiments.plan.options import Options as PlanOptions
 

@@ -133,14 +133,13 @@ def _fixed_count(hint: Any) -> int | None:
 
 def _compute(command: Common) -> None:
     """Run an experiment, print its summary, and write its record and page."""
-    from pushjax._internal.progress_bar import progress_bar
+    from pushjax._internal.progress import progress_bar
 
     command.check()
     settings = command.settings()
     if "data" in vars(command):
         settings["folder"] = data_folder(settings.pop("data", None))
-    with progress_bar() as progress:
-        progress.say("importing JAX")
+    with progress_bar("importing JAX") as progress:
         import matplotlib
 
         matplotlib.use("Agg")  # draws to files, because there may be no screen
@@ -158,14 +157,13 @@ def _compute(command: Common) -> None:
 
 def _fetch(command: Data) -> None:
     """Fetch a set of recorded pushes."""
-    from pushjax._internal.progress_bar import progress_bar
+    from pushjax._internal.progress import progress_bar
     from pushjax.datasets.data_folder import ENVIRONMENT_VARIABLE
     from pushjax.datasets.download import fetch_triangle, triangle_files
 
     files = triangle_files()
-    size = sum(file.bytes for file in files) / 1e6
-    with progress_bar() as progress:
-        progress.say(f"fetching {len(files)} files of {size:.0f} MB, without those that are there already")
+    size = f"{sum(file.bytes for file in files) / 1e6:.0f} MB"
+    with progress_bar(f"fetching {len(files)} files of {size}, without those that are there already") as progress:
         folder = fetch_triangle(command.to, progress=progress)
     print(f"the logs are in {folder}")
     elsewhere = os.environ.get(ENVIRONMENT_VARIABLE)
@@ -193,9 +191,9 @@ def data_folder(given: Path | None) -> Path:
 
 def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> None:
     """Write the record and, except for the demo, its page. Then delete what was saved in case of an interruption."""
-    from pushjax._internal.cell_cache import CellCache
-    from pushjax._internal.record import write_json
     from pushjax.cli.page import write_page
+    from pushjax.experiments._cell_cache import CellCache
+    from pushjax.experiments._record import write_json
 
     json = command.json or command.out / f"{record['experiment']}.json"
     write_json(record, json)

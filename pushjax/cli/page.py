@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pushjax._internal.record import to_builtin
+from pushjax.experiments._record import to_builtin
 
 FEW = 8  # the table shows the numbers of lists up to this length; longer ones (histograms …) are in the page's JSON
 

@@ -22,7 +22,7 @@ import scipy.stats
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.experiments._starts import uniform_in_circle
 
 DISK_RADIUS, FINGER_RADIUS, FINGER_SPACING, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
 START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
 CLOSING = 0.001  # displacement of each finger, m

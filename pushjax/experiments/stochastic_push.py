@@ -19,7 +19,7 @@ import scipy.stats
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.simulation.monte_carlo_result import COORDINATES
 from pushjax.testing.convexity import least_curvatures
 

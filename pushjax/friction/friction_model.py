@@ -15,8 +15,8 @@ from pushjax._internal.checks import (
     check_non_negative,
     common_dtype,
     concrete,
+    warn,
 )
-from pushjax._internal.warn import warn
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic

@@ -1,12 +1,14 @@
 """Smooth closed curves: cubic B-splines as shapes, with interpolation and least-squares fits."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, concrete, in_numpy
+from pushjax._internal.checks import ArrayLike, checked_array, concrete, in_numpy
 from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Vec2
@@ -148,14 +150,8 @@ class Curve(Shape):
     def boundary(self, points: int) -> Float[Array, "points 2"]:
         count = len(self.control)
         nodes = jnp.linspace(0, count, count * ARC_NODES + 1, dtype=self.control.dtype)
-        parameters, _ = equally_spaced(lambda parameters: jnp.hypot(*self._evaluate(parameters)[1]), nodes, points)
-        return jnp.stack(self._evaluate(parameters)[0], axis=1)
-
-    def _evaluate(self, parameter: Array):
-        """Return the point and its first and second derivative at parameters of any shape, counted in segments."""
-        count = len(self.control)
-        index = jnp.clip(jnp.floor(parameter).astype(int), 0, count - 1)
-        return spline_segments(self.control).select(index).evaluate(parameter - index)
+        parameters, _ = equally_spaced(lambda nodes: jnp.hypot(*_evaluate(self.control, nodes)[1]), nodes, points)
+        return jnp.stack(_evaluate(self.control, parameters)[0], axis=1)
 
     def outline(self) -> SplineOutline:
         segments = spline_segments(self.control)
@@ -183,11 +179,9 @@ def _coordinate_range(c0: Array, c1: Array, c2: Array, c3: Array) -> tuple[Array
 
 def _checked_points(name: str, points: ArrayLike) -> Array:
     """Return the argument `name` as an array of at least four finite points, each unlike the next, or raise."""
-    array = as_float(points, name=name)
-    check_shape(name, array, (name, 2))
+    array = checked_array(name, points, (name, 2))
     if len(array) < 4:
         raise ValueError(f"{name}: a curve needs at least 4; got {len(array)}")
-    check_finite(name, array)
     known = concrete(array)
     if known is not None:
         gap = np.linalg.norm(np.roll(known, -1, axis=0) - known, axis=1)
@@ -200,28 +194,21 @@ def _checked_points(name: str, points: ArrayLike) -> Array:
     return array
 
 
-# Maps the four control points around a segment (before it, near its two ends, after it) to its power coefficients.
-_BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
-
-
-def _evaluate_in_numpy(control: np.ndarray, parameter: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return points and first and second derivatives, (parameters, 2), at parameters counted in segments."""
-    # This repeats `spline_segments` and `SplineSegment.evaluate` in float64, whatever precision JAX runs in.
-    index = np.floor(parameter).astype(int)
-    t = (parameter - index)[:, None]
-    around = np.stack([control[(index + k) % len(control)] for k in (-1, 0, 1, 2)])
-    c0, c1, c2, c3 = np.tensordot(_BASIS, around, axes=1)
-    return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3), 2 * c2 + 6 * t * c3
+def _evaluate(control: Any, parameter: Any, xp: Any = jnp) -> tuple[Vec2, Vec2, Vec2]:
+    """Return the point and its first and second derivative at parameters of any shape, counted in segments."""
+    # with NumPy as `xp` in float64, whatever precision JAX runs in
+    index = xp.floor(parameter).astype(int)
+    return spline_segments(control, xp).select(index % len(control)).evaluate(parameter - index, xp)
 
 
 def _checked_signed_area(control: np.ndarray) -> float:
     """Return the approximate signed area, m^2; raise if the curve encloses no area, has a cusp or crosses itself."""
     samples = max(4, min(16, 1200 // len(control)))  # per segment; all pairs of samples are compared
-    points, velocity, _ = _evaluate_in_numpy(control, np.arange(len(control) * samples) / samples)
+    point, velocity, _ = _evaluate(control, np.arange(len(control) * samples) / samples, np)
+    points, speed = np.stack(point, axis=1), np.hypot(*velocity)
     size, area = float(np.max(np.ptp(points, axis=0))), signed_area(points)
     if abs(area) <= 1e-9 * size**2:
         raise ValueError(f"control: the curve encloses no area ({abs(area):.3g} m^2)")
-    speed = np.linalg.norm(velocity, axis=1)
     if speed.min() <= 1e-6 * speed.max():
         raise ValueError(f"control: the curve has a cusp near control point {int(np.argmin(speed)) // samples}")
     crossed = find_self_intersection(points, 1e-9 * size)
@@ -239,16 +226,15 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
     if known is None:
         return bool(claimed)
     count = len(known)
-    points, velocity, second = _evaluate_in_numpy(known.astype(np.float64), np.arange(32 * count) / 32)
-    curvature = velocity[:, 0] * second[:, 1] - velocity[:, 1] * second[:, 0]
-    curvature /= np.linalg.norm(velocity, axis=1) ** 3
+    points, velocity, second = _evaluate(known.astype(np.float64), np.arange(32 * count) / 32, np)
+    curvature = np.asarray(velocity.cross(second)) / np.hypot(*velocity) ** 3
     # Error of the curvature from roundoff in the second differences of the control points.
     tolerance = (
         16
         * float(jnp.finfo(control.dtype).eps)
         * count**2
         * np.max(np.abs(known))
-        / np.max(np.ptp(points, axis=0)) ** 2
+        / np.max(np.ptp(points, axis=1)) ** 2
     )
     convex = bool(curvature.min() >= -tolerance)
     if claimed and not convex:
@@ -264,6 +250,10 @@ def _is_convex(control: Array, claimed: bool | None) -> bool:
 def _solve(xp, matrix, right):
     """Solve a linear system."""
     return xp.linalg.solve(matrix, right)
+
+
+# Maps the four control points around a segment (before it, near its two ends, after it) to its power coefficients.
+_BASIS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 
 
 def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
@@ -287,12 +277,13 @@ def _fit_control_points(points: np.ndarray, controls: int) -> np.ndarray:
         stacked_design = np.concatenate([(row[:, :, None] * design[:, None]).reshape(len(points), -1) for row in rows])
         stacked_value = np.concatenate([np.sum(row * points, axis=1) for row in rows])
         control = np.linalg.lstsq(stacked_design, stacked_value, rcond=None)[0].reshape(2, controls).T
-        point, first, second = _evaluate_in_numpy(control, parameter)
+        point, first, second = _evaluate(control, parameter, np)
+        offset = Vec2(*points.T) - point
         # One Newton step for the parameters. The lower bound on the curvature keeps it a descent step.
-        squared = np.sum(first**2, axis=1)
-        curvature = np.maximum(squared - np.sum((points - point) * second, axis=1), 0.5 * squared)
-        parameter = parameter + np.clip(np.sum((points - point) * first, axis=1) / curvature, -0.25, 0.25)
-        tangent = _evaluate_in_numpy(control, parameter)[1]
+        squared = first.dot(first)
+        curvature = np.maximum(squared - offset.dot(second), 0.5 * squared)
+        parameter = parameter + np.clip(offset.dot(first) / curvature, -0.25, 0.25)
+        tangent = np.stack(_evaluate(control, parameter, np)[1], axis=1)
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
         normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
     return control

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype
 from pushjax._internal.xla import tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, OvalOutline, Shape
@@ -48,12 +48,8 @@ class Disk(Shape):
 
     def __init__(self, radius: ArrayLike, center: ArrayLike = (0.0, 0.0)):
         dtype = common_dtype(radius, center)
-        self.radius, self.center = as_float(radius, dtype, "radius"), as_float(center, dtype, "center")
-        check_shape("radius", self.radius, ())
-        check_shape("center", self.center, (2,))
-        for name, value in (("radius", self.radius), ("center", self.center)):
-            check_finite(name, value)
-        check_positive("radius", self.radius)
+        self.radius = checked_array("radius", radius, (), dtype, positive=True)
+        self.center = checked_array("center", center, (2,), dtype)
 
     def is_valid(self) -> Bool[Array, ""]:
         return jax.lax.stop_gradient(self.radius) > 0

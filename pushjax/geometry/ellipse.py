@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype
 from pushjax._internal.xla import decide, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, OvalOutline, Shape, equally_spaced
@@ -174,14 +174,9 @@ class Ellipse(Shape):
 
     def __init__(self, semi_x: ArrayLike, semi_y: ArrayLike, center: ArrayLike = (0.0, 0.0)):
         dtype = common_dtype(semi_x, semi_y, center)
-        self.semi_x, self.semi_y = as_float(semi_x, dtype, "semi_x"), as_float(semi_y, dtype, "semi_y")
-        self.center = as_float(center, dtype, "center")
-        for name, value in (("semi_x", self.semi_x), ("semi_y", self.semi_y)):
-            check_shape(name, value, ())
-            check_finite(name, value)
-            check_positive(name, value)
-        check_shape("center", self.center, (2,))
-        check_finite("center", self.center)
+        self.semi_x = checked_array("semi_x", semi_x, (), dtype, positive=True)
+        self.semi_y = checked_array("semi_y", semi_y, (), dtype, positive=True)
+        self.center = checked_array("center", center, (2,), dtype)
 
     def is_valid(self) -> Bool[Array, ""]:
         semi = jax.lax.stop_gradient(jnp.stack([self.semi_x, self.semi_y]))

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype, concrete
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype, concrete
 from pushjax.geometry.shape import signed_area
 
 
@@ -47,11 +47,9 @@ def intersection_area(first: ArrayLike, second: ArrayLike) -> Float[Array, ""]:
     dtype = common_dtype(first, second)
     polygons = []
     for name, vertices in (("first", first), ("second", second)):
-        array = as_float(vertices, dtype, name)
-        check_shape(name, array, ("vertices", 2))
+        array = checked_array(name, vertices, ("vertices", 2), dtype)
         if array.shape[0] < 3:
             raise ValueError(f"{name}: a polygon needs at least three vertices; got {array.shape[0]}")
-        check_finite(name, array)
         polygons.append(array)
     known = [concrete(polygon) for polygon in polygons]
     if known[0] is not None and known[1] is not None and signed_area(known[0]) * signed_area(known[1]) < 0:

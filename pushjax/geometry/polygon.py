@@ -5,17 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_finite,
-    check_positive,
-    check_shape,
-    common_dtype,
-    concrete,
-    in_numpy,
-    on_device,
-)
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype, concrete, in_numpy, on_device
 from pushjax.geometry.polygon_outline import Edge, PolygonOutline
 from pushjax.geometry.shape import Shape, check_simple_polygon, is_outline, signed_area
 
@@ -42,11 +32,9 @@ class Polygon(Shape):
     convex: bool = eqx.field(static=True)
 
     def __init__(self, vertices: ArrayLike, *, convex: bool | None = None):
-        array = as_float(vertices, name="vertices")
-        check_shape("vertices", array, ("vertices", 2))
+        array = checked_array("vertices", vertices, ("vertices", 2))
         if array.shape[0] < 3:
             raise ValueError(f"vertices: a polygon needs at least three; got {array.shape[0]}")
-        check_finite("vertices", array)
         known = concrete(array)
         if known is not None:
             check_simple_polygon("vertices", known.astype(np.float64))
@@ -70,11 +58,8 @@ class Polygon(Shape):
             ValueError: If a side is not a positive finite scalar.
         """
         dtype = common_dtype(width, height)
-        w, h = as_float(width, dtype, "width"), as_float(height, dtype, "height")
-        for name, value in (("width", w), ("height", h)):
-            check_shape(name, value, ())
-            check_finite(name, value)
-            check_positive(name, value)
+        w = checked_array("width", width, (), dtype, positive=True)
+        h = checked_array("height", height, (), dtype, positive=True)
         return Polygon(_rectangle(w, h), convex=True)
 
     @staticmethod
@@ -93,10 +78,7 @@ class Polygon(Shape):
         """
         if sides < 3:
             raise ValueError(f"sides must be at least 3; got {sides}")
-        radius = as_float(circumradius, name="circumradius")
-        check_shape("circumradius", radius, ())
-        check_finite("circumradius", radius)
-        check_positive("circumradius", radius)
+        radius = checked_array("circumradius", circumradius, (), positive=True)
         angle = 2 * jnp.pi * jnp.arange(sides, dtype=radius.dtype) / sides
         return Polygon(radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1), convex=True)
 
@@ -144,9 +126,7 @@ class Polygon(Shape):
             ValueError: If `depth` is not a finite scalar, or so large that an edge vanishes or the moved edges cross.
                 Not checked for traced values.
         """
-        distance = as_float(depth, self.vertices.dtype, "depth")
-        check_shape("depth", distance, ())
-        check_finite("depth", distance)
+        distance = checked_array("depth", depth, (), self.vertices.dtype)
         edge = jnp.roll(self.vertices, -1, axis=0) - self.vertices
         normal = jnp.stack([edge[:, 1], -edge[:, 0]], axis=1) / jnp.linalg.norm(edge, axis=1, keepdims=True)
         previous_normal = jnp.roll(normal, 1, axis=0)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype
 from pushjax._math.vec import Scalar, Vec2
 
 PAIRS_AT_ONCE = 2**20  # pairs of edges that are compared together
@@ -146,9 +146,7 @@ class Shape(eqx.Module):
         Raises:
             ValueError: If `point` has another shape, or is NaN or infinite.
         """
-        query = as_float(point, common_dtype(self, point))
-        check_shape("point", query, (2,))
-        check_finite("point", query)
+        query = checked_array("point", point, (2,), common_dtype(self, point))
         found = self.outline().closest(Vec2.of(query))
         return found.distance, found.point.array(), found.normal.array()
 

@@ -22,10 +22,10 @@ class SplineSegment(NamedTuple):
     left_jump: Vec2  # of c3, from the previous segment to this one
     right_jump: Vec2  # of c3, from this segment to the next
 
-    def evaluate(self, t: Scalar) -> tuple[Vec2, Vec2, Vec2]:
+    def evaluate(self, t: Scalar, xp: Any = jnp) -> tuple[Vec2, Vec2, Vec2]:
         """Return the point and its first and second derivative with respect to t, for t from -1 to 2, m."""
         # How far t lies past the end of the segment, and how far before its start.
-        over, under = jnp.maximum(t - 1, 0), jnp.maximum(-t, 0)
+        over, under = xp.maximum(t - 1, 0), xp.maximum(-t, 0)
         point = self.c0 + (self.c1 + (self.c2 + self.c3.scale(t)).scale(t)).scale(t)
         first = self.c1 + (self.c2.scale(2) + self.c3.scale(3 * t)).scale(t)
         second = self.c2.scale(2) + self.c3.scale(6 * t)
@@ -45,17 +45,17 @@ class SplineSegment(NamedTuple):
         return jax.tree.map(lambda field: field[index], self)
 
 
-def spline_segments(control: Float[Array, "controls 2"]) -> SplineSegment:
+def spline_segments(control: Float[Array, "controls 2"], xp: Any = jnp) -> SplineSegment:
     """Return the segments of a closed uniform cubic B-spline; segment k starts near control point k."""
-    before, here, after, next_ = (jnp.roll(control, k, axis=0) for k in (1, 0, -1, -2))
+    before, here, after, next_ = (xp.roll(control, k, axis=0) for k in (1, 0, -1, -2))
     c3 = (next_ - before) / 6 + (here - after) / 2
     coefficients = (
         (before + 4 * here + after) / 6,
         (after - before) / 2,
         (before - 2 * here + after) / 2,
         c3,
-        c3 - jnp.roll(c3, 1, axis=0),
-        jnp.roll(c3, -1, axis=0) - c3,
+        c3 - xp.roll(c3, 1, axis=0),
+        xp.roll(c3, -1, axis=0) - c3,
     )
     return SplineSegment(*(Vec2(field[:, 0], field[:, 1]) for field in coefficients))
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_non_negative, check_positive, check_shape
+from pushjax._internal.checks import ArrayLike, as_float, checked_array
 from pushjax._internal.xla import smallest
 from pushjax._math.vec import Vec2, norm
 from pushjax.geometry import se2
@@ -107,10 +107,7 @@ class Missed(Cost):
     width: Float[Array, ""]
 
     def __init__(self, goal: Goal, width: ArrayLike = 0.0):
-        self.goal, self.width = goal, as_float(width, name="width")
-        check_shape("width", self.width, ())
-        check_finite("width", self.width)
-        check_non_negative("width", self.width)
+        self.goal, self.width = goal, checked_array("width", width, (), non_negative=True)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         beyond = self.goal.max_error(_poses(push)[-1]) - 1
@@ -170,7 +167,8 @@ class Clearance(Cost):
     points: Float[Array, "points 2"]
 
     def __init__(self, shape: Shape, fixtures: Fixtures, distance: ArrayLike):
-        self.shape, self.fixtures, self.distance = shape, tuple(fixtures), _checked_distance(distance)
+        self.shape, self.fixtures = shape, tuple(fixtures)
+        self.distance = checked_array("distance", distance, (), positive=True)
         self.points = _outline_points(shape)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
@@ -213,7 +211,8 @@ class HandClearance(Cost):
     distance: Float[Array, ""]
 
     def __init__(self, hand: Hand, fixtures: Fixtures, distance: ArrayLike):
-        self.hand, self.fixtures, self.distance = hand, tuple(fixtures), _checked_distance(distance)
+        self.hand, self.fixtures = hand, tuple(fixtures)
+        self.distance = checked_array("distance", distance, (), positive=True)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         centers = self.hand.poses(push.configuration)[..., :2].reshape(-1, len(self.hand.fingers), 2)
@@ -229,15 +228,6 @@ def _fixture_distance(fixture: Wall | Fixture, points: Float[Array, "points 2"])
     if isinstance(fixture, Wall):
         return smallest((points - fixture.point[None]) @ fixture.normal)
     return _shape_distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
-
-
-def _checked_distance(distance: ArrayLike) -> Float[Array, ""]:
-    """Return a distance to keep, m, as an array, after checks."""
-    array = as_float(distance, name="distance")
-    check_shape("distance", array, ())
-    check_finite("distance", array)
-    check_positive("distance", array)
-    return array
 
 
 def _outline_points(shape: Shape) -> Float[Array, "points 2"]:

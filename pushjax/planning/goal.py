@@ -7,15 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_count,
-    check_finite,
-    check_positive,
-    check_shape,
-    common_dtype,
-)
+from pushjax._internal.checks import ArrayLike, as_float, check_count, checked_array, common_dtype
 from pushjax._math.vec import norm, wrap_to_pi
 
 ANGLE_TOLERANCE = float(np.radians(5))  # rad
@@ -67,15 +59,10 @@ class Goal(eqx.Module):
         symmetry: int | ArrayLike = 1,
     ):
         dtype = common_dtype(pose, position_tolerance, angle_tolerance, length)
-        self.pose = as_float(pose, dtype, "pose")
-        check_shape("pose", self.pose, (3,))
-        check_finite("pose", self.pose)
+        self.pose = checked_array("pose", pose, (3,), dtype)
         scalars = {"position_tolerance": position_tolerance, "angle_tolerance": angle_tolerance, "length": length}
         for name, value in scalars.items():
-            setattr(self, name, as_float(value, dtype, name))
-            check_shape(name, getattr(self, name), ())
-            check_finite(name, getattr(self, name))
-            check_positive(name, getattr(self, name))
+            setattr(self, name, checked_array(name, value, (), dtype, positive=True))
         self.turns = symmetric_turns(symmetry, dtype)
 
     def offset(self, pose: ArrayLike) -> Float[Array, "*batch 3"]:
@@ -178,9 +165,7 @@ def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array
     if np.ndim(symmetry) == 0:  # pyright: ignore[reportArgumentType]
         check_count("symmetry", symmetry)
         symmetry = 2 * np.pi * np.arange(symmetry) / symmetry  # pyright: ignore
-    turns = as_float(symmetry, dtype, "symmetry")
-    check_shape("symmetry", turns, ("turns",))
-    check_finite("symmetry", turns)
+    turns = checked_array("symmetry", symmetry, ("turns",), dtype)
     if not len(turns):
         raise ValueError("symmetry must have at least one turn, zero for a slider without symmetry; got none")
     return turns

@@ -15,11 +15,12 @@ from pushjax._internal.checks import (
     check_non_negative,
     check_shape,
     check_type,
+    checked_array,
     common_dtype,
     concrete,
     traced,
+    warn,
 )
-from pushjax._internal.warn import warn
 from pushjax.friction.friction_model import warn_about_percent
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.table import Table
@@ -92,8 +93,7 @@ def checked_rollout_arguments(
     path_array = as_float(path, dtype, "path")
     _check_columns(path_array, hand)
     if pushes is not None and path_array.ndim == 3:
-        check_shape("path", path_array, (pushes, "steps + 1", hand.dof))
-        check_finite("path", path_array)
+        path_array = checked_array("path", path_array, (pushes, "steps + 1", hand.dof))
         if path_array.shape[1] < 2:
             raise ValueError(f"path must have at least two configurations; got shape {path_array.shape}")
     else:

@@ -6,23 +6,13 @@ roundoff is not pushed out of it. A jam in which the slider touches a fixture is
 not hold the slider.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_finite,
-    check_non_negative,
-    check_shape,
-    common_dtype,
-    concrete,
-)
+from pushjax._internal.checks import ArrayLike, checked_array, common_dtype, concrete
 from pushjax._math.vec import Vec2
 from pushjax.geometry.disk import Disk
 from pushjax.geometry.polygon import Polygon
@@ -50,10 +40,8 @@ class Wall(eqx.Module):
 
     def __init__(self, point: ArrayLike, normal: ArrayLike, friction: ArrayLike = 0.0):
         dtype = common_dtype(point, normal, friction)
-        self.point, direction = as_float(point, dtype, "point"), as_float(normal, dtype, "normal")
-        for name, value in (("point", self.point), ("normal", direction)):
-            check_shape(name, value, (2,))
-            check_finite(name, value)
+        self.point = checked_array("point", point, (2,), dtype)
+        direction = checked_array("normal", normal, (2,), dtype)
         known = concrete(direction)
         if known is not None and not np.any(known):
             raise ValueError("normal must not be zero; it is the direction from the wall into the free space")
@@ -62,7 +50,7 @@ class Wall(eqx.Module):
         usable = (squared > 0) & jnp.isfinite(squared)
         safe = jnp.where(usable, direction, 1.0)
         self.normal = jnp.where(usable, safe / jnp.sqrt(jnp.sum(safe**2)), jnp.nan)
-        self.friction = _checked_friction(friction, dtype)
+        self.friction = checked_array("friction", friction, (), dtype, non_negative=True)
 
 
 class Fixture(eqx.Module):
@@ -92,10 +80,8 @@ class Fixture(eqx.Module):
                 f"{'a Polygon that is not convex' if isinstance(shape, Polygon) else type(shape).__name__}"
             )
         dtype = common_dtype(shape, pose, friction)
-        self.shape, self.pose = shape, as_float(pose, dtype, "pose")
-        check_shape("pose", self.pose, (3,))
-        check_finite("pose", self.pose)
-        self.friction = _checked_friction(friction, dtype)
+        self.shape, self.pose = shape, checked_array("pose", pose, (3,), dtype)
+        self.friction = checked_array("friction", friction, (), dtype, non_negative=True)
 
     @property
     def body(self) -> RoundFinger | Pad:
@@ -112,12 +98,3 @@ class Fixture(eqx.Module):
 
 
 Fixtures = tuple[Wall | Fixture, ...]
-
-
-def _checked_friction(friction: ArrayLike, dtype: Any) -> Float[Array, ""]:
-    """Return a coefficient of friction as an array; raise ValueError unless it is a finite scalar, not negative."""
-    mu = as_float(friction, dtype, "friction")
-    check_shape("friction", mu, ())
-    check_finite("friction", mu)
-    check_non_negative("friction", mu)
-    return mu

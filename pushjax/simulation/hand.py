@@ -8,15 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_count,
-    check_finite,
-    check_non_negative,
-    check_shape,
-    check_type,
-)
+from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type, checked_array
 from pushjax.geometry.polygon import Polygon
 
 Kinematics = Callable[[Array], Array]
@@ -35,11 +27,7 @@ class RoundFinger(eqx.Module):
     radius: Float[Array, ""]
 
     def __init__(self, radius: ArrayLike):
-        r = as_float(radius, name="radius")
-        check_shape("radius", r, ())
-        check_finite("radius", r)
-        check_non_negative("radius", r)
-        self.radius = r
+        self.radius = checked_array("radius", radius, (), non_negative=True)
 
 
 class Pad(eqx.Module):

@@ -2,9 +2,8 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -13,13 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, check_count, check_type, traced
+from pushjax._internal.checks import ArrayLike, check_count, check_type, traced, warn
 from pushjax._internal.compilation_cache import processor
-from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.warn import warn
+from pushjax._internal.progress import ProgressCallback, no_progress, progress_bar
 from pushjax.contact.problem import check_solver
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
@@ -35,7 +32,7 @@ from pushjax.simulation.checkpoint import Checkpoint, CheckpointError, digest
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.monte_carlo_result import MonteCarlo
-from pushjax.simulation.monte_carlo_tiles import Devices, PushResults, Setup, copy_to_devices, fetch_round, start_round
+from pushjax.simulation.monte_carlo_tiles import Devices, Results, Rounds, Setup
 from pushjax.simulation.slider import Slider
 
 TILE = 2048  # pushes that a CPU computes at once, so that their data stay in the cache
@@ -115,199 +112,86 @@ def monte_carlo(
         )
     check_count("n", n)
     check_count("batch_size", 1 if batch_size is None else batch_size)
-    n = int(n)
     check_solver(solver)
     check_type("model", model, FrictionModel)
-    with _progress_report(progress, n) as report:
-        slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=n)
-        key_data, impl = _key_data(key)
-        used = Devices.of(devices)
+    words = f"compiling and making {n} pushes"
+    with progress_bar(words) if progress is True else nullcontext(progress or no_progress) as report:
+        slider, hand, path_array, start, _ = checked_rollout_arguments(slider, hand, path, pose, 0.0, pushes=int(n))
+        typed_key, used = _typed_key(key), Devices.of(devices)
         default_tile = TILE if used.local[0].platform == "cpu" else ACCELERATOR_TILE
-        tile = int(batch_size) if batch_size is not None else min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
-        if used.multiprocess:
-            # connect the processes now: after compiling, one may be later than the 30 s that the others wait
-            multihost_utils.sync_global_devices("pushjax monte_carlo")
-        surfaces = model.around(slider.surface)
-        cast_table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
+        tile = batch_size or min(default_tile, -(-n // TILE_MULTIPLE) * TILE_MULTIPLE)
+        # connect the processes now: after compiling, one may be later than the 30 s that the others wait
+        used.gather(0)
+        table, fixed = checked_table(table, start.dtype), checked_fixtures(fixtures, start.dtype)
         check_start_among_fixtures(slider, fixed, start)
-        setup = Setup(key_data, surfaces, model, slider.shape, hand, solver, cast_table, fixed)
-        run = _Run(n, tile, setup, impl, used, np.asarray(start), np.asarray(path_array), trajectories)
-        saved = None if checkpoint is None else _checkpoint(Path(checkpoint), run, setup, slider, path_array, start)
-        results = run.compute_all(saved, report)
-    _warn_about_repairs(results.shrinkage)
-    return MonteCarlo(np.broadcast_to(run.start, (n, 3)), *results, time.perf_counter() - start_time)
-
-
-def _checkpoint(folder: Path, run: "_Run", setup: Setup, slider: Slider, path: Array, start: Array) -> Checkpoint:
-    """Return the checkpoint of a run, which identifies the run by its arguments, versions and platform."""
-    hand, model, solver = setup.hand, setup.model, setup.solver
-    identity = {"n": run.n, "batch_size": run.tile, "trajectories": run.keep_trajectories}
-    identity |= {"key": digest(setup.key, run.impl), "slider": digest(slider)}
-    identity |= {"hand": digest(hand, hand.poses(path)), "path": digest(path), "pose": digest(start)}
-    identity |= {"model": digest(model), "solver": digest(solver) if solver else "default"}
-    identity |= {"table": digest(setup.table) if setup.table else "uniform", "fixtures": digest(setup.fixtures)}
-    identity |= {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
-    device = run.devices.local[0]
-    identity |= {"platform": device.platform, "device": device.device_kind}
-    # other instructions or flags of the compiler give other bits; another number of devices does not
-    flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag)
-    identity |= {"processor": processor() if device.platform == "cpu" else "", "xla_flags": flags}
-    return run.in_all_processes(lambda: Checkpoint(folder.expanduser(), identity, writes=run.devices.writes))
-
-
-def _warn_about_repairs(shrinkage: np.ndarray) -> None:
-    """Warn if many of the sampled surfaces were not convex and had to be moved toward their mean."""
-    share = float(np.mean(shrinkage > 0))
+        setup = Setup(typed_key, model.around(slider.surface), model, slider.shape, hand, solver, table, fixed)
+        rounds = Rounds(int(n), int(tile), setup, used, np.asarray(start), np.asarray(path_array), trajectories)
+        results = _compute(rounds, slider, checkpoint, report)
+    share = float(np.mean(results["shrinkage"] > 0))
     if share > MANY_REPAIRS:
         warn(
             f"model: {share:.0%} of the sampled limit surfaces were not convex and were moved toward the mean; put the "
             "origin of the body frame at the center of the pressure, give a larger dof, or use "
             'sampler="sum_of_squares"'
         )
+    starts = np.broadcast_to(rounds.start, (n, 3))
+    results.setdefault("trajectory", None)
+    return MonteCarlo(start=starts, **results, seconds=time.perf_counter() - start_time)
 
 
-@contextmanager
-def _progress_report(progress: bool | ProgressCallback, n: int) -> Iterator[ProgressCallback]:
-    """Yield the progress callback of `n` pushes."""
-    if progress is not True:
-        yield progress or no_progress
-        return
-    # imported here, because nothing but a progress bar needs it
-    from pushjax._internal.progress_bar import progress_bar
-
-    with progress_bar() as reporter:
-        reporter.say(f"compiling and making {n} pushes")
-        yield reporter
-
-
-def _key_data(key: Any) -> tuple[Any, Any]:
-    """Return the raw data of a key, and the name of its PRNG implementation."""
-    message = f"key must be one key, of jax.random.key or PRNGKey; got {key!r}"
-    if not isinstance(key, (jax.Array, np.ndarray)):
-        raise ValueError(message)
+def _typed_key(key: Any) -> PRNGKeyArray:
+    """Return one key, of either style, as a typed key."""
     try:
         typed = key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(jnp.asarray(key))
-    except (TypeError, ValueError):
-        raise ValueError(message) from None
-    if typed.shape != ():
-        raise ValueError(message)
-    return jax.random.key_data(typed), str(jax.random.key_impl(typed))
+    except (AttributeError, TypeError, ValueError):
+        typed = None
+    if typed is None or typed.shape != ():
+        raise ValueError(f"key must be one key, of jax.random.key or PRNGKey; got {key!r}")
+    return typed
 
 
-class _Run:
-    """A Monte Carlo run, which computes the pushes in rounds of one tile on each device."""
-
-    def __init__(
-        self,
-        n: int,
-        tile: int,
-        setup: Setup,
-        impl: Any,
-        devices: Devices,
-        start: np.ndarray,  # pose of the slider, (3,) or (n, 3), world, m and rad
-        path: np.ndarray,  # (steps + 1, dof) or (n, steps + 1, dof)
-        keep_trajectories: bool,
-    ):
-        self.n, self.tile, self.impl, self.devices, self.keep_trajectories = n, tile, impl, devices, keep_trajectories
-        self.start, self.path = start, path
-        self.setups, self.round = copy_to_devices(setup, devices), tile * devices.count
-        # A CPU runs one tile in less time than it takes to compile it. This compares `n` with a tile and not with a
-        # round, because the bits must not depend on the number of devices.
-        self.quick = n <= tile and devices.local[0].platform == "cpu"
-
-    def in_all_processes(self, action: Callable[[], Any]) -> Any:
-        """Return `action()`; if one process raises CheckpointError, all do, so that none waits for another."""
-        error, value = None, None
-        try:
-            value = action()
-        except CheckpointError as caught:
-            error = caught
-        failed = error is not None
-        if self.devices.multiprocess:
-            failed = bool(np.any(multihost_utils.process_allgather(np.int32(failed))))
-        if failed:
-            raise error or CheckpointError("checkpoint: another process could not go on; it says why")
-        return value
-
-    def _block_is_due(self, pushes: int, seconds: float) -> bool:
-        """Return whether to write a block of the checkpoint; all processes get the answer of the first."""
-        due = pushes >= BLOCK_PUSHES or seconds >= BLOCK_SECONDS
-        return bool(multihost_utils.broadcast_one_to_all(np.int32(due))) if self.devices.multiprocess else due
-
-    def compute_all(self, saved: Checkpoint | None, report: ProgressCallback) -> PushResults:
-        """Return all pushes; compute those that are not in `saved`."""
-        with ThreadPoolExecutor(len(self.setups)) as pool:
-            return self._compute_rounds(saved, report, pool)
-
-    def _compute_rounds(
-        self, saved: Checkpoint | None, report: ProgressCallback, pool: ThreadPoolExecutor
-    ) -> PushResults:
-        """Return all pushes, computed round by round, with one thread of `pool` for each device."""
-        parts, done = self._saved_blocks(saved)
-        # block: results that are not in the checkpoint yet; block_begin: index of their first push
-        block, block_begin, block_time = [], done, time.perf_counter()
-        running: tuple[int, int, list[PushResults]] | None = None
-        report(done, self.n)
-        while done < self.n or running is not None:
-            # the devices compute the next round while the host copies this one
-            next_round = self._start_round(done, pool) if done < self.n else None
-            if running is not None:
-                first, last, device_results = running
-                results = fetch_round(device_results, self.devices)
-                block.append(jax.tree.map(lambda leaf, k=last - first: leaf[:k], results))
-                if saved is not None and (
-                    last == self.n or self._block_is_due(last - block_begin, time.perf_counter() - block_time)
-                ):
-                    parts.append(_concatenated(block))
-                    self.in_all_processes(partial(saved.write, block_begin, last, _arrays_by_name(parts[-1])))
-                    block, block_begin, block_time = [], last, time.perf_counter()
-                report(last, self.n)
-            running = next_round
-            done = done if next_round is None else next_round[1]
-        return _concatenated(parts + block)
-
-    def _start_round(self, first: int, pool: ThreadPoolExecutor) -> tuple[int, int, list[PushResults]]:
-        """Start the round of push `first`; return that index, the index after its end, and results on each device."""
-        last = min(first + self.round, self.n)
-        # the last round repeats its last push
-        indices = np.minimum(np.arange(first, first + self.round), self.n - 1).astype(np.uint32).reshape(-1, self.tile)
-        poses = np.broadcast_to(self.start, (self.n, 3))[indices]
-        # a path that all pushes share is sent once
-        paths = self.path if self.path.ndim == 2 else self.path[indices]
-        device_results = start_round(
-            self.setups,
-            self.impl,
-            self.devices,
-            indices,
-            poses,
-            paths,
-            self.keep_trajectories,
-            self.quick,
-            pool,
-        )
-        return first, last, device_results
-
-    def _saved_blocks(self, saved: Checkpoint | None) -> tuple[list[PushResults], int]:
-        """Return the pushes that are in the checkpoint, in blocks, and their number."""
-        if saved is None:
-            return [], 0
-        blocks = saved.blocks()
-        end = blocks[-1][1] if blocks else 0
-        names = tuple(name for name in PushResults._fields if self.keep_trajectories or name != "trajectory")
-
-        def read() -> list[PushResults]:
-            if self.devices.multiprocess and len(np.unique(multihost_utils.process_allgather(np.int32(end)))) > 1:
-                raise CheckpointError(
-                    f"checkpoint: not every process sees the same in {saved.folder}; give a shared one"
-                )
-            return [PushResults(**({"trajectory": None} | saved.read(path, names))) for _, _, path in blocks]
-
-        return self.in_all_processes(read), end
+def _identity(rounds: Rounds, slider: Slider) -> dict[str, Any]:
+    """Return what the bits of a run depend on: its arguments, versions and platform."""
+    setup, device = rounds.setup, rounds.devices.local[0]
+    key = jax.random.key_data(setup.key), str(jax.random.key_impl(setup.key))
+    hand = setup.hand, setup.hand.poses(jnp.asarray(rounds.path))
+    arguments = {"key": key, "slider": slider, "hand": hand, "path": rounds.path, "pose": rounds.start}
+    arguments |= {name: getattr(setup, name) for name in ("model", "solver", "table", "fixtures")}
+    # other instructions or flags of the compiler give other bits; another number of devices does not
+    flags = sorted(flag for flag in os.environ.get("XLA_FLAGS", "").split() if "device_count" not in flag)
+    return (
+        {"n": rounds.n, "batch_size": rounds.tile, "trajectories": rounds.keep_trajectories}
+        | {name: digest(value) for name, value in arguments.items()}
+        | {name: version(name) for name in ("pushjax", "jax", "jaxlib")}
+        | {"platform": device.platform, "device": device.device_kind, "xla_flags": flags}
+        | {"processor": processor() if device.platform == "cpu" else ""}
+    )
 
 
-def _concatenated(parts: list[PushResults]) -> PushResults:
+def _compute(rounds: Rounds, slider: Slider, folder: str | Path | None, report: ProgressCallback) -> Results:
+    """Return the results of all pushes; compute those that are not in the checkpoint in `folder`."""
+    devices, saved = rounds.devices, None
+    parts, done = [], 0
+    if folder is not None:
+        folder, identity = Path(folder).expanduser(), _identity(rounds, slider)
+        saved = devices.in_all_processes(lambda: Checkpoint(folder, identity, writes=devices.rank == 0))
+        parts, done = devices.in_all_processes(saved.read)
+        if len(np.unique(devices.gather(done))) > 1:
+            raise CheckpointError(f"checkpoint: not every process sees the same in {folder}; give a shared one")
+    # block: results that are not in the checkpoint yet; block_begin: index of their first push
+    block, block_begin, block_time = [], done, time.perf_counter()
+    report(done, rounds.n)
+    for end, results in rounds.compute(done):
+        block.append(results)
+        is_due = end - block_begin >= BLOCK_PUSHES or time.perf_counter() - block_time >= BLOCK_SECONDS
+        # all processes do what the first one says
+        if saved is not None and (end == rounds.n or devices.gather(int(is_due))[0]):
+            parts.append(_concatenated(block))
+            devices.in_all_processes(partial(saved.write, block_begin, end, parts[-1]))
+            block, block_begin, block_time = [], end, time.perf_counter()
+        report(end, rounds.n)
+    return _concatenated(parts + block)
+
+
+def _concatenated(parts: list[Results]) -> Results:
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-
-
-def _arrays_by_name(results: PushResults) -> dict[str, np.ndarray]:
-    return {name: leaf for name, leaf in results._asdict().items() if leaf is not None}

@@ -81,9 +81,8 @@ class MonteCarlo:
 
     def summary(self) -> dict[str, Any]:
         """Summarize the run in plain numbers, by name: counts, fractions, moments and quantiles."""
-        pose = np.asarray(self.pose, np.float64)
-        quantiles = np.quantile(pose, QUANTILES, axis=0)
         in_mode = self.steps_in_mode.sum(axis=0, dtype=np.int64)
+        shares = in_mode / np.maximum(in_mode.sum(axis=1, keepdims=True), 1)
         statuses, counts = np.unique(self.status, return_counts=True)
         repaired = self.shrinkage > 0
         return {
@@ -91,24 +90,22 @@ class MonteCarlo:
             "outcomes": self.outcomes(),
             "statuses": {Status(int(s)).name: int(c) for s, c in zip(statuses, counts, strict=True)},
             "modes": [
-                {mode.name: float(c / max(total, 1)) for mode, c in zip(ContactMode, contact, strict=True)}
-                for contact, total in zip(in_mode, in_mode.sum(axis=1), strict=True)
+                {mode.name: float(share) for mode, share in zip(ContactMode, contact, strict=True)}
+                for contact in shares
             ],
             "pose": {
-                name: {
-                    "mean": float(pose[:, k].mean()),
-                    "std": float(pose[:, k].std(ddof=1)) if len(self) > 1 else 0.0,
-                    "quantiles": {str(q): float(v) for q, v in zip(QUANTILES, quantiles[:, k], strict=True)},
-                }
-                for k, name in enumerate(COORDINATES)
+                name: _moments(values) | {"quantiles": {str(q): float(np.quantile(values, q)) for q in QUANTILES}}
+                for name, values in zip(COORDINATES, np.asarray(self.pose, np.float64).T, strict=True)
             },
-            "friction": {
-                "mean": float(self.friction.mean()),
-                "std": float(self.friction.std(ddof=1)) if len(self) > 1 else 0.0,
-            },
+            "friction": _moments(self.friction),
             "repaired": {
                 "share": float(repaired.mean()),
                 "mean_shrinkage": float(self.shrinkage[repaired].mean()) if repaired.any() else 0.0,
             },
             "seconds": self.seconds,
         }
+
+
+def _moments(values: np.ndarray) -> dict[str, float]:
+    """Return mean and standard deviation of samples; the latter is 0 for a single push."""
+    return {"mean": float(values.mean()), "std": float(values.std(ddof=1)) if len(values) > 1 else 0.0}

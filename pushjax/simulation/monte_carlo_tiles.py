@@ -1,4 +1,4 @@
-"""One round of a Monte Carlo run: a tile of pushes on every device.
+"""Rounds of a Monte Carlo run: a tile of pushes on every device.
 
 Each device runs its own program for a whole tile. The program is the same whatever the number of devices and processes,
 so the bits do not depend on that number. (XLA optimizes one program that is partitioned over the devices differently
@@ -7,8 +7,12 @@ from a program for a single device: of a million draws, some thousands differed 
 either.
 """
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -25,15 +29,18 @@ from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.surface_distributions import SurfaceDistribution
 from pushjax.friction.table import Table
 from pushjax.geometry.shape import Shape
+from pushjax.simulation.checkpoint import CheckpointError
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand
-from pushjax.simulation.random_rollout import draw, rollout_under_draws
+from pushjax.simulation.random_rollout import Draws, draw, rollout_under_draws
+
+Results = dict[str, Any]  # of pushes: the fields of `MonteCarlo` by name, also the arrays in a checkpoint
 
 
 class Setup(NamedTuple):
     """What all pushes share."""
 
-    key: Array  # raw data of the PRNG key
+    key: Array
     surfaces: SurfaceDistribution
     model: FrictionModel
     shape: Shape  # of the slider
@@ -43,155 +50,122 @@ class Setup(NamedTuple):
     fixtures: Fixtures
 
 
-class PushResults(NamedTuple):
-    """Results of pushes, as the fields of `MonteCarlo` of the same names; also the names of arrays in a checkpoint."""
-
-    pose: Any
-    status: Any
-    mode: Any
-    steps_in_mode: Any
-    failed: Any
-    first_failure: Any
-    stopped: Any
-    friction: Any
-    shrinkage: Any
-    trajectory: Any  # None, unless it is kept
-
-
 class Devices(NamedTuple):
-    """Devices of a run; the devices of the first process come first."""
+    """Devices of a run in this process. As many in each of the other processes take part."""
 
-    count: int  # of all processes
-    local: tuple[Any, ...]  # of this process
-    first: int  # index of the first of `local` among all
-    multiprocess: bool  # whether other processes take part
-    writes: bool  # whether this process writes files
+    local: list[Any]
+    rank: int  # of this process; the first one, 0, writes files
+    processes: int
 
     @staticmethod
     def of(devices: Sequence[Any] | None) -> "Devices":
         """Return the devices of a run, from JAX devices, or from all devices of all processes for None."""
-        all_devices = list(jax.devices() if devices is None else devices)
-        if not all_devices:
+        used, this_process = list(jax.devices() if devices is None else devices), jax.process_index()
+        if not used:
             raise ValueError("devices must not be empty")
-        this_process = jax.process_index()
-        by_process = [[d for d in all_devices if d.process_index == process] for process in range(jax.process_count())]
-        counts = [len(devices) for devices in by_process if devices]
-        if len(counts) not in (1, jax.process_count()) or len(set(counts)) != 1 or not by_process[this_process]:
+        counts = Counter(device.process_index for device in used)
+        if len(counts) not in (1, jax.process_count()) or len(set(counts.values())) > 1 or this_process not in counts:
             raise ValueError("devices must all be of this process, or equally many of each process")
-        multiprocess = len(counts) > 1
-        first = this_process * counts[0] if multiprocess else 0
-        writes = this_process == 0 or not multiprocess
-        return Devices(len(all_devices), tuple(by_process[this_process]), first, multiprocess, writes)
+        local = [device for device in used if device.process_index == this_process]
+        return Devices(local, this_process if len(counts) > 1 else 0, len(counts))
+
+    def gather(self, value: Any) -> np.ndarray:
+        """Return the numbers or arrays `value` of all processes, joined along the first axis."""
+        value = np.atleast_1d(value)
+        return np.asarray(multihost_utils.process_allgather(value, tiled=True)) if self.processes > 1 else value
+
+    def in_all_processes(self, action: Callable[[], Any]) -> Any:
+        """Return `action()`; if one process raises CheckpointError, all do, so that none waits for another."""
+        value, error = None, None
+        try:
+            value = action()
+        except CheckpointError as caught:
+            error = caught
+        if self.gather(int(error is not None)).any():
+            raise error or CheckpointError("checkpoint: another process could not go on; it says why")
+        return value
 
 
-def copy_to_devices(setup: Setup, devices: Devices) -> list[Setup]:
-    """Copy the setup to each device of this process."""
-    return [jax.device_put(setup, device) for device in devices.local]
+@dataclass(frozen=True)
+class Rounds:
+    """A Monte Carlo run, whose pushes are computed in rounds of one tile on each device."""
+
+    n: int
+    tile: int
+    setup: Setup
+    devices: Devices
+    start: np.ndarray  # pose of the slider, (3,) or (n, 3), world, m and rad
+    path: np.ndarray  # (steps + 1, dof) or (n, steps + 1, dof)
+    keep_trajectories: bool
+
+    def compute(self, begin: int) -> Iterator[tuple[int, Results]]:
+        """Yield the results of each round from push `begin` on, after the index at which the round ends."""
+        setups = [jax.device_put(self.setup, device) for device in self.devices.local]
+        size = self.devices.processes * len(setups) * self.tile
+
+        def fetch(*tiles: Array) -> np.ndarray:
+            return self.devices.gather(np.concatenate(tiles))[: self.n - first]
+
+        with ThreadPoolExecutor(len(setups)) as pool:
+            firsts = range(begin, self.n, size)
+            started = (self._start_round(first, setups, pool) for first in firsts)
+            # the devices compute the next round while the host copies this one
+            for first, (results, _) in zip(firsts, pairwise(chain(started, [[]])), strict=True):
+                yield min(first + size, self.n), jax.tree.map(fetch, *results)
+
+    @without_gc
+    def _start_round(self, first: int, setups: list[Setup], pool: Executor) -> list[Results]:
+        """Start the round of push `first`, and return its results on each device without waiting for them."""
+        # A CPU runs one tile in less time than it takes to compile it. This compares `n` with a tile and not with a
+        # round, because the bits must not depend on the number of devices.
+        draw_tile, push_tile = _PROGRAMS[self.n <= self.tile and self.devices.local[0].platform == "cpu"]
+        processes, rank = self.devices.processes, self.devices.rank
+        pushes = np.arange(processes * len(setups) * self.tile, dtype=np.uint32).reshape(processes, -1, self.tile)
+        index = np.minimum(first + pushes[rank], self.n - 1)  # (devices, tile); the last round repeats its last push
+        poses = np.broadcast_to(self.start, (self.n, 3))[index]
+        # a path that all pushes share is sent once to each device
+        paths = [self.path] * len(setups) if self.path.ndim == 2 else self.path[index]
+        steps = self.path.shape[-2] - 1
+        draw_args = [(steps, setup.key, setup.surfaces, setup.model, i) for setup, i in zip(setups, index, strict=True)]
+        shapes = draw_tile.eval_shape(*draw_args[0])
+        # In parallel, because each device compiles its own programs, once. XLA compiles without Python's lock, and JAX
+        # keeps what is traced here for the calls that follow.
+        drawn = [pool.submit(draw_tile, *args) for args in draw_args]
+        push_tile.trace(self.keep_trajectories, setups[0], shapes, paths[0], poses[0])
+        draws = [each.result() for each in drawn]
+        return list(pool.map(partial(push_tile, self.keep_trajectories), setups, draws, paths, poses))
 
 
-def start_round(
-    setups: list[Setup],
-    impl: Any,
-    devices: Devices,
-    indices: np.ndarray,  # of the pushes, (devices, tile), for the devices of all processes; so are poses and paths
-    poses: np.ndarray,  # (devices, tile, 3)
-    paths: np.ndarray,  # (devices, tile, steps + 1, dof), or (steps + 1, dof) for all pushes
-    keep_trajectories: bool,
-    quick: bool,  # whether to compile for a short compile time
-    pool: Executor,  # one thread for each device of this process
-) -> list[PushResults]:
-    """Start one round, and return its results on each device of this process without waiting for them."""
-    programs = _PROGRAMS[quick]
-
-    def start_on(k: int) -> PushResults:
-        setup, device_index = setups[k], devices.first + k
-        path = paths if paths.ndim == 2 else paths[device_index]
-        index, pose, path = jax.device_put((indices[device_index], poses[device_index], path), devices.local[k])
-        shared = setup.shape, setup.hand, setup.solver, setup.table, setup.fixtures
-        draw_args = impl, path.shape[-2] - 1, setup.key, setup.surfaces, setup.model, index
-
-        def push_args(draws) -> tuple:
-            return setup.model.resample_every, keep_trajectories, draws, shared, path, pose
-
-        return programs.push(*push_args(_draw_while_tracing(programs, draw_args, push_args)))
-
-    # in parallel, because each device compiles its own program, once
-    return list(pool.map(start_on, range(len(setups))))
-
-
-def fetch_round(results: list[PushResults], devices: Devices) -> PushResults:
-    """Return the results of a round on the host, from all processes, in the order of the pushes."""
-    local = jax.tree.map(lambda *leaves: np.concatenate([np.asarray(leaf) for leaf in leaves]), *results)
-    if not devices.multiprocess:
-        return local
-    return jax.tree.map(lambda leaf: np.concatenate(list(multihost_utils.process_allgather(leaf))), local)
-
-
-def _draw_tile(impl: Any, steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array):
+def _draw_tile(steps: int, key: Array, surfaces: SurfaceDistribution, model: FrictionModel, index: Array) -> Draws:
     """Sample the friction of each push of a tile; `index` has the indices of the pushes, (tile,)."""
-    root = jax.random.wrap_key_data(key, impl=impl)
-    return jax.vmap(lambda i: draw(jax.random.fold_in(root, i), surfaces, model, steps))(index)
+    return jax.vmap(lambda i: draw(jax.random.fold_in(key, i), surfaces, model, steps))(index)
 
 
-def _push_tile(
-    resample_every: int | None, keep_trajectories: bool, draws, shared: tuple, paths: Array, poses: Array
-) -> PushResults:
+def _push_tile(keep_trajectories: bool, setup: Setup, draws: Draws, paths: Array, poses: Array) -> Results:
     """Make the pushes of a tile; `paths` is (steps + 1, dof) for all of them or (tile, steps + 1, dof)."""
-    axes = (0, None if paths.ndim == 2 else 0, 0)
+    _, _, model, shape, hand, solver, table, fixtures = setup
 
-    def push_once(draws, path, pose) -> PushResults:
-        return _push_results(draws, shared, path, pose, resample_every, keep_trajectories)
+    def push_once(draws: Draws, path: Array, pose: Array) -> Results:
+        push = rollout_under_draws(draws, shape, hand, path, pose, solver, model.resample_every, table, fixtures)
+        in_mode = [jnp.sum(push.mode == mode, axis=0, dtype=jnp.int32) for mode in ContactMode]
+        results = {
+            "pose": push.pose[-1],
+            "status": push.status[-1],
+            "mode": push.mode[-1],
+            "steps_in_mode": jnp.stack(in_mode, axis=-1),
+            "failed": jnp.sum(push.failed, dtype=jnp.int32),
+            "first_failure": push.first_failure.astype(jnp.int32),
+            "stopped": push.stopped.astype(jnp.int32),
+            "friction": draws.friction,
+            "shrinkage": draws.shrinkage,
+        }
+        return results | ({"trajectory": push.pose} if keep_trajectories else {})
 
-    return jax.vmap(push_once, axes)(draws, paths, poses)
-
-
-def _push_results(draws, shared: tuple, path, pose, resample_every, keep_trajectories) -> PushResults:
-    """Make one push, and return its results."""
-    shape, hand, solver, table, fixtures = shared
-    push = rollout_under_draws(draws, shape, hand, path, pose, solver, resample_every, table, fixtures)
-    mode = push.mode
-    return PushResults(
-        push.pose[-1],
-        push.status[-1],
-        mode[-1],
-        jnp.stack([jnp.sum(mode == kind, axis=0, dtype=jnp.int32) for kind in ContactMode], axis=-1),
-        jnp.sum(push.failed, dtype=jnp.int32),
-        push.first_failure.astype(jnp.int32),
-        push.stopped.astype(jnp.int32),
-        draws.friction,
-        draws.shrinkage,
-        push.pose if keep_trajectories else None,
-    )
+    return jax.vmap(push_once, (0, None if paths.ndim == 2 else 0, 0))(draws, paths, poses)
 
 
-class _Programs(NamedTuple):
-    """The two programs of a tile, which JAX compiles at their first call."""
-
-    draw: Any  # of `_draw_tile`
-    push: Any  # of `_push_tile`
-
-    @staticmethod
-    def of(options: dict[str, str | bool | int] | None) -> "_Programs":
-        """Return the programs for options of the compiler."""
-        return _Programs(
-            *(jax.jit(tile, static_argnums=(0, 1), compiler_options=options) for tile in (_draw_tile, _push_tile))
-        )
-
-
-@without_gc
-def _draw_while_tracing(programs: _Programs, draw_args: tuple, push_args: Callable[[Any], tuple]) -> Any:
-    """Return the draws of a tile, and trace the program of the pushes while XLA compiles the other program."""
-    (device,) = draw_args[-1].devices()
-    sharding = jax.sharding.SingleDeviceSharding(device)
-    draws = jax.tree.map(
-        lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding),
-        programs.draw.eval_shape(*draw_args),
-    )
-    # XLA compiles without Python's lock, and JAX keeps what is traced for the call that follows
-    with ThreadPoolExecutor(1) as thread:
-        drawn = thread.submit(programs.draw, *draw_args)
-        programs.push.lower(*push_args(draws))
-        return drawn.result()
-
-
-_PROGRAMS = {False: _Programs.of(None), True: _Programs.of(QUICK_OPTIONS)}
+# JAX compiles the two programs of a tile at their first call, for a short run time or for a short compile time.
+_PROGRAMS = {
+    quick: [jax.jit(tile, static_argnums=0, compiler_options=options) for tile in (_draw_tile, _push_tile)]
+    for quick, options in ((False, None), (True, QUICK_OPTIONS))
+}

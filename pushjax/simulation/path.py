@@ -11,8 +11,8 @@ from pushjax._internal.checks import (
     ArrayLike,
     as_float,
     check_count,
-    check_finite,
     check_shape,
+    checked_array,
     common_dtype,
     concrete,
     in_numpy,
@@ -39,11 +39,8 @@ def line(start: ArrayLike, end: ArrayLike, steps: int) -> Float[Array, "{steps}+
     """
     check_count("steps", steps)
     dtype = common_dtype(start, end)
-    a, b = as_float(start, dtype, "start"), as_float(end, dtype, "end")
-    check_shape("start", a, ("dof",))
-    check_shape("end", b, (a.shape[0],))
-    check_finite("start", a)
-    check_finite("end", b)
+    a = checked_array("start", start, ("dof",), dtype)
+    b = checked_array("end", end, (a.shape[0],), dtype)
     return _line(a, b, steps=steps)
 
 
@@ -77,15 +74,11 @@ def arc(start: ArrayLike, center: ArrayLike, angle: ArrayLike, steps: int) -> Fl
     """
     check_count("steps", steps)
     dtype = common_dtype(start, center, angle)
-    start_array, center_array = as_float(start, dtype, "start"), as_float(center, dtype, "center")
-    angle_array = as_float(angle, dtype, "angle")
-    check_shape("start", start_array, ("dof",))
+    start_array = checked_array("start", start, ("dof",), dtype)
     if start_array.shape[0] < 2:
         raise ValueError(f"start must hold at least x and y; got shape {start_array.shape}")
-    check_shape("center", center_array, (2,))
-    check_shape("angle", angle_array, ())
-    for name, value in (("start", start_array), ("center", center_array), ("angle", angle_array)):
-        check_finite(name, value)
+    center_array = checked_array("center", center, (2,), dtype)
+    angle_array = checked_array("angle", angle, (), dtype)
     return _arc(start_array, center_array, angle_array, steps=steps)
 
 

@@ -6,15 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_count,
-    check_finite,
-    check_non_negative,
-    check_shape,
-    check_type,
-)
+from pushjax._internal.checks import ArrayLike, check_count, check_type, checked_array
 from pushjax._math.vec import Vec2, cos_sin
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.simulation.slider import Slider
@@ -61,12 +53,7 @@ def shared_params(
 
 def checked(name: str, value: ArrayLike, shape: tuple[int, ...], *, signed: bool = False) -> Array:
     """Return an argument as an array that is finite and, unless `signed`, not negative."""
-    array = as_float(value, name=name)
-    check_shape(name, array, shape)
-    check_finite(name, array)
-    if not signed:
-        check_non_negative(name, array)
-    return array
+    return checked_array(name, value, shape, non_negative=not signed)
 
 
 def with_noise(key: PRNGKeyArray, values: Array, deviation: Array | None) -> Array:

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax._internal.record import write_json
 from pushjax.cli import commands
 from pushjax.cli import main as cli
+from pushjax.experiments._record import write_json
 from pushjax.experiments.table2 import conditions as table2
 
 # Tolerances relative to the paper's figure: for the mean over conditions, and for any one condition. Of 50 pushes 35

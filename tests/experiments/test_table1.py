@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax._internal.cell_cache import CellCache
 from pushjax.cli import main as cli
 from pushjax.datasets import LogError, load_mit_pushes_npz
 from pushjax.experiments import table1
+from pushjax.experiments._cell_cache import CellCache
 from pushjax.experiments.table1 import conditions, experiment, methods
 from pushjax.experiments.table1.repeats import noise_floor_mm
 

@@ -11,10 +11,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from pushjax._internal.record import write_json
 from pushjax.datasets import LogError
 from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz, stick_deviation
 from pushjax.experiments import two_finger
+from pushjax.experiments._record import write_json
 from pushjax.experiments.two_finger import predictions
 
 EXACT = 1e-12

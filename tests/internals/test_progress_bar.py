@@ -2,7 +2,7 @@
 
 import time
 
-from pushjax._internal import progress_bar as bars
+from pushjax._internal import progress as bars
 
 
 def lines(capsys) -> list[str]:
@@ -10,8 +10,7 @@ def lines(capsys) -> list[str]:
 
 
 def test_each_tenth_is_a_line(capsys):
-    with bars.progress_bar() as progress:
-        progress.say("counting")
+    with bars.progress_bar("counting") as progress:
         assert lines(capsys) == ["pushjax: counting"]
         for done in range(101):
             progress(done, 100)
@@ -27,15 +26,16 @@ def test_each_tenth_is_a_line(capsys):
 def test_slow_work_is_not_silent(capsys, monkeypatch):
     """Work that reports nothing, as a compilation, has a line after each silence, with how far it has come."""
     monkeypatch.setattr(bars, "SILENCE", 0.05)
-    with bars.progress_bar() as progress:
+    with bars.progress_bar("working") as progress:
         time.sleep(0.3)
         progress.say("counting")
         progress(1, 1000)
         time.sleep(0.3)
     seen = lines(capsys)
     words = seen.index("pushjax: counting")
-    assert words >= 2
-    assert set(seen[:words]) == {"pushjax: working: 0 s"}
+    assert words >= 3
+    assert seen[0] == "pushjax: working"
+    assert set(seen[1:words]) == {"pushjax: working: 0 s"}
     assert len(seen) >= words + 3
     assert set(seen[words + 1 :]) == {"pushjax: counting: 0 s (1 of 1000 done)"}
     time.sleep(0.1)

@@ -19,7 +19,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.experiments.grasps.outcomes import classify, spikes, start_poses
 from pushjax.experiments.grasps.sliders import SLIDERS
 

@@ -16,8 +16,8 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.datasets import LogError, Recordings, load_recordings
+from pushjax.experiments._record import result_record
 from pushjax.experiments._slider_options import expected_surface
 from pushjax.experiments.identify_logs import setting, words
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions

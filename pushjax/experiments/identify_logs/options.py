@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pushjax._internal.options import cli_option
+from pushjax.experiments._cli_option import cli_option
 
 Meters = Annotated[float | None, cli_option("M")]
 

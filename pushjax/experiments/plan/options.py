@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pushjax._internal.options import cli_option
+from pushjax.experiments._cli_option import cli_option
 
 Pose = tuple[float, float, float]
 FIXTURES = "wall@X,Y,ANGLE of its normal, or SHAPE@X,Y,THETA with a shape as in --shape"

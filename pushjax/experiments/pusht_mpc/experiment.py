@@ -16,7 +16,7 @@ from scipy.stats import beta
 
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
+from pushjax.experiments._record import result_record
 from pushjax.experiments.pusht_mpc import player, setting
 
 PUBLISHED = (

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 import pushjax as pj
-from pushjax._internal.cell_cache import CellCache
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.experiments._cell_cache import CellCache
+from pushjax.experiments._record import result_record
 from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table1.conditions import (
     MODELS,

@@ -22,8 +22,8 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.datasets import PushLog
+from pushjax.experiments._record import result_record
 from pushjax.experiments._tables import bootstrapped_ci95
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (

@@ -24,10 +24,10 @@ import jax
 import numpy as np
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import result_record
 from pushjax.datasets import LogError
 from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz
 from pushjax.datasets.two_finger_logs import load_two_finger_logs
+from pushjax.experiments._record import result_record
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
 from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, object_scores

@@ -25,17 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_count,
-    check_finite,
-    check_non_negative,
-    check_positive,
-    check_shape,
-    check_type,
-    concrete,
-)
+from pushjax._internal.checks import ArrayLike, as_float, check_count, check_shape, check_type, checked_array, concrete
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import wrap_to_pi
 from pushjax.friction.friction_model import FrictionModel
@@ -149,11 +139,8 @@ class FrictionFilter(eqx.Module):
         self.slider, self.hand, self.model, self.samples = slider, hand, model, samples
         numbers = {"effective": effective, "error": error, "relative_error": relative_error}
         for name, value in numbers.items():
-            number = as_float(value, slider.surface.length.dtype, name)
-            check_shape(name, number, ())
-            check_finite(name, number)
-            (check_non_negative if name == "relative_error" else check_positive)(name, number)
-            setattr(self, name, number)
+            sign = {"non_negative" if name == "relative_error" else "positive": True}
+            setattr(self, name, checked_array(name, value, (), slider.surface.length.dtype, **sign))
         known = concrete(self.effective)
         if known is not None and not 1 <= known <= samples:
             raise ValueError(f"effective must be from 1 to the number of samples, {samples}; got {effective!r}")

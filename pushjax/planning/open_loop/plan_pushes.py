@@ -24,16 +24,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
+from pushjax._internal.checks import ArrayLike, check_count, check_type, checked_array
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
-from pushjax.geometry.se2_numpy import to_body
 from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
 from pushjax.planning.goal import Goal
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE, Obstacles
 from pushjax.planning.open_loop.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
 from pushjax.planning.open_loop.push_sequence import PushSequence
+from pushjax.planning.se2_numpy import to_body
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
 from pushjax.planning.transits.between_pushes import TIGHT, transits_between
 from pushjax.planning.transits.roadmap import Transit, TransitStatus
@@ -271,9 +271,7 @@ def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarra
         return None
     if not _is_one_finger(problem.hand):
         raise ValueError("finger is for a hand of one finger; this hand has another configuration")
-    given = as_float(finger, problem.start.dtype, "finger")
-    check_shape("finger", given, (2,))
-    check_finite("finger", given)
+    given = checked_array("finger", finger, (2,), problem.start.dtype)
     center, radius = np.asarray(given, float), problem.hand.radius[0]
     in_body = to_body(np.asarray(mean_pose(problem.start), float), center)
     from_slider = float(signed_distances(outline_vertices(problem.slider.shape), in_body) - radius)

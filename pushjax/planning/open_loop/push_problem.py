@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, check_shape, common_dtype
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, checked_array, common_dtype
 from pushjax._internal.jit import jit, quick_jit
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.metrics import mean_pose
@@ -238,9 +238,7 @@ def push_outcomes(
     """
     check_slider_and_hand(slider, hand)
     problem = push_problem(key, slider, hand, start, model, samples, fixtures, None)
-    paths = as_float(path, problem.start.dtype, "path")
-    check_shape("path", paths, ("pushes", "steps + 1", hand.dof))
-    check_finite("path", paths)
+    paths = checked_array("path", path, ("pushes", "steps + 1", hand.dof), problem.start.dtype)
     return simulated(paths, problem)
 
 

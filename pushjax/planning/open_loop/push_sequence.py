@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_positive, check_shape
+from pushjax._internal.checks import ArrayLike, check_count, checked_array
 from pushjax._math.vec import Vec2, Vec3
 from pushjax.geometry import se2
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
@@ -70,14 +70,9 @@ class PushSequence(eqx.Module):
         if not isinstance(bends, (int, np.integer)) or isinstance(bends, bool) or bends < 0:
             raise ValueError(f"bends must be a whole number, at least 0; got {bends!r}")
         self.count, self.steps, self.bends = int(count), int(steps), int(bends)
-        self.length, self.clearance = as_float(length, name="length"), as_float(clearance, name="clearance")
-        for name in ("length", "clearance"):
-            check_shape(name, getattr(self, name), ())
-            check_finite(name, getattr(self, name))
-            check_positive(name, getattr(self, name))
-        self.opening = as_float(opening, name="opening")
-        check_shape("opening", self.opening, ("numbers",))
-        check_finite("opening", self.opening)
+        self.length = checked_array("length", length, (), positive=True)
+        self.clearance = checked_array("clearance", clearance, (), positive=True)
+        self.opening = checked_array("opening", opening, ("numbers",))
 
     @property
     def size(self) -> int:

@@ -22,16 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_count,
-    check_finite,
-    check_key,
-    check_positive,
-    check_shape,
-    common_dtype,
-)
+from pushjax._internal.checks import ArrayLike, check_count, check_key, check_positive, checked_array, common_dtype
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
 from pushjax.friction.friction_model import FrictionModel
@@ -78,12 +69,9 @@ class Squeezes(eqx.Module):
         angles: int = 24,
         offsets: ArrayLike = (0.0,),
     ):
-        self.opening, self.closed = as_float(opening, name="opening"), as_float(closed, name="closed")
-        self.offsets = as_float(offsets, name="offsets")
-        for name, shape in (("opening", ()), ("closed", ()), ("offsets", ("offsets",))):
-            check_shape(name, getattr(self, name), shape)
-            check_finite(name, getattr(self, name))
-        check_positive("closed", self.closed)
+        self.opening = checked_array("opening", opening, ())
+        self.closed = checked_array("closed", closed, (), positive=True)
+        self.offsets = checked_array("offsets", offsets, ("offsets",))
         if not self.opening > self.closed:
             raise ValueError(f"opening must be larger than closed, {float(self.closed)} m; got {float(self.opening)}")
         check_count("offsets", len(self.offsets))
@@ -262,9 +250,7 @@ def squeeze_outcomes(
         TypeError: For arguments of other types.
     """
     poses = _checked(key, slider, hand, belief)
-    placed = as_float(jaws, name="jaws")
-    check_shape("jaws", placed, ("squeezes", 3))
-    check_finite("jaws", placed)
+    placed = checked_array("jaws", jaws, ("squeezes", 3))
     draws = draw_friction(key, slider.surface, model, len(poses))
     reached, all_held, all_failed = [poses], [], []
     for jaw in np.asarray(placed, float):
@@ -283,9 +269,7 @@ def _checked(key: PRNGKeyArray, slider: Slider, hand: Hand, belief: ArrayLike) -
     check_slider_and_hand(slider, hand)
     if hand.dof != 4:
         raise ValueError(f"hand must have the configuration x, y, theta, opening; this one has {hand.dof} coordinates")
-    poses = as_float(belief, common_dtype(slider, hand), "belief")
-    check_shape("belief", poses, ("poses", 3))
-    check_finite("belief", poses)
+    poses = checked_array("belief", belief, ("poses", 3), common_dtype(slider, hand))
     check_count("number of poses in belief", len(poses))
     return np.asarray(poses, float)
 

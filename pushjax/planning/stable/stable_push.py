@@ -20,11 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
+from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_type, checked_array
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon import Polygon
-from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.planning.friction_samples import draw_friction
+from pushjax.planning.se2_numpy import compose, inverse
 from pushjax.planning.stable.dubins import DubinsPath, dubins
 from pushjax.planning.stable.line_contact import LineContact, Turn, hand_front, line_contacts, tightest_turn
 from pushjax.simulation.hand import Hand
@@ -212,10 +212,7 @@ def shortest_push(
     """
     ends = []
     for name, value in (("start", start), ("goal", goal)):
-        pose = as_float(value, name=name)
-        check_shape(name, pose, (3,))
-        check_finite(name, pose)
-        ends.append(np.asarray(pose, np.float64))
+        ends.append(np.asarray(checked_array(name, value, (3,)), np.float64))
     if steps is not None:
         check_count("steps", steps)
         if steps < 3:

@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.__main__ import main as benchmarks
 from benchmarks.robot import causes
-from pushjax._internal.cell_cache import CellCache
 from pushjax.cli.main import main as pushjax
 from pushjax.experiments import table1
+from pushjax.experiments._cell_cache import CellCache
 
 RUNS = {
     "table1-causes": (causes, benchmarks, ["table1_causes"]),

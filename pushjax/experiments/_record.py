@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pushjax._internal.warn import warn
+from pushjax._internal.checks import warn
 
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "matplotlib")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._internal.record import write_json
+from pushjax.experiments._record import write_json
 
 Labels = dict[str, str]
 
