@@ -120,6 +120,8 @@ def in_search_tiles(search: Callable[[Any], Any], count: Int[Array, ""], problem
     """
     size = jax.tree.leaves(blank)[0].shape[-1]
     tile = min(tile_size(SEARCH_TILE), size)
+    if tile == size:  # without a loop, which takes as long as the search of a small batch
+        return jax.lax.cond(count > 0, search, lambda _: blank, problem)
 
     def next_tile(state: tuple[Array, Any]) -> tuple[Array, Any]:
         k, results = state  # slices that would end beyond the batch begin earlier

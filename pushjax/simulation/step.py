@@ -196,9 +196,6 @@ def compute_step(
         found = _map_bodies(partial(part.contacts_of, frame, fraction), motions, fixtures, features, before.at_start)
         contacts, active, at_start, near = zip(*found, strict=True)
         contacts, active = joined(*contacts), jnp.concatenate(active)
-        holds = jnp.asarray(len(motions) > 1)
-        for k, is_near in enumerate(near):
-            holds &= is_near if k < len(motions) else ~is_near
         used_urgency, working, guess = before.urgency, given_set, before.solution.best
         if fixtures and used_urgency is not None:
             # in the first try, contacts are selected by how far the step would press them into a slider at rest
@@ -218,7 +215,7 @@ def compute_step(
             frame.angle,
             *jax.lax.stop_gradient((contacts.point, contacts.normal)),
             at_start,
-            holds,
+            _holds(near, len(motions)),
             is_long,
             used_urgency,
             None if urgency is None else violations(contacts, active, solution),
@@ -229,6 +226,14 @@ def compute_step(
     moved_pose = start.moved(last.middle, last.solution.twist, last.angle).pose
     status = _status(last, motions, fixtures, overlap_before, form.length)
     return _keep_pose_unless_moving(last, moved_pose, pose, status), last
+
+
+def _holds(near: tuple[Bool[Array, ""], ...], num_fingers: int) -> Bool[Array, ""]:
+    """Return whether all of several fingers, and no fixture, are near enough to hold a jammed slider."""
+    holds = jnp.asarray(num_fingers > 1)
+    for k, is_near in enumerate(near):
+        holds &= is_near if k < num_fingers else ~is_near
+    return holds
 
 
 def _status(
