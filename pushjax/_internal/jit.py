@@ -14,6 +14,7 @@ from typing import Any, ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 try:
     from jax.extend.core import get_opaque_trace_state
@@ -41,7 +42,7 @@ def outside_trace() -> bool:
 
 def is_compiling() -> bool:
     """Return whether the caller is part of a program that is compiled as a whole, inside `jit` or a loop of JAX."""
-    return isinstance(jnp.zeros(()), jax.core.Tracer)
+    return isinstance(jnp.zeros(()), Tracer)
 
 
 def eager_context() -> AbstractContextManager[Any]:

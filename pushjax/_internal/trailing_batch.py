@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -55,7 +56,7 @@ def _batch_shape(leaves: Sequence[Array], ranks: Sequence[int]) -> tuple[int, ..
     return jnp.broadcast_shapes(*(leaf.shape[rank:] for leaf, rank in zip(leaves, ranks, strict=True)))
 
 
-def _merged(chosen: Sequence[bool], yes: Iterable[Array], no: Iterable[Array]) -> list[Array]:
+def _merged(chosen: Sequence[bool], yes: Iterable[Any], no: Iterable[Any]) -> list[Any]:
     """Return one list of the leaves that are chosen, and of the others."""
     yes, no = iter(yes), iter(no)
     return [next(yes) if is_chosen else next(no) for is_chosen in chosen]
@@ -76,7 +77,7 @@ def _batching_rule(leaves, axes, *, function, ranks):
 
 
 def _jvp_rule(primals, tangents, *, function, ranks):
-    varies = [type(tangent) is not ad.Zero for tangent in tangents]
+    varies = [type(tangent) is not ad.Zero and tangent.dtype != jax.dtypes.float0 for tangent in tangents]
     fixed = [not v for v in varies]
     count = len(primals)
 
@@ -118,7 +119,7 @@ def _call(*leaves, function, ranks):
 
 primitive.def_impl(_call)
 primitive.def_abstract_eval(
-    lambda *leaves, function, ranks: [jax.core.ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(function, *leaves)]
+    lambda *leaves, function, ranks: [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(function, *leaves)]
 )
 batching.primitive_batchers[primitive] = _batching_rule
 ad.primitive_jvps[primitive] = _jvp_rule

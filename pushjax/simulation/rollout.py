@@ -14,6 +14,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from pushjax._internal.autodiff import save_search_results
@@ -188,7 +189,7 @@ def _rollout_with_padding(slider, hand, path, *rest) -> Trajectory:
     steps, size = len(path) - 1, MIN_SIZE
     while size < steps:
         size *= SIZE_RATIO
-    xp = jnp if isinstance(path, jax.core.Tracer) else np  # with NumPy nothing is compiled for the padding
+    xp = jnp if isinstance(path, Tracer) else np  # with NumPy nothing is compiled for the padding
     padded = jnp.asarray(xp.concatenate([path, xp.broadcast_to(path[-1], (size - steps, path.shape[1]))]))
     return _first_steps(_rollout(slider, hand, padded, *rest, num_steps=jnp.asarray(steps)), steps)
 

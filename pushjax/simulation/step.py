@@ -298,6 +298,6 @@ def _keep_pose_unless_moving(last: Stage, moved_pose: Vec3, pose: Vec3, status: 
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
     pose, solution = tree_where(moves, moved_pose, pose), last.solution
     vectors = solution.twist, solution.wrench, solution.force, last.point, last.normal
-    vectors = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), vectors)
+    twist, wrench, force, point, normal = jax.tree.map(lambda entry: jnp.where(moves, entry, 0.0), vectors)
     mode = jnp.where(moves, solution.mode, ContactMode.SEPARATED).astype(jnp.int8)
-    return StepRecord(pose, *vectors, mode, status, jnp.zeros_like(pose.x))
+    return StepRecord(pose, twist, wrench, force, point, normal, mode, status, jnp.zeros_like(pose.x))
