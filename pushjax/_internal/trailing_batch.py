@@ -69,7 +69,7 @@ def _chosen(chosen: Sequence[bool], leaves: Iterable[Any]) -> list[Any]:
 
 def _batching_rule(leaves, axes, *, function, ranks):
     moved = [
-        jnp.expand_dims(leaf, -1) if axis is batching.not_mapped else jnp.moveaxis(leaf, axis, -1)
+        jnp.expand_dims(leaf, -1) if axis is None else jnp.moveaxis(leaf, axis, -1)
         for leaf, axis in zip(leaves, axes, strict=True)
     ]
     results = primitive.bind(*moved, function=function, ranks=ranks)
