@@ -40,8 +40,8 @@ def outside_trace() -> bool:
     return get_opaque_trace_state() == NO_TRACE
 
 
-def is_compiling() -> bool:
-    """Return whether the caller is part of a program that is compiled as a whole, inside `jit` or a loop of JAX."""
+def is_staging() -> bool:
+    """Return whether the caller becomes part of a program: inside `jit`, `checkpoint`, `eval_shape`, a loop of JAX."""
     return isinstance(jnp.zeros(()), Tracer)
 
 

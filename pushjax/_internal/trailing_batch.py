@@ -19,15 +19,15 @@ from jaxtyping import Array
 
 Function = Callable[..., list[Array]]  # of the leaves
 
-primitive = Primitive("with_batch_last")
-primitive.multiple_results = True
+_with_batch_last_p = Primitive("with_batch_last")
+_with_batch_last_p.multiple_results = True
 
 
 def with_batch_last(function: Callable[..., Any], *args: Any) -> Any:
-    """Return `function(*args)`, a pytree of floats, for pytrees of arrays of one example.
+    """Return `function(*args)`, a pytree of arrays of floats, for pytrees of arrays of one example.
 
     `function` must also take arrays with more axes at the end, of which some have length one, and must not close over
-    traced arrays.
+    traced arrays. It is traced in each call, so this is for programs that are compiled as a whole.
     """
     arrays, others = eqx.partition(args, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
@@ -35,20 +35,28 @@ def with_batch_last(function: Callable[..., Any], *args: Any) -> Any:
     def results_of(*leaves: Array) -> Any:
         return function(*eqx.combine(jax.tree.unflatten(structure, leaves), others))
 
-    result_structure = jax.tree.structure(jax.eval_shape(results_of, *leaves))
-    results = _bind(lambda *leaves: jax.tree.leaves(results_of(*leaves)), leaves, [leaf.ndim for leaf in leaves])
+    shapes, result_structure = jax.tree.flatten(jax.eval_shape(results_of, *leaves))
+    ranks, result_ranks = [leaf.ndim for leaf in leaves], [shape.ndim for shape in shapes]
+    results = _bind(lambda *leaves: jax.tree.leaves(results_of(*leaves)), leaves, ranks, result_ranks)
     return jax.tree.unflatten(result_structure, results)
 
 
-def _bind(function: Function, leaves: Sequence[Array], ranks: Sequence[int]) -> list[Array]:
-    """Bind the primitive to a function of arrays that have these ranks in one example."""
+def _bind(
+    function: Function, leaves: Sequence[Array], ranks: Sequence[int], result_ranks: Sequence[int]
+) -> list[Array]:
+    """Bind the primitive to a function whose arrays and results have these ranks in one example."""
 
     @jax.jit  # traced once, for the shapes and for the program
     def broadcast(*leaves: Array) -> list[Array]:
         batch = _batch_shape(leaves, ranks)
-        return [jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch)) for x in function(*leaves)]
 
-    return primitive.bind(*leaves, function=broadcast, ranks=tuple(ranks))
+        def of_batch(x: Array, rank: int) -> Array:
+            missing = (1,) * (rank + len(batch) - x.ndim)  # axes of a result that does not depend on the batch
+            return jnp.broadcast_to(x.reshape(*x.shape, *missing), (*x.shape[:rank], *batch))
+
+        return [of_batch(x, rank) for x, rank in zip(function(*leaves), result_ranks, strict=True)]
+
+    return _with_batch_last_p.bind(*leaves, function=broadcast, ranks=tuple(ranks), result_ranks=tuple(result_ranks))
 
 
 def _batch_shape(leaves: Sequence[Array], ranks: Sequence[int]) -> tuple[int, ...]:
@@ -67,16 +75,16 @@ def _chosen(chosen: Sequence[bool], leaves: Iterable[Any]) -> list[Any]:
     return [leaf for leaf, is_chosen in zip(leaves, chosen, strict=True) if is_chosen]
 
 
-def _batching_rule(leaves, axes, *, function, ranks):
+def _batching_rule(leaves, axes, **parameters):
     moved = [
         jnp.expand_dims(leaf, -1) if axis is None else jnp.moveaxis(leaf, axis, -1)
         for leaf, axis in zip(leaves, axes, strict=True)
     ]
-    results = primitive.bind(*moved, function=function, ranks=ranks)
+    results = _with_batch_last_p.bind(*moved, **parameters)
     return results, [x.ndim - 1 for x in results]
 
 
-def _jvp_rule(primals, tangents, *, function, ranks):
+def _jvp_rule(primals, tangents, *, function, ranks, result_ranks):
     varies = [type(tangent) is not ad.Zero and tangent.dtype != jax.dtypes.float0 for tangent in tangents]
     fixed = [not v for v in varies]
     count = len(primals)
@@ -90,11 +98,12 @@ def _jvp_rule(primals, tangents, *, function, ranks):
         at, along = zip(*pairs, strict=True)
         return jax.jvp(lambda *varied: function(*_merged(varies, varied, constants)), at, along)[1]
 
-    results = primitive.bind(*primals, function=function, ranks=ranks)
-    return results, _bind(change, [*primals, *_chosen(varies, tangents)], [*ranks, *_chosen(varies, ranks)])
+    results = _with_batch_last_p.bind(*primals, function=function, ranks=ranks, result_ranks=result_ranks)
+    arguments, all_ranks = [*primals, *_chosen(varies, tangents)], [*ranks, *_chosen(varies, ranks)]
+    return results, _bind(change, arguments, all_ranks, result_ranks)
 
 
-def _transpose_rule(cotangents, *leaves, function, ranks):
+def _transpose_rule(cotangents, *leaves, function, ranks, result_ranks):
     is_linear = [ad.is_undefined_primal(leaf) for leaf in leaves]
     shapes = [leaf.aval for leaf in _chosen(is_linear, leaves)]
     known = _chosen([not linear for linear in is_linear], leaves)
@@ -109,19 +118,19 @@ def _transpose_rule(cotangents, *leaves, function, ranks):
         transposed = jax.linear_transpose(lambda *linear: function(*_merged(is_linear, linear, constants)), *linear)
         return list(transposed([jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch)) for x in cotangents]))
 
-    results = _bind(backward, all_leaves, ranks_now)
+    results = _bind(backward, all_leaves, ranks_now, [len(aval.shape) for aval in shapes])
     return _merged(is_linear, results, [None] * len(known))
 
 
-def _call(*leaves, function, ranks):
+def _call(*leaves, function, **_):
     return function(*leaves)
 
 
-primitive.def_impl(_call)
-primitive.def_abstract_eval(
-    lambda *leaves, function, ranks: [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(function, *leaves)]
+_with_batch_last_p.def_impl(_call)
+_with_batch_last_p.def_abstract_eval(
+    lambda *leaves, function, **_: [ShapedArray(x.shape, x.dtype) for x in jax.eval_shape(function, *leaves)]
 )
-batching.primitive_batchers[primitive] = _batching_rule
-ad.primitive_jvps[primitive] = _jvp_rule
-ad.primitive_transposes[primitive] = _transpose_rule
-mlir.register_lowering(primitive, mlir.lower_fun(_call, multiple_results=True))
+batching.primitive_batchers[_with_batch_last_p] = _batching_rule
+ad.primitive_jvps[_with_batch_last_p] = _jvp_rule
+ad.primitive_transposes[_with_batch_last_p] = _transpose_rule
+mlir.register_lowering(_with_batch_last_p, mlir.lower_fun(_call, multiple_results=True))

@@ -58,17 +58,20 @@ def update_if(condition: Bool[Array, ""], update: Callable, state):
     return jax.lax.while_loop(lambda loop_state: loop_state[0], run_update, (condition, state))[1]
 
 
-def skipped_unless(is_needed: Callable[..., Bool[Array, ""]], body: Callable, state: Any, x: Any) -> Callable:
-    """Return the body of a scan that leaves the state, and gives zeros, where it is not needed by any of a batch."""
+def skippable(is_needed: Callable[..., Bool[Array, ""]], body: Callable, state: Any, x: Any) -> Callable:
+    """Return the body of a scan, which leaves the state and gives zeros where none of a batch needs it.
+
+    `state` and `x` are examples of its arguments.
+    """
     traced_once = jax.jit(body)  # for the shapes and for the loop
     shapes = jax.eval_shape(traced_once, state, x)[1]
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-    def skippable(state: Any, x: Any) -> Any:
-        needed = eqxi.unvmap_any(is_needed(state, x))
-        return jax.lax.cond(needed, traced_once, lambda state, _: (state, blank), state, x)
+    def body_or_blank(state: Any, x: Any) -> Any:
+        any_needs_it = eqxi.unvmap_any(is_needed(state, x))
+        return jax.lax.cond(any_needs_it, traced_once, lambda state, _: (state, blank), state, x)
 
-    return skippable
+    return body_or_blank
 
 
 def tree_where(condition, yes, no):

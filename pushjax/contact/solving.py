@@ -106,27 +106,25 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
 def _solve_jvp(primals, tangents):
     (arguments, settings), change = primals, tangents[0][0]
     answer = search_result(_solve(arguments, settings))
-    wants_margin = settings[1] and len(answer.mode) > 1
-    known = jax.lax.stop_gradient(answer)
+    near, known = partial(_near, *settings), jax.lax.stop_gradient(answer)
     _, (solution, margin) = eqx.filter_jvp(
-        lambda problem: with_batch_last(partial(_near, wants_margin), _arrays(problem), known),
-        (arguments[0],),
-        (change,),
+        lambda problem: with_batch_last(near, _arrays(problem), known), (arguments[0],), (change,)
     )
     unchanged = jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if eqx.is_inexact_array(leaf) else None, answer)
     return answer, unchanged._replace(solution=solution, margin=margin)
 
 
-def _near(wants_margin: bool, given: ContactArrays, answer: Answer) -> tuple[Solution, Array]:
+def _near(solver: ContactSolver, margin: bool, given: ContactArrays, answer: Answer) -> tuple[Solution, Array]:
     """The solution and the margin as functions that JAX can differentiate; their values are right to roundoff."""
+    if isinstance(solver, Frictionless):
+        given = given._replace(friction=jnp.zeros_like(given.friction))
     scaled = nondimensionalize(given)
     solved, twist = answer.status == Status.MOVING, answer.solution.twist
     near = differentiable_solution(scaled, answer.best, solved, answer.loaded, answer.indeterminate, answer.dual, twist)
-    margin = jnp.zeros_like(scaled.unit)
-    if wants_margin:
-        power = squeeze_power(scaled, answer.squeeze_edges) * scaled.unit
-        margin = jnp.where(jnp.isfinite(answer.margin), -power, margin)
-    return jax.tree.map(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), (near, margin))
+    power = jnp.zeros_like(scaled.unit)
+    if margin and scaled.count > 1:
+        power = jnp.where(jnp.isfinite(answer.margin), squeeze_power(scaled, answer.squeeze_edges) * scaled.unit, power)
+    return jax.tree.map(lambda value: jnp.where(jnp.isfinite(value), value, 0.0), (near, -power))
 
 
 def _arrays(problem: Problem) -> ContactArrays:

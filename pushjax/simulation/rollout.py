@@ -19,8 +19,8 @@ from jaxtyping import Array
 
 from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
-from pushjax._internal.jit import is_compiling, quick_jit
-from pushjax._internal.xla import decide, skipped_unless, tree_where
+from pushjax._internal.jit import is_staging, quick_jit
+from pushjax._internal.xla import decide, skippable, tree_where
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
@@ -173,7 +173,7 @@ def rollout(
     fixed = checked_fixtures(fixtures, start.dtype)
     check_start_among_fixtures(slider, fixed, start)
     checked = slider, hand, path_array, start, mu, solver, checked_table(table, start.dtype), fixed
-    return _rollout(*checked) if is_compiling() else _rollout_with_padding(*checked)
+    return _rollout(*checked) if is_staging() else _rollout_with_padding(*checked)
 
 
 @quick_jit
@@ -321,7 +321,7 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
     motions = push.motions_at(first, push.friction_at(first, start)[1])
     before = start, max_penetration(push.outline, motions, start, 0.0)
     if push.num_steps is not None:
-        body = skipped_unless(lambda _, step: step < push.num_steps, body, before, first)
+        body = skippable(lambda _, step: step < push.num_steps, body, before, first)
     body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
     _, (records, is_too_long) = jax.lax.scan(body, before, jnp.arange(push.steps, dtype=jnp.int32))
     failed = resting(records, records.pose)._replace(overlap=records.overlap)

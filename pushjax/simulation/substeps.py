@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import save_search_results
-from pushjax._internal.xla import compute_once, decide, skipped_unless, tree_where
+from pushjax._internal.xla import compute_once, decide, skippable, tree_where
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import Status
@@ -87,18 +87,22 @@ class PushState(NamedTuple):
     guess: EdgeSet | None  # cone edges that carried the force last; None with one contact
 
 
+class Outcome(NamedTuple):
+    """What a step leaves."""
+
+    pose: Vec3  # of the slider after the step, world
+    twist: Vec3  # over the step, body frame
+    status: Int[Array, ""]
+    overlap: Scalar  # as in `StepRecord`
+    source: Int[Array, ""]  # number of the trial that wrench, forces and contacts are those of, or -1 for none
+
+
 class StepEnd(NamedTuple):
     """How a step ended, if a trial ended one."""
 
     ended: Bool[Array, ""]
     step: Int[Array, ""]  # index
-    pose: Vec3  # of the slider after the step, world
-    twist: Vec3  # over the step, body frame
-    status: Int[Array, ""]
-    overlap: Scalar  # as in `StepRecord`
-    source: Int[
-        Array, ""
-    ]  # number of the trial whose wrench, forces and contacts are those of the step, or -1 for none
+    outcome: Outcome
 
 
 class DividedPush(NamedTuple):
@@ -190,7 +194,7 @@ def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[StepRecord, Sca
             ongoing &= number < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
         return ongoing
 
-    trial = skipped_unless(is_ongoing, push.trial, initial_state, numbers[0])
+    trial = skippable(is_ongoing, push.trial, initial_state, numbers[0])
     # Reverse mode keeps only poses and what searches found, and computes a step again: writing everything that a step
     # computes to memory and reading it back took twice as long.
     trial = jax.checkpoint(trial, prevent_cse=False, policy=save_search_results)
@@ -205,7 +209,7 @@ def _records_of_steps(records: StepRecord, ends: StepEnd, steps: int, last: Push
     trial_of_step = jnp.full(steps, NO_TRIAL).at[step].set(numbers, mode="drop")
     stop_status = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED).astype(jnp.int8)
     zero = jax.tree.map(jnp.zeros_like, last.twist)
-    unfinished = last.pose, zero, stop_status, last.overlap, jnp.full_like(last.source, NO_TRIAL)
+    unfinished = Outcome(last.pose, zero, stop_status, last.overlap, jnp.full_like(last.source, NO_TRIAL))
 
     def at(number: Int[Array, "steps"], rows: Any, otherwise: Any) -> Any:
         """Return the rows of these trials; another value where there is none."""
@@ -216,9 +220,9 @@ def _records_of_steps(records: StepRecord, ends: StepEnd, steps: int, last: Push
 
         return jax.tree.map(of, rows, otherwise)
 
-    pose, twist, status, overlap, source = at(trial_of_step, ends[2:], unfinished)
-    records = at(source, records, jax.tree.map(lambda _: 0, records))
-    return records._replace(pose=pose, twist=twist, status=status, overlap=overlap)
+    outcome = at(trial_of_step, ends.outcome, unfinished)
+    records = at(outcome.source, records, jax.tree.map(lambda _: 0, records))
+    return records._replace(pose=outcome.pose, twist=outcome.twist, status=outcome.status, overlap=outcome.overlap)
 
 
 class Decision(NamedTuple):
@@ -298,10 +302,10 @@ def _next_state(
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
     status = jnp.where(source >= 0, Status.MOVING, Status.FREE)
     still, none = jax.tree.map(jnp.zeros_like, twist), jnp.full_like(source, NO_TRIAL)
-    passed = pose, twist, status.astype(jnp.int8), depth, source
-    failed = state.origin, still, decision.reason, depth, none
-    stopped = state.pose, state.twist, record.status, state.overlap, state.source
-    end = StepEnd(ends, state.step, *tree_where(stops, stopped, tree_where(accepted, passed, failed)))
+    passed = Outcome(pose, twist, status.astype(jnp.int8), depth, source)
+    failed = Outcome(state.origin, still, decision.reason, depth, none)
+    stopped = Outcome(state.pose, state.twist, record.status, state.overlap, state.source)
+    outcome = tree_where(stops, stopped, tree_where(accepted, passed, failed))
 
     # the next trial: where it starts, and how large its part is
     continues = decide(accepted & ~ends, pose.x)
@@ -311,8 +315,8 @@ def _next_state(
     smaller = jnp.where(again, state.part, jnp.where(jams, JAM_PART, state.part / 2))
     larger = jnp.where(state.halved | ~speed.allowed_in_double, state.part, 2 * state.part)
     next_state = PushState(
-        pose=tree_where(ends, end.pose, tree_where(continues, pose, state.pose)),
-        origin=tree_where(ends, end.pose, state.origin),
+        pose=tree_where(ends, outcome.pose, tree_where(continues, pose, state.pose)),
+        origin=tree_where(ends, outcome.pose, state.origin),
         step=jnp.where(ends, jnp.where(stops, steps, state.step + 1), state.step),
         done=jnp.where(restarts, 0.0, jnp.where(accepted, done, state.done)),
         part=jnp.where(restarts, 1.0, jnp.where(accepted, jnp.minimum(larger, 1 - done), smaller)),
@@ -329,7 +333,9 @@ def _next_state(
         source=jnp.where(ends, NO_TRIAL, jnp.where(continues, source, state.source)),
         guess=None if state.guess is None else tree_where(accepted & moves, last_stage.solution.best, state.guess),
     )
-    return jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state), end
+    return jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state), StepEnd(
+        ends, state.step, outcome
+    )
 
 
 def hand_stops(status: Array) -> Bool[Array, "..."]:

@@ -192,7 +192,9 @@ def _begin(*args) -> _Progress:
 def _advance(progress: _Progress, *args) -> _Progress:
     """Try the next part of a step, and note the status of the step if that ended it."""
     state, (_, end) = _divided(*args)[0].trial(progress.push, progress.trials_left)
-    status = progress.status.at[jnp.where(end.ended, end.step, len(progress.status))].set(end.status, mode="drop")
+    status = progress.status.at[jnp.where(end.ended, end.step, len(progress.status))].set(
+        end.outcome.status, mode="drop"
+    )
     return _Progress(state, progress.trials_left - 1, status)
 
 

@@ -57,3 +57,27 @@ def test_only_for_ellipsoids():
     quartic = pj.Quartic([1.0, *[0.0] * 14], 0.03)
     with pytest.raises(ValueError, match="Frictionless needs an ellipsoid; the surface has degree 4"):
         pj.solve_contacts(quartic, contacts, solver=Frictionless())
+
+
+def test_derivatives_are_those_without_friction():
+    """The coefficients of friction, which the solver ignores, have no influence on derivatives."""
+    with jax.enable_x64(True):
+        point, normal = np.array([[-0.03, 0.01], [-0.03, -0.02]]), np.array([[1.0, 0.0], [1.0, 0.0]])
+        surface = pj.Ellipsoid(np.diag([1.0, 1.0, 1.3]), 0.03)
+
+        @jax.jit
+        def twist(displacement, mu):
+            contacts = pj.Contacts(point, normal, displacement, mu)
+            return pj.solve_contacts(surface, contacts, solver=Frictionless()).twist
+
+        at, mu = jnp.array([[1e-3, 2e-4], [1.2e-3, -1e-4]]), jnp.array([0.3, 0.3])
+        by_displacement, by_friction = jax.jacrev(twist, argnums=(0, 1))(at, mu)
+        forward = jax.jacfwd(twist)(at, mu)
+        differences = np.zeros((3, 2, 2))
+        for i, k in np.ndindex(2, 2):
+            change = np.zeros((2, 2))
+            change[i, k] = 1e-8
+            differences[:, i, k] = (twist(at + change, mu) - twist(at - change, mu)) / 2e-8
+        assert (np.asarray(by_friction) == 0).all()
+    np.testing.assert_allclose(by_displacement, differences, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(forward, by_displacement, rtol=1e-9, atol=1e-12)

@@ -57,3 +57,22 @@ def test_function_with_the_batch_last_is_that_of_single_examples(transform):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert a.shape == b.shape
         np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_results_that_depend_on_nothing_have_the_batch_too(size):
+    vectors = jnp.arange(3.0 * size).reshape(size, 3)
+    fixed, twice = jax.vmap(lambda v: with_batch_last(lambda v: (jnp.array([1.0, 2.0, 3.0]), 2 * v), v))(vectors)
+    np.testing.assert_array_equal(fixed, np.tile([1.0, 2.0, 3.0], (size, 1)))
+    np.testing.assert_array_equal(twice, 2 * vectors)
+
+
+def test_integer_arguments_and_linear_transposes():
+    def function(vector, number):
+        return jnp.where(number > 0, 3 * vector, vector)
+
+    vectors, numbers = jnp.ones((2, 3)), jnp.array([0, 1])
+    slopes = jax.vmap(jax.grad(lambda v, k: jnp.sum(with_batch_last(function, v, k))))(vectors, numbers)
+    np.testing.assert_array_equal(slopes, [[1.0] * 3, [3.0] * 3])
+    both = jax.linear_transpose(lambda a, b: with_batch_last(lambda a, b: 2 * a, a, b), vectors[0], vectors[0])
+    np.testing.assert_array_equal(jnp.stack(both(vectors[0])), [[2.0] * 3, [0.0] * 3])
