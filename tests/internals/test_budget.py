@@ -43,12 +43,12 @@ FINGER, JAW = pj.Hand.finger(0.005), pj.Hand.parallel_jaw(0.027, 0.01)
 one = push(RECTANGLE, FINGER, (-0.06, 0.0), (-0.02, 0.0))
 # kernels and instructions of each program
 PROGRAMS = {
-    "push": (one, 289, 7257),
-    "gradient": (lambda pose, mu: jax.grad(lambda p, m: one(p, m).sum(), argnums=(0, 1))(pose, mu), 742, 21069),
-    "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 884, 21198),
-    "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 933, 23194),
-    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1175, 30101),
-    "PushT step": (step_of_task, 1168, 26760),
+    "push": (one, 286, 7156),
+    "gradient": (lambda pose, mu: jax.grad(lambda p, m: one(p, m).sum(), argnums=(0, 1))(pose, mu), 737, 20882),
+    "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 872, 20923),
+    "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 922, 23004),
+    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1164, 29911),
+    "PushT step": (step_of_task, 1152, 26475),
 }
 
 
