@@ -199,10 +199,8 @@ def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | S
     solver = solver or (ScalarRoot() if len(friction) == 1 else Exhaustive())
     result = solve_problem(form, contacts_in_columns(contacts, friction), contacts.active, solver, None, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
-    return Motion(
-        *(result.twist.array(), wrench.array(), result.force.array().T, result.mode),
-        *(result.status, result.margin, result.unique),
-    )
+    twist, force = result.twist.array(), result.force.array().T
+    return Motion(twist, wrench.array(), force, result.mode, result.status, result.margin, result.unique)
 
 
 class ContactSolution(NamedTuple):

@@ -46,8 +46,7 @@ LOWER = np.maximum(LOWER, LOWER.T)
 
 BARRIER_PARAMETER = 9  # of the logarithmic barrier: the number of rows of both blocks together
 MAX_ROUNDS = 60
-# Weight of the scale relative to the barrier: initial value, and factor after each centering
-BARRIER_WEIGHTS = (4.0, 16.0)
+FIRST_WEIGHT, WEIGHT_RATIO = 4.0, 16.0  # of the scale relative to the barrier: at first, and after each centering
 STEP_LENGTHS = (1.0, 0.7, 0.4)  # step lengths that each Newton round tries
 INITIAL_SCALES = (0.0, -0.1, -0.3, -1.0, -3.0, -10.0, -100.0, -1e4, -1e6)  # the largest that is feasible
 
@@ -227,12 +226,12 @@ def _search(enough: float, tolerance: float, problem: _Problem) -> Certificate:
         # search ends with the previous one.
         is_invalid = ~jnp.isfinite(jnp.sum(new, axis=0))
         done = is_invalid | (new[6] >= enough) | (centered & (BARRIER_PARAMETER / weight < tolerance))
-        weight = jnp.where(centered, BARRIER_WEIGHTS[1] * weight, weight)
+        weight = jnp.where(centered, WEIGHT_RATIO * weight, weight)
         x = jnp.where((going & ~is_invalid)[None], new, x)
         # a round that changes nothing would be repeated for ever
         return rounds + 1, x, weight, going & ~done & (centered | has_moved), converged | (going & done)
 
     x = jnp.zeros((7, like.size), like.dtype).at[6].set(start)
-    state = jnp.zeros((), jnp.int32), x, jnp.full_like(like, BARRIER_WEIGHTS[0]), ~known & (start > -jnp.inf), known
+    state = jnp.zeros((), jnp.int32), x, jnp.full_like(like, FIRST_WEIGHT), ~known & (start > -jnp.inf), known
     state = jax.lax.while_loop(lambda state: (state[0] < MAX_ROUNDS) & jnp.any(state[3]), next_round, state)
     return Certificate(state[1][6], state[1][:6], state[4])

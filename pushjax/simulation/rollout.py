@@ -52,7 +52,7 @@ from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.simulation.step import StepRecord, compute_step
-from pushjax.simulation.substeps import DividedPush, hand_stops, resting, simulate_in_substeps
+from pushjax.simulation.substeps import DividedPush, hand_stops, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 
 MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 512, ...
@@ -324,6 +324,6 @@ def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
         body = skippable(lambda _, step: step < push.num_steps, body, before, first)
     body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
     _, (records, is_too_long) = jax.lax.scan(body, before, jnp.arange(push.steps, dtype=jnp.int32))
-    failed = resting(records, records.pose)._replace(overlap=records.overlap)
+    failed = jax.tree.map(jnp.zeros_like, records)._replace(pose=records.pose, overlap=records.overlap)
     failed = failed._replace(status=jnp.full_like(records.status, Status.NOT_CONVERGED))
     return jax.vmap(tree_where)(is_too_long, failed, records)

@@ -94,7 +94,16 @@ class Stage(NamedTuple):
         mode, moving = jnp.zeros(all_rows.size, jnp.int8), jnp.zeros((), jnp.int8)  # SEPARATED and MOVING are 0
         solution = ContactSolution(still, still, columns, mode, moving, zero, no, guess)
         return Stage(
-            *(solution, Vec2(zero, zero), start.angle, columns, columns, nowhere, no, no, urgency, urgency),
+            solution=solution,
+            middle=Vec2(zero, zero),
+            angle=start.angle,
+            point=columns,
+            normal=columns,
+            at_start=nowhere,
+            holds=no,
+            is_long=no,
+            urgency=urgency,
+            urgency_after=urgency,
         )
 
 

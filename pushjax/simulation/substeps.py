@@ -333,17 +333,10 @@ def _next_state(
         source=jnp.where(ends, NO_TRIAL, jnp.where(continues, source, state.source)),
         guess=None if state.guess is None else tree_where(accepted & moves, last_stage.solution.best, state.guess),
     )
-    return jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state), StepEnd(
-        ends, state.step, outcome
-    )
+    next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
+    return next_state, StepEnd(ends, state.step, outcome)
 
 
 def hand_stops(status: Array) -> Bool[Array, "..."]:
     """Return whether a step of this status stops the hand for good."""
     return (status == Status.JAMMED) | (status == Status.GRASPED)
-
-
-def resting(record: StepRecord, pose: Vec3) -> StepRecord:
-    """Record of a slider that stays at `pose` while nothing pushes."""
-    blank = jax.tree.map(jnp.zeros_like, record)
-    return blank._replace(pose=pose, status=jnp.full_like(record.status, Status.FREE))
