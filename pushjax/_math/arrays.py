@@ -4,8 +4,11 @@ A sum over an axis is one operation of XLA, which its fusions do not compute twi
 and programs stay small. Sums that are written out entry by entry have neither property.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
 # The products F_i F_j of a vector's components, and so the entries of a symmetric matrix.
@@ -13,9 +16,39 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # where the entries of the matrix stand among the six
 
 
+def summed(terms: Float[Array, "..."], axis: int | tuple[int, ...]) -> Float[Array, "..."]:
+    """The sum of terms along axes."""
+    return _sum_p.bind(terms, axes=tuple(a % terms.ndim for a in np.atleast_1d(axis).tolist()))
+
+
+# XLA of JAX 0.11 and 0.12 hands small sums of float32 to a library that takes up to twenty times as long, with which a
+# jaw's step takes three times as long. It does not know the form of a sum that `_sum` has.
+_sum_p = Primitive("sum")
+
+
+def _sum(terms, *, axes):
+    return jax.lax.reduce(terms, np.zeros((), terms.dtype), lambda a, b: a - (-b), axes)
+
+
+def _batched_sum(arguments, batch_axes, *, axes):
+    terms = jnp.moveaxis(arguments[0], batch_axes[0], 0)
+    return _sum_p.bind(terms, axes=tuple(axis + 1 for axis in axes)), 0
+
+
+def _transposed_sum(cotangent, terms, *, axes):
+    return [jnp.broadcast_to(jnp.expand_dims(cotangent, axes), terms.aval.shape)]
+
+
+_sum_p.def_impl(_sum)
+_sum_p.def_abstract_eval(lambda terms, axes: terms.update(shape=tuple(np.delete(terms.shape, axes).tolist())))
+ad.deflinear2(_sum_p, _transposed_sum)
+batching.primitive_batchers[_sum_p] = _batched_sum
+mlir.register_lowering(_sum_p, mlir.lower_fun(_sum, multiple_results=False))
+
+
 def dot(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
     """Dot products."""
-    return jnp.sum(a * b, axis=0)
+    return summed(a * b, 0)
 
 
 def cross(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
@@ -25,7 +58,7 @@ def cross(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array
 
 def times(matrix: Float[Array, "3 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
     """Products of symmetric matrices and vectors."""
-    return jnp.sum(matrix * v[:, None], axis=0)
+    return summed(matrix * v[:, None], 0)
 
 
 def solve(matrix: Float[Array, "3 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
@@ -47,12 +80,12 @@ def dual(
 
 def products(vectors: Float[Array, "n 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "n *rest"]:
     """Dot products of vectors, (vector, component), with v."""
-    return jnp.sum(vectors * v[None], axis=1)
+    return summed(vectors * v[None], 1)
 
 
 def combined(vectors: Float[Array, "n 3 *rest"], weight: Float[Array, "n *rest"]) -> Float[Array, "3 *rest"]:
     """The sum of vectors, (vector, component), times weights."""
-    return jnp.sum(vectors * weight[:, None], axis=0)
+    return summed(vectors * weight[:, None], 0)
 
 
 def unit(v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import combined, cross, dot, dual, products, times
+from pushjax._math.arrays import combined, cross, dot, dual, products, summed, times
 from pushjax.contact.cubic import Roots
 from pushjax.contact.scaled_problem import NO_EDGE, ScaledProblem, violation_per_weight
 from pushjax.contact.tolerances import (
@@ -86,8 +86,8 @@ def with_batch(numbers: Numbers) -> Array:
 
 def _motions(problem: ScaledProblem, twist: Float[Array, "3 sets batch"]) -> tuple[Array, Array]:
     """Motion of each contact point relative to its pusher, (n, gap added) and t, each (m, sets, batch)."""
-    normal = jnp.sum(problem.normal[:, :, None] * twist[:, None], axis=0) - problem.goal[0][:, None]
-    return normal, jnp.sum(problem.tangent[:, :, None] * twist[:, None], axis=0) - problem.goal[1][:, None]
+    normal = summed(problem.normal[:, :, None] * twist[:, None], 0) - problem.goal[0][:, None]
+    return normal, summed(problem.tangent[:, :, None] * twist[:, None], 0) - problem.goal[1][:, None]
 
 
 def is_kinematic(problem: ScaledProblem, twist: Float[Array, "3 sets batch"], sets: Sets) -> Bool[Array, "sets batch"]:
@@ -159,7 +159,7 @@ class Segment(NamedTuple):
         """The values of u where both conditions can hold, and the intervals in which they are."""
         # orthogonal to the twists that satisfy both conditions up to a common factor
         across = self.rows[0] * self.goal[1][None] - self.rows[1] * self.goal[0][None]
-        return Roots.of(jnp.sum(self.motion * across[None], axis=1), -self.nearest, 1 - self.nearest)
+        return Roots.of(summed(self.motion * across[None], 1), -self.nearest, 1 - self.nearest)
 
     def are_independent(self) -> Bool[Array, "sets batch"]:
         """Whether the two conditions do not depend on each other."""
@@ -188,8 +188,8 @@ def solve_two(problem: ScaledProblem, sets: Sets) -> Solutions:
     segment, all_sets = jax.tree.map(repeated, segment), Sets(*(repeated(with_batch(x)) for x in sets))
     motion = segment.motion_at(u)
     along_rows = products(segment.rows, motion)
-    size = jnp.sum(along_rows * along_rows, axis=0)
-    scale = jnp.sum(segment.goal * along_rows, axis=0) / jnp.where(size > 0, size, 1.0)
+    size = summed(along_rows * along_rows, 0)
+    scale = summed(segment.goal * along_rows, 0) / jnp.where(size > 0, size, 1.0)
     wrench = segment.center + u[None] * segment.along
     degree_times_h = dot(motion, wrench)
     power = _power(problem, scale * degree_times_h, degree_times_h / problem.surface.degree)
@@ -292,7 +292,7 @@ def _cone_coordinates(f: Array, edges: Array, per_weight: Array) -> tuple[Array,
     basis, regular = dual(edges, min_determinant(f.dtype))
     weight = products(basis, f)
     weight = weight + products(basis, f - combined(edges, weight))
-    total = jnp.sum(jnp.abs(weight), axis=0)
+    total = summed(jnp.abs(weight), 0)
     share = jnp.min(weight, axis=0) / jnp.where(total > 0, total, 1.0)
     left = f - combined(edges, weight)
     inside = regular & (dot(left, left) <= (64 * eps * total) ** 2)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import tree_where
-from pushjax._math.arrays import combined, cross, dot, dual, products, solve, times, unit
+from pushjax._math.arrays import combined, cross, dot, dual, products, solve, summed, times, unit
 from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem, selected, violation_per_weight
 from pushjax.contact.status import ContactMode
 from pushjax.contact.tolerances import (
@@ -67,10 +67,10 @@ class System(NamedTuple):
     def newton_step(self, hessian: Array, residual: Array) -> Array:
         """Newton step -J^-1 residual with J = R hess H Q; zero where J is singular."""
         moved = times(hessian[:, :, None], jnp.moveaxis(self.axes, 1, 0))  # (component, axis, batch)
-        jacobian = jnp.sum(jnp.moveaxis(self.rows, 1, 0)[:, None] * moved[:, :, None], axis=0)  # (axis, row, batch)
+        jacobian = summed(jnp.moveaxis(self.rows, 1, 0)[:, None] * moved[:, :, None], 0)  # (axis, row, batch)
         diagonal = jnp.eye(3, dtype=bool).reshape(3, 3, *(1,) * (residual.ndim - 1)) & self.unused[None]
         jacobian = jnp.where(diagonal, 1.0, jacobian)
-        sizes = jnp.sum(jacobian * jacobian, axis=1)
+        sizes = summed(jacobian * jacobian, 1)
         least = jnp.finfo(residual.dtype).eps * 1e-2 * jnp.sqrt(sizes[0] * sizes[1] * sizes[2])
         return products(dual(jacobian, least)[0], -residual)
 
@@ -142,7 +142,7 @@ def refine(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]
     for _ in range(2):  # the second pass is for nearly dependent rows
         twist = twist + combined(row_basis, b - products(rows, twist))
     weight = jnp.where(used, weight, 0.0)  # directions orthogonal to the edges get none
-    total, left = jnp.sum(jnp.abs(weight), axis=0), f - combined(edges, weight)
+    total, left = summed(jnp.abs(weight), 0), f - combined(edges, weight)
     is_wrench = dot(left, left) <= (64 * jnp.finfo(f.dtype).eps * total) ** 2
     is_wrench &= dot(f, f) > (zero_wrench_tolerance(f.dtype) * total) ** 2
     h = dot(f, gradient) / problem.surface.degree
@@ -159,7 +159,7 @@ def completed(vectors: Array, used: Bool[Array, "3 *batch"], relative: float) ->
     sideways = jnp.stack([-v1[1], v1[0], zero]), jnp.stack([zero, -v1[2], v1[1]])
     v2 = jnp.where(used[1:2], vectors[1], jnp.where((jnp.abs(v1[0]) > jnp.abs(v1[1]))[None], *sideways))
     full = jnp.stack([v1, v2, jnp.where(used[2:], vectors[2], cross(v1, v2))])
-    sizes = jnp.sum(full * full, axis=1)
+    sizes = summed(full * full, 1)
     return full, dual(full, relative * jnp.sqrt(sizes[0] * sizes[1] * sizes[2]))[0]
 
 
@@ -192,7 +192,7 @@ def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"],
     fits = (sides <= wide[:, None]) & (problem.active & (slip_n <= wide))[:, None]
     passes &= jnp.all(fits | ~in_set, axis=(0, 1))
     per_weight = selected(violation_per_weight(problem.friction)[None], chosen.edges >> 1)[0]
-    total = jnp.sum(jnp.abs(weight), axis=0)
+    total = summed(jnp.abs(weight), 0)
     passes &= jnp.all((per_weight * weight >= -relative / 2 * total[None]) | (chosen.edges < 0), axis=0)
     # In a wedge the rows are nearly dependent. They then determine grad H only up to this tolerance.
     direction = 1.25 * ill_conditioned_tolerance(dtype)

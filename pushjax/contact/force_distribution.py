@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import ENTRIES, dot
+from pushjax._math.arrays import ENTRIES, dot, summed
 
 MAX_NEWTON_ITERATIONS = 7
 LINE_SEARCH_ITERATIONS = 5  # in each Newton iteration
@@ -59,7 +59,7 @@ def distribute_force(
 def of_chosen(edges: Float[Array, "3 edges *batch"], chosen: Int[Array, "3 *batch"], weights: Vector) -> Weights:
     """The weights of the chosen edges as one weight for each edge, zero for the others."""
     numbers = jnp.arange(edges.shape[1]).reshape(1, -1, *(1,) * (weights.ndim - 1))
-    return jnp.sum(jnp.where(chosen[:, None] == numbers, weights[:, None], 0.0), axis=0)
+    return summed(jnp.where(chosen[:, None] == numbers, weights[:, None], 0.0), 0)
 
 
 def _shared(
@@ -95,7 +95,7 @@ def shared_weights(
 
 def _products(edges: Array, y: Vector) -> Weights:
     """The products g . y."""
-    return jnp.sum(edges * y[:, None], axis=0)
+    return summed(edges * y[:, None], 0)
 
 
 def _weights(edges: Array, y: Vector) -> Weights:
@@ -105,7 +105,7 @@ def _weights(edges: Array, y: Vector) -> Weights:
 
 def _total(edges: Array, weights: Weights) -> Vector:
     """The wrench of the weights."""
-    return jnp.sum(edges * weights[None], axis=1)
+    return summed(edges * weights[None], 1)
 
 
 def _minimize_dual(usable: Array, start: Vector, target: Vector, needs_search: Bool[Array, "*batch"]) -> Vector:
@@ -127,7 +127,7 @@ def _minimize_dual(usable: Array, start: Vector, target: Vector, needs_search: B
 def _reproduces(usable: Array, weights: Weights, target: Vector, roundings: int) -> Bool[Array, "*batch"]:
     """Whether the weights make up the target, up to `roundings` times eps of the sum of the forces."""
     residual = target - _total(usable, weights)
-    allowed = roundings * jnp.finfo(target.dtype).eps * (1 + jnp.sum(weights, axis=0))
+    allowed = roundings * jnp.finfo(target.dtype).eps * (1 + summed(weights, 0))
     return dot(residual, residual) <= allowed**2
 
 
@@ -137,8 +137,8 @@ def _dual_hessian(usable: Array, loaded: Bool[Array, "edges *batch"]) -> Float[A
     Without it, coplanar edges leave one direction of y undetermined, which F does not need.
     """
     chosen = jnp.where(loaded[None], usable, 0.0)
-    hessian = jnp.sum(jnp.stack([chosen[i] * usable[j] for i, j in ENTRIES]), axis=1)
-    diagonal = _relative_regularization(usable.dtype) * (jnp.sum(hessian[:3], axis=0) + 1e-3)
+    hessian = summed(jnp.stack([chosen[i] * usable[j] for i, j in ENTRIES]), 1)
+    diagonal = _relative_regularization(usable.dtype) * (summed(hessian[:3], 0) + 1e-3)
     is_diagonal = jnp.asarray([1.0, 1, 1, 0, 0, 0], usable.dtype).reshape(6, *(1,) * (usable.ndim - 2))
     return hessian + is_diagonal * diagonal[None]
 
@@ -175,8 +175,8 @@ def _line_search_step(usable: Array, target: Vector, y: Vector) -> Vector:
     def shorten(_, state):
         t, low, high = state
         along = at_y + t[None] * rates
-        slope = jnp.sum(jnp.maximum(along, 0) * rates, axis=0) - gain
-        curvature = jnp.sum(jnp.where(along > 0, rates * rates, 0.0), axis=0)
+        slope = summed(jnp.maximum(along, 0) * rates, 0) - gain
+        curvature = summed(jnp.where(along > 0, rates * rates, 0.0), 0)
         descends = slope <= 0
         low, high = jnp.where(descends, t, low), jnp.where(descends, high, t)
         newton = t - slope / jnp.where(curvature > 0, curvature, 1.0)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import combined, dual, times
+from pushjax._math.arrays import combined, dual, summed, times
 from pushjax.contact.edge_sets import along
 from pushjax.contact.scaled_problem import NO_EDGE, ContactSolver, EdgeSet, Found, ScaledProblem
 
@@ -56,7 +56,7 @@ def least_violation(problem: ScaledProblem) -> LeastViolation:
     used, number = (contacts >= 0)[..., None], np.maximum(contacts, 0)
     motions = times(problem.surface.hessian(problem.normal), problem.normal)  # by a unit force at each contact
     # the Delassus matrix of the normals, which is symmetric; of each set, completed by the identity
-    gram = jnp.sum(problem.normal[:, :, None] * motions[:, None], axis=0)
+    gram = summed(problem.normal[:, :, None] * motions[:, None], 0)
     pairs = m * number[:, None] + number[None]
     matrix = jnp.take(gram.reshape(m * m, -1), pairs.reshape(-1), axis=0).reshape(*pairs.shape, -1)
     identity = jnp.eye(3, dtype=gram.dtype)[..., None, None]
@@ -65,12 +65,12 @@ def least_violation(problem: ScaledProblem) -> LeastViolation:
     diagonal = jnp.stack([matrix[k, k] for k in range(3)])
     basis, regular = dual(matrix, SINGULAR[gram.dtype.itemsize] * diagonal[0] * diagonal[1] * diagonal[2])
     force = combined(basis, goal)
-    twist = jnp.sum(jnp.where(used, jnp.take(motions, number, axis=1) * force[None], 0.0), axis=1)
+    twist = summed(jnp.where(used, jnp.take(motions, number, axis=1) * force[None], 0.0), 1)
     # a force of the wrong sign is a violation, too: by the motion that it alone would cause
     violation = jnp.max(jnp.where(used, -force * diagonal, 0.0), axis=0)
-    open_by = problem.goal[0][:, None] - jnp.sum(problem.normal[:, :, None] * twist[:, None], axis=0)
+    open_by = problem.goal[0][:, None] - summed(problem.normal[:, :, None] * twist[:, None], 0)
     violation = jnp.maximum(violation, jnp.max(jnp.where(problem.active[:, None], open_by, 0.0), axis=0))
-    usable = regular & (jnp.sum(jnp.abs(twist), axis=0) < MAX_MOTION)
+    usable = regular & (summed(jnp.abs(twist), 0) < MAX_MOTION)
     usable &= jnp.all(jnp.take(problem.active, number, axis=0) | ~used, axis=0)
     violation = jnp.where(usable, violation, jnp.inf)
     index = jnp.argmin(violation, axis=0)[None]

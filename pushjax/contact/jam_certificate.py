@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import cross, dot, unit
+from pushjax._math.arrays import cross, dot, summed, unit
 from pushjax.contact.scaled_problem import ScaledProblem, selected
 
 # The unbalanced part that two or three edges may have and still balance, relative to their sum: roundoff of the numbers
@@ -184,9 +184,9 @@ def _equilibrium(four: _Four) -> _Equilibrium:
     no = jnp.zeros_like(four.has_moment)
     is_dummy = jnp.stack([no, no, four.has_moment, four.has_across])
     is_dummy = jnp.broadcast_to(is_dummy, weights.shape)
-    dummy_weight = jnp.sum(jnp.where(is_dummy, jnp.abs(weights), 0.0), axis=0)
+    dummy_weight = summed(jnp.where(is_dummy, jnp.abs(weights), 0.0), 0)
     weights = jnp.where(is_dummy, 0.0, weights)
-    total, absolute_total = jnp.sum(weights, axis=0), jnp.sum(jnp.abs(weights), axis=0)
+    total, absolute_total = summed(weights, 0), summed(jnp.abs(weights), 0)
     eps, tolerance = jnp.finfo(total.dtype).eps, BALANCE_TOLERANCE[total.dtype.itemsize]
     term_size = mu34 * size34 * (_norm1(g1) + _norm1(g2)) + mu12 * size12 * (_norm1(g3) + _norm1(g4))
     roundoff = jax.lax.stop_gradient(DETERMINANT_ROUNDOFF * eps * term_size)
@@ -198,7 +198,7 @@ def _equilibrium(four: _Four) -> _Equilibrium:
         & (dummy_weight <= tolerance * absolute_total)
     )
     per_total = 1 / jnp.where(total != 0, total, 1.0)
-    power, largest_power = jnp.sum(weights * four.power, axis=0), jnp.max(jnp.abs(four.power), axis=0)
+    power, largest_power = summed(weights * four.power, 0), jnp.max(jnp.abs(four.power), axis=0)
     return _Equilibrium(per_total * power, jax.lax.stop_gradient(jnp.abs(per_total) * largest_power * roundoff), exists)
 
 
@@ -218,11 +218,11 @@ def _pair_cross(four: _Four, pair: int, same_contact: Bool[Array, "*rest"]) -> t
 
 def _norm1(v: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
     """The sum of the components' absolute values."""
-    return jnp.sum(jnp.abs(v), axis=0)
+    return summed(jnp.abs(v), 0)
 
 
 def _orthogonal_direction(*products: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
     """A unit vector along the longest product; a constant to every derivative."""
     stacked = jax.lax.stop_gradient(jnp.stack(products, axis=1))
-    longest = jnp.argmax(jnp.sum(stacked * stacked, axis=0), axis=0)
+    longest = jnp.argmax(summed(stacked * stacked, 0), axis=0)
     return unit(selected(stacked, longest[None])[:, 0])

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pushjax._internal.xla import compute_once
-from pushjax._math.arrays import times
+from pushjax._math.arrays import summed, times
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.contact.contact_plane import LimitCurve
 from pushjax.contact.edge_sets import Sets
@@ -206,8 +206,8 @@ class Projected(ContactSolver):
         start = jnp.where(problem.active & (problem.goal[0] > 0), problem.goal[0], 0.0)
 
         def iterate(_, forces: Array) -> Array:
-            wrench = jnp.sum(problem.normal * forces[:1] + problem.tangent * forces[1:], axis=1)
-            nonzero = jnp.sum(wrench * wrench, axis=0) > 0
+            wrench = summed(problem.normal * forces[:1] + problem.tangent * forces[1:], 1)
+            nonzero = summed(wrench * wrench, 0) > 0
             along_x = jnp.zeros_like(wrench).at[0].set(1)
             return self._sweep(problem, jnp.where(nonzero[None], wrench, along_x), forces)
 
@@ -218,7 +218,7 @@ class Projected(ContactSolver):
         surface, m = problem.surface, problem.count
         rows = jnp.stack([problem.normal, problem.tangent], axis=1)  # (3, (n, t), contacts, batch)
         moved = times(surface.hessian(wrench)[:, :, None, None], rows)
-        compliance = jnp.sum(rows * moved, axis=0)  # how far a unit force moves its own contact point
+        compliance = summed(rows * moved, 0)  # how far a unit force moves its own contact point
         per_motion = jnp.where(compliance > 0, 1 / jnp.where(compliance > 0, compliance, 1.0), 0.0)
         # c = grad H - hess H F, and hess H F = (d - 1) grad H by Euler's identity
         constant = surface.gradient(wrench) * (2 - surface.degree)
@@ -229,16 +229,16 @@ class Projected(ContactSolver):
         def update(i: Int[Array, ""], state: tuple[Array, Array]) -> tuple[Array, Array]:
             forces, twist = state
             (row, along), goal, scale = ((x[:, :, i] for x in (rows, moved)), problem.goal[:, i], per_motion[:, i])
-            normal = forces[0, i] - scale[0] * (jnp.sum(row[:, 0] * twist, axis=0) - goal[0])
+            normal = forces[0, i] - scale[0] * (summed(row[:, 0] * twist, 0) - goal[0])
             normal = jnp.where(problem.active[i], jnp.maximum(normal, 0), 0.0)
             twist = twist + along[:, 0] * (normal - forces[0, i])[None]
-            tangential = forces[1, i] - scale[1] * (jnp.sum(row[:, 1] * twist, axis=0) - goal[1])
+            tangential = forces[1, i] - scale[1] * (summed(row[:, 1] * twist, 0) - goal[1])
             bound = problem.friction[i] * normal
             tangential = jnp.clip(tangential, -bound, bound)
             twist = twist + along[:, 1] * (tangential - forces[1, i])[None]
             return forces.at[:, i].set(jnp.stack([normal, tangential])), twist
 
-        twist = constant + jnp.sum(moved * forces[None], axis=(1, 2))
+        twist = constant + summed(moved * forces[None], (1, 2))
         return jax.lax.fori_loop(0, self.sweeps, sweep, (forces, twist))[0]
 
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from pushjax._math.arrays import summed
 from pushjax.friction.polynomial import Polynomial
 
 NO_EDGE = -1  # the number of an edge or a contact that is not there
@@ -61,7 +62,7 @@ class ScaledProblem(NamedTuple):
     def slips(self, twist: Float[Array, "3 *batch"]) -> Float[Array, "2 contacts *batch"]:
         """Motion (n, t) of each contact point relative to its pusher; a normal motion below zero is a violation."""
         rows = jnp.stack([self.normal, self.tangent], axis=1)
-        return jnp.sum(rows * twist[:, None, None], axis=0) - self.goal
+        return summed(rows * twist[:, None, None], 0) - self.goal
 
 
 class EdgeSet(NamedTuple):
@@ -147,8 +148,8 @@ def nondimensionalize(given: ContactArrays) -> ScaledProblem:
     along = jnp.stack([jnp.ones_like(friction), friction])[:, :, None]  # (n, t), contact, side
     sides = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], gap.dtype).reshape(2, 1, 2, *(1,) * (gap.ndim - 1))
     rows = jnp.stack([a_n, a_t], axis=1)[:, :, :, None]
-    edges = jnp.sum(rows * (along * sides)[None], axis=1).reshape(3, 2 * len(gap), *gap.shape[1:])
-    along_normal = jnp.sum(displacement * normal, axis=0) - gap
+    edges = summed(rows * (along * sides)[None], 1).reshape(3, 2 * len(gap), *gap.shape[1:])
+    along_normal = summed(displacement * normal, 0) - gap
     goal = jnp.stack([along_normal, displacement[1] * normal[0] - displacement[0] * normal[1]]) / unit[None, None]
     pushes = jnp.any(active & (goal[0] > 0), axis=0)
     surface = Polynomial(given.surface.table / scale[None, None, None])
@@ -178,7 +179,7 @@ def _displacement_unit(displacement: Array, depth: Array) -> Array:
     # Divide by the largest component first, because the square of a small displacement underflows.
     component = jnp.max(jnp.abs(displacement), axis=(0, 1))
     component = jnp.where(component > 0, component, 1.0)
-    squared = jnp.max(jnp.sum((displacement / component[None, None]) ** 2, axis=0), axis=0)
+    squared = jnp.max(summed((displacement / component[None, None]) ** 2, 0), axis=0)
     unit = jnp.maximum(component * jnp.sqrt(squared), jnp.max(depth, axis=0))
     return jnp.where(unit > 0, unit, 1.0)
 
@@ -189,7 +190,7 @@ def selected(values: Array, index: Int[Array, "picks *batch"]) -> Array:
     A masked sum, because a gather is slow in a batch and its derivative is a scatter.
     """
     numbers = jnp.arange(values.shape[1]).reshape(1, -1, *(1,) * (index.ndim - 1))
-    return jnp.sum(jnp.where((index[:, None] == numbers)[None], values[:, None], 0), axis=2)
+    return summed(jnp.where((index[:, None] == numbers)[None], values[:, None], 0), 2)
 
 
 def violation_per_weight(friction: Array) -> Array:

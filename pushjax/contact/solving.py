@@ -21,6 +21,7 @@ from pushjax._internal.autodiff import search_result
 from pushjax._internal.batch_last import batch_last, in_search_tiles
 from pushjax._internal.trailing_batch import with_batch_last
 from pushjax._internal.xla import compute_once, tree_where
+from pushjax._math.arrays import summed
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.derivative import differentiable_solution
 from pushjax.contact.exhaustive import Continuing
@@ -207,7 +208,7 @@ def _without_friction(again: Array, given: ContactArrays, guess: None) -> tuple[
     status = jnp.where(problem.valid, status, Status.INVALID).astype(jnp.int8)
     loaded = solved[None] & (weights[::2] > 0)
     slides = jnp.where(problem.slips(twist)[1] < 0, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT)
-    wrench, squeeze = jnp.sum(problem.normal * weights[None, ::2], axis=1), Squeeze.none(problem.unit)
+    wrench, squeeze = summed(problem.normal * weights[None, ::2], 1), Squeeze.none(problem.unit)
     answer = Answer(
         in_units(problem, solved, twist, wrench, weights),
         jnp.where(loaded, slides, ContactMode.SEPARATED).astype(jnp.int8),

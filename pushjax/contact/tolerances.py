@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import dot
+from pushjax._math.arrays import dot, summed
 
 # Up to this factor above `max_twist_ratio`, a twist still shows that a motion exists. Beyond it, rows that are
 # dependent up to roundoff can give any number.
@@ -18,7 +18,7 @@ def kinematic_tolerance(twist: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]
     bound equals `relative_tolerance`, so nothing is added. For a twist that is too fast to be an answer
     (`max_twist_ratio`), the tolerance is the roundoff alone.
     """
-    eps, size = float(jnp.finfo(twist.dtype).eps), jnp.sum(jnp.abs(twist), axis=0)
+    eps, size = float(jnp.finfo(twist.dtype).eps), summed(jnp.abs(twist), 0)
     usual = jnp.minimum(relative_tolerance(twist.dtype) + 64 * eps * size, ill_conditioned_tolerance(twist.dtype))
     return jnp.where(is_slow(dot(twist, twist)), usual, 8 * eps * size)
 
