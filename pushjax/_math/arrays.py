@@ -18,32 +18,60 @@ FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # where the entries of the m
 
 def summed(terms: Float[Array, "..."], axis: int | tuple[int, ...]) -> Float[Array, "..."]:
     """The sum of terms along axes."""
-    return _sum_p.bind(terms, axes=tuple(a % terms.ndim for a in np.atleast_1d(axis).tolist()))
+    return _sum_p.bind(terms, axes=tuple(sorted(a % terms.ndim for a in np.atleast_1d(axis).tolist())))
+
+
+def repeated(values: Float[Array, "..."], axis: int, count: int) -> Float[Array, "..."]:
+    """Values with another axis, along which they are the same; in reverse mode this is `summed`."""
+    return _repeat_p.bind(values, axis=axis, count=count)
 
 
 # XLA of JAX 0.11 and 0.12 hands small sums of float32 to a library that takes up to twenty times as long, with which a
 # jaw's step takes three times as long. It does not know the form of a sum that `_sum` has.
-_sum_p = Primitive("sum")
+_sum_p, _repeat_p = Primitive("sum"), Primitive("repeat")
 
 
 def _sum(terms, *, axes):
     return jax.lax.reduce(terms, np.zeros((), terms.dtype), lambda a, b: a - (-b), axes)
 
 
-def _batched_sum(arguments, batch_axes, *, axes):
-    terms = jnp.moveaxis(arguments[0], batch_axes[0], 0)
-    return _sum_p.bind(terms, axes=tuple(axis + 1 for axis in axes)), 0
+def _repeat(values, *, axis, count):
+    return jnp.broadcast_to(jnp.expand_dims(values, axis), (*values.shape[:axis], count, *values.shape[axis:]))
 
 
 def _transposed_sum(cotangent, terms, *, axes):
-    return [jnp.broadcast_to(jnp.expand_dims(cotangent, axes), terms.aval.shape)]
+    for axis in axes:
+        cotangent = repeated(cotangent, axis, terms.aval.shape[axis])
+    return [cotangent]
 
 
-_sum_p.def_impl(_sum)
-_sum_p.def_abstract_eval(lambda terms, axes: terms.update(shape=tuple(np.delete(terms.shape, axes).tolist())))
-ad.deflinear2(_sum_p, _transposed_sum)
-batching.primitive_batchers[_sum_p] = _batched_sum
-mlir.register_lowering(_sum_p, mlir.lower_fun(_sum, multiple_results=False))
+def _with_rules(primitive, function, shape_of, transposed, batched):
+    """Give a linear primitive its rules; `batched` returns its parameters where the batch is the first axis."""
+
+    def batching_rule(arguments, batch_axes, **parameters):
+        return primitive.bind(jnp.moveaxis(arguments[0], batch_axes[0], 0), **batched(**parameters)), 0
+
+    primitive.def_impl(function)
+    primitive.def_abstract_eval(lambda x, **parameters: x.update(shape=shape_of(x.shape, **parameters)))
+    ad.deflinear2(primitive, transposed)
+    batching.primitive_batchers[primitive] = batching_rule
+    mlir.register_lowering(primitive, mlir.lower_fun(function, multiple_results=False))
+
+
+_with_rules(
+    _sum_p,
+    _sum,
+    lambda shape, axes: tuple(size for axis, size in enumerate(shape) if axis not in axes),
+    _transposed_sum,
+    lambda axes: {"axes": tuple(axis + 1 for axis in axes)},
+)
+_with_rules(
+    _repeat_p,
+    _repeat,
+    lambda shape, axis, count: (*shape[:axis], count, *shape[axis:]),
+    lambda cotangent, _, axis, count: [summed(cotangent, axis)],
+    lambda axis, count: {"axis": axis + 1, "count": count},
+)
 
 
 def dot(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
@@ -58,7 +86,7 @@ def cross(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array
 
 def times(matrix: Float[Array, "3 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
     """Products of symmetric matrices and vectors."""
-    return summed(matrix * v[:, None], 0)
+    return summed(matrix * repeated(v, 1, 3), 0)
 
 
 def solve(matrix: Float[Array, "3 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
@@ -80,12 +108,12 @@ def dual(
 
 def products(vectors: Float[Array, "n 3 *rest"], v: Float[Array, "3 *rest"]) -> Float[Array, "n *rest"]:
     """Dot products of vectors, (vector, component), with v."""
-    return summed(vectors * v[None], 1)
+    return summed(vectors * repeated(v, 0, len(vectors)), 1)
 
 
 def combined(vectors: Float[Array, "n 3 *rest"], weight: Float[Array, "n *rest"]) -> Float[Array, "3 *rest"]:
     """The sum of vectors, (vector, component), times weights."""
-    return summed(vectors * weight[:, None], 0)
+    return summed(vectors * repeated(weight, 1, 3), 0)
 
 
 def unit(v: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import combined, dot, products, summed
+from pushjax._math.arrays import combined, dot, products, repeated, summed
 from pushjax.contact.finish import Equations, Solution, System, in_units
 from pushjax.contact.force_distribution import of_chosen, shared_weights
 from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem
@@ -31,7 +31,7 @@ def differentiable_solution(
     fixed, constant = jax.lax.stop_gradient((problem, equations))
     _, basis, axes = constant.bases()
     into_edges = jnp.where(constant.used[:, None], summed(basis[:, None] * axes[None], 2), 0.0)  # (edge, axis)
-    moving_axes = summed(equations.edges[:, None] * into_edges[:, :, None], 0)
+    moving_axes = summed(repeated(equations.edges, 1, 3) * into_edges[:, :, None], 0)
     system = System(problem.surface, moving_axes, equations.rows, equations.b, ~constant.used)
     # the wrench of the size at which grad H is the twist
     wrench = combined(constant.edges, best.weight)
@@ -44,7 +44,7 @@ def differentiable_solution(
     beta = _implicit(system, jax.lax.stop_gradient(products(axes, wrench) * factor[None]))
     placeholder = jnp.zeros_like(beta).at[0].set(1)
     wrench = jnp.where(solved[None], combined(moving_axes, beta), placeholder)
-    own = of_chosen(problem.edges, best.edges, summed(into_edges * beta[None], 1))
+    own = of_chosen(problem.edges, best.edges, summed(into_edges * repeated(beta, 0, 3), 1))
     shared = shared_weights(problem.edges, loaded & indeterminate[None], wrench, dual)
     weights = jnp.where(indeterminate[None], shared, own)
     return in_units(problem, solved, problem.surface.gradient(wrench), wrench, weights)

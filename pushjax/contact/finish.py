@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import tree_where
-from pushjax._math.arrays import combined, cross, dot, dual, products, solve, summed, times, unit
+from pushjax._math.arrays import combined, cross, dot, dual, products, repeated, solve, summed, times, unit
 from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem, selected, violation_per_weight
 from pushjax.contact.status import ContactMode
 from pushjax.contact.tolerances import (
@@ -67,7 +67,9 @@ class System(NamedTuple):
     def newton_step(self, hessian: Array, residual: Array) -> Array:
         """Newton step -J^-1 residual with J = R hess H Q; zero where J is singular."""
         moved = times(hessian[:, :, None], jnp.moveaxis(self.axes, 1, 0))  # (component, axis, batch)
-        jacobian = summed(jnp.moveaxis(self.rows, 1, 0)[:, None] * moved[:, :, None], 0)  # (axis, row, batch)
+        jacobian = summed(
+            repeated(jnp.moveaxis(self.rows, 1, 0), 1, 3) * repeated(moved, 2, 3), 0
+        )  # (axis, row, batch)
         diagonal = jnp.eye(3, dtype=bool).reshape(3, 3, *(1,) * (residual.ndim - 1)) & self.unused[None]
         jacobian = jnp.where(diagonal, 1.0, jacobian)
         sizes = summed(jacobian * jacobian, 1)

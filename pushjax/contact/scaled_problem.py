@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import summed
+from pushjax._math.arrays import repeated, summed
 from pushjax.friction.polynomial import Polynomial
 
 NO_EDGE = -1  # the number of an edge or a contact that is not there
@@ -147,8 +147,8 @@ def nondimensionalize(given: ContactArrays) -> ScaledProblem:
     # a sum over an axis, because XLA would compute other sums again wherever an edge is used
     along = jnp.stack([jnp.ones_like(friction), friction])[:, :, None]  # (n, t), contact, side
     sides = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], gap.dtype).reshape(2, 1, 2, *(1,) * (gap.ndim - 1))
-    rows = jnp.stack([a_n, a_t], axis=1)[:, :, :, None]
-    edges = summed(rows * (along * sides)[None], 1).reshape(3, 2 * len(gap), *gap.shape[1:])
+    rows = repeated(jnp.stack([a_n, a_t], axis=1), 3, 2)
+    edges = summed(rows * repeated(along * sides, 0, 3), 1).reshape(3, 2 * len(gap), *gap.shape[1:])
     along_normal = summed(displacement * normal, 0) - gap
     goal = jnp.stack([along_normal, displacement[1] * normal[0] - displacement[0] * normal[1]]) / unit[None, None]
     pushes = jnp.any(active & (goal[0] > 0), axis=0)
@@ -190,7 +190,7 @@ def selected(values: Array, index: Int[Array, "picks *batch"]) -> Array:
     A masked sum, because a gather is slow in a batch and its derivative is a scatter.
     """
     numbers = jnp.arange(values.shape[1]).reshape(1, -1, *(1,) * (index.ndim - 1))
-    return summed(jnp.where((index[:, None] == numbers)[None], values[:, None], 0), 2)
+    return summed(jnp.where((index[:, None] == numbers)[None], repeated(values, 1, len(index)), 0), 2)
 
 
 def violation_per_weight(friction: Array) -> Array:

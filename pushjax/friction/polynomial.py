@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._math.arrays import ENTRIES, FULL, dot, summed
+from pushjax._math.arrays import ENTRIES, FULL, dot, repeated, summed
 
 
 class Polynomial(NamedTuple):
@@ -31,14 +31,14 @@ class Polynomial(NamedTuple):
         """The Hessian at wrenches."""
         if self.degree == 2:
             return jnp.broadcast_to(self._table(f)[:, :, 0], (3, 3, *f.shape[1:]))
-        return summed(self._table(f) * _pairs(f)[None, None], 2)
+        return summed(self._table(f) * repeated(repeated(_pairs(f), 0, 3), 0, 3), 2)
 
     def gradient(self, f: Float[Array, "3 *rest"]) -> Float[Array, "3 *rest"]:
         """grad H at wrenches."""
         # one sum, because XLA fuses a sum into a sum, which is slow
         if self.degree == 2:
-            return summed(self._table(f)[:, :, 0] * f[None], 1)
-        return summed(self._table(f) * (f[:, None] * _pairs(f)[None])[None], (1, 2)) / 3
+            return summed(self._table(f)[:, :, 0] * repeated(f, 0, 3), 1)
+        return summed(self._table(f) * repeated(repeated(f, 1, 6) * repeated(_pairs(f), 0, 3), 0, 3), (1, 2)) / 3
 
     def _table(self, f: Float[Array, "3 *rest"]) -> Float[Array, "3 3 products *rest"]:
         """The table with axes between its own and the batch, like those of wrenches."""
