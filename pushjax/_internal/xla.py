@@ -42,11 +42,6 @@ def compute_once(values, runtime_scalar: Scalar):
     return jax.tree.map(divided_by_one, values)
 
 
-def decide(conditions, runtime_scalar: Scalar):
-    """Compute conditions exactly once (`compute_once`), so that all code that uses a condition has the same result."""
-    return compute_once(conditions, runtime_scalar)
-
-
 def update_if(condition: Bool[Array, ""], update: Callable, state):
     """Return `update(state)` if `condition` holds, else `state`; it has no derivatives in reverse mode."""
     # Under `vmap`, `lax.cond` always runs both branches. This loop of at most one iteration skips `update` if the

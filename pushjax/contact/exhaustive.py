@@ -3,7 +3,7 @@
 The wrench has three components, so it is a positive combination of at most three linearly independent cone edges
 (Caratheodory). Each such set gives as many kinematic conditions as it has edges: the normal condition of each of its
 contacts, and the tangential condition of a contact that has both its edges in the set (and then sticks). So a solution
-of the problem solves one of these square systems. Each system has a closed form, or takes a fixed number of Newton
+of the problem solves one of these square systems. Each system has a closed form, or takes a bounded number of
 iterations. With m contacts, the systems are:
 
 one edge      The edge gives the direction of the wrench. 2 m sets.
@@ -69,7 +69,10 @@ class Exhaustive(ContactSolver):
 
 
 class Continuing(Exhaustive):
-    """The default in rollouts: one contact alone, then the cone edges of the stage before, are tried first."""
+    """The default in rollouts: one contact alone, then the cone edges of the stage before, are tried first.
+
+    `solving` does this, because it takes no search.
+    """
 
 
 def _all_sets(m: int) -> tuple[Sets, Sets, np.ndarray]:

@@ -1,6 +1,6 @@
 """The motion under the forces along a given set of cone edges, to the last digit; it is not differentiated.
 
-A search (`exhaustive`, `projected`) or the stage of a rollout before gives the set. Its wrench F = Q beta and its
+A search (`exhaustive`, `paper`) or the stage of a rollout before gives the set. Its wrench F = Q beta and its
 conditions R V = b make a square system R grad H(Q beta) = b in three slots, one for each edge that a set can have. A
 slot without an edge has zero axis, row and right-hand side, and a one on the Jacobian's diagonal. Newton's method
 solves the system; then every condition of the problem is checked. For a guess, this is the only check.

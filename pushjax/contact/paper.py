@@ -59,11 +59,11 @@ class HessianIteration(StickingSolver):
     max_rounds: int = eqx.field(static=True, default=25)
     tolerance: float | None = eqx.field(static=True, default=None)
 
-    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> tuple[Scalar, Int[Array, ""]]:
-        f, iterations, _ = self.trace(curve, v)
+    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Scalar:
+        f, _, _ = self.trace(curve, v)
         # where f_n <= 0 the contact does not stick, and any finite ratio will do
         forward = f.x > 0
-        return jnp.where(forward, f.y / jnp.where(forward, f.x, 1.0), friction), iterations
+        return jnp.where(forward, f.y / jnp.where(forward, f.x, 1.0), friction)
 
     def trace(self, curve: LimitCurve, v: Vec2) -> tuple[Vec2, Int[Array, ""], Scalar]:
         """Return the force (f_n, f_t) whose motion is along v, the iterations, and |sin| between motion and v."""

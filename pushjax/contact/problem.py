@@ -21,7 +21,7 @@ from pushjax._internal.checks import (
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
-from pushjax.contact.exhaustive import Continuing, Exhaustive
+from pushjax.contact.exhaustive import Continuing
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.single import solve_single
 from pushjax.contact.solving import solve
@@ -196,7 +196,6 @@ def _solved(surface: LimitSurface, contacts: Contacts, solver: ContactSolver | S
     """`solve_contacts`, compiled."""
     form, friction = form_and_friction(surface, contacts.friction)
     friction = jnp.where(_is_unit(contacts.normal), friction, jnp.nan)  # `Contacts` could not check a traced normal
-    solver = solver or (ScalarRoot() if len(friction) == 1 else Exhaustive())
     result = solve_problem(form, contacts_in_columns(contacts, friction), contacts.active, solver, None, margin=True)
     wrench = Vec3(result.wrench.x, result.wrench.y, result.wrench.z * form.length)
     twist, force = result.twist.array(), result.force.array().T
@@ -227,7 +226,8 @@ def solve_problem(
 ) -> ContactSolution:
     """Solve a contact problem.
 
-    `guess` may be the cone edges that carried the force before; the default solver tries them first.
+    `guess` may be the cone edges that carried the force before; the default solver tries them after one contact
+    alone.
 
     Raises:
         ValueError: For more than eight contacts, or for more than one with a solver of one contact.
@@ -253,7 +253,7 @@ def solve_problem(
 
 
 def form_and_friction(surface: LimitSurface, friction: Array) -> tuple[Form, Array]:
-    """H of the limit surface, and the friction of the contacts, (contacts,)."""
+    """H of the limit surface, and the friction of contacts or fingers, both without invalid numbers."""
     form = surface.form()
     # A surface with numbers that cannot be computed with is replaced by one with all numbers one, which keeps NaN out.
     # The friction is then NaN, which makes every contact invalid.

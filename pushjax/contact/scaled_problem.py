@@ -5,8 +5,9 @@ The slider's contact point moves by (a_n . V, a_t . V) along normal and tangent,
 f_n a_n + f_t a_t. The friction cone has two edges. Their wrenches are a_n + mu a_t (the pusher slides left) and
 a_n - mu a_t (right). Edges are numbered 2 i for the left and 2 i + 1 for the right edge of contact i.
 
-Displacements are divided by the longest displacement of a pusher, and H by the sum of its values at the three unit
-wrenches. So tolerances are relative, and powers of the coefficients of H stay within the range of float32.
+Displacements are divided by the longest displacement of a pusher, or the deepest overlap if that is larger, and H by
+the sum of its values at the three unit wrenches. So tolerances are relative, and powers of the coefficients of H stay
+within the range of float32.
 
 Arrays have vectors along the first axis, then contacts, then the batch, if there is one.
 """

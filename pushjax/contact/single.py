@@ -6,11 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._internal.xla import compute_once, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact, LimitCurve
 from pushjax.contact.status import ContactMode, Status
-from pushjax.contact.sticking import StickingSolver, sticking_tolerance
+from pushjax.contact.sticking import StickingSolver
+from pushjax.contact.tolerances import relative_tolerance
 from pushjax.friction.limit_surface import Form
 
 
@@ -51,7 +52,7 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     curve, size = compute_once((LimitCurve(tuple(c / size for c in curve.c)), size), contact.approach().x)
     mu, v = contact.friction, contact.approach()
     valid = usable & jnp.isfinite(sum(curve.c))
-    pushes = decide(valid & (v.x > 0), v.x)
+    pushes = compute_once(valid & (v.x > 0), v.x)
     v = tree_where(pushes, v, Vec2(jnp.ones_like(v.x), jnp.zeros_like(v.y)))  # placeholder where nothing pushes
     curve = LimitCurve(tuple(jnp.where(valid, c, float(k == 0)) for k, c in enumerate(curve.c)))
 
@@ -82,8 +83,8 @@ def solve_single(form: Form, contact: Contact, solver: StickingSolver) -> Single
     normal = contact.normal
     linear = normal.scale(point_motion.x) + normal.perp().scale(point_motion.y) - contact.point.perp().scale(omega)
     h = curve.value(s)
-    solved = (h > 0) & (slides | (sticking.residual <= sticking_tolerance(s.dtype))) & jnp.isfinite(omega)
-    moves = decide(pushes & solved, v.x)
+    solved = (h > 0) & (slides | (sticking.residual <= relative_tolerance(s.dtype))) & jnp.isfinite(omega)
+    moves = compute_once(pushes & solved, v.x)
     force_scale = (jnp.where(h > 0, h, 1.0) ** (-1 / form.degree)) * size ** (-1 / form.degree)
 
     def where_moving(value):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from pushjax._internal.xla import decide
+from pushjax._internal.xla import compute_once
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.single import SingleSolution, solve_single
 from pushjax.contact.status import Status
@@ -42,4 +42,4 @@ def solve_most_pressed(
     clear = normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size
     answers = jnp.all(clear | is_main) & (one.status == Status.MOVING)
     suffices = jnp.all(contacts.friction >= 0) & (answers | jnp.all(approach <= 0))
-    return decide(suffices, contacts.gap[0]), one, is_main
+    return compute_once(suffices, contacts.gap[0]), one, is_main

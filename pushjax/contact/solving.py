@@ -1,10 +1,10 @@
 """The answer to a problem of several contacts: a guess or a search for the edges that carry the force, then the finish.
 
-In a rollout, one contact alone is tried first (`single_first`). Where it does not suffice, the cone edges that carried
-the force in the stage before mostly carry it again: their equations are solved and every condition is checked
-(`finish`). A search follows where they do not solve the problem. In a batch, each of these is done only for the
-examples that need it (`batch_last`). Where there are several motions, the one that continues is then the answer,
-although another may have larger power, which `solve_contacts` gives.
+In a rollout, one contact alone is tried first (`single_first`), for every example. Where it does not suffice, the cone
+edges that carried the force in the stage before mostly carry it again: their equations are solved and every condition
+is checked (`finish`). A search follows where they do not solve the problem. In a batch, guess and search are done only
+for the examples that need them (`batch_last`). Where there are several motions, the one that continues is then the
+answer, although another may have larger power, which `solve_contacts` gives.
 
 Derivatives are those of the solution (`derivative`), whatever found it.
 """

@@ -40,6 +40,7 @@ class Status(IntEnum):
             slider is left where it is.
     """
 
+    # Up to FREE the contact problem is solved; from OVERLAPPING on there is none to solve.
     MOVING = 0
     FREE = 1
     JAMMED = 2

@@ -15,19 +15,12 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Int
 
-from pushjax._internal.xla import compute_once, decide
+from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.contact.contact_plane import LimitCurve
 
 MAX_ITERATIONS = 12  # iterations with a bracket at most; see `ScalarRoot`
-
-
-def sticking_tolerance(dtype) -> float:
-    """Largest sine of the angle between motion and push that counts as sticking: 4e-10, or 7e-5 in float32."""
-    return float(jnp.finfo(dtype).eps) ** 0.6
 
 
 class Sticking(NamedTuple):
@@ -35,14 +28,13 @@ class Sticking(NamedTuple):
 
     ratio: Scalar  # f_t / f_n
     residual: Scalar  # sine of the angle that is left between motion and push, less roundoff
-    iterations: Int[Array, ""]
 
 
 class StickingSolver(eqx.Module):
     """Finds the ratio f_t / f_n of a sticking contact. It has settings only, no state."""
 
     @abstractmethod
-    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> tuple[Scalar, Int[Array, ""]]:
+    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Scalar:
         """Search for the ratio; not differentiated.
 
         Args:
@@ -51,13 +43,12 @@ class StickingSolver(eqx.Module):
             friction: Coefficient of friction mu.
 
         Returns:
-            The ratio and the number of iterations. The ratio is meaningful only where v_n > 0 and the contact sticks.
-            It is always finite.
+            The ratio. It is meaningful only where v_n > 0 and the contact sticks, and always finite.
         """
 
     def __call__(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Sticking:
         """Find the ratio, with its derivatives and its residual; the arguments are as in `iterate`."""
-        ratio, iterations = _solve(self, curve, v, friction)
+        ratio = _solve(self, curve, v, friction)
         motion = curve.motion(ratio)
         size = jnp.sqrt(motion.dot(motion) * v.dot(v))
         # The roundoff of the terms of g is subtracted, because no iteration can reduce it: where h is ill-conditioned
@@ -65,7 +56,7 @@ class StickingSolver(eqx.Module):
         absolute_terms = LimitCurve(tuple(jnp.abs(c) for c in curve.c)).motion(jnp.abs(ratio))
         roundoff = 4 * jnp.finfo(size.dtype).eps * (absolute_terms.x * jnp.abs(v.y) + absolute_terms.y * jnp.abs(v.x))
         residual = jnp.maximum(jnp.abs(motion.cross(v)) - roundoff, 0) / jnp.where(size > 0, size, 1.0)
-        return Sticking(ratio, jax.lax.stop_gradient(residual), iterations)
+        return Sticking(ratio, jax.lax.stop_gradient(residual))
 
 
 @eqx.filter_custom_jvp
@@ -78,7 +69,7 @@ def _solve(solver: StickingSolver, curve: LimitCurve, v: Vec2, friction: Scalar)
 def _solve_jvp(primals, tangents):
     solver, curve, v, friction = primals
     _, d_curve, d_v, _ = tangents
-    ratio, iterations = _solve(solver, curve, v, friction)
+    ratio = _solve(solver, curve, v, friction)
     zero = jnp.zeros_like(ratio)
     # Equinox gives None as the tangent of what is not perturbed.
     d_curve = LimitCurve(tuple(zero if d is None else d for d in d_curve.c))
@@ -88,7 +79,7 @@ def _solve_jvp(primals, tangents):
     change = d_motion.cross(v) + motion.cross(d_v)
     usable = slope > jnp.finfo(slope.dtype).tiny
     d_ratio = jnp.where(usable, change / jnp.where(usable, slope, 1.0), 0.0)
-    return (ratio, iterations), (d_ratio, np.zeros(np.shape(iterations), jax.dtypes.float0))
+    return ratio, d_ratio
 
 
 def _slope(curve: LimitCurve, v: Vec2, s: Scalar, motion: Vec2) -> Scalar:
@@ -114,7 +105,7 @@ class ScalarRoot(StickingSolver):
 
     rounds: int | None = eqx.field(static=True, default=None)
 
-    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> tuple[Scalar, Int[Array, ""]]:
+    def iterate(self, curve: LimitCurve, v: Vec2, friction: Scalar) -> Scalar:
         # start with the force along v: there motion . v = d h > 0, so motion and push do not oppose each other
         forward = v.x > 0
         s = jnp.clip(v.y / jnp.where(forward, v.x, 1.0), -friction, friction)
@@ -122,7 +113,7 @@ class ScalarRoot(StickingSolver):
             motion = curve.motion(s)
             slope = _slope(curve, v, s, motion)
             s = jnp.clip(s - v.cross(motion) / jnp.where(slope > 0, slope, 1.0), -friction, friction)
-            return s, jnp.ones_like(s, jnp.int32)
+            return s
         eps = float(jnp.finfo(s.dtype).eps)
         # Newton's method doubles the digits, so it has converged after a step as short as `newton_tolerance`. A
         # bisection is only as exact as its own length, so that has to be as short as `bisection_tolerance`.
@@ -135,7 +126,7 @@ class ScalarRoot(StickingSolver):
             next_s, power, rising, _ = _newton_step(curve, v, s)
             converged = rising & (power > 0) & (jnp.abs(next_s - s) <= newton_tolerance) & (jnp.abs(next_s) <= friction)
             s = compute_once(jnp.clip(next_s, -friction, friction), v.x)
-        converged = decide(converged | (friction <= 0), v.x)  # without friction there is nothing to find
+        converged = compute_once(converged | (friction <= 0), v.x)  # without friction there is nothing to find
 
         def guarded_iteration(state):
             # Let phi(s) be the angle of motion(s) and phi_v that of v. The sign of phi(s) - phi_v says which end of the
@@ -153,8 +144,7 @@ class ScalarRoot(StickingSolver):
 
         # a loop, because in an unrolled one the compiler would recompute each bracket from all iterations before it
         start = (s, -friction, friction, ~converged, jnp.zeros_like(s, jnp.int32))
-        s, *_, guarded = jax.lax.while_loop(lambda state: state[3] & (state[4] < max_guarded), guarded_iteration, start)
-        return s, unguarded + guarded
+        return jax.lax.while_loop(lambda state: state[3] & (state[4] < max_guarded), guarded_iteration, start)[0]
 
 
 def _newton_step(curve: LimitCurve, v: Vec2, s: Scalar):

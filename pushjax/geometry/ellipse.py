@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, checked_array, common_dtype
-from pushjax._internal.xla import decide, tree_where
+from pushjax._internal.xla import compute_once, tree_where
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, OvalOutline, Shape, equally_spaced
 
@@ -85,9 +85,9 @@ def _falling_root_on_circle(
         q, low, high = carry
         value, slope, step = function(q)
         proposal = _rotated(q, step)
-        is_positive, is_zero = decide((value > 0, jnp.abs(value) <= zero_tolerance), like)
+        is_positive, is_zero = compute_once((value > 0, jnp.abs(value) <= zero_tolerance), like)
         low, high = tree_where(is_positive, q, low), tree_where(is_positive, high, q)
-        (is_usable,) = decide((_lies_on_arc(proposal, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
+        (is_usable,) = compute_once((_lies_on_arc(proposal, low, high) & (slope < 0) & (jnp.abs(step) < 1),), like)
         return tree_where(is_zero, q, tree_where(is_usable, proposal, _arc_midpoint(low, high))), low, high
 
     return jax.lax.fori_loop(0, iterations, iterate, (q, low, high))[0]
@@ -129,7 +129,7 @@ def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi
     # Halley's method can overshoot a root at an end of the quadrant. Where f has the right sign beyond that end, the
     # bracket extends past it. Where it does not, a root at that end is a critical point that is not the closest point,
     # and the search must not begin there.
-    past_start, past_end = decide((ax > a2_minus_b2, by > -a2_minus_b2), ax)
+    past_start, past_end = compute_once((ax > a2_minus_b2, by > -a2_minus_b2), ax)
     low = tree_where(past_start, Vec2(0.8 * one, -0.6 * one), Vec2(one, zero))
     high = tree_where(past_end, Vec2(-0.6 * one, 0.8 * one), Vec2(zero, one))
     # The closest point satisfies c = ax / (t + a^2) and s = by / (t + b^2) for one t, which is a b / speed times the
@@ -140,7 +140,7 @@ def _closest_in_first_quadrant(a2_minus_b2: Scalar, ax: Scalar, by: Scalar, semi
     margin = 0.05 * guess_size + jnp.finfo(guess_size.dtype).tiny
     guess = Vec2(jnp.where(past_end, guess.x, guess.x + margin), jnp.where(past_start, guess.y, guess.y + margin))
     guess = guess.scale(1 / (jnp.abs(guess.x) + jnp.abs(guess.y) + jnp.finfo(guess_size.dtype).tiny))
-    is_degenerate = decide(guess.x + guess.y < 0.5, ax)
+    is_degenerate = compute_once(guess.x + guess.y < 0.5, ax)
     q = _unit(tree_where(is_degenerate, Vec2(one, one), guess))
     zero_tolerance = 2 * jnp.finfo(ax.dtype).eps * (jnp.abs(a2_minus_b2) + ax + by)
     least_slope = jnp.full_like(ax, jnp.finfo(ax.dtype).tiny)

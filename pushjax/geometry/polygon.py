@@ -20,8 +20,8 @@ class Polygon(Shape):
         vertices: Vertices, shape (vertices, 2), m, at least three, in either orientation. The first vertex is not
             repeated at the end.
         convex: Whether the polygon is convex, so that a finger touches it in one place only. None: determined from the
-            vertices; if they are traced, convexity is not assumed. False for a convex polygon costs time but does not
-            change results.
+            vertices; if they are traced, convexity is not assumed. False for a convex polygon costs time, and
+            gives a finger room for two contacts, but does not change the motion.
 
     Raises:
         ValueError: If there are fewer than three vertices, or NaN or repeated vertices among them; if edges cross; if

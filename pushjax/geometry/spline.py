@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import compute_once, decide, tree_where
+from pushjax._internal.xla import compute_once, tree_where
 from pushjax._math.roots import Proposal, bracketed_root
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline
@@ -114,7 +114,7 @@ class SplineOutline(Outline):
         second_guess = jnp.where(other_values[second] < jnp.inf, minima.position[second], least)
         refined, refined_second = self._refine(fixed, least), self._refine(fixed, second_guess)
         offset, offset_second = (fixed - segment.evaluate(t)[0] for _, segment, t in (refined, refined_second))
-        (nearer,) = decide((offset_second.dot(offset_second) < offset.dot(offset),), x.x)
+        (nearer,) = compute_once((offset_second.dot(offset_second) < offset.dot(offset),), x.x)
         return minima, *tree_where(nearer, refined_second, refined)
 
     def closest(self, x: Vec2) -> ClosestPoint:
@@ -130,7 +130,7 @@ class SplineOutline(Outline):
         chosen = jnp.argmin(jnp.where(others, minima.value, jnp.inf))
         _, segment, t = self._refine(x, minima.position[chosen])
         second = _closest_on_segment(segment, t, x)
-        (found,) = decide((jnp.any(others) & (second.distance > 0),), x.x)
+        (found,) = compute_once((jnp.any(others) & (second.distance > 0),), x.x)
         none = ClosestPoint(first.distance + self.perimeter, first.point, first.normal)
         return first, tree_where(found, second, none)
 

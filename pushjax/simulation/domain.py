@@ -39,12 +39,12 @@ def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], leng
         shape = body if isinstance(body, Shape) else getattr(body, "shape", None)
         if shape is not None:
             lengths = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(shape)])
-            valid &= within(lengths, length) & shape.is_valid()
+            valid &= within(lengths, length, is_pose=False) & shape.is_valid()
             valid &= jnp.max(jnp.abs(lengths)) >= jnp.finfo(length.dtype).eps * length
         if isinstance(body, RoundFinger):
-            valid &= within(body.radius[None], length) & (body.radius >= 0)
+            valid &= within(body.radius[None], length, is_pose=False) & (body.radius >= 0)
         if isinstance(body, Wall):
-            valid &= within(body.point, length) & (jnp.sum(body.normal**2) > 0)
+            valid &= within(body.point, length, is_pose=False) & (jnp.sum(body.normal**2) > 0)
         if isinstance(body, Fixture):
             valid &= within(body.pose, length)
         if isinstance(body, Wall | Fixture):
@@ -52,10 +52,10 @@ def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], leng
     return valid
 
 
-def within(pose: Float[Array, "*rows coordinates"], length: Scalar) -> Bool[Array, "*rows"]:
+def within(pose: Float[Array, "*rows coordinates"], length: Scalar, *, is_pose: bool = True) -> Bool[Array, "*rows"]:
     """Return whether lengths and angles are no larger than a float resolves to a tenth of `length` and of a radian."""
     pose, unit = jax.lax.stop_gradient((pose, jnp.broadcast_to(length, pose.shape[-1:])))
-    if pose.shape[-1] == 3:  # a pose (x, y, theta); otherwise all numbers are lengths
+    if is_pose and pose.shape[-1] == 3:  # (x, y, theta); the others, and centers of fingers, are lengths
         unit = unit.at[2].set(1.0)
     largest = min(0.1 / float(jnp.finfo(pose.dtype).eps), 1e9)
     return jnp.all(jnp.abs(pose) <= largest * unit.reshape(*(1,) * (pose.ndim - 1), -1), axis=-1)

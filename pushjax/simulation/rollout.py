@@ -1,7 +1,7 @@
 """Rollouts of pushes and grasps: one step, and a path of steps.
 
 Quasi-static motion does not depend on time, so a step is a displacement of the hand; `pushjax.simulation.step` has the
-scheme of a step. The state is the pose of the pushed slider, with two exceptions (`rollout`).
+scheme of a step. The state is the pose of the pushed slider, with few exceptions (`rollout`).
 
 If no motion satisfies every contact, the hand has jammed, and it stops there for good. A step in which the hand stays
 changes nothing.
@@ -10,21 +10,17 @@ changes nothing.
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from pushjax._internal.autodiff import save_search_results
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_shape
 from pushjax._internal.jit import is_staging, quick_jit
-from pushjax._internal.xla import decide, skippable, tree_where
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
-from pushjax.contact.status import Status
 from pushjax.contact.sticking import StickingSolver
 from pushjax.friction.limit_surface import Form
 from pushjax.friction.table import Table, TransformedForm
@@ -41,19 +37,16 @@ from pushjax.simulation.arguments import (
 from pushjax.simulation.detection import num_contacts
 from pushjax.simulation.domain import MAX_FRICTION, are_valid, replace_invalid, valid_path, within
 from pushjax.simulation.finger_motion import (
-    allowed_penetration,
     finger_motions,
     fixture_motions,
-    max_displacement,
-    max_penetration,
     unstack_finger_poses,
 )
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
-from pushjax.simulation.step import StepRecord, compute_step
-from pushjax.simulation.substeps import DividedPush, hand_stops, simulate_in_substeps
+from pushjax.simulation.substeps import PreparedPush, hand_stops, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
+from pushjax.simulation.whole_steps import simulate_in_whole_steps
 
 MIN_SIZE, SIZE_RATIO = 32, 4  # steps that programs are compiled for: 32, 128, 512, ...
 
@@ -70,7 +63,7 @@ def step(
     table: Table | None = None,
     fixtures: Sequence[Wall | Fixture] = (),
 ) -> Step:
-    """Move the hand from one configuration to another; this is the one step that `rollout` scans.
+    """Move the hand from one configuration to another: a rollout of one step, which is divided where it must be.
 
     Some faults raise no error, but show in the status of the step. It is OVERLAPPING if a finger or a fixture starts
     too deep in the slider, and INVALID if a traced value is not finite or a traced friction is negative.
@@ -129,8 +122,9 @@ def rollout(
     """Push the slider along a path of hand configurations.
 
     There is no state besides the slider's pose: a push continues with `rollout(..., rest_of_path, pose=push.pose[-1])`.
-    There are two exceptions. Within one rollout, the step after a failed one is not divided. And where several motions
-    satisfy all contacts, a rollout goes on with the motion that continues.
+    Four things are remembered within a rollout only. A hand that has jammed stays where it is. The step after a failed
+    one is not divided. Where several motions satisfy all contacts, the one that continues is taken. And a path of n
+    steps has at most 4 n + 64 trials of a step or a part of one.
 
     The result is differentiable, in forward and reverse mode, in slider, hand, path, pose, friction and table. Use
     `vmap` for batches.
@@ -233,10 +227,10 @@ def simulate(
     num_steps: Array | None = None,  # steps to simulate; None for all. The rest of the result has no meaning
 ) -> Trajectory:
     """Roll out a path, with arguments that have been checked. `rollout` is the public function."""
-    push, first_pose = divided_push(shape, hand, path, pose, solver, friction_at, fixtures)
+    push, first_pose = prepared_push(shape, hand, path, pose, solver, friction_at, fixtures)
     push, start, steps = push._replace(num_steps=num_steps), Vec3.of(first_pose), len(path) - 1
     if not fixtures and sum(num_contacts(finger, push.outline) for finger in hand.fingers) == 1:
-        records = _simulate_one_contact(push, start)
+        records = simulate_in_whole_steps(push, start)
         fraction = jnp.zeros_like(start.x)
     else:
         records, fraction = simulate_in_substeps(push, start)
@@ -255,7 +249,7 @@ def simulate(
     return Trajectory(pose=poses, configuration=configuration, **other_fields)
 
 
-def divided_push(
+def prepared_push(
     shape: Shape,
     hand: Hand,
     path: Array,
@@ -263,7 +257,7 @@ def divided_push(
     solver: ContactSolver | StickingSolver | None,
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
-) -> tuple[DividedPush, Array]:
+) -> tuple[PreparedPush, Array]:
     """Return a push whose steps can be divided, and its first pose, (3,), both without invalid numbers (`domain`)."""
     length = friction_at(jnp.zeros((), jnp.int32), Vec3.of(jnp.zeros_like(pose)))[0].length
     shape_valid, hand_valid, fixtures_valid, pose_valid = (
@@ -292,38 +286,7 @@ def divided_push(
         valid_before, valid_after = rows_at(step, row_valid)
         return form, jnp.where(valid_before & valid_after & (mu <= MAX_FRICTION), mu, jnp.nan)
 
-    push = DividedPush(shape.outline(), len(path) - 1, motions_at, solver, friction_if_valid, fixture_motions(fixtures))
+    push = PreparedPush(
+        shape.outline(), len(path) - 1, motions_at, solver, friction_if_valid, fixture_motions(fixtures)
+    )
     return push, jnp.where(pose_valid, pose, 0.0)
-
-
-def _simulate_one_contact(push: DividedPush, start: Vec3) -> StepRecord:
-    """Return the records of all steps of a hand with one contact."""
-    # This is a round finger on a convex outline, or a pad on a disk. Such a step is not divided. If it is too long, it
-    # is NOT_CONVERGED.
-
-    def body(before: tuple[Vec3, Array], step: Array):
-        pose, depth = before
-        form, mu = push.friction_at(step, pose)
-        motions = push.motions_at(step, mu)
-        # one contact holds nothing
-        record, *_ = compute_step(form, push.outline, motions, push.solver, pose, depth, jnp.zeros_like(pose.x))
-        allowed = jnp.maximum(depth, allowed_penetration(max_displacement(motions), form.length))
-        depth = max_penetration(push.outline, motions, record.pose, 1.0)
-        is_solved = (record.status == Status.MOVING) | (record.status == Status.FREE)
-        is_too_long = decide(is_solved & (depth > allowed), pose.x)
-        depth_at_rest = jax.lax.cond(
-            eqxi.unvmap_any(is_too_long), lambda: max_penetration(push.outline, motions, pose, 1.0), lambda: depth
-        )
-        pose, depth = tree_where(is_too_long, (pose, depth_at_rest), (record.pose, depth))
-        return (pose, depth), (record._replace(pose=pose, overlap=depth), is_too_long)
-
-    first = jnp.zeros((), jnp.int32)
-    motions = push.motions_at(first, push.friction_at(first, start)[1])
-    before = start, max_penetration(push.outline, motions, start, 0.0)
-    if push.num_steps is not None:
-        body = skippable(lambda _, step: step < push.num_steps, body, before, first)
-    body = jax.checkpoint(body, prevent_cse=False, policy=save_search_results)
-    _, (records, is_too_long) = jax.lax.scan(body, before, jnp.arange(push.steps, dtype=jnp.int32))
-    failed = jax.tree.map(jnp.zeros_like, records)._replace(pose=records.pose, overlap=records.overlap)
-    failed = failed._replace(status=jnp.full_like(records.status, Status.NOT_CONVERGED))
-    return jax.vmap(tree_where)(is_too_long, failed, records)

@@ -32,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from pushjax._internal.xla import compute_once, decide, map_items, tree_where
+from pushjax._internal.xla import compute_once, map_items, tree_where
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.problem import ContactSolution, solve_problem
@@ -66,7 +66,7 @@ class StepRecord(NamedTuple):
     contact_normal: Vec2  # of each contact, inward, of unit length, body frame
     mode: Int[Array, "contacts"]  # `ContactMode` of each contact
     status: Int[Array, ""]  # `Status`
-    overlap: Scalar  # depth of the deepest finger at the end, m; zero until it is computed
+    overlap: Scalar  # depth of the deepest finger or fixture at the end, m; zero until it is computed
 
 
 class Stage(NamedTuple):
@@ -188,7 +188,7 @@ def compute_step(
     ongoing: Bool[Array, ""] | bool = True,  # where False, no contact problem is solved, and the result has no meaning
     fixtures: tuple[FingerMotion, ...] = (),  # as fingers that stay where they are
     is_first_try: Bool[Array, ""] | bool = True,  # True where `urgency` has no meaning yet
-    guess: EdgeSet | None = None,  # cone edges that carried the force last, which are tried first
+    guess: EdgeSet | None = None,  # cone edges that carried the force last
 ) -> tuple[StepRecord, Stage]:
     """Compute one step of all fingers, or a part of one: its record, and the last stage."""
     start = BodyFrame.at(pose)
@@ -303,7 +303,7 @@ def _keep_pose_unless_moving(last: Stage, moved_pose: Vec3, pose: Vec3, status: 
     """Return the record of a step; a slider that does not move keeps its pose bit for bit."""
     # A motion that is not finite becomes the status INVALID, and the slider keeps its pose, too.
     finite_pose = jnp.isfinite(moved_pose.x + moved_pose.y + moved_pose.z)
-    moves = decide((status == Status.MOVING) & finite_pose, pose.x)
+    moves = compute_once((status == Status.MOVING) & finite_pose, pose.x)
     status = jnp.where((status == Status.MOVING) & ~finite_pose, Status.INVALID, status).astype(jnp.int8)
     pose, solution = tree_where(moves, moved_pose, pose), last.solution
     vectors = solution.twist, solution.wrench, solution.force, last.point, last.normal

@@ -4,8 +4,8 @@ A step is too long if its result leaves a finger inside the slider. This happens
 another of its corners came to touch, or if it slid past the end of what a finger rests on; no contact that is detected
 at the start shows either. Such a step is undone and tried again with half the size, down to a part of `SMALLEST_PART`
 of the step. A part that succeeds is followed by one of twice the size. Right after a failure it is first followed by
-one of the same size. Before a part is halved, a contact that the result violates and that was not in the contact
-problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
+one of the same size. Before a part is accepted or halved, a contact that the result violates and that was not in the
+contact problem joins the problem (`working_set`), which is then solved again. If the smallest part fails, the step is
 NOT_CONVERGED, and the slider stays where the step began.
 
 A step is also too long if the slider moves far and much faster than the hand (`slider_speed`).
@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.autodiff import save_search_results
-from pushjax._internal.xla import compute_once, decide, skippable, tree_where
+from pushjax._internal.xla import compute_once, skippable, tree_where
 from pushjax._math.vec import Scalar, Vec3
 from pushjax.contact.scaled_problem import ContactSolver, EdgeSet
 from pushjax.contact.status import Status
@@ -105,8 +105,13 @@ class StepEnd(NamedTuple):
     outcome: Outcome
 
 
-class DividedPush(NamedTuple):
-    """A push whose steps can be divided: everything that stays the same from trial to trial."""
+def max_trials(steps):
+    """Number of trials of a path after which the steps that are left are NOT_CONVERGED."""
+    return TRIALS_PER_STEP * steps + EXTRA_TRIALS
+
+
+class PreparedPush(NamedTuple):
+    """Everything about a push that stays the same from step to step and from trial to trial."""
 
     outline: Outline
     steps: int  # of the path, with those that only fill it up
@@ -122,11 +127,6 @@ class DividedPush(NamedTuple):
     def end(self) -> Int[Array, ""] | int:
         """Index of the step at which the push has ended."""
         return self.steps if self.num_steps is None else self.num_steps
-
-    @property
-    def max_trials(self) -> int:
-        """Number of trials after which the steps that are left are NOT_CONVERGED."""
-        return TRIALS_PER_STEP * self.steps + EXTRA_TRIALS
 
     def first_state(self, pose: Vec3) -> PushState:
         """Return the state before the first trial, with the slider at `pose`, world."""
@@ -184,14 +184,14 @@ class DividedPush(NamedTuple):
         return [num_contacts(motion.finger, self.outline) for motion in motions + self.fixtures]
 
 
-def simulate_in_substeps(push: DividedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
+def simulate_in_substeps(push: PreparedPush, pose: Vec3) -> tuple[StepRecord, Scalar]:
     """Return the stacked records of all steps, and the fraction of its last step that a stopped hand did."""
-    initial_state, numbers = push.first_state(pose), jnp.arange(push.max_trials, dtype=jnp.int32)
+    initial_state, numbers = push.first_state(pose), jnp.arange(max_trials(push.steps), dtype=jnp.int32)
 
     def is_ongoing(state: PushState, number: Int[Array, ""]) -> Bool[Array, ""]:
         ongoing = state.step < push.end
         if push.num_steps is not None:
-            ongoing &= number < TRIALS_PER_STEP * push.num_steps + EXTRA_TRIALS
+            ongoing &= number < max_trials(push.num_steps)
         return ongoing
 
     trial = skippable(is_ongoing, push.trial, initial_state, numbers[0])
@@ -273,9 +273,8 @@ def _decide(
     ends_at_once = abandons & ~is_solved & (state.part == 1)
     reason = jnp.where(is_solved, Status.NOT_CONVERGED, record.status)
     reason = jnp.where(fails, state.abandon_status, reason).astype(jnp.int8)
-    return Decision(
-        accepted, joins, braces, stops, abandons & ~ends_at_once, decide(fails | ends_at_once, state.pose.x), reason
-    )
+    fails = compute_once(fails | ends_at_once, state.pose.x)
+    return Decision(accepted, joins, braces, stops, abandons & ~ends_at_once, fails, reason)
 
 
 def _next_state(
@@ -291,12 +290,12 @@ def _next_state(
 ) -> tuple[PushState, StepEnd]:
     """Return the state after a trial, and how its step ended."""
     ongoing = state.step < steps
-    pose = tree_where(decide(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
+    pose = tree_where(compute_once(state.abandon_status != 0, state.pose.x), state.origin, record.pose)
     depth = max_penetration(outline, part, pose, 1.0)
     decision = _decide(state, record, last_stage.urgency_after, depth, tolerance, speed)
     accepted, stops, fails = decision.accepted, decision.stops, decision.fails
 
-    moves = decide(record.status == Status.MOVING, pose.x)
+    moves = compute_once(record.status == Status.MOVING, pose.x)
     twist, source = state.twist + record.twist, jnp.where(moves, number, state.source)
     done = state.done + state.part
     ends = ongoing & (fails | stops | (accepted & (done >= 1)))
@@ -308,7 +307,7 @@ def _next_state(
     outcome = tree_where(stops, stopped, tree_where(accepted, passed, failed))
 
     # the next trial: where it starts, and how large its part is
-    continues = decide(accepted & ~ends, pose.x)
+    continues = compute_once(accepted & ~ends, pose.x)
     restarts = (ends & ~stops) | decision.abandons
     jams = (state.part == 1) & hand_stops(record.status)
     again = decision.joins | decision.braces

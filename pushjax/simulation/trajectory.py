@@ -60,8 +60,9 @@ class Step(eqx.Module):
 class Trajectory(eqx.Module):
     """A push, step by step: the fields of `Step` with a leading axis of steps, and the configurations of the hand.
 
-    At a jam the hand stops, within a sixteenth of a step before the jam. The status is then JAMMED, or GRASPED if every
-    finger and no fixture holds the slider, at this step and at every step after it, and nothing moves any more.
+    At a jam the hand stops, within a sixteenth of a step before the jam (right after a failed step, within a whole
+    step). The status is then JAMMED, or GRASPED if every finger and no fixture holds the slider, at this step and at
+    every step after it, and nothing moves any more.
 
     Attributes:
         pose: Poses of the slider, (steps + 1, 3), world, m and rad; the first is the start.

@@ -23,8 +23,8 @@ from pushjax.geometry.polygon_outline import PolygonOutline
 from pushjax.simulation.finger_motion import DEPTH_PER_DISPLACEMENT
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.simulation.rollout import FrictionAt, divided_push, simulate
-from pushjax.simulation.substeps import DividedPush, PushState
+from pushjax.simulation.rollout import FrictionAt, prepared_push, simulate
+from pushjax.simulation.substeps import PreparedPush, PushState, max_trials
 from pushjax.simulation.trajectory import Trajectory
 from pushjax.tasks.separation import DEEP, overlap_of_finger, overlap_of_wall, separate
 
@@ -174,17 +174,17 @@ class _Progress(NamedTuple):
     status: Int[Array, "steps"]
 
 
-def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[DividedPush, Array]:
+def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[PreparedPush, Array]:
     """The push with all contacts, and the pose at its start."""
     solver, friction_at = _contact_model(polygon, surface, friction, hand, path)
-    return divided_push(polygon, hand, path, pose, solver, friction_at, walls)
+    return prepared_push(polygon, hand, path, pose, solver, friction_at, walls)
 
 
 @jax.jit
 def _begin(*args) -> _Progress:
     """Return the state before the first trial."""
     push, start = _divided(*args)
-    trials = jnp.full((), push.max_trials, jnp.int32)
+    trials = jnp.full((), max_trials(push.steps), jnp.int32)
     return _Progress(push.first_state(Vec3.of(start)), trials, jnp.full(push.steps, -1, jnp.int8))
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import pushjax as pj
 from pushjax._internal.jit import jit, outside_trace, quick_jit, without_gc
-from pushjax._internal.xla import decide
+from pushjax._internal.xla import compute_once
 
 
 @pytest.fixture
@@ -229,6 +229,6 @@ def test_decisions_are_kept_where_the_scalar_is_a_constant():
     length = jnp.asarray(0.03)
 
     def larger(x, y):
-        return jnp.where(decide(x > y, length), x, y)
+        return jnp.where(compute_once(x > y, length), x, y)
 
     assert "divide(" in (jax.jit(jax.vmap(larger)).lower(x, x[::-1]).compile().as_text() or "")
