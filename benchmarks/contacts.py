@@ -47,7 +47,7 @@ def run(
 ) -> dict[str, Any]:
     """Check the answers to random problems, one row for each number of contacts and each model.
 
-    All rows take an hour.
+    All rows take a quarter of an hour of one core.
 
     Args:
         seed: Seed of the problems and of the search for other solutions.
