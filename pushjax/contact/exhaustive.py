@@ -54,8 +54,8 @@ class Exhaustive(ContactSolver):
     """Tries every set of cone edges: exact, at a fixed cost.
 
     A problem that it reports as JAMMED has no solution. In float32 this is wrong for a few of 100 000 problems, at the
-    border of a jam. In either type it can be wrong where two of at least three contacts are exactly opposite on one line
-    (see the header of this module).
+    border of a jam. In either type it can be wrong where two of at least three contacts are exactly opposite on one
+    line (see the header of this module).
     """
 
     proves_jams: ClassVar[bool] = True

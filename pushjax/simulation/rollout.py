@@ -44,7 +44,8 @@ from pushjax.simulation.finger_motion import (
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
-from pushjax.simulation.substeps import PreparedPush, hand_stops, simulate_in_substeps
+from pushjax.simulation.step import hand_stops
+from pushjax.simulation.substeps import PreparedPush, simulate_in_substeps
 from pushjax.simulation.trajectory import Step, Trajectory, first_true, to_arrays
 from pushjax.simulation.whole_steps import simulate_in_whole_steps
 

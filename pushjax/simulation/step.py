@@ -184,6 +184,7 @@ def compute_step(
     pose: Vec3,  # of the slider at the start, world
     overlap_before: Scalar,  # depth of the deepest finger or fixture at the start, m
     reach: Scalar,  # distance within which a finger holds a jammed slider, m
+    *,
     urgency: Urgency | None = None,  # of each contact (`working_set`); None if all are solved together
     ongoing: Bool[Array, ""] | bool = True,  # where False, no contact problem is solved, and the result has no meaning
     fixtures: tuple[FingerMotion, ...] = (),  # as fingers that stay where they are
@@ -219,15 +220,16 @@ def compute_step(
             solution = solution._replace(best=tree_where(solution.best.exists(), solution.best, guess))
         is_long = before.is_long | _turns_or_slips_too_far(contacts, active & has_end, solution, form.length)
         return Stage(
-            solution._replace(status=jnp.where(works, solution.status, before.solution.status)),
-            _force_weighted_point(contacts, solution.force),
-            frame.angle,
-            *jax.lax.stop_gradient((contacts.point, contacts.normal)),
-            at_start,
-            _holds(near, len(motions)),
-            is_long,
-            used_urgency,
-            None if urgency is None else violations(contacts, active, solution),
+            solution=solution._replace(status=jnp.where(works, solution.status, before.solution.status)),
+            middle=_force_weighted_point(contacts, solution.force),
+            angle=frame.angle,
+            point=jax.lax.stop_gradient(contacts.point),
+            normal=jax.lax.stop_gradient(contacts.normal),
+            at_start=at_start,
+            holds=_holds(near, len(motions)),
+            is_long=is_long,
+            urgency=used_urgency,
+            urgency_after=None if urgency is None else violations(contacts, active, solution),
         ), None
 
     fractions = jnp.array([0.0, 0.5], pose.x.dtype)
@@ -264,6 +266,11 @@ def _status(
     status = jnp.where(moves | (status == Status.INVALID), status, Status.FREE)
     overlapping = (depth > MAX_PENETRATION * length) & (status != Status.INVALID)
     return jnp.where(overlapping, Status.OVERLAPPING, status).astype(jnp.int8)
+
+
+def hand_stops(status: Array) -> Bool[Array, "..."]:
+    """Return whether a step of this status stops the hand for good."""
+    return (status == Status.JAMMED) | (status == Status.GRASPED)
 
 
 def _has_end(bodies: tuple[FingerMotion, ...], counts: list[int]) -> Bool[Array, "contacts"]:

@@ -47,7 +47,7 @@ from pushjax.simulation.finger_motion import (
     max_penetration,
 )
 from pushjax.simulation.slider_speed import SpeedJudgment, judge_speed
-from pushjax.simulation.step import Stage, StepRecord, compute_step
+from pushjax.simulation.step import Stage, StepRecord, compute_step, hand_stops
 from pushjax.simulation.working_set import LOADED, Urgency, initial_urgency
 
 SMALLEST_PART = 1 / 256  # of a step
@@ -134,13 +134,26 @@ class PreparedPush(NamedTuple):
         motions = self.motions_at(first, self.friction_at(first, pose)[1])
         overlap = max_penetration(self.outline, motions + self.fixtures, pose, 0.0)
         zero, one = jnp.zeros_like(pose.x), jnp.ones_like(pose.x)
-        status, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
+        none, no = jnp.zeros((), jnp.int8), jnp.zeros((), bool)
         counts = self._counts(motions)
-        urgency = initial_urgency(counts, pose.x)
-        guess, source = EdgeSet.none(zero) if sum(counts) > 1 else None, jnp.full((), NO_TRIAL, jnp.int32)
         return PushState(
-            *(pose, pose, first, zero, one, no, no, urgency, no, status),
-            *(overlap, status, status, no, Vec3(zero, zero, zero), source, guess),
+            pose=pose,
+            origin=pose,
+            step=first,
+            done=zero,
+            part=one,
+            halved=no,
+            whole_step_jams=no,
+            urgency=initial_urgency(counts, pose.x),
+            braced=no,
+            swaps=none,
+            overlap=overlap,
+            stop_status=none,
+            abandon_status=none,
+            failed=no,
+            twist=Vec3(zero, zero, zero),
+            source=jnp.full((), NO_TRIAL, jnp.int32),
+            guess=EdgeSet.none(zero) if sum(counts) > 1 else None,
         )
 
     def trial(self, state: PushState, number: Int[Array, ""]) -> tuple[PushState, tuple[StepRecord, StepEnd]]:
@@ -163,11 +176,11 @@ class PreparedPush(NamedTuple):
             state.pose,
             state.overlap,
             reach,
-            state.urgency,
-            state.step < self.end,
-            fixtures,
-            state.swaps == 0,
-            state.guess,
+            urgency=state.urgency,
+            ongoing=state.step < self.end,
+            fixtures=fixtures,
+            is_first_try=state.swaps == 0,
+            guess=state.guess,
         )
         is_smallest = state.part < 2 * SMALLEST_PART
         speed = judge_speed(record.twist, last_stage.middle, state.part * displacement, form.length, is_smallest)
@@ -334,8 +347,3 @@ def _next_state(
     )
     next_state = jax.tree.map(lambda new, old: jnp.where(ongoing, new, old), next_state, state)
     return next_state, StepEnd(ends, state.step, outcome)
-
-
-def hand_stops(status: Array) -> Bool[Array, "..."]:
-    """Return whether a step of this status stops the hand for good."""
-    return (status == Status.JAMMED) | (status == Status.GRASPED)
