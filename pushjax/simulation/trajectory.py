@@ -6,8 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._math.vec import Scalar
 from pushjax.contact.status import Status
-from pushjax.simulation.step import StepRecord
-from pushjax.simulation.substeps import hand_stops
+from pushjax.simulation.step import StepRecord, hand_stops
 
 
 class Step(eqx.Module):
