@@ -180,12 +180,15 @@ def solve_two(problem: ScaledProblem, sets: Sets) -> Solutions:
     roots, independent = segment.roots(), segment.are_independent()
     intervals = len(roots.ends) - 1
 
-    def repeated(x: Array) -> Array:
+    def per_interval(x: Array) -> Array:
         return jnp.concatenate([x] * intervals, axis=-2)
 
     exists = (roots.exist() & independent[None]).reshape(-1, independent.shape[1])
     u = roots.find().reshape(exists.shape)
-    segment, all_sets = jax.tree.map(repeated, segment), Sets(*(repeated(with_batch(x)) for x in sets))
+    segment, all_sets = (
+        jax.tree.map(per_interval, segment),
+        Sets(*(per_interval(with_batch(x)) for x in sets)),
+    )
     motion = segment.motion_at(u)
     along_rows = products(segment.rows, motion)
     size = summed(along_rows * along_rows, 0)

@@ -55,7 +55,7 @@ def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], leng
 def within(pose: Float[Array, "*rows coordinates"], length: Scalar, *, is_pose: bool = True) -> Bool[Array, "*rows"]:
     """Return whether lengths and angles are no larger than a float resolves to a tenth of `length` and of a radian."""
     pose, unit = jax.lax.stop_gradient((pose, jnp.broadcast_to(length, pose.shape[-1:])))
-    if is_pose and pose.shape[-1] == 3:  # (x, y, theta); the others, and centers of fingers, are lengths
+    if is_pose and pose.shape[-1] == 3:  # (x, y, theta); all other numbers are lengths
         unit = unit.at[2].set(1.0)
     largest = min(0.1 / float(jnp.finfo(pose.dtype).eps), 1e9)
     return jnp.all(jnp.abs(pose) <= largest * unit.reshape(*(1,) * (pose.ndim - 1), -1), axis=-1)

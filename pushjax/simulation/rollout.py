@@ -259,7 +259,7 @@ def prepared_push(
     friction_at: FrictionAt,
     fixtures: Fixtures = (),
 ) -> tuple[PreparedPush, Array]:
-    """Return a push whose steps can be divided, and its first pose, (3,), both without invalid numbers (`domain`)."""
+    """Return what a rollout needs of a push, and its first pose, (3,), both without invalid numbers (`domain`)."""
     length = friction_at(jnp.zeros((), jnp.int32), Vec3.of(jnp.zeros_like(pose)))[0].length
     shape_valid, hand_valid, fixtures_valid, pose_valid = (
         are_valid((shape,), length),
