@@ -4,7 +4,6 @@ A wrench of each of S sets is (3, S, batch). The equations of each kind of set a
 checks do not depend on how a set was found or solved, so a wrong answer cannot pass.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -30,23 +29,19 @@ class Sets(NamedTuple):
     """Sets of edges; a static table (3, sets), or numbers that differ between problems, (3, sets, batch)."""
 
     edges: Numbers  # numbers of the edges, then `NO_EDGE`
-    # Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the same, the second
-    # condition is that the contact sticks.
-    contacts: Numbers
+    conditions: Numbers  # numbers of the rows whose conditions fix the twist, then `NO_EDGE`
 
     @staticmethod
     def of(edges: Numbers) -> "Sets":
-        """Sets of one edge or of two, (1 or 2, sets) or (1 or 2, sets, batch)."""
-        xp = np if isinstance(edges, np.ndarray) else jnp
-        none = xp.full((3 - len(edges), *edges.shape[1:]), NO_EDGE, np.int32)
-        return Sets(xp.concatenate([edges, none]), xp.concatenate([edges >> 1, none]))
+        """Sets of one edge or of two, (1 or 2, sets) or (1 or 2, sets, batch), under their contacts' conditions."""
+        return Sets(*(padded(numbers) for numbers in (edges, own_conditions(edges))))
 
 
 class Solutions(NamedTuple):
     """A solution of each of S sets."""
 
     edges: Int[Array, "3 sets batch"]  # numbers of the edges, then `NO_EDGE`
-    contacts: Int[Array, "3 sets batch"]  # as in `Sets`
+    conditions: Int[Array, "3 sets batch"]  # as in `Sets`
     weight: Float[Array, "3 sets batch"]  # of each edge in the wrench
     twist: Float[Array, "3 sets batch"]  # dimensionless
     power: Float[Array, "sets batch"]  # with the wrench on H = 1
@@ -55,8 +50,21 @@ class Solutions(NamedTuple):
     @staticmethod
     def of(sets: Sets, weight: Array, twist: Array, power: Array, passes: Array) -> "Solutions":
         """The solutions of sets."""
-        edges, contacts = (jnp.broadcast_to(with_batch(x), weight.shape) for x in sets)
-        return Solutions(edges, contacts, weight, twist, power, passes)
+        edges, conditions = (jnp.broadcast_to(with_batch(x), weight.shape) for x in sets)
+        return Solutions(edges, conditions, weight, twist, power, passes)
+
+
+def own_conditions(edges: Numbers) -> Numbers:
+    """The conditions of the contacts of one edge or two: the normal ones, or of one that sticks both."""
+    xp = np if isinstance(edges, np.ndarray) else jnp
+    normal = edges >> 1 << 1
+    return normal if len(edges) == 1 else xp.stack([normal[0], normal[1] + (normal[0] == normal[1])])
+
+
+def padded(numbers: Numbers) -> Numbers:
+    """Three numbers of each set, the last ones `NO_EDGE`."""
+    xp = np if isinstance(numbers, np.ndarray) else jnp
+    return xp.concatenate([numbers, xp.full((3 - len(numbers), *numbers.shape[1:]), NO_EDGE, np.int32)])
 
 
 def along(x: Array, index: Array, axis: int) -> Array:
@@ -92,21 +100,20 @@ def _motions(problem: ScaledProblem, twist: Float[Array, "3 sets batch"]) -> tup
 
 def is_kinematic(problem: ScaledProblem, twist: Float[Array, "3 sets batch"], sets: Sets) -> Bool[Array, "sets batch"]:
     """Whether no contact is violated, and those of the set touch and slip to the side of their edge, or not at all."""
-    edges, contacts = (with_batch(x)[:, None] for x in sets)
-    is_own = contacts == jnp.arange(problem.count)[None, :, None, None]  # (3, contacts, sets, batch)
-    is_one = contacts[0] == contacts[1]  # both edges are of one contact, which sticks
-    touches, sticks = jnp.any(is_own, axis=0), is_own[0] & is_one
-    side = jnp.sum(jnp.where(is_own & ~is_one[None], 1 - 2 * (edges & 1), 0), axis=0).astype(twist.dtype)
+    edges, conditions = (with_batch(x)[:, None] for x in sets)
+    contacts = jnp.arange(problem.count)[None, :, None, None]
+    left, right = (jnp.any(edges == 2 * contacts + side, axis=0) for side in (0, 1))  # (contacts, sets, batch)
+    touches = left | right | jnp.any(conditions >> 1 == contacts, axis=0)
     normal, slip = _motions(problem, twist)
     violation = jnp.maximum(-normal, jnp.where(touches, jnp.abs(normal), 0.0))
-    violation = jnp.maximum(violation, jnp.maximum(jnp.where(sticks, jnp.abs(slip), 0.0), side * slip))
+    violation = jnp.maximum(violation, jnp.maximum(jnp.where(left, slip, 0.0), jnp.where(right, -slip, 0.0)))
     violation = jnp.where(problem.active[:, None], violation, jnp.where(touches, jnp.inf, 0.0))
     return jnp.max(violation, axis=0) <= kinematic_tolerance(twist)
 
 
 def solve_one(problem: ScaledProblem, sets: Sets) -> Solutions:
     """Solve sets of one edge."""
-    owner, wrench = sets.contacts[0], at(problem.edges, sets.edges[0])
+    owner, wrench = sets.edges[0] >> 1, at(problem.edges, sets.edges[0])
     motion = problem.surface.gradient(wrench)
     normal_motion = dot(at(problem.normal, owner), motion)
     # both may be negative: a receding pusher can drag the slider along
@@ -152,7 +159,7 @@ class Segment(NamedTuple):
         at_center, at_along = surface.hessian(center), surface.hessian(along)
         ends = times(at_center, center) / (surface.degree - 1), times(at_along, along) / (surface.degree - 1)
         middle = (times(at_center, along), times(at_along, center)) if surface.degree == 4 else ()
-        rows, goal = conditions(problem, sets.contacts[:2])
+        rows, goal = rows_of(problem, sets.conditions[:2])
         return Segment(center, along, nearest, jnp.stack([ends[0], *middle, ends[1]]), rows, goal)
 
     def roots(self) -> Roots:
@@ -202,34 +209,24 @@ def solve_two(problem: ScaledProblem, sets: Sets) -> Solutions:
     return Solutions.of(all_sets, jnp.stack([1 - s, s, jnp.zeros_like(s)]), twist, power, passes)
 
 
-def conditions(problem: ScaledProblem, contacts: Sequence[Numbers] | Numbers) -> tuple[Array, Array]:
-    """Rows (n, 3, sets, batch) and right-hand sides (n, sets, batch) of the conditions of two or three contacts.
+def rows_of(problem: ScaledProblem, conditions: Numbers) -> tuple[Array, Array]:
+    """Rows (n, 3, sets, batch) and right-hand sides (n, sets, batch) of n conditions of each set."""
+    rows, goal = problem.numbered_rows()
+    return jnp.stack([at(rows, k) for k in conditions]), jnp.stack([at(goal, k) for k in conditions])
 
-    These are the normal conditions. If the first two contacts are the same, the second condition is the tangential one.
+
+def solve_three(problem: ScaledProblem, conditions: Numbers, choices: Numbers) -> Solutions:
+    """Solve sets of three conditions, (3, sets), which fix the twist.
+
+    Several choices of three edges, (choices, 3, sets), are tried for the wrench of each, in turn.
     """
-    sticks = with_batch(contacts[0][None] == contacts[1][None])[0]
-    rows = [at(problem.normal, c) for c in contacts]
-    goal = [at(problem.goal[0], c) for c in contacts]
-    rows[1] = jnp.where(sticks[None], at(problem.tangent, contacts[1]), rows[1])
-    goal[1] = jnp.where(sticks, at(problem.goal[1], contacts[1]), goal[1])
-    return jnp.stack(rows), jnp.stack(goal)
-
-
-def solve_three(problem: ScaledProblem, contacts: Numbers) -> Solutions:
-    """Solve sets of three edges, given by their contacts, (3, sets): one edge each, or one contact that sticks.
-
-    The conditions of these contacts fix the twist. Where one of them sticks, the third edge may also belong to another
-    contact that happens to touch under this twist. This occurs where two fingers are exactly opposite each other and
-    move together, so that their normal conditions are the same, and a third contact limits how far the slider turns,
-    at a force of zero.
-    """
-    twist, regular = _solve_rows(*conditions(problem, contacts))
+    twist, regular = _solve_rows(*rows_of(problem, conditions))
     normal, slip = _motions(problem, twist)
     active, tolerance = problem.active[:, None], kinematic_tolerance(twist)[None]
     touches = active & (jnp.abs(normal) <= tolerance)
     feasible = regular & jnp.all(~active | (normal >= -tolerance), axis=0)
-    for numbers in contacts:
-        feasible &= flag_at(touches, numbers)
+    for numbers in conditions:
+        feasible &= flag_at(touches, numbers >> 1)
     # whether an edge may carry force: both edges may where the contact sticks
     may_carry = jnp.stack([touches & (slip <= tolerance), touches & (slip >= -tolerance)], axis=1)
     may_carry = may_carry.reshape(2 * problem.count, *feasible.shape)
@@ -250,25 +247,28 @@ def solve_three(problem: ScaledProblem, contacts: Numbers) -> Solutions:
         ), None
 
     none = jnp.full(twist.shape, NO_EDGE, jnp.int32)
-    choices = jnp.asarray(_choices_of_edges(contacts, problem.count), jnp.int32)
-    share, weight, edges = jax.lax.scan(try_choice, (jnp.full_like(f[0], -1.0), 0 * f, none), choices)[0]
+    start = jnp.full_like(f[0], -1.0), 0 * f, none
+    share, weight, edges = jax.lax.scan(try_choice, start, jnp.asarray(choices, jnp.int32))[0]
     h = problem.surface.value(f)
     passes = feasible & aligned & (h > 0) & (share >= 0)
-    return Solutions.of(Sets(edges, contacts), weight, twist, _power(problem, dot(f, twist), h), passes)
+    return Solutions.of(Sets(edges, conditions), weight, twist, _power(problem, dot(f, twist), h), passes)
 
 
-def _choices_of_edges(contacts: Numbers, m: int) -> Numbers:
-    """Numbers of three edges of each set, (choices, 3, sets) or with the batch: every choice that may be needed."""
+def triples(contacts: Numbers, m: int) -> tuple[Numbers, Numbers]:
+    """Conditions and choices of edges of three contacts each, (3, sets); the first two are the same if it sticks.
+
+    Where one sticks, the third edge may also belong to another contact that happens to touch under this twist
+    (`exhaustive`): a third one may then limit how far the slider turns, at a force of zero.
+    """
     xp = np if isinstance(contacts, np.ndarray) else jnp
     c1, c2, c3 = contacts
-    choices = []
+    sticks, choices = c1 == c2, []
     for k in range(2 if m == 2 else max(8, 2 * (m - 1))):
-        sticks = c1 == c2
         # after c3 the other contacts in a circle, without c1
         last = xp.where(sticks, (c1 + 1 + ((c3 - c1 - 1) % m + k // 2) % max(m - 1, 1)) % m, c3)
         first, second = xp.where(sticks, 0, k // 4 % 2), xp.where(sticks, 1, k // 2 % 2)
         choices.append(xp.stack([2 * c1 + first, 2 * c2 + second, 2 * last + k % 2]))
-    return xp.stack(choices)
+    return xp.stack([2 * c1, 2 * c2 + sticks, 2 * c3]), xp.stack(choices)
 
 
 def _solve_rows(rows: Float[Array, "3 3 sets batch"], b: Float[Array, "3 sets batch"]) -> tuple[Array, Array]:

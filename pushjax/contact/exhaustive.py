@@ -17,15 +17,15 @@ three edges   The conditions alone fix the twist. The slip under this twist show
               m (m - 1) + C(m, 3) twists.
 
 If the three conditions of a system depend on one another (parallel or concurrent normals), its solutions form a
-segment. The system is skipped, because the ends of the segment are solutions of other sets. At an end where another
-contact just touches, at a force of zero, the conditions and the edges belong to different contacts. Where one contact
-sticks, `solve_three` therefore tries the edges of every contact that touches, with both edges of the one that sticks.
-Each solution is checked against every condition of the problem, so a wrong answer cannot pass.
+segment. The system is skipped, because the ends of the segment are solutions of other sets. Where two contacts are
+exactly opposite on one line and move together, as the fingers of a closed gripper, those sets are not always among the
+ones above: at an end where another contact just touches, or one just sticks, at a force of zero, the conditions and the
+edges belong to different contacts. So if nothing passes, each such pair is searched, with an edge of both contacts:
 
-Three further ends with two contacts that are exactly opposite on one line are not tried. Both slide, and a third just
-touches, or one of them just sticks. Both stick, and nothing else fixes the twist. One sticks, and the force has one of
-its edges and one of each of two others, which slide. Of 600 000 random problems with one fixture, seven motions were
-missed (the four that were looked at are of these kinds), and none of 880 000 without.
+two edges     under the normal condition of the pair and any other condition. 8 m sets.
+three edges   under the normal condition of the pair and any two others, with any third edge. C(2 m, 2) twists.
+
+Each solution is checked against every condition of the problem, so a wrong answer cannot pass.
 
 If no solution passes and the hand's squeeze power is positive (`jam_certificate`), the problem has no solution: a jam.
 If no solution passes and the squeeze power is not positive, a solution exists that the floating-point type has too few
@@ -44,8 +44,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from pushjax._math.arrays import dot
-from pushjax.contact.edge_sets import Numbers, Sets, Solutions, along, solve_one, solve_three, solve_two
+from pushjax._internal.xla import tree_where
+from pushjax._math.arrays import dot, summed
+from pushjax.contact.edge_sets import (
+    Numbers,
+    Sets,
+    Solutions,
+    along,
+    padded,
+    solve_one,
+    solve_three,
+    solve_two,
+    triples,
+)
 from pushjax.contact.scaled_problem import NO_EDGE, ContactSolver, EdgeSet, Found, ScaledProblem
 from pushjax.contact.tolerances import TOO_FAST, is_slow, relative_tolerance, same_solution_tolerance
 
@@ -54,8 +65,7 @@ class Exhaustive(ContactSolver):
     """Tries every set of cone edges: exact, at a fixed cost.
 
     A problem that it reports as JAMMED has no solution. In float32 this is wrong for a few of 100 000 problems, at the
-    border of a jam. In either type it can be wrong where two of at least three contacts are exactly opposite on one
-    line (see the header of this module).
+    border of a jam.
     """
 
     proves_jams: ClassVar[bool] = True
@@ -69,7 +79,8 @@ class Exhaustive(ContactSolver):
         Returns:
             The best set of cone edges of each problem.
         """
-        return best_of_sets(problem, *_all_sets(problem.count))
+        found = best_of_sets(problem, *_all_sets(problem.count))
+        return _with_opposite_pairs(problem, found) if problem.count > 2 else found
 
 
 class Continuing(Exhaustive):
@@ -88,6 +99,39 @@ def _all_sets(m: int) -> tuple[Sets, Sets, np.ndarray]:
     return Sets.of(one), Sets.of(two), np.array(triples, np.int32).reshape(-1, 3).T
 
 
+def _with_opposite_pairs(problem: ScaledProblem, found: Found) -> Found:
+    """Search the sets of opposite contacts where nothing is found yet."""
+    dtype = problem.unit.dtype
+    unfound = problem.pushes & ~found.best.exists() & ~found.too_fast
+
+    def try_pair(found: Found, pair: Int[Array, "2"]) -> tuple[Found, None]:
+        row, goal, active = (jnp.take(x, pair, axis=-2) for x in (problem.normal, problem.goal[0], problem.active))
+        row, goal = summed(row, 1), jnp.abs(summed(goal, 0))
+        opposite = (dot(row, row) <= float(jnp.finfo(dtype).eps)) & (goal <= relative_tolerance(dtype))
+        wanted = unfound & ~found.best.exists() & opposite & jnp.all(active, axis=0)
+
+        def search(found: Found) -> Found:
+            two, three = _sets_of_pair(pair, problem.count)
+            return tree_where(wanted, _best([solve_two(problem, two), solve_three(problem, *three)]), found)
+
+        return jax.lax.cond(jnp.any(wanted), search, lambda found: found, found), None
+
+    pairs = jnp.asarray([*combinations(range(problem.count), 2)], jnp.int32)
+    return jax.lax.scan(try_pair, found, pairs)[0]
+
+
+def _sets_of_pair(pair: Int[Array, "2"], m: int) -> tuple[Sets, tuple[Array, Array]]:
+    """Sets of two edges, and conditions and choices of edges of sets of three, for two opposite contacts of m."""
+    i, j = 2 * pair
+    numbers = np.tile(np.arange(2 * m, dtype=np.int32), 4)  # of all edges or rows, once for each two edges of the pair
+    own = jnp.stack(
+        [i + np.repeat(np.array([0, 0, 1, 1], np.int32), 2 * m), j + np.repeat(np.array([0, 1, 0, 1], np.int32), 2 * m)]
+    )
+    others = np.array([*combinations(range(2 * m), 2)], np.int32).T
+    two = Sets(padded(own), padded(jnp.stack([jnp.full_like(own[0], i), numbers])))
+    return two, (jnp.stack([jnp.full(others.shape[1], i), *others]), jnp.stack([*own, numbers], axis=1)[..., None])
+
+
 def best_of_sets(problem: ScaledProblem, one: Sets, two: Sets, three: Numbers) -> Found:
     """The best solution of each problem with these sets of one edge, of two, and of three, given by their contacts.
 
@@ -96,12 +140,13 @@ def best_of_sets(problem: ScaledProblem, one: Sets, two: Sets, three: Numbers) -
     better conditioned.
     """
     solutions = [solve_one(problem, one), solve_two(problem, two)]
-    solutions += [solve_three(problem, three)] if three.shape[1] else []
-    return _best(jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *solutions))
+    solutions += [solve_three(problem, *triples(three, problem.count))] if three.shape[1] else []
+    return _best(solutions)
 
 
-def _best(solutions: Solutions) -> Found:
+def _best(kinds: list[Solutions]) -> Found:
     """The best solution: most power on H = 1, of those with equal power the smallest twist, of those the first."""
+    solutions = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=-2), *kinds)
     dtype = solutions.power.dtype
     tolerance = relative_tolerance(dtype)
     squared = dot(solutions.twist, solutions.twist)
@@ -116,8 +161,8 @@ def _best(solutions: Solutions) -> Found:
     difference = solutions.twist - best.twist[:, None]
     far = same_solution_tolerance(dtype) ** 2 * (squared + dot(best.twist, best.twist)[None])
     found = jnp.any(accepted, axis=0)
-    edges, contacts = (jnp.where(found[None], x, NO_EDGE) for x in (best.edges, best.contacts))
-    chosen = EdgeSet(edges, contacts, best.weight)
+    edges, conditions = (jnp.where(found[None], x, NO_EDGE) for x in (best.edges, best.conditions))
+    chosen = EdgeSet(edges, conditions, best.weight)
     second_found = jnp.any(accepted & (dot(difference, difference) > far), axis=0) & found
     return Found(chosen, second_found, jnp.any(passes & ~slow & too_fast, axis=0))
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import tree_where
 from pushjax._math.arrays import combined, cross, dot, dual, products, repeated, solve, summed, times, unit
-from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem, selected, violation_per_weight
+from pushjax.contact.scaled_problem import NO_EDGE, EdgeSet, ScaledProblem, selected, violation_per_weight
 from pushjax.contact.status import ContactMode
 from pushjax.contact.tolerances import (
     ill_conditioned_tolerance,
@@ -102,15 +102,12 @@ class Equations(NamedTuple):
     @staticmethod
     def of(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> "Equations":
         """The equations of a set, none where not `moves`."""
-        used, conditioned = moves[None] & (chosen.edges >= 0), moves[None] & (chosen.contacts >= 0)
-        contacts = jnp.where(conditioned, chosen.contacts, -1)
-        sticks = (chosen.contacts[0] == chosen.contacts[1]) & used[1]
-        is_tangential = jnp.stack([jnp.zeros_like(sticks), sticks, jnp.zeros_like(sticks)])
-        rows, goal = selected(problem.normal, contacts), selected(problem.goal, contacts)
-        rows = jnp.where(is_tangential[None], selected(problem.tangent, contacts), rows)
-        edges = selected(problem.edges, jnp.where(used, chosen.edges, -1))
-        edges, rows = jnp.moveaxis(edges, 1, 0), jnp.moveaxis(rows, 1, 0)
-        return Equations(used, edges, conditioned, rows, jnp.where(is_tangential, goal[1], goal[0]))
+        used, conditioned = moves[None] & (chosen.edges >= 0), moves[None] & (chosen.conditions >= 0)
+        rows, goal = problem.numbered_rows()
+        numbered = selected(jnp.concatenate([rows, goal[None]]), jnp.where(conditioned, chosen.conditions, NO_EDGE))
+        edges = selected(problem.edges, jnp.where(used, chosen.edges, NO_EDGE))
+        edges, rows = jnp.moveaxis(edges, 1, 0), jnp.moveaxis(numbered[:3], 1, 0)
+        return Equations(used, edges, conditioned, rows, numbered[3])
 
     def bases(self) -> tuple[Array, Array, Array]:
         """The edges completed to a basis, its dual basis, and orthonormal axes of one, two and three edges."""

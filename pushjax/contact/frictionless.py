@@ -78,4 +78,4 @@ def least_violation(problem: ScaledProblem) -> LeastViolation:
     force, twist = (along(x, index[None], 1)[:, 0] for x in (force, twist))
     edges = jnp.where(chosen >= 0, 2 * chosen, NO_EDGE)
     solved = problem.pushes & (jnp.min(violation, axis=0) < TOLERANCE)
-    return LeastViolation(EdgeSet(edges, chosen, jnp.where(chosen >= 0, jnp.maximum(force, 0), 0.0)), twist, solved)
+    return LeastViolation(EdgeSet(edges, edges, jnp.where(chosen >= 0, jnp.maximum(force, 0), 0.0)), twist, solved)

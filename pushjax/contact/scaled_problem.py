@@ -3,7 +3,8 @@
 With the normalized twist (vx, vy, length omega) and wrench (fx, fy, tau / length), a contact is two rows, a_n and a_t.
 The slider's contact point moves by (a_n . V, a_t . V) along normal and tangent, and the force (f_n, f_t) has the wrench
 f_n a_n + f_t a_t. The friction cone has two edges. Their wrenches are a_n + mu a_t (the pusher slides left) and
-a_n - mu a_t (right). Edges are numbered 2 i for the left and 2 i + 1 for the right edge of contact i.
+a_n - mu a_t (right). Edges are numbered 2 i for the left and 2 i + 1 for the right edge of contact i, and rows 2 i for
+a_n and 2 i + 1 for a_t.
 
 Displacements are divided by the longest displacement of a pusher, or the deepest overlap if that is larger, and H by
 the sum of its values at the three unit wrenches. So tolerances are relative, and powers of the coefficients of H stay
@@ -60,6 +61,11 @@ class ScaledProblem(NamedTuple):
         """Number of contacts."""
         return self.friction.shape[0]
 
+    def numbered_rows(self) -> tuple[Float[Array, "3 rows *batch"], Float[Array, "rows *batch"]]:
+        """All rows, a_n and a_t of each contact in turn, and their goals."""
+        rows = jnp.stack([self.normal, self.tangent], axis=2)
+        return rows.reshape(3, -1, *rows.shape[3:]), jnp.stack([*self.goal], axis=1).reshape(-1, *rows.shape[3:])
+
     def slips(self, twist: Float[Array, "3 *batch"]) -> Float[Array, "2 contacts *batch"]:
         """Motion (n, t) of each contact point relative to its pusher; a normal motion below zero is a violation."""
         rows = jnp.stack([self.normal, self.tangent], axis=1)
@@ -70,10 +76,9 @@ class EdgeSet(NamedTuple):
     """The cone edges that carry the force of a solution."""
 
     edges: Int[Array, "3 *batch"]  # numbers of the edges, the used ones first, then `NO_EDGE`
-    # Numbers of the contacts whose conditions fix the twist, then `NO_EDGE`. If the first two are the same, the second
-    # condition is that this contact sticks. They are the contacts of the edges, but for the third one in a case that
-    # `edge_sets.solve_three` describes.
-    contacts: Int[Array, "3 *batch"]
+    # Numbers of the rows whose conditions a . V = goal fix the twist, then `NO_EDGE`. They are those of the edges'
+    # contacts (of one that sticks, both rows), except at the ends of segments of solutions (`exhaustive`).
+    conditions: Int[Array, "3 *batch"]
     weight: Float[Array, "3 *batch"]  # of each edge in the wrench, up to one common factor
 
     @staticmethod

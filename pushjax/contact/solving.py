@@ -149,8 +149,8 @@ def _edges_of_one(
     tangential = force[1] / jnp.where(mu > 0, mu, 1.0)
     left, right = (force[0] + tangential) / 2, (force[0] - tangential) / 2
     weight = jnp.stack([jnp.where(sticks, left, force[0]), jnp.where(sticks, right, 0.0), jnp.zeros_like(left)])
-    contacts = jnp.stack([contact, jnp.where(sticks, contact, NO_EDGE), none])
-    return EdgeSet(jnp.stack([first, jnp.where(sticks, 2 * contact + 1, NO_EDGE), none]), contacts, weight)
+    second = jnp.where(sticks, 2 * contact + 1, NO_EDGE)
+    return EdgeSet(jnp.stack([first, second, none]), jnp.stack([2 * contact, second, none]), weight)
 
 
 def _attempt(

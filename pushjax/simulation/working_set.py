@@ -68,30 +68,29 @@ class WorkingSet(NamedTuple):
         masks, index = self.masks, jnp.arange(self.masks.shape[1])
         slots = jnp.arange(len(self.masks), dtype=jnp.int32)
 
-        def slot_of(contact: Int[Array, "3"]) -> Int[Array, "3"]:
-            is_slot = jnp.any((contact[:, None] == index[None])[:, None] & masks[None], axis=2)
-            number = jnp.sum(jnp.where(is_slot, slots[None], 0), axis=1, dtype=jnp.int32)
-            return jnp.where(jnp.any(is_slot, axis=1), number, NO_EDGE)
+        def renumbered(numbers: Int[Array, "3"]) -> Int[Array, "3"]:
+            is_slot = jnp.any(((numbers >> 1)[:, None] == index[None])[:, None] & masks[None], axis=2)
+            slot = jnp.sum(jnp.where(is_slot, slots[None], 0), axis=1, dtype=jnp.int32)
+            return jnp.where(jnp.any(is_slot, axis=1), 2 * slot + (numbers & 1), NO_EDGE)
 
-        owner, contact = slot_of(guess.edges >> 1), slot_of(guess.contacts)
-        complete = jnp.all((owner >= 0) | (guess.edges < 0)) & jnp.all((contact >= 0) | (guess.contacts < 0))
-        edges = jnp.where(complete & (owner >= 0), 2 * owner + (guess.edges & 1), NO_EDGE)
-        return EdgeSet(edges, jnp.where(complete, contact, NO_EDGE), guess.weight)
+        edges, conditions = renumbered(guess.edges), renumbered(guess.conditions)
+        complete = jnp.all((edges >= 0) | (guess.edges < 0)) & jnp.all((conditions >= 0) | (guess.conditions < 0))
+        edges, conditions = (jnp.where(complete, numbers, NO_EDGE) for numbers in (edges, conditions))
+        return EdgeSet(edges, conditions, guess.weight)
 
     def spread_edges(self, best: EdgeSet) -> EdgeSet:
         """Number a set of cone edges by all contacts: the reverse of `local`."""
         if self.masks is None:
             return best
-        numbers = jnp.argmax(self.masks, axis=1).astype(jnp.int32)
+        contacts = jnp.argmax(self.masks, axis=1).astype(jnp.int32)
         slots = jnp.arange(len(self.masks))
 
-        def number_of(slot: Int[Array, "3"]) -> Int[Array, "3"]:
-            number = jnp.sum(jnp.where(slot[:, None] == slots[None], numbers[None], 0), axis=1, dtype=jnp.int32)
-            return jnp.where(slot >= 0, number, NO_EDGE)
+        def renumbered(numbers: Int[Array, "3"]) -> Int[Array, "3"]:
+            is_slot = (numbers >> 1)[:, None] == slots[None]
+            contact = jnp.sum(jnp.where(is_slot, contacts[None], 0), axis=1, dtype=jnp.int32)
+            return jnp.where(numbers >= 0, 2 * contact + (numbers & 1), NO_EDGE)
 
-        owner = number_of(best.edges >> 1)
-        edges = jnp.where(owner >= 0, 2 * owner + (best.edges & 1), NO_EDGE)
-        return EdgeSet(edges, number_of(best.contacts), best.weight)
+        return EdgeSet(renumbered(best.edges), renumbered(best.conditions), best.weight)
 
     def spread(self, solution: ContactSolution) -> ContactSolution:
         """Extend the motion to all contacts; force and mode are zero outside the set."""

@@ -95,6 +95,27 @@ def test_random_problems(count, degree):
 
 
 @pytest.mark.parametrize("degree", [2, 4])
+def test_closed_gripper_beside_a_fixture(rng, degree):
+    """Two contacts that are exactly opposite and move together, and one that stays: every jam is one."""
+    surface, contacts = problems(3, degree, slots=slots(3), gaps=0.0)
+    point, normal, displacement = (np.array(a) for a in (contacts.point, contacts.normal, contacts.displacement))
+    own, others, still = np.argsort(~np.asarray(contacts.active), axis=1, kind="stable")[:, :3].T
+    row = np.arange(BATCH)
+    inward = normal[row, own]
+    point[row, others] = point[row, own] + rng.uniform(0.01, 0.1, (BATCH, 1)) * inward
+    normal[row, others] = -inward
+    slide = 1e-3 * rng.normal(size=(BATCH, 1)) * (row % 2)[:, None]  # of half of the pairs
+    displacement[row, others] = displacement[row, own] + slide * np.stack([-inward[:, 1], inward[:, 0]], axis=1)
+    displacement[row, still] = 0
+    contacts = jax.vmap(pj.Contacts)(point, normal, displacement, contacts.friction, contacts.gap, contacts.active)
+    counts, worst = bench_contacts.judge(
+        ProblemBatch.of(surface, contacts), solve_all(surface, contacts), "float64", 50
+    )
+    assert counts["wrong"] == counts["not_converged"] == 0, worst
+    assert counts["jammed"] > BATCH // 10
+
+
+@pytest.mark.parametrize("degree", [2, 4])
 def test_one_contact_has_the_same_answer(degree):
     surface, contacts = problems(1, degree)
     one = solve_all(surface, contacts)

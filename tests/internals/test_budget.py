@@ -47,7 +47,7 @@ PROGRAMS = {
     "gradient": (lambda pose, mu: jax.grad(lambda p, m: one(p, m).sum(), argnums=(0, 1))(pose, mu), 737, 20882),
     "T": (push(TEE, FINGER, (-0.08, 0.02), (-0.03, 0.02)), 872, 20923),
     "two fingers": (push(RECTANGLE, pj.Hand.two_fingers(0.005), (-0.08, 0, 0, 0.04), (-0.03, 0, 0, 0.04)), 922, 23004),
-    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1164, 29911),
+    "jaw": (push(RECTANGLE, JAW, (0, 0, 0, 0.13), (0, 0, 0, 0.05)), 1337, 33941),
     "PushT step": (step_of_task, 1152, 26475),
 }
 
