@@ -19,13 +19,10 @@ import tyro
 
 from benchmarks import speed
 from pushjax._internal.progress import ProgressCallback, no_progress, progress_bar
-from pushjax.experiments._cell_cache import CellCache
 from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import write_json
 
-TimedCase = Literal[
-    "push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo", "outline"
-]
+TimedCase = Literal["push", "ellipsoid", "gradient", "grasp", "t", "hands", "solve", "sampling", "fit", "monte_carlo"]
 TIMED = {
     "push": "pushes of a square, 50 mm, in as few steps as 0.1 mm takes",
     "ellipsoid": "the same, with an ellipsoid for a limit surface",
@@ -37,34 +34,23 @@ TIMED = {
     "sampling": "random limit surfaces",
     "fit": "limit surfaces from 400 pairs",
     "monte_carlo": "pushes under random friction: a key in, a summary out",
-    "outline": "pushes of polygons and of smooth shapes",
 }
 # Modules of the other cases. Each has `run`, whose arguments are the options, and `summary`; the first line of its
 # docstring is that of the list.
-MODULES = {
-    name: name
-    for name in (
-        "accuracy",
-        "contacts",
-        "cost_by_batch",
-        "derivatives",
-        "environments",
-        "first_calls",
-        "friction",
-        "identification",
-        "many_identifications",
-        "million_pushes",
-        "mit_repetitions",
-        "numerics",
-        "overlaps",
-        "pusht",
-        "pusht_table",
-        "robust_plans",
-        "solvers",
-        "squeezes",
-        "stable_pushes",
-    )
-} | {"table1_causes": "robot.causes", "table1_spread": "robot.spread"}
+MODULES = (
+    "accuracy",
+    "contacts",
+    "derivatives",
+    "environments",
+    "first_calls",
+    "friction",
+    "identification",
+    "million_pushes",
+    "numerics",
+    "overlaps",
+    "pusht",
+    "solvers",
+)
 PICTURES = Path("pushjax-out")
 
 
@@ -109,17 +95,17 @@ def timed(
 
 def listing() -> str:
     """Return the list of cases, with one line on each."""
-    rows = TIMED | {name: _first_line(module) for name, module in MODULES.items()}
+    rows = TIMED | {name: _first_line(name) for name in MODULES}
     return "\n".join(f"{name:22}{line}" for name, line in rows.items())
 
 
 def _first_line(module: str) -> str:
     """Return the first line of the docstring of a module, without its period; the module is not imported."""
-    source = Path(__file__).parent.joinpath(*module.split(".")).with_suffix(".py").read_text()
+    source = Path(__file__).with_name(f"{module}.py").read_text()
     return (ast.get_docstring(ast.parse(source)) or "").split("\n")[0].rstrip(".")
 
 
-Given = tuple[Callable[..., dict[str, Any]], Path | None, Path]
+Given = tuple[Callable[..., dict[str, Any]], Path | None]
 
 
 def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
@@ -130,8 +116,8 @@ def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
             are called with the number of rows done and their total, and with the record so far.
 
     Returns:
-        A function of the same arguments, and of `json`. It returns `run` with its arguments except those two, the file
-        for the record, and the folder for pictures.
+        A function of the same arguments, and of `json`. It returns `run` with its arguments except those two, and the
+        file for the record.
     """
     signature = inspect.signature(run)
     parameters = [
@@ -143,7 +129,7 @@ def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
     parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=file))
 
     def given(json: Path | None = None, **chosen: Any) -> Given:
-        return partial(run, **chosen), json, chosen.get("out", PICTURES)
+        return partial(run, **chosen), json
 
     given.__doc__ = run.__doc__
     given.__annotations__ = {each.name: each.annotation for each in parameters}
@@ -165,10 +151,10 @@ def main(arguments: list[str]) -> None:
     module: ModuleType = speed
     run, program, about = timed, "python -m benchmarks", None
     if arguments[0] in MODULES:
-        module = import_module(f"benchmarks.{MODULES[arguments[0]]}")
+        module = import_module(f"benchmarks.{arguments[0]}")
         run, program, about = module.run, f"{program} {arguments[0]}", module.__doc__
         arguments = arguments[1:]
-    case, json, out = tyro.cli(options(run), args=arguments, prog=program, description=about)
+    case, json = tyro.cli(options(run), args=arguments, prog=program, description=about)
 
     def keep(so_far: dict[str, Any]) -> None:
         if json is not None:
@@ -181,13 +167,7 @@ def main(arguments: list[str]) -> None:
             record = case(**{name: each for name, each in callbacks.items() if name in takes})
         print(", ".join(f"{name} {value}" for name, value in (record["machine"] | record["versions"]).items()))
         print(module.summary(record))
-        study = module.__name__.startswith("benchmarks.robot.")
-        if study and json is None:  # its cells are deleted below
-            json = out / f"{record['experiment']}.json"
         keep(record)
-        if study:
-            print(f"wrote {json}")
-            CellCache.delete(record["experiment"], out)
         if record.get("slower"):
             raise ValueError("slower than the baseline: see above")
     except (ValueError, OSError) as error:

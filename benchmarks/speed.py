@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cases, outlines
+from benchmarks import cases
 from benchmarks.timing import Program, Timing, alternate, both_dtypes, called, ceiling, compiled, rates
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
@@ -24,7 +24,6 @@ CASES: dict[str, tuple[Make, ...]] = {
     "sampling": (cases.sampling,),
     "fit": tuple(partial(cases.fit, degree=degree) for degree in (4, 2)),
     "monte_carlo": (cases.monte_carlo,),
-    "outline": tuple(partial(outlines.push, which=each) for each in outlines.OUTLINES),
 }
 BATCH = 2000
 BATCHES = {"fit": (200,), "monte_carlo": (2000, 100_000)}  # for cases with other batches

@@ -240,7 +240,8 @@ def test_benchmarks_in_commands_exist():
     from benchmarks.__main__ import listing
 
     cases = {line.split()[0] for line in listing().splitlines()}
-    named = {name for path in PAGES for name in re.findall(r"python -m benchmarks ([a-z]\w+)", path.read_text())}
+    present = r"python -m benchmarks ([a-z]\w+)(?![^`]*` at commit)"  # studies are in the history
+    named = {name for path in PAGES for name in re.findall(present, path.read_text())}
     assert named
     assert named <= cases
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from benchmarks import cases, contacts, grasps, numerics, outlines, speed, tasks, timing
+from benchmarks import cases, contacts, grasps, numerics, speed, tasks, timing
 from benchmarks.__main__ import MODULES, listing, main
 from benchmarks.hlo import traffic
 from benchmarks.peers import rows
@@ -200,35 +200,6 @@ def test_a_jaw_begins_at_the_touch():
     assert np.all(np.diff(path[..., 3]) < 0)
 
 
-def needed_by(which):
-    """Return the FLOPs of a push before the compiler optimizes it, and the work."""
-    work = outlines.push("float64", 2, which)
-    costs = jax.jit(work.function).lower(*work.args).cost_analysis() or {}
-    return costs["flops"], work
-
-
-@pytest.mark.long
-def test_smooth_outlines_cost_the_same_whatever_they_were_traced_with():
-    """The cost depends on the control points of a curve, or on the vertices of a polygon."""
-    coarse, fine = (needed_by(("curve", 12, traced))[0] for traced in outlines.TRACED)
-    assert coarse == fine
-    few, many, most = (needed_by(("polygon", n, 0))[0] for n in (4, 16, 64))
-    assert few < many < most
-    # in proportion: an additional vertex costs the same at 16 vertices as at 64
-    assert (most - many) / 48 == pytest.approx((many - few) / 12, rel=0.2)
-    flops, work = needed_by(("disk", 0, 0))
-    assert flops < few
-    mode = jax.vmap(lambda *each: outlines.task("float64", ("disk", 0, 0)).push(*each).mode)(*work.args)
-    assert np.all(np.asarray(mode) != pj.ContactMode.SEPARATED)  # the finger touches in every step
-
-
-@pytest.mark.parametrize("which", [("polygon", 6, 0), ("polygon", 64, 0), ("curve", 24, 1024), ("ellipse", 0, 0)])
-def test_outlines_are_touched_where_the_pushes_begin(which):
-    shape = outlines.outline(*which)
-    distance = float(shape.signed_distance(np.array([-outlines.HALF - 0.01, 0.0])))
-    assert distance == pytest.approx(0.01, abs=1e-6)
-
-
 @pytest.mark.long
 def test_rows_of_fits_and_of_monte_carlo():
     """Cases that are not pushes have rows with the same names."""
@@ -320,7 +291,7 @@ def test_every_case_is_listed_with_a_line(capsys):
     main([])
     lines = capsys.readouterr().out.splitlines()
     assert lines == listing().splitlines()
-    assert {"push", "contacts", "table1_causes", *MODULES} <= {line.split()[0] for line in lines}
+    assert {"push", *MODULES} <= {line.split()[0] for line in lines}
     assert all(len(line.split()) > 2 for line in lines)
 
 
