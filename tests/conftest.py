@@ -1,16 +1,21 @@
 """Settings and fixtures of all tests: float64 is enabled (tests of float32 pass float32), and the folders of data.
 
-The compiled programs are cached between runs and between pytest's workers if JAX_COMPILATION_CACHE_DIR is set.
+Pytest's workers share a cache of compiled programs: JAX_COMPILATION_CACHE_DIR, or else a folder that lasts as long as
+the run.
 """
 
 import gc
 import os
 import sys
+import tempfile
 from pathlib import Path
 
 from compiling import set_quick
 
 set_quick()
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # workers and commands inherit it
+    CACHE = tempfile.TemporaryDirectory(prefix="pushjax-tests-", ignore_cleanup_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = CACHE.name
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -19,8 +24,6 @@ import pytest  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # commands would write to the user's own cache
-    jax.config.update("jax_enable_compilation_cache", False)
 
 from pushjax.datasets import find_data  # noqa: E402
 

@@ -22,8 +22,8 @@ exactly opposite on one line and move together, as the fingers of a closed gripp
 ones above: at an end where another contact just touches, or one just sticks, at a force of zero, the conditions and the
 edges belong to different contacts. So if nothing passes, each such pair is searched, with an edge of both contacts:
 
-two edges     under the normal condition of the pair and any other condition. 8 m sets.
-three edges   under the normal condition of the pair and any two others, with any third edge. C(2 m, 2) twists.
+two edges     under the normal condition of the pair and any other condition. 8 (m - 1) sets.
+three edges   under the normal condition of the pair and any two others, with any third edge. C(2 m - 2, 2) twists.
 
 Each solution is checked against every condition of the problem, so a wrong answer cannot pass.
 
@@ -51,7 +51,6 @@ from pushjax.contact.edge_sets import (
     Sets,
     Solutions,
     along,
-    padded,
     solve_one,
     solve_three,
     solve_two,
@@ -104,32 +103,31 @@ def _with_opposite_pairs(problem: ScaledProblem, found: Found) -> Found:
     dtype = problem.unit.dtype
     unfound = problem.pushes & ~found.best.exists() & ~found.too_fast
 
-    def try_pair(found: Found, pair: Int[Array, "2"]) -> tuple[Found, None]:
+    def try_pair(found: Found, tables: tuple[Array, ...]) -> tuple[Found, None]:
+        pair, edges, conditions, three, choices = tables
         row, goal, active = (jnp.take(x, pair, axis=-2) for x in (problem.normal, problem.goal[0], problem.active))
         row, goal = summed(row, 1), jnp.abs(summed(goal, 0))
         opposite = (dot(row, row) <= float(jnp.finfo(dtype).eps)) & (goal <= relative_tolerance(dtype))
         wanted = unfound & ~found.best.exists() & opposite & jnp.all(active, axis=0)
 
         def search(found: Found) -> Found:
-            two, three = _sets_of_pair(pair, problem.count)
-            return tree_where(wanted, _best([solve_two(problem, two), solve_three(problem, *three)]), found)
+            solutions = [solve_two(problem, Sets(edges, conditions)), solve_three(problem, three, choices)]
+            return tree_where(wanted, _best(solutions), found)
 
         return jax.lax.cond(jnp.any(wanted), search, lambda found: found, found), None
 
-    pairs = jnp.asarray([*combinations(range(problem.count), 2)], jnp.int32)
-    return jax.lax.scan(try_pair, found, pairs)[0]
+    tables = zip(*(_sets_of_pair(i, j, problem.count) for i, j in combinations(range(problem.count), 2)), strict=True)
+    return jax.lax.scan(try_pair, found, tuple(jnp.asarray(np.stack(table), jnp.int32) for table in tables))[0]
 
 
-def _sets_of_pair(pair: Int[Array, "2"], m: int) -> tuple[Sets, tuple[Array, Array]]:
-    """Sets of two edges, and conditions and choices of edges of sets of three, for two opposite contacts of m."""
-    i, j = 2 * pair
-    numbers = np.tile(np.arange(2 * m, dtype=np.int32), 4)  # of all edges or rows, once for each two edges of the pair
-    own = jnp.stack(
-        [i + np.repeat(np.array([0, 0, 1, 1], np.int32), 2 * m), j + np.repeat(np.array([0, 1, 0, 1], np.int32), 2 * m)]
-    )
-    others = np.array([*combinations(range(2 * m), 2)], np.int32).T
-    two = Sets(padded(own), padded(jnp.stack([jnp.full_like(own[0], i), numbers])))
-    return two, (jnp.stack([jnp.full(others.shape[1], i), *others]), jnp.stack([*own, numbers], axis=1)[..., None])
+def _sets_of_pair(i: int, j: int, m: int) -> tuple[np.ndarray, ...]:
+    """Two opposite contacts of m, edges and conditions of sets of two, conditions and choices of edges of three."""
+    edges = [(a, b) for a in (2 * i, 2 * i + 1) for b in (2 * j, 2 * j + 1)]
+    rows = [row for row in range(2 * m) if row not in (2 * i, 2 * j)]
+    two = [((*own, NO_EDGE), (2 * i, row, NO_EDGE)) for own in edges for row in rows]
+    three = [(2 * i, *others) for others in combinations(rows, 2)]
+    choices = [[(a,), (b,), (edge,)] for a, b in edges for edge in range(2 * m) if edge not in (a, b)]
+    return np.array([i, j]), *np.array(two).transpose(1, 2, 0), np.array(three).T, np.array(choices)
 
 
 def best_of_sets(problem: ScaledProblem, one: Sets, two: Sets, three: Numbers) -> Found:
