@@ -43,7 +43,6 @@ from .metrics import coverage as coverage
 from .metrics import deviation as deviation
 from .metrics import energy_score as energy_score
 from .metrics import log_density as log_density
-from .metrics import total_variation as total_variation
 from .simulation.fixtures import Fixture as Fixture
 from .simulation.fixtures import Wall as Wall
 from .simulation.hand import Hand as Hand

@@ -16,7 +16,6 @@ from pushjax._internal.checks import (
     ArrayLike,
     as_float,
     check_finite,
-    check_non_negative,
     check_positive,
     check_shape,
     common_dtype,
@@ -218,35 +217,6 @@ def _coverage(x: Array, y: Array, scale: Array, levels: Array, min_bandwidth: Ar
         jnp.asarray(len(points) / (len(points) - 1), sample_log_densities.dtype)
     )
     return jnp.mean(observed_log_densities[None] >= thresholds[:, None], axis=1, dtype=sample_log_densities.dtype)
-
-
-def total_variation(counts_a: ArrayLike, counts_b: ArrayLike) -> float:
-    """Return the total variation distance between two histograms on the same edges, from 0 to 1.
-
-    It is the fraction of one histogram that would have to move to make it equal to the other.
-
-    Args:
-        counts_a: Counts of the first histogram, of any dimension.
-        counts_b: Counts of the second histogram, of the same shape.
-
-    Returns:
-        The distance of the histograms after each is normalized to a sum of one.
-
-    Raises:
-        ValueError: If the shapes differ, or counts are negative, not finite, or all zero.
-    """
-    shares = []
-    for name, counts in (("counts_a", counts_a), ("counts_b", counts_b)):
-        values = np.asarray(counts, float)
-        check_finite(name, values)
-        check_non_negative(name, values)
-        if not values.sum() > 0:
-            raise ValueError(f"{name} must not all be zero")
-        shares.append(values / values.sum())
-    a, b = shares
-    if a.shape != b.shape:
-        raise ValueError(f"counts_a and counts_b must have one shape; got {a.shape} and {b.shape}")
-    return float(np.abs(a - b).sum() / 2)
 
 
 def mean_pose(poses: Float[Array, "n 3"]) -> Float[Array, "3"]:

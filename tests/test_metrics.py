@@ -140,12 +140,6 @@ def test_the_mean_pose_is_the_same_in_any_frame(samples):
     assert np.allclose(mean_pose(jnp.asarray(wrapped)), [2.0, 3.0, np.pi], atol=1e-6)
 
 
-def test_total_variation():
-    assert pj.total_variation([1, 2, 3], [2, 4, 6]) == 0
-    assert pj.total_variation([1, 0], [0, 5]) == 1
-    assert pj.total_variation([[1, 1], [0, 0]], [[1, 0], [1, 0]]) == pytest.approx(0.5)
-
-
 def test_bad_input(samples):
     for arguments, message in (
         ((samples[:1], samples[0], LENGTH), r"samples has shape \(1, 3\)"),
@@ -162,10 +156,3 @@ def test_bad_input(samples):
         pj.log_density(samples, samples[0], LENGTH, min_bandwidth=0.0)
     with pytest.raises(ValueError, match="levels must be numbers between 0 and 1"):
         pj.coverage(samples, samples[0], LENGTH, levels=(0.5, 1.0))
-    for counts, message in (
-        (([1, 2], [1, 2, 3]), "one shape"),
-        (([0, 0], [1, 2]), "counts_a must not all be zero"),
-        (([1, 1], [-1, 2]), "counts_b must not be negative"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            pj.total_variation(*counts)
