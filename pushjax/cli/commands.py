@@ -22,13 +22,9 @@ DataFolder = Annotated[Path | None, cli_option("FOLDER")]
 
 @dataclass
 class Common:
-    """Options of every command that computes.
+    """Options of every command that computes."""
 
-    Attributes:
-        module: Module of the experiment, below `pushjax.experiments`.
-    """
-
-    module: ClassVar[str] = ""
+    module: ClassVar[str] = ""  # of the experiment, below `pushjax.experiments`
 
     @property
     def title(self) -> str:
@@ -190,14 +186,10 @@ class Capture(Common):
 
 @dataclass
 class Grasp(Common):
-    """A parallel jaw closes on an object from random poses under random friction.
-
-    Attributes:
-        slider: Name of the object.
-    """
+    """A parallel jaw closes on an object from random poses under random friction."""
 
     module = "grasps"
-    slider: ClassVar[str] = ""
+    slider: ClassVar[str] = ""  # name of the object
 
     n: Annotated[int | None, cli_option("N")] = None
     """Number of grasps. Default: the paper's."""

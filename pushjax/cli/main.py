@@ -30,13 +30,7 @@ from pushjax.cli.commands import (
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line.
-
-    Invalid input ends with one line on standard error and exit status 1, a wrong word with exit status 2.
-
-    Args:
-        arguments: The command's arguments. Default: those of the process.
-    """
+    """Run the command line, by default with the arguments of the process."""
     try:
         _run(list(sys.argv[1:] if arguments is None else arguments))
         sys.stdout.flush()
@@ -104,10 +98,8 @@ def _check_word(kind: str, given: list[str], known: Sequence[str]) -> None:
 
 
 def _check_counts(given: list[str]) -> None:
-    """End with exit status 2 if an option has fewer or more values than it takes.
-
-    It is checked here because tyro's own message lists every type of every value.
-    """
+    """End with exit status 2 if an option has fewer or more values than it takes."""
+    # checked here, because tyro's own message lists every type of every value
     first, second = [*given[:2], "", ""][:2]
     kind = EXPERIMENTS.get(second) if first == "reproduce" else COMMAND_CLASSES.get(first)
     options = {} if kind is None else get_type_hints(kind, include_extras=True)
@@ -172,11 +164,7 @@ def _fetch(command: Data) -> None:
 
 
 def data_folder(given: Path | None) -> Path:
-    """Return the folder of the recorded pushes: the given one, else the one that `find_data` finds.
-
-    Raises:
-        ValueError: If there is none.
-    """
+    """Return the folder of the recorded pushes: the given one, else the one that `find_data` finds."""
     if given is not None and not given.is_dir():
         raise ValueError(f"--data: there is no folder {given}")
     from pushjax.datasets.data_folder import find_data
@@ -204,10 +192,7 @@ def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> 
 
 
 def _keep_compiled(cache: bool) -> None:
-    """Turn the cache of compiled programs on or off.
-
-    The warning that programs cannot be cached is printed once, not for every program.
-    """
+    """Turn the cache of compiled programs on or off."""
     import jax
 
     from pushjax._internal.compilation_cache import enable_compilation_cache
@@ -218,6 +203,7 @@ def _keep_compiled(cache: bool) -> None:
     folder = enable_compilation_cache()
     show, told = warnings.showwarning, []
 
+    # the warning that programs cannot be cached is printed once, not for every program
     def show_once(message, *where, **more):
         if "persistent compilation cache" not in str(message):
             show(message, *where, **more)

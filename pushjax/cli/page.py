@@ -42,22 +42,11 @@ ABOUT = ("settings", "versions", "machine", "date")
 
 
 def write_page(record: dict[str, Any], text: str, path: Path, figures: Sequence[tuple[str, str]] | None = None) -> Path:
-    """Write a record and its pictures as one HTML page.
-
-    Args:
-        record: The record (see `result_record`). Its entry "pictures" lists files, whose content is embedded.
-        text: The text that the command printed.
-        path: The HTML file. Its folder is created.
-        figures: What the table of figures shows, as pairs of a name and a value in words. None: the printed text has
-            the figures in words, and the table, which is closed at first, has every entry of the record by its key.
-
-    Returns:
-        The path.
-    """
+    """Write a record, with its pictures embedded, as one HTML page, and return the page's path."""
     whole = json.loads(json.dumps(record, default=to_builtin))
     results = {name: value for name, value in whole.items() if name not in (*ABOUT, "pictures", "experiment")}
     pictures = "\n".join(_picture(Path(picture)) for picture in record.get("pictures", ()))
-    if figures is None:
+    if figures is None:  # the printed text has them in words, so the table of all entries by key is closed at first
         table = f"<details><summary>Figures by their keys in the JSON</summary>{_table(_leaves(results))}</details>"
     else:
         table = f"<details open><summary>Figures</summary>{_table(figures)}</details>"

@@ -14,19 +14,7 @@ Arrays = dict[str, NDArray[np.generic]]
 
 
 def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
-    """Read arrays of an `.npz` archive.
-
-    Args:
-        path: The archive.
-        wanted: Names of the arrays to read.
-        holds: What the archive contains, for error messages ("pushes", say).
-
-    Returns:
-        The arrays by name.
-
-    Raises:
-        LogError: If the file is missing, is no archive, is damaged, or lacks an array.
-    """
+    """Read the wanted arrays of an `.npz` archive, or raise LogError with what the archive `holds`."""
     names = list(wanted)
     try:
         # The file is opened here, because np.load does not close a file that is no archive.
@@ -49,31 +37,15 @@ def read_archive(path: Path, wanted: Iterable[str], holds: str) -> Arrays:
 
 
 def archive_names(path: Path, holds: str) -> frozenset[str]:
-    """Return the names of the arrays in an `.npz` archive.
-
-    Args:
-        path: The archive.
-        holds: What the archive contains, for error messages.
-
-    Raises:
-        LogError: If the file is missing, damaged or no archive, as in `read_archive`.
-    """
+    """Return the names of the arrays in an `.npz` archive, or raise LogError as `read_archive` does."""
     read_archive(path, (), holds)  # raises LogError if the file is no archive
     with np.load(path, allow_pickle=False) as archive:
         return frozenset(archive.files)
 
 
 def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> int:
-    """Return the number of pushes in an archive, after checking that all arrays have this number of rows.
-
-    Args:
-        path: The archive, for error messages.
-        data: Its arrays; the length of `push_index` is the number of pushes.
-        shapes: Shape of one row of each array to check, by name.
-
-    Raises:
-        LogError: If an array has another number of rows or another row shape.
-    """
+    """Return the number of pushes, after checking that arrays have as many rows, of the given row shapes."""
+    # `push_index` has one row for each push
     count = len(data["push_index"]) if data["push_index"].ndim else -1
     for name, row_shape in shapes.items():
         if data[name].shape != (count, *row_shape):
@@ -83,16 +55,7 @@ def row_count(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -
 
 
 def check_shapes(path: Path, data: Arrays, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Check the shapes of arrays against those expected.
-
-    Args:
-        path: The archive, for error messages.
-        data: Its arrays.
-        shapes: Expected shape of each array to check, by name.
-
-    Raises:
-        LogError: For the first array that has another shape.
-    """
+    """Raise LogError for the first array that does not have the given shape."""
     for name, shape in shapes.items():
         if data[name].shape != shape:
             raise LogError(path, f"expected {name} of shape {shape}, found {data[name].shape}")

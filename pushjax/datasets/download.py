@@ -19,19 +19,12 @@ TIMEOUT = 30  # s without an answer
 
 
 class RemoteFile(NamedTuple):
-    """A published file.
+    """A published file."""
 
-    Attributes:
-        file: Its path in the folder of recorded pushes.
-        sha256: Its SHA-256.
-        bytes: Its size.
-        source: Its path in the repository.
-    """
-
-    file: str
+    file: str  # path in the folder of recorded pushes
     sha256: str
-    bytes: int
-    source: str
+    bytes: int  # size
+    source: str  # path in the repository
 
 
 def triangle_files() -> list[RemoteFile]:
@@ -61,21 +54,7 @@ def fetch_triangle(to: str | PathLike[str] | None = None, *, progress: ProgressC
 
 
 def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: ProgressCallback = no_progress) -> None:
-    """Fetch files and check their content.
-
-    A file that is there and has the right content is not fetched again, so an interrupted call can be repeated. A file
-    that arrives incomplete or changed is not kept.
-
-    Args:
-        files: The files.
-        source: Address that their paths continue.
-        folder: Folder of the files here.
-        progress: Called with the number of bytes that are there and their total.
-
-    Raises:
-        OSError: If a file cannot be fetched or written, or arrives with other content. The files that were fetched
-            before it stay.
-    """
+    """Fetch files from the address `source` and check their SHA-256; OSError if one cannot be fetched or differs."""
     import pooch  # imported here, because only those who fetch need it
     import requests
 
@@ -85,6 +64,8 @@ def fetch(files: Sequence[RemoteFile], source: str, folder: Path, *, progress: P
     progress(done, total)
     for remote in files:
         target, address = folder / remote.file, source + quote(remote.source)
+        # `retrieve` skips a file that is there with the right content, so an interrupted call can be repeated; it does
+        # not keep a file that arrives incomplete or changed
         try:
             pooch.retrieve(address, f"sha256:{remote.sha256}", target.name, target.parent, downloader=downloader)
         except requests.RequestException as error:

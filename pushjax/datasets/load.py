@@ -81,11 +81,7 @@ _SUFFIXES: dict[str, Loader] = {
 
 
 def _select_loader(path: Path) -> Loader:
-    """Select the loader by the first bytes of the file or else by its suffix.
-
-    Raises:
-        LogError: If the file is unreadable, empty or of no known kind.
-    """
+    """Select the loader by the first bytes of the file or else by its suffix."""
     try:
         with path.open("rb") as file:
             head = file.read(max(len(signature) for signature in _SIGNATURES))

@@ -160,16 +160,7 @@ def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[Push
 def _read_pushes(
     files: list[tuple[int, PushParameters, Path]], speeds: tuple[float, ...], progress: ProgressCallback
 ) -> tuple[list[list[MitPush]], list[LogError]]:
-    """Read the files whose push has one of the wanted speeds.
-
-    Args:
-        files: Index, parameters and path of each push.
-        speeds: The wanted speeds, in m/s.
-        progress: Called after each file with the number of files read and the number of files to read.
-
-    Returns:
-        The pushes of each speed, and one error for each file that cannot be used.
-    """
+    """Read the pushes of each of the speeds, m/s, with one error for each file that cannot be used."""
     pushes: list[list[MitPush]] = [[] for _ in speeds]
     problems = []
     wanted = [
@@ -231,13 +222,7 @@ def _push_group(pushes: Sequence[MitPush], fractions: tuple[float, float], body:
 
 
 def _is_trustworthy(pose: Floats, tip: Floats, body: MitShape) -> NDArray[np.bool_]:
-    """Return whether the tracker can be trusted in each of k pushes.
-
-    Args:
-        pose: (k, 2, 3) poses of the object before and after each push, in m and rad.
-        tip: (k, 2, 2) centers of the tip before and after each push, in m.
-        body: The object.
-    """
+    """Return a mask (k,) of pushes whose poses (k, 2, 3) and tips (k, 2, 2) at the ends can be trusted."""
     if not len(pose):
         return np.zeros(0, bool)
     before, after = (

@@ -33,17 +33,7 @@ _OBJECT_ARRAYS = ("vertices_body", "rho", "tip_radius")
 
 
 def load_mit_json(path: Path) -> Recordings:
-    """Read a `.json` file of the data set, which maps `tip_pose`, `object_pose` and `ft_wrench` to lists of rows.
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its one push.
-
-    Raises:
-        LogError: If the file is not a log of this form, or if its push cannot be used.
-    """
+    """Read a `.json` file of the data set, which maps `tip_pose`, `object_pose` and `ft_wrench` to lists of rows."""
     try:
         record = json.loads(path.read_bytes())
     except OSError as error:
@@ -56,17 +46,7 @@ def load_mit_json(path: Path) -> Recordings:
 
 
 def load_mit_hdf5(path: Path) -> Recordings:
-    """Read an HDF5 file with the datasets `tip_pose`, `object_pose` and `ft_wrench`, each (n, 4).
-
-    Args:
-        path: The file.
-
-    Returns:
-        Its one push.
-
-    Raises:
-        LogError: If the file is not a log of this form, if its push cannot be used, or if h5py is not installed.
-    """
+    """Read an HDF5 file with the datasets `tip_pose`, `object_pose` and `ft_wrench`, each (n, 4)."""
     try:
         import h5py
     except ImportError as error:
@@ -87,19 +67,7 @@ def load_mit_hdf5(path: Path) -> Recordings:
 
 
 def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
-    """Read a curated archive from the folder `mit_push_full`, including what it says about the object.
-
-    Args:
-        path: The archive.
-        names: Names of all arrays in it.
-
-    Returns:
-        Its one push, with outline, characteristic length and tip radius if the file has them.
-
-    Raises:
-        LogError: If an array is missing, has the wrong shape or is not numeric, if a number about the object is not
-            finite, or if the push cannot be used.
-    """
+    """Read a curated archive from the folder `mit_push_full`, including what it says about the object."""
     values = [name for name, _ in ARCHIVE_ARRAYS.values()]
     data = read_archive(path, [*ARCHIVE_ARRAYS, *values, *(name for name in _OBJECT_ARRAYS if name in names)], "a push")
     _check_arrays(path, data)
@@ -115,11 +83,7 @@ def load_mit_npz(path: Path, names: frozenset[str]) -> Recordings:
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
-    """Check types and shapes, and that the numbers about the object are finite.
-
-    Raises:
-        LogError: For the first array that fails.
-    """
+    """Check types and shapes, and that the numbers about the object are finite."""
     shapes: dict[str, tuple[int, ...]] = {}
     for time, (values, columns) in ARCHIVE_ARRAYS.items():
         count = data[time].size
@@ -135,12 +99,7 @@ def _check_arrays(path: Path, data: Arrays) -> None:
 
 
 def _rows_to_array(rows: Any) -> Floats:
-    """Convert the rows of a JSON stream to an array (n, 4).
-
-    Raises:
-        ValueError: If `rows` is not a list, or if a row is not a list of four numbers. For a row that is no list or has
-            another length, the message names the first one.
-    """
+    """Convert the rows of a JSON stream to an array (n, 4), or raise ValueError with the first bad row."""
     if not isinstance(rows, list):
         raise ValueError(f"a {type(rows).__name__}")
     for index, row in enumerate(rows):
@@ -150,16 +109,7 @@ def _rows_to_array(rows: Any) -> Floats:
 
 
 def _stream_tables(path: Path, record: Mapping[str, Any], to_array: Callable[[Any], Floats]) -> list[Floats]:
-    """Return the streams of a record in the order of STREAMS, each (n, 4).
-
-    Args:
-        path: The file, for error messages.
-        record: The streams by name.
-        to_array: Function that converts a stream to an array.
-
-    Raises:
-        LogError: If a stream is missing or is something else.
-    """
+    """Return the streams of a record in the order of STREAMS, each (n, 4)."""
     missing = [name for name in STREAMS if name not in record]
     if missing:
         found = ", ".join(list(record)[:10]) or "nothing"

@@ -87,11 +87,7 @@ def parse_push_name(path: str | PathLike[str]) -> PushParameters:
 
 
 def _number(path: str | PathLike[str], fields: dict[str, str], key: str) -> float:
-    """Return a field as a number.
-
-    Raises:
-        LogError: If it is no finite number.
-    """
+    """Return a field as a finite number."""
     try:
         value = float(fields[key])
     except ValueError:
@@ -102,11 +98,7 @@ def _number(path: str | PathLike[str], fields: dict[str, str], key: str) -> floa
 
 
 def _nonnegative_int(path: str | PathLike[str], key: str, value: float) -> int:
-    """Return a value as an integer.
-
-    Raises:
-        LogError: If it is negative or not an integer.
-    """
+    """Return a value as a nonnegative integer."""
     if value != int(value) or value < 0:
         raise LogError(path, f"expected a number from 0 without a fraction for {key} in the name, found {value:g}")
     return int(value)

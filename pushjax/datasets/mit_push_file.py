@@ -34,23 +34,14 @@ MIN_MOTION, MIN_FORCE, MAX_FORCE_ANGLE = 0.0002, 0.1, np.deg2rad(30)
 
 
 class MitPush(NamedTuple):
-    """A push from the first to the last sample at which tip, object and force are known, in the world frame.
+    """A push from the first to the last sample at which tip, object and force are known, in the world frame."""
 
-    Attributes:
-        index: Position of the file in `find_mit_pushes`.
-        name: Parameters of the push.
-        time: (m,) times, in s.
-        tip: (m, 2) centers of the tip, in m.
-        pose: (m, 3) poses of the object, in m and rad.
-        force: (m, 2) forces on the object, in N.
-    """
-
-    index: int
+    index: int  # position of the file in `find_mit_pushes`
     name: PushParameters
-    time: Floats
-    tip: Floats
-    pose: Floats
-    force: Floats
+    time: Floats  # (m,), s
+    tip: Floats  # (m, 2), centers of the tip, m
+    pose: Floats  # (m, 3), poses of the object, m and rad
+    force: Floats  # (m, 2), forces on the object, N
 
     def times_at(self, fractions: Sequence[float] | Floats) -> Floats:
         """Return the times (k,), in s, at these fractions (k,) of the duration."""
@@ -64,11 +55,7 @@ class MitPush(NamedTuple):
 
 
 def read_push(index: int, name: PushParameters, path: Path) -> MitPush:
-    """Read the push of a file.
-
-    Raises:
-        LogError: If the file is damaged, or if the tracker lost the object.
-    """
+    """Read the push of a file; LogError if the file is damaged or the tracker lost the object."""
     (push,) = (load_mit_json if path.suffix.lower() == ".json" else load_mit_hdf5)(path).pushes
     assert push.force is not None  # these files always have force and time
     assert push.time is not None
@@ -79,14 +66,11 @@ def read_push(index: int, name: PushParameters, path: Path) -> MitPush:
 
 
 def _known_span(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
-    """Return the range from the first to the last sample (m,) that is known.
-
-    Raises:
-        LogError: If a sample in between is unknown. The object was not seen there, because the force has no gaps.
-    """
+    """Return the range from the first to the last known sample (m,); LogError if one in between is unknown."""
     rows = np.flatnonzero(known)
     if len(rows) < 2 or time[rows[-1]] == time[rows[0]]:
         raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
+    # the force has no gaps, so an unknown sample is one at which the object was not seen
     lost = rows[0] + np.flatnonzero(~known[rows[0] : rows[-1]])
     if len(lost):
         span = f"{time[lost[0]]:.2f} to {time[lost[-1]]:.2f} s"
@@ -95,14 +79,9 @@ def _known_span(path: Path, time: Floats, known: NDArray[np.bool_]) -> slice:
 
 
 def _check_no_jump(path: Path, time: Floats, tip: Floats, pose: Floats) -> None:
-    """Check that the tracker does not jump.
-
-    The test compares all samples of a stretch of the path, not only neighbors. The poses are interpolated at the time
-    stamps of the tip. Where the tracker has fewer samples than the tip, a jump is spread over several samples.
-
-    Raises:
-        LogError: If it jumps.
-    """
+    """Raise LogError if the tracker jumps."""
+    # All samples of a stretch of the path are compared, not only neighbors. The poses are interpolated at the time
+    # stamps of the tip, so where the tracker has fewer samples than the tip, a jump is spread over several samples.
     travel = float(np.linalg.norm(tip[-1] - tip[0]))
     window = len(time) if travel <= JUMP_WINDOW else max(2, round(len(time) * JUMP_WINDOW / travel))
     extent = np.ptp(np.lib.stride_tricks.sliding_window_view(pose, window, axis=0), axis=2)
@@ -123,12 +102,7 @@ def in_body(pose: Floats, vectors: Floats) -> Floats:
 
 
 def training_pairs(push: MitPush, body: MitShape) -> Iterator[tuple[Floats, Floats]]:
-    """Iterate over the wrenches and displacements of the parts in which the finger pushes.
-
-    Yields:
-        The wrench (3,), in N and N m, and the displacement (3,), in m and rad, both about the body origin and in the
-            body frame at the middle of the part.
-    """
+    """Iterate over the wrenches (3,), N and N m, and displacements (3,), m and rad, of the parts with pressing."""
     tip, force = in_body(push.pose, push.tip - push.pose[:, :2]), in_body(push.pose, push.force)
     distance, contact = nearest_on_outline(body.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
@@ -140,6 +114,7 @@ def training_pairs(push: MitPush, body: MitShape) -> Iterator[tuple[Floats, Floa
         rows_of_part = slice(row_at[part], row_at[part + 2])
         if rows_of_part.start == rows_of_part.stop:
             continue
+        # wrench and displacement are about the body origin, in the body frame at the middle of the part
         to_body = rotation(poses[part + 1, 2]).T
         displacement = poses[part + 2] - poses[part]
         wrench = np.append(to_body @ push.force[rows_of_part].mean(axis=0), torque[rows_of_part].mean())

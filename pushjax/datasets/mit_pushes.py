@@ -162,11 +162,7 @@ def load_mit_pushes_npz(path: str | PathLike[str]) -> MitPushes:
 
 
 def _read_group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
-    """Read the group of pushes whose arrays have this prefix.
-
-    Raises:
-        LogError: If an array has the wrong shape, or if a number is not finite or is too large.
-    """
+    """Read the group of pushes whose arrays have this prefix."""
     count = len(data[f"{prefix}_index"]) if data[f"{prefix}_index"].ndim else -1
     shapes: dict[str, tuple[int, ...]] = {f"{prefix}_{name}": (count, 3) for name in _POSE_ARRAYS}
     shapes |= {f"{prefix}_sim_pose_end_{kind}": (count, 3) for kind in TOOLBOX_SUFFIXES.values()}
@@ -183,20 +179,14 @@ def _read_group(path: Path, data: Arrays, prefix: str) -> StraightPushes:
 
 
 def _check_finite(path: Path, data: Arrays, names: tuple[str, ...]) -> None:
-    """Check that the named arrays have only finite numbers, with magnitudes below LARGEST_NUMBER.
-
-    Raises:
-        LogError: For the first array that fails.
-    """
+    """Raise LogError unless the named arrays have only finite numbers, with magnitudes below LARGEST_NUMBER."""
     for name in names:
         if not np.issubdtype(data[name].dtype, np.number) or not (np.abs(data[name]) < LARGEST_NUMBER).all():
             raise LogError(path, f"expected finite numbers below {LARGEST_NUMBER:g}, found others in {name}")
 
 
 def wrap_to_pi(angle: Floats) -> Floats:
-    """Wrap angles, in rad, to [-pi, pi).
-
-    `push_log.wrap_angle` wraps to (-pi, pi] and rounds differently. Both are kept, because the poses that are read from
-    the two data sets would otherwise change in their last bits.
-    """
+    """Wrap angles, rad, to [-pi, pi)."""
+    # `push_log.wrap_angle` wraps to (-pi, pi] and rounds differently. Both are kept, because the poses that are read
+    # from the two data sets would otherwise change in their last bits.
     return (angle + np.pi) % (2 * np.pi) - np.pi

@@ -73,16 +73,7 @@ def mit_shape(name: str) -> MitShape:
 
 
 def nearest_on_outline(vertices: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Find the points on a polygon that are nearest to the given points.
-
-    Args:
-        vertices: (v, 2) vertices of the outline, in m.
-        points: (n, 2) points, in m.
-
-    Returns:
-        The signed distances (n,) of the points from the outline, in m, negative inside, and the nearest points (n, 2)
-            on it.
-    """
+    """Return signed distances (n,), m, negative inside, of points from a polygon, and its nearest points (n, 2)."""
     edge = np.roll(vertices, -1, axis=0) - vertices
     offset = points[:, None] - vertices
     fraction = np.clip(np.sum(offset * edge, axis=2) / np.sum(edge**2, axis=1), 0, 1)
@@ -120,10 +111,7 @@ def _on_unit_circle(count: int, first: int) -> Floats:
 
 
 def _butterfly() -> Floats:
-    """Return the butterfly's vertices, from the waist on the left around the lower wing and then the upper one.
-
-    The upper wing is the lower one, turned by half a turn.
-    """
+    """Return the butterfly's vertices, from the waist on the left around the lower wing and then the upper one."""
     u = np.arange(-_STEPS, _STEPS + 1.0)
     beyond = np.clip(np.abs(u) - _KNOT, 0, None) ** 3
     x = _X[0] * u + _X[1] * u**3 + _X[2] * np.sign(u) * beyond + _SHIFT
@@ -133,4 +121,4 @@ def _butterfly() -> Floats:
     point = np.arange(end)
     lower_x = np.interp(point, [0, *(step - 1), end], [-_WAIST, *x, _WAIST])
     lower = np.stack([lower_x, np.interp(point, [0, *step, end], [0, *y, 0])], axis=1)
-    return np.concatenate([lower, -lower])
+    return np.concatenate([lower, -lower])  # the upper wing is the lower one, turned by half a turn

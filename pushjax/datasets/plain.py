@@ -33,32 +33,14 @@ LAYOUT = "path (n, k, dof) with start and end (n, 3) or pose (n, k, 3), if known
 
 
 class _Row(NamedTuple):
-    """One row of a table.
+    """One row of a table."""
 
-    Attributes:
-        line: Line of the file on which the row ends, from 1.
-        cells: The text of each cell.
-    """
-
-    line: int
+    line: int  # line of the file on which the row ends, from 1
     cells: list[str]
 
 
 def load_csv(path: Path) -> Recordings:
-    """Read a table with a header.
-
-    Columns may be in any order. The rows of one push follow each other. A push becomes a problem if one of its cells is
-    bad, or if the object is not seen in its first or last row.
-
-    Args:
-        path: The table, in UTF-8 text.
-
-    Returns:
-        The usable pushes, and the problems of the others.
-
-    Raises:
-        LogError: If the file is no such table, if it has other columns, or if no push is usable.
-    """
+    """Read a table in UTF-8 text, with a header, columns in any order, and consecutive rows for each push."""
     rows = _nonblank_rows(path)
     header = next(rows, None)
     if header is None:
@@ -67,6 +49,7 @@ def load_csv(path: Path) -> Recordings:
     label_column = names.index(_PUSH)
     # Rows that are too short to have a label form a push of their own, which becomes a problem.
     pushes = groupby(rows, key=lambda row: row.cells[label_column].strip() if label_column < len(row.cells) else "")
+    # A push becomes a problem if a cell is bad, or if the object is not seen in its first or last row.
     return collect(path, (_read_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
 
 
@@ -87,11 +70,7 @@ def _nonblank_rows(path: Path) -> Iterator[_Row]:
 
 
 def _check_header(path: Path, header: _Row) -> list[str]:
-    """Check the names of the columns, and return them.
-
-    Raises:
-        LogError: If a column is unknown, required but missing, or present twice.
-    """
+    """Return the names of the columns; LogError if one is unknown, missing or duplicated."""
     names = [cell.strip() for cell in header.cells]
     missing = [name for name in _REQUIRED if name not in names]
     for group in _OPTIONAL_GROUPS:
@@ -129,11 +108,7 @@ def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Re
 
 
 def _read_row(names: list[str], row: _Row) -> Mapping[str, float]:
-    """Read the numbers of a row, by column; a blank cell gives NaN where blanks are allowed.
-
-    Raises:
-        ParseError: If a cell is bad, or if the row has too many or too few.
-    """
+    """Read the numbers of a row, by column, or raise ParseError; NaN for a blank cell where it is allowed."""
     if len(row.cells) != len(names):
         raise ParseError(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
     cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
@@ -143,11 +118,7 @@ def _read_row(names: list[str], row: _Row) -> Mapping[str, float]:
 
 
 def _read_cell(name: str, cell: str, line: int) -> float:
-    """Read the number in a cell; a blank cell gives NaN where blanks are allowed.
-
-    Raises:
-        ParseError: If the cell has no number or, where it must, no finite one.
-    """
+    """Read the number in a cell, or raise ParseError; NaN for a blank cell where it is allowed."""
     if not cell and name in _MAY_BE_BLANK:
         return math.nan
     try:
@@ -161,21 +132,7 @@ def _read_cell(name: str, cell: str, line: int) -> float:
 
 
 def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
-    """Read an `.npz` archive of pushes with equally many samples.
-
-    A push becomes a problem if it has numbers that are not finite. In `pose` and `force`, NaN is allowed: the object
-    was not seen, or no force was measured.
-
-    Args:
-        path: The archive.
-        names: Names of the arrays in it; `path` must be one of them.
-
-    Returns:
-        The usable pushes, and the problems of the others.
-
-    Raises:
-        LogError: If the archive has other arrays or other shapes, or if no push is usable.
-    """
+    """Read an `.npz` archive of pushes with equally many samples and with the arrays `names`."""
     wanted = _arrays_to_read(path, names)
     data = read_archive(path, wanted, "pushes")
     _check_arrays(path, data)
@@ -189,6 +146,7 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
     def optional_row(name: str, index: int) -> Floats | None:
         return numbers[name][index] if name in numbers else None
 
+    # A push becomes a problem if it has numbers that are not finite, other than NaN for an unseen pose or no force.
     return collect(
         path,
         (
@@ -201,11 +159,7 @@ def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
 
 
 def _arrays_to_read(path: Path, names: frozenset[str]) -> list[str]:
-    """Return the names of the arrays to read, which are all that the archive should have.
-
-    Raises:
-        LogError: If an array is unknown, or if poses are given both as `pose` and as `start` and `end`.
-    """
+    """Return the names of the arrays to read, or raise LogError for unknown or conflicting arrays."""
     unknown = sorted(names - set(ARRAYS))
     if unknown:
         raise LogError(path, f"expected {LAYOUT}; found unknown arrays {', '.join(unknown)}")
@@ -217,11 +171,7 @@ def _arrays_to_read(path: Path, names: frozenset[str]) -> list[str]:
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
-    """Check types and shapes.
-
-    Raises:
-        LogError: If an array has no numbers, or a shape that does not fit that of `path`.
-    """
+    """Raise LogError unless the arrays have numbers and shapes that fit the shape of `path`."""
     for name, array in data.items():
         if array.dtype.kind not in "fiu":
             raise LogError(path, f"expected numbers in {name}, found {array.dtype}")

@@ -69,15 +69,7 @@ def _rebuild_error(path: str, message: str, push: int | None, line: int | None) 
 
 
 def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> LogError:
-    """Build the error for a file without a usable push: the first problem, and the number of further ones.
-
-    Args:
-        path: The file.
-        problems: The errors of its pushes.
-
-    Returns:
-        The error, to be raised by the caller.
-    """
+    """Return the error for a file without a usable push: the first problem, and how many more there are."""
     if not problems:
         return LogError(path, "expected at least one push, found none")
     first = problems[0]

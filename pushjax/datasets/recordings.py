@@ -115,35 +115,13 @@ def _from_push(push: Push) -> Recording:
 
 
 def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """Interpolate columns linearly at other times.
-
-    Args:
-        time: (m,) times to interpolate at, in s.
-        known_time: (k,) times of the known values, in s, non-decreasing.
-        known: (k, c) known values.
-
-    Returns:
-        (m, c) interpolated values; NaN outside the known times.
-    """
+    """Interpolate known values (k, c) linearly at the times (m,); NaN outside the known times (k,)."""
     columns = [np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in known.T]
     return np.stack(columns, axis=1)
 
 
 def collect(path: Path, results: Iterable[Recording | LogError]) -> Recordings:
-    """Collect the results of all pushes of a file.
-
-    If more than a quarter of the results are `AnglesInDegrees`, all other pushes become such errors too.
-
-    Args:
-        path: The file.
-        results: The recording of each push, or its error.
-
-    Returns:
-        The usable pushes, and the problems of the others.
-
-    Raises:
-        LogError: If no push is usable.
-    """
+    """Collect the recordings and the errors of all pushes of a file; LogError if no push is usable."""
     results = list(results)
     if 4 * sum(isinstance(result, AnglesInDegrees) for result in results) > len(results):
         # The others only seem to be in rad, because their angles in degrees are small.
@@ -163,26 +141,13 @@ def checked_recording(
     path: Path,
     index: int,
     hand: Floats,
-    pose: Floats,
+    pose: Floats,  # NaN where the object was not seen, as `force` where there is none; angles may be wrapped
     *,
     force: Floats | None = None,
     time: Floats | None = None,
-    lines: Sequence[int] | None = None,
+    lines: Sequence[int] | None = None,  # (m,), line of each sample in the file, from 1
 ) -> Recording | LogError:
-    """Check the arrays of one push.
-
-    Args:
-        path: The file, for error messages.
-        index: Index of the push in the file, from 0.
-        hand: (m, dof) configurations of the hand, as in `Recording`.
-        pose: (m, 3) poses of the object, NaN where it was not seen. Angles need not be continuous.
-        force: (m, 2) forces on the object, NaN where there is none; None if not recorded.
-        time: (m,) times in s; None if not recorded.
-        lines: (m,) line of each sample in the file, from 1; None if the file has no lines.
-
-    Returns:
-        The recording, with unwrapped angles, or the error that describes the first fault.
-    """
+    """Return the recording of one push, with unwrapped angles, or the error for its first fault."""
 
     def error_at(message: str, row: int) -> LogError:
         return LogError(
@@ -211,10 +176,7 @@ def checked_recording(
 def _find_problem(
     hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, error_at: Callable[[str, int], LogError]
 ) -> LogError | None:
-    """Find the first fault in the arrays of `checked_recording`.
-
-    `error_at` makes an error of a message and a row of the push.
-    """
+    """Return the first fault in the arrays of `checked_recording`; `error_at` makes it of message and row."""
     columns = [(hand_columns(hand.shape[1]), hand, False), (OBJECT, pose, True)]
     if force is not None:
         columns.append((FORCE, force, True))
@@ -241,18 +203,9 @@ def hand_columns(dof: int) -> tuple[str, ...]:
 
 
 def find_bad_number(names: Sequence[str], values: Floats, may_be_missing: bool) -> tuple[str, int] | None:
-    """Find the first row with a number that is not finite or too large.
-
-    Args:
-        names: (c,) names of the columns, for the message.
-        values: (m, c) numbers.
-        may_be_missing: Whether all numbers of a row may be missing. They are NaN then.
-
-    Returns:
-        A message and the row; None if all rows are good.
-    """
+    """Return a message and the row of the first number (m, c) that is not finite or too large, or None."""
     bad = ~(np.abs(values) < LARGEST_NUMBER)
-    if may_be_missing:
+    if may_be_missing:  # then all numbers of a row may be NaN
         bad[np.isnan(values).all(axis=1)] = False
     rows = np.flatnonzero(bad.any(axis=1))
     if not len(rows):

@@ -33,21 +33,13 @@ _GZIP_MAGIC = b"\x1f\x8b"
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One push as logged.
+    """One push as logged."""
 
-    Attributes:
-        index: Number of the push in its log, from 0.
-        line: Line of the first pose in the file, from 1.
-        poses: (2, 7) object poses before and after the push, one logged line each.
-        force: (K, 3) force samples.
-        robot: (M, 8) robot samples.
-    """
-
-    index: int
-    line: int
-    poses: Floats
-    force: Floats
-    robot: Floats
+    index: int  # number of the push in its log, from 0
+    line: int  # line of the first pose in the file, from 1
+    poses: Floats  # (2, 7), object poses before and after the push, one logged line each
+    force: Floats  # (K, 3), samples
+    robot: Floats  # (M, 8), samples
 
     @property
     def force_line(self) -> int:
@@ -61,32 +53,16 @@ class Record:
 
 
 class ParseError(Exception):
-    """A record that cannot be read, raised before the file and the push that it belongs to are known.
-
-    Attributes:
-        line: Line of the problem, from 1.
-        at_end: Whether the problem is that the log ends too early.
-    """
+    """A record that cannot be read, raised before the file and the push that it belongs to are known."""
 
     def __init__(self, message: str, line: int, *, at_end: bool = False) -> None:
         super().__init__(message)
-        self.line = line
-        self.at_end = at_end
+        self.line = line  # from 1
+        self.at_end = at_end  # whether the log ends too early
 
 
 def read_records(path: Path) -> Iterator[Record | LogError]:
-    """Iterate over the records of a log in order.
-
-    Args:
-        path: The log, plain or gzip-compressed.
-
-    Yields:
-        A `Record` for each intact record and a `LogError` for each damaged one. A damaged header or a damaged end of
-            the file gives one further `LogError`.
-
-    Raises:
-        LogError: If the file is unreadable or empty.
-    """
+    """Iterate over the records of a log, plain or gzip-compressed, with an error for each damaged part."""
     lines, damage = _read_lines(path)
     promised, fault = _read_header(lines)
     if fault is not None:
@@ -117,10 +93,7 @@ def read_records(path: Path) -> Iterator[Record | LogError]:
 
 
 def _read_lines(path: Path) -> tuple[list[str], str]:
-    """Read the lines of a log, and describe the damage of its gzip stream ("" if there is none).
-
-    The lines before the damage are intact.
-    """
+    """Read the intact lines of a log, and describe the damage of its gzip stream ("" if there is none)."""
     damage = ""
     try:
         text = path.read_bytes()
@@ -145,14 +118,11 @@ def _read_lines(path: Path) -> tuple[list[str], str]:
 
 
 def _decompress_readable_part(zipped: bytes) -> bytes:
-    """Return what a gzip stream holds before its damage.
-
-    The stream is decompressed byte by byte, because a call that fails returns nothing.
-    """
+    """Return what a gzip stream holds before its damage."""
     stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     text = bytearray()
     try:
-        for position in range(len(zipped)):
+        for position in range(len(zipped)):  # byte by byte, because a call that fails returns nothing
             if len(text) > MAX_BYTES:
                 break
             text += stream.decompress(zipped[position : position + 1])
@@ -178,11 +148,7 @@ def _promised_count(promised: int | None) -> str:
 
 
 def _read_record(lines: list[str], start: int, number: int) -> tuple[Record, int]:
-    """Read the record that starts at line index `start`, and return it with the line index after its end.
-
-    Raises:
-        ParseError: If the record is damaged.
-    """
+    """Read the record that starts at line index `start`, and return it with the line index after its end."""
     pose_before = _read_table(lines, start, 1, POSE_COLUMNS, "object pose before the push")
     pose_after = _read_table(lines, start + 1, 1, POSE_COLUMNS, "object pose after the push")
     force_count = _read_count(lines, start + 2, "force samples")
@@ -199,11 +165,7 @@ def _read_record(lines: list[str], start: int, number: int) -> tuple[Record, int
 
 
 def _read_count(lines: list[str], index: int, what: str) -> int:
-    """Read the number of samples or pushes at line index `index`.
-
-    Raises:
-        ParseError: If the line is missing, is no integer, or is not between 0 and MAX_SAMPLES.
-    """
+    """Read the number of samples or pushes, 0 to MAX_SAMPLES, at line index `index`."""
     if index >= len(lines):
         raise ParseError(f"expected the number of {what}, found the end of the log", len(lines), at_end=True)
     try:
@@ -216,11 +178,7 @@ def _read_count(lines: list[str], index: int, what: str) -> int:
 
 
 def _read_table(lines: list[str], first: int, count: int, columns: int, what: str) -> Floats:
-    """Read a table of shape (count, columns) from `count` lines, starting at line index `first`.
-
-    Raises:
-        ParseError: If a line is missing or has other numbers than expected.
-    """
+    """Read a table (count, columns) from `count` lines, starting at line index `first`."""
     rows = [line.split() for line in lines[first : first + count]]
     try:
         table = np.array(rows, dtype=np.float64).reshape(-1, columns) if rows else np.empty((0, columns))
@@ -267,25 +225,14 @@ def _column_count(lines: list[str], index: int) -> int:
 
 
 def _matching_start_lines(lines: list[str], index: int) -> int:
-    """Count the lines, of the three from index `index`, whose number of columns fits the start of a record.
-
-    An intact start scores 3. A start with one damaged line scores 2.
-    """
+    """Count those of three lines from `index` whose number of columns fits the start of a record."""
+    # an intact start scores 3, a start with one damaged line 2
     start_columns = (POSE_COLUMNS, POSE_COLUMNS, COUNT_COLUMNS)
     return sum(_column_count(lines, index + row) == columns for row, columns in enumerate(start_columns))
 
 
 def _find_next_record(lines: list[str], start: int, fault_at: int) -> int:
-    """Find the line index at which to continue after a damaged record.
-
-    Args:
-        lines: Lines of the log.
-        start: Line index at which the damaged record starts.
-        fault_at: Line index of the fault.
-
-    Returns:
-        Line index of the next record's start; the number of lines if there is no further start.
-    """
+    """Return the line index of the next record after a damaged one, or the number of lines."""
     try:
         robot_at = start + 3 + _read_count(lines, start + 2, "")
         end = robot_at + 1 + _read_count(lines, robot_at, "")
@@ -302,11 +249,7 @@ def _find_next_record(lines: list[str], start: int, fault_at: int) -> int:
 
 
 def check_quaternions(quaternions: Floats, line: int, what: str) -> None:
-    """Check that the quaternions, the first of which is on `line`, have unit norm.
-
-    Raises:
-        ParseError: For the first that has not.
-    """
+    """Raise ParseError unless the quaternions, the first of which is on `line`, have unit norm."""
     norm = np.linalg.norm(quaternions, axis=1)
     bad = np.flatnonzero(np.abs(norm - 1) > QUATERNION_TOLERANCE)
     if len(bad):

@@ -18,19 +18,12 @@ MAX_JITTER = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """One recorded stream.
+    """One recorded stream."""
 
-    Attributes:
-        name: Name of the stream in the file.
-        columns: Names of its c values.
-        time: (n,) times, in s.
-        values: (n, c) values.
-    """
-
-    name: str
-    columns: tuple[str, ...]
-    time: Floats
-    values: Floats
+    name: str  # in the file
+    columns: tuple[str, ...]  # names of the c values
+    time: Floats  # (n,), s
+    values: Floats  # (n, c)
 
     def rows(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Stream":
         """Return the stream of the selected rows, given as a mask or as indices."""
@@ -38,22 +31,7 @@ class Stream:
 
 
 def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording | LogError:
-    """Combine three streams with time stamps of one clock into the one push of a file.
-
-    The result has the hand's samples from the first to the last one at which the object is seen. The object's pose and
-    the force on it are interpolated at these samples; the angle of the pose takes the short way. The object counts as
-    unseen within gaps of its stream that are longer than MAX_GAP. Rows of its stream that are all NaN are ignored.
-    Time starts at the first sample of the hand's stream.
-
-    Args:
-        path: The file, for error messages.
-        hand: Configurations of the hand (n, dof).
-        body: Poses of the object (n, 3).
-        force: Forces on the object (n, 2).
-
-    Returns:
-        The recording, or the error that describes the first fault.
-    """
+    """Combine three streams of one clock into the one push of a file, sampled as the hand, or return its fault."""
     for stream, max_backstep, may_be_missing in ((hand, 0.0, False), (body, MAX_JITTER, True), (force, 0.0, False)):
         fault = _describe_fault(stream, max_backstep, may_be_missing)
         if fault is not None:
@@ -63,7 +41,7 @@ def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Reco
     for other in (body, force):
         if hand.time[0] > other.time[-1] or other.time[0] > hand.time[-1]:
             return LogError(path, _describe_disjoint_times(hand, other), push=0)
-    body = body.rows(np.isfinite(body.values[:, 0]))
+    body = body.rows(np.isfinite(body.values[:, 0]))  # without the rows that are all NaN
     # Unix times in s use most digits of a float64, so times are taken relative to the first one.
     time, seen_time, force_time = (stream.time - hand.time[0] for stream in (hand, body, force))
     pose = _interpolate_poses(time, seen_time, body.values)
@@ -71,19 +49,14 @@ def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Reco
     if len(seen) < 2:
         message = f"expected the object to be seen at two samples of {hand.name} at least, found {len(seen)}"
         return LogError(path, f"{message} that are not in a gap of {body.name} longer than {MAX_GAP:g} s", push=0)
+    # the hand's samples from the first to the last one at which the object is seen
     span = slice(seen[0], seen[-1] + 1)
     object_force = interpolated(time[span], force_time, force.values)
     return checked_recording(path, 0, hand.values[span], pose[span], force=object_force, time=time[span])
 
 
 def _describe_fault(stream: Stream, max_backstep: float, may_be_missing: bool) -> str | None:
-    """Describe the first fault of a stream; None if there is none.
-
-    Args:
-        stream: The stream.
-        max_backstep: Largest step, in s, by which a time stamp may go back.
-        may_be_missing: Whether all values of a row may be NaN.
-    """
+    """Describe the first fault of a stream, whose time stamps may go back by `max_backstep`, s; else None."""
     if len(stream.time) < 2:
         return f"expected at least two samples in {stream.name}, found {len(stream.time)}"
     for names, values, row_may_be_missing in (
@@ -114,11 +87,7 @@ def _describe_disjoint_times(hand: Stream, other: Stream) -> str:
 
 
 def _interpolate_poses(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """Interpolate poses (k, 3) known at times (k,), at other times (m,).
-
-    Returns:
-        (m, 3) poses, in m and rad; NaN outside the known times and within gaps longer than MAX_GAP.
-    """
+    """Interpolate poses (k, 3) at times (m,); NaN outside the known times (k,) and in gaps over MAX_GAP."""
     if len(known) == 0:
         return np.full((len(time), 3), np.nan)
     pose = interpolated(time, known_time, np.column_stack([known[:, :2], np.unwrap(known[:, 2])]))

@@ -113,11 +113,7 @@ def _select_support(path: Path, arrangement: str | None, points: ArrayLike | Non
 
 
 def _usable_push(record: Record) -> Push:
-    """Convert a record to a push.
-
-    Raises:
-        ParseError: If the record cannot be trusted.
-    """
+    """Convert a record to a push, or raise ParseError if the record cannot be trusted."""
     _check_record(record)
     push = _convert_record(record)
     _check_motion(push, record.line + 1)
@@ -130,11 +126,7 @@ def _usable_push(record: Record) -> Push:
 
 
 def _check_record(record: Record) -> None:
-    """Check that a record has enough samples, unit quaternions, and clocks that do not go back and overlap in time.
-
-    Raises:
-        ParseError: If a condition is violated.
-    """
+    """Check that a record has enough samples, unit quaternions, and clocks that rise and overlap in time."""
     robot_count_line = record.robot_line - 1
     for what, samples, line in (
         ("force", record.force, record.line + 2),
@@ -151,11 +143,7 @@ def _check_record(record: Record) -> None:
 
 
 def _check_clock(time: Floats, line: int, what: str) -> None:
-    """Check that the times, the first of which is on `line`, do not decrease.
-
-    Raises:
-        ParseError: For the first that does.
-    """
+    """Raise ParseError if the times, the first of which is on `line`, decrease."""
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
         step = time[back[0] + 1] - time[back[0]]
@@ -164,13 +152,8 @@ def _check_clock(time: Floats, line: int, what: str) -> None:
 
 
 def _check_motion(push: Push, line: int) -> None:
-    """Check that the finger moves and that the motion capture does not jump.
-
-    `line` is the line of the pose after the push, which is where a jump shows.
-
-    Raises:
-        ParseError: If a condition is violated.
-    """
+    """Raise ParseError if the finger does not move or the motion capture jumps."""
+    # `line` has the pose after the push, which is where a jump shows
     travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
     if not travel >= MIN_TRAVEL:
         raise ParseError(

@@ -85,11 +85,7 @@ def load_push_npz(path: str | PathLike[str]) -> PushLog:
 
 
 def _check_sizes(path: Path, data: Arrays) -> None:
-    """Check the numbers of rows, and that the offsets of the streams rise from 0.
-
-    Raises:
-        LogError: For the first array that fails.
-    """
+    """Check the numbers of rows, and that the offsets of the streams rise from 0."""
     count = row_count(path, data, _PUSH_ARRAYS)
     for offsets_name, names in _STREAM_ARRAYS.items():
         offsets = data[offsets_name]

@@ -47,35 +47,14 @@ _SIX_NUMBERS = re.compile(r"(?<![\d.])\d+(?:\.\d+)?(?:_\d+(?:\.\d+)?){5}(?![\d.]
 
 
 def support_points(arrangement: str) -> Floats:
-    """Return the support points of a named arrangement.
-
-    Args:
-        arrangement: A key of ARRANGEMENTS.
-
-    Returns:
-        (p, 2) support points, in m, body frame; none for "patch".
-
-    Raises:
-        ValueError: If the arrangement is unknown.
-    """
+    """Return the support points (p, 2), m, body frame, of a key of ARRANGEMENTS; none for "patch"."""
     if arrangement not in ARRANGEMENTS:
         raise ValueError(f"arrangement must be one of {', '.join(ARRANGEMENTS)}; got {arrangement!r}")
     return _body_from_corner(ARRANGEMENTS[arrangement])
 
 
 def support_force(points: ArrayLike) -> Floats:
-    """Return the normal forces at the support points that carry the triangle's weight in equilibrium.
-
-    Args:
-        points: (p, 2) support points, in m, body frame: three, or none, which gives no forces.
-
-    Returns:
-        (p,) normal forces, in N.
-
-    Raises:
-        ValueError: If there is another number of points, which would not determine the forces; if the points lie on one
-            line; or if the center of mass lies outside their triangle, so that the object would tip over.
-    """
+    """Return the normal forces (p,), N, of static equilibrium at three support points (p, 2), m, or at none."""
     vertices = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     if len(vertices) == 0:
         return np.empty(0)
@@ -87,27 +66,16 @@ def support_force(points: ArrayLike) -> Floats:
     if np.linalg.cond(balance) > 1e8:
         raise ValueError(f"support points must not lie on one line; got {vertices.tolist()}")
     force = np.linalg.solve(balance, np.array([MASS * GRAVITY, 0.0, 0.0]))
-    if np.any(force < 0):
+    if np.any(force < 0):  # the object would tip over
         raise ValueError(f"the center of mass must lie inside the support points; got {vertices.tolist()}")
     return force.astype(np.float64)
 
 
 def support_from_name(path: Path) -> tuple[str, Floats] | None:
-    """Determine the support arrangement from the names of a file and its folder.
-
-    Recognized are `3pts1` ... `3pts4`, `patch`, and six numbers such as `30_90_30_30_30_90`: millimeters in the corner
-    frame, first x of the three points and then y. Numbers of no known arrangement get the name "unknown".
-
-    Args:
-        path: The file.
-
-    Returns:
-        The name of the arrangement and its support points (p, 2), in m, body frame. None if neither the file's name nor
-        the folder's contains an arrangement.
-    """
+    """Determine arrangement and support points (p, 2), m, body frame, from the names of a file and its folder."""
     for name in (path.name, path.parent.name):
         numbers = _SIX_NUMBERS.search(name)
-        if numbers:
+        if numbers:  # such as 30_90_30_30_30_90: x of the three points and then y, mm, corner frame
             values = np.array([float(number) for number in numbers.group().split("_")])
             points = values.reshape(2, 3).T
             known = [key for key, value in ARRANGEMENTS.items() if value and np.allclose(value, points)]
@@ -119,18 +87,9 @@ def support_from_name(path: Path) -> tuple[str, Floats] | None:
 
 
 def surface_from_name(path: Path) -> str:
-    """Determine the surface from the names of a file and its folder.
-
-    The original logs have `wood` in the folder's name for plywood, and only the arrangement for hardboard.
-
-    Args:
-        path: The file.
-
-    Returns:
-        "plywood", "hardboard" or "unknown".
-    """
+    """Determine "plywood", "hardboard" or "unknown" from the names of a file and its folder."""
     for name in (path.name, path.parent.name):
-        if "wood" in name:
+        if "wood" in name:  # original logs name the folder so, and give only the arrangement for hardboard
             return "plywood"
         if "hardboard" in name:
             return "hardboard"

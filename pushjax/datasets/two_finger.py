@@ -118,25 +118,12 @@ class TwoFingerLog:
 def stick_deviation(
     hand_start: ArrayLike, hand_end: ArrayLike, pose_start: ArrayLike, pose_end: ArrayLike, length: float
 ) -> Floats:
-    """Return the motion of the object relative to the hand from start to end.
-
-    It is the length of the translation plus `length` times the angle of the rotation. It is zero if both moved as one
-    body. Closing an initial gap between hand and object counts as relative motion too.
-
-    Args:
-        hand_start: (..., 3) poses of the hand before the push, in m and rad, world frame.
-        hand_end: (..., 3) poses of the hand after the push.
-        pose_start: (..., 3) poses of the object before the push.
-        pose_end: (..., 3) poses of the object after the push.
-        length: Characteristic length, in m, which weighs rotation against translation.
-
-    Returns:
-        (...,) deviations, in m.
-    """
+    """Return the motions (...,) of the object relative to the hand, m, between poses (..., 3) in the world."""
     before, after = (
         _in_hand_frame(np.asarray(hand), np.asarray(pose))
         for hand, pose in ((hand_start, pose_start), (hand_end, pose_end))
     )
+    # zero if both moved as one body; closing an initial gap between hand and object counts as relative motion too
     change = after - before
     return np.hypot(change[..., 0], change[..., 1]) + length * np.abs(wrap_angle(change[..., 2]))
 
@@ -201,11 +188,7 @@ def load_two_finger_npz(path: str | PathLike[str]) -> TwoFingerLog:
 
 
 def _checked_count(path: Path, data: Arrays) -> int:
-    """Return the number of pushes, after checking shapes and types.
-
-    Raises:
-        LogError: For the first array that fails.
-    """
+    """Return the number of pushes, after checking shapes and types."""
     count = row_count(path, data, _PUSH_ARRAYS)
     check_shapes(path, data, _FILE_ARRAYS)
     points, force = data["support_points_body"], data["support_normal_force"]

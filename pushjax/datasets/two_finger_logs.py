@@ -32,23 +32,14 @@ NUMBERS_PER_LINE = (3, 3, 3, 2)  # on the lines of an action after its type
 
 
 class Action(NamedTuple):
-    """A planned push, in the body frame of the object before the push.
+    """A planned push, in the body frame of the object before the push."""
 
-    Attributes:
-        turns: Whether the hand turns; else it moves straight.
-        contact: (2,) point midway between the fingers when they touch, m.
-        target: (2,) center of rotation, m; or direction of the straight motion, a unit vector.
-        approach: (2,) direction of the approach, a unit vector.
-        amount: Angle of the rotation, rad, or length of the straight motion, m.
-        closing: Distance from the point midway between the fingers to `contact` at the start, along `approach`, m.
-    """
-
-    turns: bool
-    contact: Floats
-    target: Floats
-    approach: Floats
-    amount: float
-    closing: float
+    turns: bool  # whether the hand turns; else it moves straight
+    contact: Floats  # (2,), point midway between the fingers when they touch, m
+    target: Floats  # (2,), center of rotation, m; or unit vector of the straight motion
+    approach: Floats  # (2,), unit vector of the approach
+    amount: float  # angle of the rotation, rad, or length of the straight motion, m
+    closing: float  # distance from the point midway between the fingers to `contact` at the start, along `approach`, m
 
 
 def load_two_finger_logs(folder: str | PathLike[str]) -> TwoFingerLog:
@@ -114,11 +105,7 @@ def load_two_finger_logs(folder: str | PathLike[str]) -> TwoFingerLog:
 
 
 def _read_actions(path: Path) -> Iterator[Action]:
-    """Iterate over the actions of a file of planned pushes.
-
-    Raises:
-        LogError: If the file is missing or damaged.
-    """
+    """Iterate over the actions of a file of planned pushes."""
     try:
         lines = path.read_text("utf-8", errors="replace").splitlines()
     except OSError as error:

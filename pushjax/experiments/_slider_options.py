@@ -15,15 +15,7 @@ NUM_POINTS = 100  # points in place of a continuous pressure, "uniform" or "rim"
 
 
 def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj.Ellipse:
-    """Return the outline that a text describes, m.
-
-    Args:
-        text: The text.
-        option: Name of the option, for the message.
-
-    Raises:
-        ValueError: If the text is no outline.
-    """
+    """Return the outline, m, that the value of a command-line option describes."""
     kind, colon, rest = text.partition(":")
     if kind not in ("rectangle", "disk", "ellipse", "regular"):
         if colon and not Path(text).expanduser().exists():
@@ -42,15 +34,7 @@ def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj
 
 
 def parse_support(text: str, shape: pj.Shape) -> pj.Support:
-    """Return the support, with unit load, that the option `--support` describes.
-
-    Args:
-        text: The value of the option.
-        shape: Outline of the slider.
-
-    Raises:
-        ValueError: If the text is no support.
-    """
+    """Return the support, with unit load, that the value of the option `--support` describes."""
     if text == "uniform":
         return pj.Support.uniform(shape, NUM_POINTS)
     if text == "rim":
@@ -63,13 +47,7 @@ def parse_support(text: str, shape: pj.Shape) -> pj.Support:
 
 
 def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSurface:
-    """Fit a limit surface to the wrench-twist pairs of a support.
-
-    Args:
-        support: The support.
-        degree: 4 for a quartic, else an ellipsoid.
-        seed: Seed of the wrench-twist pairs.
-    """
+    """Fit a quartic (`degree` 4) or else an ellipsoid to sampled wrench-twist pairs of a support."""
     pairs = support.wrench_twist_pairs(jax.random.key(seed), NUM_PAIRS)
     return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
 
@@ -93,19 +71,7 @@ def _vertices(path: Path, option: str) -> np.ndarray:
 
 
 def parse_numbers(option: str, value: str, text: str, separator: str, count: int, allowed: str) -> list[float]:
-    """Return the numbers in a part of an option's value.
-
-    Args:
-        option: Name of the option, for the message.
-        value: Its whole value, for the message.
-        text: The part with the numbers.
-        separator: What stands between two numbers.
-        count: How many numbers there must be.
-        allowed: Description of what is allowed, for the message.
-
-    Raises:
-        ValueError: If the text is anything else.
-    """
+    """Parse `count` numbers from `text`, the part of an option's `value` that holds them."""
     try:
         found = [float(part) for part in text.split(separator)]
     except ValueError:

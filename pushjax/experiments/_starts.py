@@ -4,15 +4,6 @@ import numpy as np
 
 
 def uniform_in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
-    """Sample points uniformly in a circle about the origin.
-
-    Args:
-        rng: Random generator.
-        radius: Radius of the circle, m.
-        n: Number of points.
-
-    Returns:
-        The points (n, 2), m.
-    """
+    """Sample points (n, 2) uniformly in a circle about the origin, m."""
     distance, angle = radius * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
     return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)

@@ -11,17 +11,7 @@ BOOTSTRAP_SAMPLES = 2000
 
 @jax.jit
 def final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: jax.Array):
-    """Simulate every push with every coefficient of friction.
-
-    Args:
-        slider: The pushed object.
-        hand: The hand that pushes it.
-        pushes: Start poses and paths of one condition.
-        frictions: (frictions,), coefficients of friction.
-
-    Returns:
-        The final poses (frictions, pushes, 3), world, m and rad, and the number of failed steps (frictions, pushes).
-    """
+    """Simulate pushes at every friction: poses (frictions, pushes, 3) and failed steps (frictions, pushes)."""
 
     def final_pose(path, start, friction):
         push = pj.rollout(slider, hand, path, pose=start, friction=friction)
@@ -32,11 +22,6 @@ def final_poses(slider: pj.Slider, hand: pj.Hand, pushes: pj.Pushes, frictions: 
 
 
 def bootstrapped_ci95(values: np.ndarray, rng: np.random.Generator) -> float:
-    """Return half the width of the 95 % confidence interval of a mean, by bootstrap, in the unit of the values.
-
-    Args:
-        values: (n,), the values whose mean is taken.
-        rng: Random generator of the bootstrap.
-    """
+    """Return half the width of the bootstrapped 95 % confidence interval of the mean of values (n,)."""
     resampled = rng.choice(values, (BOOTSTRAP_SAMPLES, len(values))).mean(axis=1)
     return float(np.diff(np.quantile(resampled, [0.025, 0.975]))[0] / 2)

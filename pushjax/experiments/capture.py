@@ -128,15 +128,7 @@ def run(
 
 
 def start_poses(n: int, seed: int) -> np.ndarray:
-    """Sample start poses of the disk with centers uniform in the circle.
-
-    Args:
-        n: Number of poses.
-        seed: Seed of the centers.
-
-    Returns:
-        The poses (n, 3), world, m and rad; all angles are zero.
-    """
+    """Sample start poses (n, 3) of the disk: centers uniform in the circle (m), angles zero."""
     centers = uniform_in_circle(np.random.default_rng(seed), START_RADIUS, n) + np.array([0, START_DISTANCE])
     return np.column_stack([centers, np.zeros(n)]).astype(jnp.result_type(float))
 

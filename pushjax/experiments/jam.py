@@ -28,16 +28,8 @@ THRESHOLD_DISTANCE = 1e-3  # relative distance from the threshold to the nearest
 
 
 def contacts(friction) -> pj.Contacts:
-    """Return the two contacts: A on the left, low, and C on the right, high.
-
-    The closing fingers turn the slider counterclockwise.
-
-    Args:
-        friction: Coefficient of friction of both contacts.
-
-    Returns:
-        The contacts in the body frame, with the displacements of the two fingers (m).
-    """
+    """Return contacts A (left, low) and C (right, high), in the body frame, of the closing fingers."""
+    # the closing fingers turn the slider counterclockwise
     point = jnp.array([[-HALF_WIDTH, -HALF_OFFSET], [HALF_WIDTH, HALF_OFFSET]])
     normal = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
     return pj.Contacts(point, normal, CLOSING * normal, friction)
@@ -49,14 +41,7 @@ def threshold() -> float:
 
 
 def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
-    """Fit an ellipsoid and a quartic to uniform pressure under a rectangle.
-
-    Args:
-        seed: Seed of the wrench-twist pairs.
-
-    Returns:
-        The rectangle, and the two limit surfaces by name.
-    """
+    """Return the rectangle, and by name an ellipsoid and a quartic that are fitted to uniform pressure."""
     block = pj.Polygon.rectangle(2 * HALF_WIDTH, 0.05)
     pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(seed), 400)
     return block, {name: pj.fit_limit_surface(*pairs, degree=d) for name, d in (("ellipsoid", 2), ("quartic", 4))}

@@ -65,15 +65,7 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
 
 
 def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
-    """Classify how one closing ended.
-
-    Args:
-        grasp: Trajectory of the rectangle.
-
-    Returns:
-        The outcome in words, the final status, the opening at which the jaw stopped (mm), the angle between the
-        rectangle and the nearest multiple of 90 degrees (degrees), and the number of failed steps.
-    """
+    """Classify how one closing ended."""
     status = pj.Status(int(grasp.status[-1]))
     stop_step = int(grasp.stopped)
     tilt = abs((float(grasp.pose[-1, 2]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
@@ -84,7 +76,7 @@ def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
         "outcome": outcome_in_words,
         "status": status.name,
         "opening_mm": 1e3 * float(grasp.configuration[-1, 3]),
-        "tilt_deg": float(np.degrees(tilt)),
+        "tilt_deg": float(np.degrees(tilt)),  # from the nearest multiple of 90 degrees
         "failed_steps": int(np.sum(np.asarray(grasp.failed))),
     }
 

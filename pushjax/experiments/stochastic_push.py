@@ -37,15 +37,7 @@ LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi,
 
 
 def push_setup(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
-    """Build the slider, the hand and the path that all pushes share.
-
-    Args:
-        seed: Seed of the wrench-twist pairs that the quartic is fitted to.
-        steps: Number of steps of the path.
-
-    Returns:
-        The square with its quartic, the finger, and the path (steps + 1, 2) of the finger's center, in m.
-    """
+    """Return the square with its quartic, the finger, and the path (steps + 1, 2) of its center, m."""
     block = pj.Polygon.rectangle(SIDE, SIDE)
     pairs = pj.Support.uniform(block, points=SUPPORT_POINTS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
     slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
@@ -132,10 +124,7 @@ def _describe_coordinate(values: np.ndarray) -> dict[str, Any]:
 
 
 def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -> np.ndarray:
-    """Return the least curvature of every sampled surface.
-
-    The surfaces are sampled again, with the keys that `monte_carlo` used.
-    """
+    """Return the least curvatures (n,) of the sampled surfaces, sampled again with `monte_carlo`'s keys."""
     distribution: Any = model.around(surface)
 
     def sampled_coefficients(index):

@@ -20,16 +20,7 @@ MIN_SPIKE_SHARE = 0.02  # smallest share of all angles that makes a spike
 
 
 def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
-    """Compute the least distance between the pads that leaves room for the slider at each pose.
-
-    Args:
-        shape: Outline of the slider.
-        poses: (n, 3), m and rad, in the frame of the jaw.
-        pad: Width of the pads, which are centered at the origin, m.
-
-    Returns:
-        (n,), m; zero where the slider is not between the pads.
-    """
+    """Return the least pad distances (n,), m, with room for the slider at poses (n, 3) in the jaw's frame."""
     outline = np.asarray(shape.boundary(OUTLINE_POINTS), np.float64)
     if isinstance(shape, pj.Polygon):
         corners = np.asarray(shape.vertices, np.float64)
@@ -40,6 +31,7 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     y = poses[:, 1:2] + s * outline[:, 0] + c * outline[:, 1]
     top, bottom = np.full(len(poses), -np.inf), np.full(len(poses), np.inf)
     next_x, next_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    # the pads are centered at the origin
     for side in (-pad / 2, pad / 2):  # where the outline crosses the lines through the pads' corners
         crosses = (x - side) * (next_x - side) < 0
         fraction = np.where(crosses, (side - x) / np.where(crosses, next_x - x, 1.0), 0.0)
@@ -49,7 +41,7 @@ def openings(shape: pj.Shape, poses: np.ndarray, pad: float) -> np.ndarray:
     between_pads = np.abs(x) <= pad / 2
     top = np.maximum(top, np.where(between_pads, y, -np.inf).max(axis=1))
     bottom = np.minimum(bottom, np.where(between_pads, y, np.inf).min(axis=1))
-    return np.where(top >= bottom, top - bottom, 0.0)
+    return np.where(top >= bottom, top - bottom, 0.0)  # zero if the slider is not between the pads
 
 
 def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
@@ -74,22 +66,7 @@ def classify(grasps: pj.MonteCarlo, shape: pj.Shape, pad: float) -> np.ndarray:
 def start_poses(
     slider: pj.Slider, hand: pj.Hand, configuration: Any, circle: float, n: int, seed: int
 ) -> tuple[np.ndarray, int]:
-    """Sample start poses that do not overlap the open jaw.
-
-    Centers are uniform in a circle, and angles are uniform within 90 degrees of zero. Poses that overlap the jaw are
-    sampled again.
-
-    Args:
-        slider: The slider.
-        hand: The jaw.
-        configuration: Configuration of the open jaw.
-        circle: Radius of the circle, m.
-        n: Number of poses.
-        seed: Seed of the poses.
-
-    Returns:
-        The poses (n, 3), and how many were sampled again.
-    """
+    """Sample poses (n, 3), m and rad, clear of the open jaw, and count those that had to be sampled again."""
     from pushjax.simulation.slider import overlaps
 
     rng = np.random.default_rng(seed)
@@ -107,15 +84,7 @@ def start_poses(
 
 
 def spikes(angles: np.ndarray, symmetry: float) -> list[dict[str, float]]:
-    """Find spikes in a distribution of angles: bins that hold at least the share `MIN_SPIKE_SHARE` of all angles.
-
-    Args:
-        angles: Angles, rad.
-        symmetry: Angle after which the outline is the same, rad. The angles are taken modulo it.
-
-    Returns:
-        The angle (degrees) and the share of each spike, largest share first.
-    """
+    """Find spikes in a distribution of angles, rad, modulo the outline's symmetry, largest share first."""
     wrapped = np.mod(np.asarray(angles, np.float64) + symmetry / 2, symmetry) - symmetry / 2
     bins = round(symmetry / BIN_WIDTH)
     # bins are centered at multiples of a degree, so that a spike at a right angle is in one bin

@@ -16,22 +16,15 @@ BINS = 60  # of each histogram in the picture; the record has fewer
 
 
 def draw(
-    out: Path, name: str, setting: Setting, hand: pj.Hand, path: Any, starts: np.ndarray, shown: dict[str, tuple]
+    out: Path,
+    name: str,
+    setting: Setting,
+    hand: pj.Hand,
+    path: Any,  # (steps + 1, dof), configurations of the jaw
+    starts: np.ndarray,  # (n, 3), m and rad
+    shown: dict[str, tuple[pj.MonteCarlo, np.ndarray]],
 ) -> list[str]:
-    """Draw start poses and final poses, with histograms, for every pressure.
-
-    Args:
-        out: Folder for the picture.
-        name: Name of the file, without its suffix.
-        setting: The slider.
-        hand: The jaw.
-        path: (steps + 1, dof), configurations of the jaw.
-        starts: (n, 3), start poses, m and rad.
-        shown: By pressure, the grasps and the outcome of each.
-
-    Returns:
-        The path of the picture, in a list.
-    """
+    """Draw start poses and, for each pressure in `shown`, the final poses by outcome, with histograms."""
     with plt.rc_context(plot.STYLE):
         rows = len(shown) + 1
         figure, axes = plt.subplots(rows, 4, figsize=(14.0, 3.4 * rows), layout="constrained")

@@ -18,23 +18,14 @@ CURVE_POINTS = 24
 
 
 class Setting(NamedTuple):
-    """One experiment.
-
-    Attributes:
-        shape: Outline of the slider.
-        supports: Supports by the name of their pressure.
-        n: Number of grasps.
-        circle: Radius of the circle that start centers lie in, m.
-        symmetry: Angle after which the outline is the same, rad.
-        opening: First and last opening of the jaw, m.
-    """
+    """Slider, supports, start poses and jaw of one experiment."""
 
     shape: pj.Shape
-    supports: dict[str, pj.Support]
-    n: int
-    circle: float
-    symmetry: float
-    opening: tuple[float, float]
+    supports: dict[str, pj.Support]  # by the name of the pressure distribution
+    n: int  # number of grasps
+    circle: float  # radius of the circle of start centers, m
+    symmetry: float  # rotation after which the outline is the same, rad
+    opening: tuple[float, float]  # first and last opening of the jaw, m
 
 
 def rectangle() -> Setting:

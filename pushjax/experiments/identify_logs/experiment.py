@@ -102,22 +102,7 @@ def find(
     say: Callable[[str], None],
     note: Callable[[str], None],
 ) -> Findings:
-    """Identify from logs, with intervals, predictions and noise.
-
-    Logs that cannot be used become problems, as long as one log can be used.
-
-    Args:
-        logs: Files of recorded pushes.
-        options: What is known, and what is to be found.
-        seed: Seed of the wrench-twist pairs of the expected surfaces, and of the noise.
-        progress: Called with the number of parts done and their total.
-        say: Called with a description of what is done next.
-        note: Called with the problem of each push or log that is left out.
-
-    Raises:
-        LogError: If no log, or no push of any log, can be used.
-        ValueError: If the options do not fit together or to the logs, or there are too few pushes.
-    """
+    """Identify from logs, with intervals, predictions and noise; logs that cannot be used become problems."""
     if not logs:
         raise ValueError("LOGS: give at least one file of recorded pushes")
     options.check()
@@ -178,11 +163,7 @@ def _check_forces(recordings: list[Recordings], options: Options) -> None:
 
 
 def _for_each(items: list, function: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
-    """Return the results of a function of each item, and the errors of the items where it fails.
-
-    Raises:
-        LogError: The first error, if it fails for all.
-    """
+    """Apply a function to each item, and return the results and the errors; raise if it fails for all."""
     good, bad = [], []
     for item in items:
         try:
@@ -195,22 +176,9 @@ def _for_each(items: list, function: Callable[[Any], Recordings]) -> tuple[list[
 
 
 def conditions(recordings: list[Recordings], shape, options: Options, seed: int) -> tuple[pj.Pushes, pj.Slider]:
-    """Convert the logs to one condition each, or to a single condition for all of them.
-
-    Poses during the push are used if every log has enough of them, and forces if every log has them. Logs of a
-    single condition must have the same expected surface.
-
-    Args:
-        recordings: The logs.
-        shape: Outline of the object.
-        options: What is known, and what is to be found. `separate` gives each log its own condition.
-        seed: Seed of the wrench-twist pairs of the expected surfaces.
-
-    Returns:
-        The pushes, and the slider with the expected surface or, for several conditions, the stacked surfaces.
-    """
+    """Convert the logs to one condition each (`options.separate`) or else to a single one for all."""
     degree = {"quartic": 4, "ellipsoid": 2}[options.surface]
-    # the same for every log, because they become one array
+    # Poses during the push and forces are used only if every log has them, because the logs become one array.
     parts = options.parts if all(observed_often_enough(one, options.parts) for one in recordings) else 1
     forces = options.forces and all(has_wrenches(one) for one in recordings)
     each = [Pushes.of(one, options.steps, parts=parts, shape=shape if forces else None) for one in recordings]

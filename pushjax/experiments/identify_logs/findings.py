@@ -17,29 +17,17 @@ ANGLE = "frame_offset.2"
 
 
 class Findings(NamedTuple):
-    """Everything that was found, before it is printed and drawn.
+    """Everything that was found, before it is printed and drawn."""
 
-    Attributes:
-        problems: Errors of the logs and pushes that were left out.
-        slider: The slider as expected before the fit.
-        hand: The hand.
-        pushes: The pushes that were learned from.
-        found: The result of the identification.
-        predicted: The same pushes, predicted with that result.
-        profiles: Profile of each number that is no part of the surface.
-        noise: How much friction scatters, if asked for.
-        length: Length that weighs rotation in the deviations, m.
-    """
-
-    problems: tuple[LogError, ...]
-    slider: pj.Slider
+    problems: tuple[LogError, ...]  # errors of the logs and pushes that were left out
+    slider: pj.Slider  # as expected before the fit
     hand: pj.Hand
-    pushes: pj.Pushes
+    pushes: pj.Pushes  # training pushes
     found: pj.Identified
-    predicted: pj.Trajectory
-    profiles: tuple[Profile, ...]
-    noise: Noise | None
-    length: float
+    predicted: pj.Trajectory  # the training pushes, predicted with `found`
+    profiles: tuple[Profile, ...]  # of each number that is no part of the surface
+    noise: Noise | None  # scatter of friction, if asked for
+    length: float  # characteristic length of the deviations, m
 
     @property
     def final(self) -> np.ndarray:
@@ -47,11 +35,7 @@ class Findings(NamedTuple):
         return self.rows(self.predicted.pose[..., -1, :])
 
     def rows(self, value: Any) -> np.ndarray:
-        """Put the pushes of all conditions in a row, without the padding.
-
-        Args:
-            value: (..., pushes, ...), with the axes of conditions and pushes first.
-        """
+        """Flatten (conditions, pushes, ...) or (pushes, ...) to (pushes, ...), without the padding."""
         used = np.asarray(self.pushes.weight) > 0
         return np.asarray(value, float)[used]
 
@@ -68,15 +52,7 @@ def unit(label: str) -> tuple[str, float]:
 
 
 def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
-    """Describe each number found that is no part of the surface.
-
-    Args:
-        findings: What was found.
-        level: Level of the intervals, such as 0.9.
-
-    Returns:
-        One row per number: estimate, normal and profile interval, how far it is determined, and its profile.
-    """
+    """Return one row for each identified number, except those of the surface: estimate, intervals, profile."""
     found, rows = findings.found, []
     deviation = np.sqrt(np.diagonal(np.asarray(found.covariance, float)))
     for each in findings.profiles:
@@ -100,10 +76,7 @@ def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
 
 
 def predictions(findings: Findings) -> dict[str, Any]:
-    """Describe how well the pushes are predicted.
-
-    Deviations of the final poses are in mm: with what was found, as expected before the fit, and if nothing had moved.
-    """
+    """Return the deviations of the final poses: as identified, as expected before, and without motion."""
     found = findings.found
     off = findings.deviation_mm(findings.final)
     determined = [value for label, value in found.variance_reduction.items() if label.startswith("surface")]

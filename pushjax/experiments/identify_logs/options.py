@@ -60,11 +60,7 @@ class Options:
     """Also estimate how much pushes scatter."""
 
     def check(self) -> None:
-        """Check the options as far as no log is needed.
-
-        Raises:
-            ValueError: For the first option that is invalid.
-        """
+        """Raise ValueError for the first invalid option that can be found without a log."""
         low, high = self.friction
         if not 0 <= low < high < math.inf:
             raise ValueError(f"--friction must be lowest and highest, at least 0 and different; got {low:g} {high:g}")

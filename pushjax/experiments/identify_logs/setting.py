@@ -12,15 +12,7 @@ HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width an
 
 
 def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.Disk | pj.Ellipse:
-    """Return the outline of the object.
-
-    Args:
-        text: The outline as an option, m. None: that of the logs.
-        recordings: The logs.
-
-    Raises:
-        ValueError: If the text is no outline, or the logs have none or different ones.
-    """
+    """Return the outline of the object, m, from the option or else from the logs."""
     if text is not None:
         return parse_shape(text)
     known = [one.vertices for one in recordings if one.vertices is not None]
@@ -32,16 +24,7 @@ def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.
 
 
 def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj.Hand:
-    """Return the hand.
-
-    Args:
-        text: The kind of hand as an option.
-        radius: Radius of the fingers, m. None: that of the logs. Not used for a parallel jaw.
-        recordings: The logs.
-
-    Raises:
-        ValueError: If the text is no hand, or the logs do not have one radius.
-    """
+    """Return the hand; fingers have the given radius, m, or else that of the logs."""
     kind, _, rest = text.partition(":")
     if kind == "parallel_jaw":
         return pj.Hand.parallel_jaw(*parse_numbers("--hand", text, rest, "x", 2, HANDS))
@@ -61,16 +44,7 @@ def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj
 
 
 def support_of(text: str | None, shape: pj.Shape, recordings: Recordings) -> pj.Support:
-    """Return the support of the object in one log, with unit load.
-
-    Args:
-        text: The support as an option. None: the support points of the log, or uniform pressure if it has none.
-        shape: Outline of the object.
-        recordings: The log.
-
-    Raises:
-        ValueError: If the text is no support.
-    """
+    """Return the support with unit load: the option's, or else the log's points, or else uniform pressure."""
     if text is None and recordings.support_points is not None and len(recordings.support_points):
         return pj.Support.tripod(recordings.support_points)
     return parse_support("uniform" if text is None else text, shape)

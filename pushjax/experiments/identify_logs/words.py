@@ -24,11 +24,7 @@ NAMES = {
 
 
 def figures(record: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the figures of a report, as pairs of what it is and its value with its unit.
-
-    Args:
-        record: What `run` returns.
-    """
+    """Return the figures of a record as pairs of a description and a value with its unit."""
     level = f"{record['settings']['level']:.0%}"
     rows = [_unknown(row, level) for row in record["rows"]]
     rows += [
@@ -50,10 +46,8 @@ def figures(record: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def is_not_normal(row: dict[str, Any]) -> bool:
-    """Return whether the posterior of a number is so far from normal that only its profile's interval is right.
-
-    An example is the friction of a finger that never slides: the pushes only bound it from below.
-    """
+    """Return whether a posterior is so far from normal that only its profile's interval is right."""
+    # An example is the friction of a finger that never slides: the pushes only bound it from below.
     normal, exact = (row[name][1] - row[name][0] for name in ("interval", "profile"))
     return not normal / NOT_NORMAL <= exact <= normal * NOT_NORMAL
 

@@ -37,21 +37,7 @@ POSSIBLE = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)  # the finger can do 
 def run(
     options: Options, seed: int = 0, out: Path | None = None, progress: ProgressCallback = no_progress
 ) -> dict[str, Any]:
-    """Plan the pushes, and write way points and picture.
-
-    Args:
-        options: The block, its poses, and friction.
-        seed: Seed of everything random.
-        out: Folder for the way points and the picture. None: neither.
-        progress: Called with the number of attempts done and their total.
-
-    Returns:
-        The record: status and probability of success of the plan, its paths and transits, predicted final poses and
-        their spread, and the files that were written.
-
-    Raises:
-        ValueError: If an option is invalid.
-    """
+    """Plan the pushes, write way points and picture into the folder `out`, and return the record."""
     options.check()
     shape, hand, fixtures = parse_shape(options.shape), pj.Hand.finger(options.radius), parse_fixtures(options)
     _check_sizes(shape, options)

@@ -10,11 +10,7 @@ OPTION = "--fixtures"
 
 
 def parse_fixtures(options: Options) -> tuple[pj.Wall | pj.Fixture, ...]:
-    """Return the fixtures that the options describe.
-
-    Raises:
-        ValueError: If a text is no fixture, or if a body is not convex.
-    """
+    """Return the walls and fixed bodies that the options describe."""
     return tuple(_parse_fixture(text, options.fixture_friction) for text in options.fixtures)
 
 

@@ -63,11 +63,7 @@ class Options:
     """Number of searches with different random numbers, until one finds a plan that is sure enough."""
 
     def check(self) -> None:
-        """Check the options as far as that needs no JAX.
-
-        Raises:
-            ValueError: For the first option that is invalid.
-        """
+        """Raise ValueError for the first invalid option that can be found without JAX."""
         if self.goal is None:
             raise ValueError("--goal: give the pose that is wanted, X Y THETA (m and rad)")
         for name in ("start", "goal", "finger"):

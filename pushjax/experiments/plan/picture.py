@@ -18,16 +18,7 @@ DRAWN = 40  # largest number of predicted ends that are drawn
 
 
 def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, options: Options, path: Path) -> Path:
-    """Draw a plan, and the errors of its predicted ends, and return the path of the picture.
-
-    Args:
-        slider: The block.
-        goal: The goal.
-        fixtures: What stands fixed on the table.
-        plan: The plan.
-        options: Radius of the finger, and tolerances.
-        path: File of the picture.
-    """
+    """Draw a plan and the errors of its predicted final poses, and return the path of the picture."""
     with plt.rc_context(plot.STYLE):
         figure, panels = plt.subplots(
             1, 3, figsize=(12.5, 4.6), layout="constrained", gridspec_kw={"width_ratios": [2, 1, 1]}

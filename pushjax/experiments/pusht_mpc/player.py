@@ -25,35 +25,21 @@ INSTALL = "gym-pusht is not installed; `pip install gym-pusht` gets it"
 
 @dataclass
 class Episode:
-    """One episode.
+    """Result of one episode."""
 
-    Attributes:
-        seed: Seed of the start.
-        success: Whether the coverage was above 0.95 at the end of a control step.
-        steps: Number of control steps.
-        largest_coverage: Largest coverage at the end of a control step.
-        final_coverage: Coverage at the end of the episode.
-        pushes: Number of pushes that were planned.
-        seconds: Time of the controller in each control step, s.
-        processor_seconds: Processor time of the same, s; other programs on the machine change it less than `seconds`.
-    """
-
-    seed: int
-    success: bool = False
-    steps: int = 0
-    largest_coverage: float = 0.0
+    seed: int  # of the start
+    success: bool = False  # whether the coverage was above 0.95 at the end of a control step
+    steps: int = 0  # control steps
+    largest_coverage: float = 0.0  # at the end of a control step
     final_coverage: float = 0.0
-    pushes: int = 0
-    seconds: list[float] = field(default_factory=list)
+    pushes: int = 0  # planned pushes
+    seconds: list[float] = field(default_factory=list)  # time of the controller in each control step
+    # processor time of the same; other programs on the machine change it less than `seconds`
     processor_seconds: list[float] = field(default_factory=list)
 
 
 def make_plant() -> Any:
-    """Return the environment.
-
-    Raises:
-        ValueError: If its package is not installed.
-    """
+    """Return the environment, or raise ValueError if its package is not installed."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import gym_pusht  # noqa: F401  # registers the environment
@@ -69,13 +55,7 @@ def cache_folder() -> Path:
 
 
 def library(slider: pj.Slider, folder: Path, **friction: Any) -> tuple[PushLibrary, bool]:
-    """Return the library of the finger's pushes, and whether it was read from a file.
-
-    Args:
-        slider: The slider.
-        folder: Folder of the file. If there is none, it is written.
-        **friction: Friction in the model, as in `PushLibrary.simulate`.
-    """
+    """Return the library of the finger's pushes, and whether it was read from a file rather than simulated."""
     hand = pj.Hand.finger(setting.FINGER_RADIUS)
     starts, directions = fan(slider, setting.FINGER_RADIUS)
     wanted = digest(slider, hand, starts, directions, **friction)
@@ -99,28 +79,15 @@ def planner(
 
 
 def controller(
-    folder: Path | None = None,
+    folder: Path | None = None,  # of the tables' files; None: `cache_folder`
     *,
-    lookahead: bool = True,
-    cost_to_go: bool = True,
-    feedback: bool = True,
-    friction_in_model: float = 0.0,
-    observation_noise: float = 0.0,
+    lookahead: bool = True,  # consider plans of two pushes
+    cost_to_go: bool = True,  # choose pushes far from the goal by the cost to go, else by the distance to the goal
+    feedback: bool = True,  # correct pushes while they run
+    friction_in_model: float = 0.0,  # at the contact; the plant has none
+    observation_noise: float = 0.0,  # standard deviation, m
 ) -> tuple[PushController, dict[str, Any]]:
-    """Build the controller, or read its tables from files.
-
-    Args:
-        folder: Folder of the files. None: `cache_folder`.
-        lookahead: Whether plans of two pushes are considered.
-        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
-        feedback: Whether pushes are corrected while they run.
-        friction_in_model: Coefficient of contact friction in the model; there is none in the plant.
-        observation_noise: Standard deviation of what is seen, m.
-
-    Returns:
-        The controller; and how long its parts took to set up, s, by name, with "library_from_file": whether the library
-        was read from a file.
-    """
+    """Build the controller, and return it with the setup times of its parts, s."""
     folder, began = folder or cache_folder(), time.perf_counter()
     slider = setting.slider()
     pushes, loaded = library(slider, folder, friction=friction_in_model)
@@ -151,19 +118,7 @@ def play(
     actuation_noise: float = 0.0,
     observation_noise: float = 0.0,
 ) -> Episode:
-    """Play one episode.
-
-    Args:
-        plant: The environment, from `make_plant`.
-        push_controller: The controller.
-        seed: Seed of the start and of the noise.
-        actuation_noise: Standard deviation of normal noise on each number of the action, px.
-        observation_noise: Standard deviation of normal noise on each position that the controller sees, px, and on the
-            angle, in units of the surface's length.
-
-    Returns:
-        How the episode went.
-    """
+    """Play one episode; noise is in px, and on the observed angle px over the surface's length."""
     rng = np.random.default_rng([seed, 1])
     turn = observation_noise * setting.PIXEL / push_controller.length
     scale = np.array([observation_noise] * 4 + [turn])

@@ -1,7 +1,4 @@
-"""The objects and surfaces of table 1, the paper's figures for them, and the pushes as arrays.
-
-The curated archives hold two surfaces. The published folders also hold a third, delrin.
-"""
+"""The objects and surfaces of table 1, the paper's figures for them, and the pushes as arrays."""
 
 import warnings
 from collections.abc import Sequence
@@ -19,7 +16,7 @@ from pushjax.datasets.push_log import Floats, rotation
 ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")
 OBJECTS = ("rect1", "rect2", "rect3", "tri1", "tri3", "ellip1", "ellip2", "ellip3", "hex", "butter", "tri2")
-ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the archives
+ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the curated archives, only in the published folders
 NOT_IN_PAPER = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
 MODELS = {"quartic": 4, "ellipsoid": 2}
 # Polygons with fewer vertices get this many, by splitting edges, so that one compiled program serves all polygons.
@@ -50,17 +47,7 @@ PAPER_PERCENT = {"quartic": 20.05, "ellipsoid": 21.39}
 
 
 def checked_surfaces(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
-    """Check the names of surfaces and objects, and return the surfaces.
-
-    Args:
-        folder: Folder of the data.
-        surface: Names of surfaces. None: those of the curated archives.
-        object: Names of objects.
-
-    Raises:
-        ValueError: If a name is unknown, if none is given, or if delrin is asked for where the folder holds the curated
-            archives.
-    """
+    """Check the names of surfaces and objects, and return the surfaces, by default the archives' ones."""
     surface = SURFACES if surface is None else surface
     for name, given, allowed in (("surface", surface, ALL_SURFACES), ("object", object, OBJECTS)):
         unknown = [one for one in given if one not in allowed]
@@ -72,17 +59,7 @@ def checked_surfaces(folder: Path, surface: Sequence[str] | None, object: Sequen
 
 
 def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
-    """Load the pushes of one object on one surface, and warn of files that are left out.
-
-    The curated archives are read from the subfolder `mit_push` if there is one, else the files of the published data
-    set.
-
-    Args:
-        folder: Folder of the data.
-        surface: Name of the surface.
-        name: Name of the object.
-        seed: Seed of the choice of training pushes, where the data do not have one.
-    """
+    """Load the pushes of one object on one surface from its archive or else from the published files."""
     if (folder / ARCHIVES).is_dir():
         return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
     log, problems = load_mit_folder(folder, surface, name, train_share=TRAIN_SHARE, seed=seed)
@@ -98,11 +75,7 @@ def paper_mm(surface: str, name: str, model: str) -> float | None:
 
 
 def outline(log: MitPushes) -> pj.Shape:
-    """Return the outline of the object.
-
-    The data give ellipses and the butterfly by many vertices. An ellipse is fitted to its vertices, and
-    `BUTTERFLY_VERTICES` of the butterfly's vertices are kept. Other polygons get at least `MIN_VERTICES` vertices.
-    """
+    """Return the object's outline: a fitted ellipse, or a polygon with a suitable number of vertices."""
     if log.shape.startswith("ellip"):
         inverse_squares = np.linalg.lstsq(log.vertices**2, np.ones(len(log.vertices)), rcond=None)[0]
         return pj.Ellipse(*(1 / np.sqrt(inverse_squares)))
@@ -121,19 +94,10 @@ def _with_split_edges(vertices: Floats) -> Floats:
 
 
 def pushed_sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
-    """Find the side of the object that the tip is nearest to at the start of each push.
-
-    Args:
-        log: The object, with its outline.
-        pushes: Pushes of that object.
-
-    Returns:
-        (pushes,), the index of the nearest edge. For an outline of more than `SIDES` vertices it is the quadrant of the
-        body frame in which the tip is.
-    """
+    """Return the edge (or quadrant) nearest to the tip at the start of each push, (pushes,)."""
     tip = np.einsum("nji,nj->ni", rotation(pushes.start[:, 2]), pushes.tip_start - pushes.start[:, :2])
     vertices = log.vertices
-    if len(vertices) > SIDES:
+    if len(vertices) > SIDES:  # the quadrant of the body frame that the tip is in
         return (np.arctan2(tip[:, 1], tip[:, 0]) // (np.pi / 2)).astype(int) % 4
     edges = [
         np.stack([vertex, next_vertex])
@@ -143,24 +107,12 @@ def pushed_sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
 
 
 def padded_pushes(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
-    """Convert some of the pushes to `Pushes`, padded to a fixed number.
-
-    The padding has no weight. With it, one compiled program serves all objects of a kind. Each push carries the side
-    that it pushes (`pushed_sides`), and as its age how late it comes in the file.
-
-    Args:
-        log: The object and all its pushes.
-        pushes: The group of pushes in `log` to choose from.
-        rows: Indices of the chosen pushes.
-        steps: Steps of each path.
-        batch: Number of pushes after padding.
-
-    Raises:
-        ValueError: If `batch` is smaller than the number of chosen pushes.
-    """
+    """Convert the pushes `rows` to `Pushes` that are padded to the number `batch`."""
     path = straight_paths(pushes, rows, steps)
+    # how late a push comes in the file
     age = pushes.index / max(int(log.whole.index.max()), 1)
     parts = pushes.start[rows], path, pushes.end[rows], age[rows], pushed_sides(log, pushes)[rows]
+    # The padding has no weight. With it, one compiled program serves all objects of a kind.
     padding = batch - len(rows)
     if padding < 0:
         raise ValueError(f"batch must be at least {len(rows)}; got {batch}")

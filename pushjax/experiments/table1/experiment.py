@@ -2,8 +2,7 @@
 
 The limit surface and the friction of the finger are learned from about eighty whole pushes of each object. The other
 pushes are predicted, from 10 to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al.
-2017, section VI.B, table 1).
-The curated archives also hold what the authors' toolbox predicts for the same pushes.
+2017, section VI.B, table 1). The curated archives also hold what the authors' toolbox predicts for the same pushes.
 
 Deviations from the paper: there is one split, where the paper has ten. Pushes that the tracker lost are tested too, as
 in the paper. The curated archives have no pushes on delrin, the paper's third surface; the published folders do.
@@ -131,12 +130,7 @@ def _calibration(predicted: Prediction) -> dict[str, Any]:
 
 
 def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:
-    """Return the deviations of the test pushes, (pushes,), mm.
-
-    Args:
-        log: The pushes.
-        final: (pushes, 3), final poses predicted for `log.middle`.
-    """
+    """Return the deviations (pushes,), mm, of the final poses (pushes, 3) predicted for `log.middle`."""
     return 1e3 * np.asarray(pj.deviation(final, log.middle.end, log.length), np.float64)
 
 
@@ -152,17 +146,14 @@ def _means_by_surface(cells: list[dict], method: str, model: str) -> dict[str, A
 
 
 def _mean_cell(cells: list[dict], model: str) -> dict[str, float | None]:
-    """Return the means over cells of one method and model.
-
-    `paper_percent` is not of these cells: the paper gives only the mean over all three surfaces.
-    """
+    """Return the means over cells of one method and model."""
     toolbox = [cell["toolbox_mm"] for cell in cells]
     return {
         "mean_mm": float(np.mean([cell["mean_mm"] for cell in cells])),
         "paper_mm": float(np.mean([cell["paper_mm"] for cell in cells])),
         "toolbox_mm": None if None in toolbox else float(np.mean(toolbox)),
         "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in cells])),
-        "paper_percent": PAPER_PERCENT[model],
+        "paper_percent": PAPER_PERCENT[model],  # not of these cells: the paper has only the mean over all surfaces
     }
 
 

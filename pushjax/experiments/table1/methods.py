@@ -1,7 +1,5 @@
 """Two ways to predict the test pushes, which are not used for training.
 
-Each gives the final poses (pushes, 3), the friction that it found, and the number of failed steps.
-
 wrench_twist  The method of the paper. The surface is fitted to measured forces and motions. The friction is found on a
               grid.
 identified    Friction, surface, center of pressure, and the true positions of tip and object are identified from the
@@ -38,51 +36,28 @@ UNKNOWNS: dict[str, Any] = {
 
 
 class Prediction(NamedTuple):
-    """Predictions of the test pushes.
+    """Predictions of the test pushes."""
 
-    Attributes:
-        final: (pushes, 3), final poses, world, m and rad.
-        friction: The coefficient of friction that was found.
-        failed: Number of failed steps.
-        found: The result of the identification; None if there was none.
-    """
-
-    final: np.ndarray
-    friction: float
-    failed: int
-    found: pj.Identified | None
+    final: np.ndarray  # (pushes, 3), final poses, world, m and rad
+    friction: float  # identified coefficient of friction
+    failed: int  # number of failed steps
+    found: pj.Identified | None  # None if the method identifies nothing else
 
 
 class ConditionData(NamedTuple):
-    """One object on one surface as both methods take it, with pushes as padded arrays.
-
-    Attributes:
-        training: Pushes to learn from.
-        coarse: The same pushes in at most `IDENTIFY_STEPS` steps.
-        test: Pushes to predict.
-        shape: Outline of the object.
-        hand: The round finger.
-        surface: Limit surface fitted to measured forces and motions.
-        length: Length that weighs rotation against translation, m.
-    """
+    """One object on one surface as both methods take it, with pushes as padded arrays."""
 
     training: pj.Pushes
-    coarse: pj.Pushes
+    coarse: pj.Pushes  # training pushes in at most `IDENTIFY_STEPS` steps
     test: pj.Pushes
     shape: pj.Shape
     hand: pj.Hand
-    surface: pj.LimitSurface
-    length: float
+    surface: pj.LimitSurface  # fitted to measured forces and motions
+    length: float  # characteristic length of the deviations, m
 
     @staticmethod
     def of(log: MitPushes, model: str, steps: int) -> "ConditionData":
-        """Prepare the data of one object.
-
-        Args:
-            log: The pushes of the object.
-            model: "quartic" or "ellipsoid".
-            steps: Steps of each push.
-        """
+        """Prepare the data of one object for a model, with `steps` steps of each push."""
         rows = np.flatnonzero(log.is_training & log.whole.valid)
         dtype = jnp.result_type(float)
         pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
@@ -122,22 +97,13 @@ def identified(condition: ConditionData) -> Prediction:
 
 
 def fitted(pushes: pj.Pushes, condition: ConditionData, unknowns: pj.Unknowns, overlap: float = 1.0) -> pj.Identified:
-    """Identify the unknowns, assuming that the finger touches the object at the end of most pushes.
-
-    Tip and object may overlap at the start of a push. One part of the overlap is a measurement error, and the rest is
-    real and pushes the object. The training pushes are whole, from the touch on, so they carry no information about it.
-    How large the part is in the pushes to predict is imposed, not estimated.
-
-    Args:
-        pushes: Pushes to learn from.
-        condition: The object, its hand and its length.
-        unknowns: What to find, with its priors.
-        overlap: Fraction of the overlap at the start of the pushes to predict that is a measurement error, as in
-            `pj.Unknowns`.
-    """
+    """Identify the unknowns, assuming that the finger touches the object at the end of most pushes."""
     found = pj.identify(
         pushes, condition.slider, condition.hand, unknowns, length=condition.length, contact_at_end=True
     )
+    # Tip and object may overlap at the start of a push to predict. The part `overlap` of it is a measurement error; the
+    # rest is real and pushes the object. The part is imposed, not estimated: the training pushes are whole, from the
+    # touch on, so they carry no information about it.
     return found.with_known(overlap=overlap)
 
 

@@ -8,21 +8,13 @@ from pushjax.geometry.se2 import compose, inverse
 
 
 def noise_floor_mm(log: MitPushes) -> float | None:
-    """Estimate the mean deviation of a push from the mean of all its repetitions, in mm.
-
-    The estimate comes from pairs of repetitions: two pushes differ by sqrt(2) times that deviation. The two pushes of a
-    pair start a millimeter or less apart, and one was twice as fast. Both are whole. The pushes that are tested are
-    shorter, so their floor is assumed to be lower in proportion to how far the object moves.
-
-    Args:
-        log: The pushes of one object on one surface.
-
-    Returns:
-        The floor of the tested pushes, or None if there are no repetitions.
-    """
+    """Estimate the mean deviation of a push from the mean of its repetitions; None without repetitions."""
     rows = log.repeats[log.fast.valid[log.repeats[:, 0]] & log.whole.valid[log.repeats[:, 1]]]
     if not len(rows):
         return None
+    # Two pushes of a pair differ by sqrt(2) times the deviation. They start a millimeter or less apart, and one was
+    # twice as fast. Both are whole. The test pushes are shorter, so their floor is assumed to be lower in proportion to
+    # how far the object moves.
     fast, slow = relative_motions(log.fast)[rows[:, 0]], relative_motions(log.whole)[rows[:, 1]]
     differences = np.asarray(pj.deviation(fast, slow, log.length), float)
     ratio = _mean_motion(log.middle, log.length) / _mean_motion(log.whole, log.length)

@@ -29,17 +29,11 @@ PAPER_PERCENT = {"quartic": 20.48, "ellipsoid": 24.97}
 
 
 class Geometry(NamedTuple):
-    """Where the robot's finger really was.
+    """Radius and path of the robot's finger, and size of the outline, as they really were."""
 
-    Attributes:
-        radius: Radius of the finger, m.
-        inset: Distance by which the outline is smaller than nominal, m.
-        commanded_end: Whether the path continues past the last logged sample, to where the robot was told to stop.
-    """
-
-    radius: float
-    inset: float
-    commanded_end: bool
+    radius: float  # m
+    inset: float  # distance by which the outline is smaller than nominal, m
+    commanded_end: bool  # whether the path continues past the last logged sample to the commanded end
 
 
 # nominal: the paper's setup. measured: according to the force sensor, contact began with the center of the finger 0.7
@@ -49,14 +43,7 @@ GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 
 
 
 def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
-    """Load the pushes of every condition that the folder has, by surface and object.
-
-    Args:
-        folder: Folder of the files.
-
-    Raises:
-        ValueError: If the folder has none of the conditions.
-    """
+    """Load the pushes of every condition that the folder has, by surface and object."""
     logs = {condition: load(folder, *condition) for condition in CONDITIONS}
     known = {condition: log for condition, log in logs.items() if log is not None}
     if not known:
@@ -69,18 +56,7 @@ def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
 
 
 def load(folder: Path, surface: str, name: str) -> PushLog | None:
-    """Load the pushes of a condition from its curated archive, or else from an original log.
-
-    The name of an original log begins with the condition. If there are several, the first is read.
-
-    Args:
-        folder: Folder of the files.
-        surface: Name of the surface.
-        name: Name of the object, which stands for the arrangement of its supports.
-
-    Returns:
-        The pushes, or None if there is neither an archive nor a log.
-    """
+    """Load the pushes of a condition from its archive or else from the first original log, if there is one."""
     archive = folder / f"{surface}_{name}.npz"
     originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
     if archive.exists():
@@ -89,13 +65,7 @@ def load(folder: Path, surface: str, name: str) -> PushLog | None:
 
 
 def reason_missing(train: np.ndarray | None, method: str, model: str) -> str | None:
-    """Say in a few words why a cell cannot be computed; None if it can.
-
-    Args:
-        train: (splits, pushes), True for the pushes to learn from. None if there is no log.
-        method: "ideal", "wrench_twist" or "identified".
-        model: "quartic" or "ellipsoid".
-    """
+    """Say why a cell cannot be computed from training masks (splits, pushes); None if it can."""
     if train is None:
         return "no log"
     if train.shape[1] < 2:  # one to learn from, one to predict
@@ -123,13 +93,7 @@ def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
 
 
 def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
-    """Convert a log to `Pushes`.
-
-    Args:
-        log: The pushes of a condition.
-        geometry: Says whether the paths continue to where the robot was told to stop.
-        steps: Steps of each path.
-    """
+    """Convert a log to `Pushes`, with paths that end where the geometry says."""
     if geometry.commanded_end:
         log = replace(log, pushes=tuple(_with_commanded_end(log, push) for push in log.pushes))
     return pj.Pushes.of(log, steps)
@@ -142,16 +106,8 @@ def _with_commanded_end(log: PushLog, push: Push) -> Push:
 
 
 def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Return masks of the pushes that each random split learns from.
-
-    Args:
-        log: The pushes of a condition.
-        share: Fraction of the pushes to learn from, more than a quarter and less than three quarters.
-        rng: Random generator.
-
-    Returns:
-        (splits, pushes), True for the pushes to learn from. Of two or more pushes, that is at least one, and not all.
-    """
+    """Return masks (splits, pushes) of the training pushes of random splits."""
+    # with a share between one and three quarters, two or more pushes are never all on one side
     chosen = np.zeros((SPLITS, len(log.pushes)), bool)
     for row in chosen:
         row[rng.permutation(len(row))[: round(share * len(row))]] = True

@@ -1,8 +1,5 @@
 """Three ways to predict the pushes that were not learned from.
 
-Each gives the deviation of every push under every split in mm, (splits, pushes); the friction that it found, (splits,);
-and the number of failed steps.
-
 ideal         The surface of the known support, with the friction found on a grid: the paper's.
 wrench_twist  The surface fitted to the forces measured during the pushes, with the friction found on a grid: the other
               way of the paper.
@@ -33,33 +30,20 @@ SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
 
 
 class ConditionData(NamedTuple):
-    """One condition as the methods take it.
+    """One condition as the methods take it."""
 
-    Attributes:
-        log: The pushes as logged, with their forces.
-        pushes: The same pushes as arrays.
-        surface: Limit surface of the known support.
-        train: (splits, pushes), True for the pushes to learn from.
-    """
-
-    log: PushLog
-    pushes: pj.Pushes
-    surface: pj.LimitSurface
-    train: np.ndarray
+    log: PushLog  # the pushes as logged, with their forces
+    pushes: pj.Pushes  # the same as arrays
+    surface: pj.LimitSurface  # of the known support
+    train: np.ndarray  # (splits, pushes), True for training pushes
 
 
 class Prediction(NamedTuple):
-    """Predictions of one condition.
+    """Predictions of all pushes of one condition."""
 
-    Attributes:
-        errors: (splits, pushes), deviation of every push, mm.
-        friction: (splits,), the coefficient of friction that was found.
-        failed: Number of failed steps.
-    """
-
-    errors: np.ndarray
-    friction: np.ndarray
-    failed: int
+    errors: np.ndarray  # (splits, pushes), deviations, mm
+    friction: np.ndarray  # (splits,), identified coefficients of friction
+    failed: int  # number of failed steps
 
 
 def ideal(condition: ConditionData, geometry: Geometry) -> Prediction:

@@ -90,15 +90,7 @@ def run(
 
 
 def load(folder: Path, name: str) -> TwoFingerLog:
-    """Load the pushes of an arrangement from its curated archive, or else from a folder of original logs.
-
-    Args:
-        folder: Folder of the archives, or of the folders of logs.
-        name: Name of the arrangement, and of the archive or the folder.
-
-    Raises:
-        LogError: If there is neither, or what is there is damaged.
-    """
+    """Load the pushes of an arrangement from its archive, or else from its folder of original logs."""
     archive, originals = folder / f"{name}.npz", folder / name
     if archive.exists():
         return load_two_finger_npz(archive)

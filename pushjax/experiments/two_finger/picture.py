@@ -8,22 +8,14 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax.datasets.two_finger import TwoFingerLog
-from pushjax.experiments.two_finger.predictions import deviation_mm, per_push
+from pushjax.experiments.two_finger.predictions import Tested, deviation_mm, per_push
+
+# name, log, predicted final poses (radii, frictions, n, 3), their deviations (radii, frictions, n), mm, and the splits
+Shown = tuple[str, TwoFingerLog, np.ndarray, np.ndarray, Tested]
 
 
-def draw(shown: list[tuple], out: Path) -> str:
-    """Draw for each object the distribution of deviations, and three test pushes of the first random split.
-
-    The three pushes are those with the median, the 90th percentile and the largest deviation of the final pose.
-
-    Args:
-        shown: One tuple per object: its name, its log, the predicted final poses (radii, frictions, n, 3), their
-            deviations from the measured ones in mm (radii, frictions, n), and what the splits gave (`Tested`).
-        out: Folder for the picture.
-
-    Returns:
-        The path of the picture.
-    """
+def draw(shown: list[Shown], out: Path) -> str:
+    """Draw for each object the distribution of deviations, and three test pushes of the first random split."""
     with plt.rc_context(plot.STYLE):
         figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
         for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
@@ -42,14 +34,7 @@ def draw(shown: list[tuple], out: Path) -> str:
 
 
 def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray) -> None:
-    """Draw the cumulative distributions of two sets of deviations.
-
-    Args:
-        axes: The panel.
-        name: Name of the object.
-        predicted: Deviations of the predicted final poses, mm.
-        no_motion: Deviations if nothing moved, that is, of the start poses, mm.
-    """
+    """Draw the cumulative distributions of the deviations, mm, of the predictions and of the start poses."""
     for values, color, dash, label in (
         (predicted, plot.BLUE, "-", "predicted"),
         (no_motion, plot.GRAY, "--", "no motion"),

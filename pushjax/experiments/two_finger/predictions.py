@@ -17,29 +17,18 @@ RADII = (0.0, 0.0005, 0.001, 0.0015)
 
 
 class Prediction(NamedTuple):
-    """Predictions of every push with every radius and friction.
+    """Predictions of every push with every radius and friction."""
 
-    Attributes:
-        final: (radii, frictions, n, 3), final poses, world, m and rad.
-        failed: (radii, frictions, n), number of failed steps.
-        jammed: (radii, frictions, n), whether the hand jammed or grasped on the way.
-    """
-
-    final: np.ndarray
-    failed: np.ndarray
-    jammed: np.ndarray
+    final: np.ndarray  # (radii, frictions, n, 3), final poses, world, m and rad
+    failed: np.ndarray  # (radii, frictions, n), number of failed steps
+    jammed: np.ndarray  # (radii, frictions, n), whether the hand jammed or grasped on the way
 
 
 class Tested(NamedTuple):
-    """The radius and friction that each split chose, and the pushes that it tested.
+    """The radius and friction that each split chose, and the pushes that it tested."""
 
-    Attributes:
-        chosen: Indices (radius, friction) that each split chose.
-        test: Indices of the pushes that each split tested.
-    """
-
-    chosen: list[tuple[int, int]]
-    test: list[np.ndarray]
+    chosen: list[tuple[int, int]]  # (radius, friction) indices, one for each split
+    test: list[np.ndarray]  # indices of the test pushes of each split
 
 
 def support(log: TwoFingerLog) -> pj.Support:
@@ -50,18 +39,10 @@ def support(log: TwoFingerLog) -> pj.Support:
 
 
 def predict(log: TwoFingerLog, model: str, key: jax.Array, steps: int, batch: int | None = None) -> Prediction:
-    """Simulate every push with every radius and friction.
-
-    Args:
-        log: The pushes of one object.
-        model: "quartic" or "ellipsoid".
-        key: PRNG key of the wrench-twist pairs.
-        steps: Steps of each push.
-        batch: Number to which the pushes are padded, so that logs of different lengths share one compiled program.
-            None: no padding.
-    """
+    """Simulate every push with every radius and friction, with pushes padded to the number `batch`."""
     pairs = support(log).wrench_twist_pairs(key, PAIRS)
     slider = pj.Slider(pj.Polygon(log.vertices), pj.fit_limit_surface(*pairs, degree=MODELS[model]))
+    # logs that are padded to the same number share one compiled program
     rows = np.arange(max(len(log), batch or 0)) % len(log)
     paths, starts = jnp.asarray(log.paths(steps)[rows]), jnp.asarray(log.pose_start[rows])
     results = [_final_poses(slider, jnp.asarray(radius), paths, starts, jnp.asarray(FRICTIONS)) for radius in RADII]
@@ -83,26 +64,12 @@ def _final_poses(slider: pj.Slider, radius, paths, starts, frictions):
 
 
 def deviation_mm(log: TwoFingerLog, final: np.ndarray) -> np.ndarray:
-    """Return the deviation of predicted from measured final poses, (..., n), mm.
-
-    Args:
-        log: The n pushes.
-        final: (..., n, 3), predicted final poses, world, m and rad.
-    """
+    """Return the deviations (..., n), mm, of predicted final poses (..., n, 3) from the measured ones."""
     return 1e3 * np.asarray(pj.deviation(final, log.pose_end, log.length), np.float64)
 
 
 def splits(log: TwoFingerLog, errors: np.ndarray, rng: np.random.Generator) -> Tested:
-    """Choose friction and radius on part of the actions, for each of `SPLITS` random splits.
-
-    Args:
-        log: The n pushes.
-        errors: (radii, frictions, n), deviations.
-        rng: Random generator of the splits.
-
-    Returns:
-        The choice of each split, and the pushes of the actions that it did not use.
-    """
+    """Choose friction and radius on random training actions, by their deviations (radii, frictions, n)."""
     actions = np.unique(log.group)
     chosen, test = [], []
     for _ in range(SPLITS):
@@ -116,15 +83,7 @@ def splits(log: TwoFingerLog, errors: np.ndarray, rng: np.random.Generator) -> T
 
 
 def per_push(values: np.ndarray, tested: Tested) -> np.ndarray:
-    """Average the values of each push over the splits that tested it.
-
-    Args:
-        values: (radii, frictions, n).
-        tested: The choices and the test pushes of the splits.
-
-    Returns:
-        (n,), NaN where no split tested the push.
-    """
+    """Average values (radii, frictions, n) over the splits that tested each push; NaN if none did."""
     count, total = np.zeros(values.shape[-1]), np.zeros(values.shape[-1])
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
         total[pushes] += values[at][pushes]

@@ -23,15 +23,7 @@ DAY = 86400.0  # s
 def object_scores(
     log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int
 ) -> dict[str, Any]:
-    """Compute every score of one object.
-
-    Args:
-        log: The n pushes of the object.
-        prediction: Predictions of every push with every radius and friction.
-        errors: (radii, frictions, n), deviations of these predictions, mm.
-        tested: The radius and friction that each split chose, and the pushes that it tested.
-        seed: Seed of the bootstrap.
-    """
+    """Return every score of one object, from the deviations (radii, frictions, n), mm, of its predictions."""
     no_motion_errors = deviation_mm(log, log.pose_start)
     pairs = list(zip(tested.chosen, tested.test, strict=True))
     means = [errors[at][pushes].mean() for at, pushes in pairs]
@@ -62,15 +54,8 @@ def object_scores(
 
 
 def _interval(push_errors: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
-    """Return half the width of the 95 % interval of the mean error, in the unit of the errors.
-
-    The bootstrap is over actions, because repeats of an action are not independent.
-
-    Args:
-        push_errors: Error of each push, (n,).
-        group: Number of the action of each push, (n,).
-        rng: Random generator of the bootstrap.
-    """
+    """Return half the width of the bootstrapped 95 % confidence interval of the mean of errors (n,)."""
+    # The bootstrap is over actions, because repeats of an action are not independent.
     actions, action_of_push = np.unique(group, return_inverse=True)
     total, count = np.bincount(action_of_push, push_errors), np.bincount(action_of_push)
     resampled = rng.integers(len(actions), size=(BOOTSTRAP_SAMPLES, len(actions)))
@@ -79,11 +64,7 @@ def _interval(push_errors: np.ndarray, group: np.ndarray, rng: np.random.Generat
 
 
 def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
-    """Compare prediction and measurement on whether the object stuck to the hand.
-
-    Returns:
-        How often the two agree, the agreement by chance, and the shares of the four cases, over all tests.
-    """
+    """Compare prediction and measurement on whether the object stuck to the hand."""
     measured_stuck = log.stick_deviation < MAX_STUCK_MOTION
     table = np.zeros((2, 2))
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
@@ -107,12 +88,7 @@ def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> di
 
 
 def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
-    """Compare the repeats of each action with each other, and with the model on the same pushes.
-
-    `floor_mm` is the mean deviation of a push from what its action does on average. It is estimated from the mean of
-    the other repeats. For k repeats that estimate is too large by sqrt(k / (k - 1)), which is divided out.
-    `floor_agreement` is how often two repeats agree on whether the object stuck.
-    """
+    """Compare the repeats of each action with each other, and with the model on the same pushes."""
     moved, stuck = _object_motion(log), log.stick_deviation < MAX_STUCK_MOTION
     floor, model, agree = [], [], []
     for action in np.unique(log.group):
@@ -122,6 +98,8 @@ def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
         for push in same_action:
             others = same_action[same_action != push]
             distance = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
+            # The mean of all repeats is estimated from the other k - 1, which makes the deviation too large by
+            # sqrt(k / (k - 1)).
             floor.append(1e3 * float(distance) * np.sqrt(len(others) / len(same_action)))
             model.append(push_errors[push])
             agree += list(stuck[others] == stuck[push])
@@ -134,7 +112,7 @@ def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
         "floor_median_mm": float(np.median(floor)),
         "model_mm": float(np.mean(model)) if len(model) else None,
         "model_median_mm": float(np.median(model)) if len(model) else None,
-        "floor_agreement": float(np.mean(agree)),
+        "floor_agreement": float(np.mean(agree)),  # on whether the object stuck
     }
 
 
@@ -144,17 +122,7 @@ def _object_motion(log: TwoFingerLog) -> np.ndarray:
 
 
 def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
-    """Find the friction and radius that suit each day's pushes (UTC) best, to see whether the setup stayed the same.
-
-    All pushes of a day are used; none are held back. Days with fewer than `MIN_PUSHES_OF_A_DAY` pushes are left out.
-
-    Args:
-        log: The n pushes of one object.
-        errors: (radii, frictions, n), deviations, mm.
-
-    Returns:
-        One row per day: date, number of pushes, friction, radius and mean deviation.
-    """
+    """Find each day's (UTC) best friction and radius on all its pushes, to see whether the setup stayed the same."""
     rows, day = [], np.floor(log.time / DAY).astype(int)
     for number in np.unique(day):
         of_day = day == number
