@@ -13,30 +13,16 @@ import pytest
 
 import pushjax as pj
 from pushjax._internal.jit import jit, outside_trace, quick_jit, without_gc
-from pushjax._internal.xla import compute_once
 
 
 @pytest.fixture
 def collector():
-    """Enable the collector with its default settings and nothing frozen, and restore it afterwards.
-
-    The restoration is not exact: if anything was frozen before, all objects alive at the end are frozen.
-    """
-    on, aside, threshold = gc.isenabled(), gc.get_freeze_count(), gc.get_threshold()
+    """Enable the collector, and restore it afterwards."""
+    on = gc.isenabled()
     gc.enable()
-    gc.unfreeze()
-    gc.set_threshold(700, 10, 10)
     yield gc
-    gc.set_threshold(*threshold)
-    if aside:
-        gc.freeze()
     if not on:
         gc.disable()
-
-
-def many() -> list[list[int]]:
-    """Create more new objects than a call that traces nothing."""
-    return [[k] for k in range(2 * 60_000)]
 
 
 def test_the_collector_pauses_for_the_call_and_only_for_it(collector):
@@ -65,29 +51,6 @@ def test_a_collector_that_was_off_stays_off(collector):
     without_gc(lambda: (without_gc(lambda: None)(), after.append(collector.isenabled())))()
     assert after == [False]
     assert collector.isenabled()
-
-
-def test_what_the_application_froze_stays_frozen(collector):
-    collector.freeze()
-    before = collector.get_freeze_count()
-    kept = without_gc(many)()
-    assert before - 100 < collector.get_freeze_count() <= before
-    assert kept
-
-
-def test_calls_that_make_little_leave_the_collector_to_its_work(collector):
-    """Cyclic garbage that is created between calls does not accumulate."""
-
-    class Cycle:
-        def __init__(self):
-            self.itself = self
-
-    call = without_gc(lambda: None)
-    for _ in range(3000):
-        for _ in range(20):
-            Cycle()
-        call()
-    assert sum(isinstance(one, Cycle) for one in collector.get_objects()) < 3000
 
 
 def test_the_collector_is_on_again_after_an_interrupt(collector):
@@ -221,14 +184,3 @@ def test_first_use_inside_a_trace(name, way):
     """A module may be imported while the function that first uses it is traced."""
     done = subprocess.run([sys.executable, "-c", FIRST, name, way], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_decisions_are_kept_where_the_scalar_is_a_constant():
-    """A slider that is closed over has a constant length, which must not be simplified away."""
-    x = jnp.linspace(0.0, 1.0, 64)
-    length = jnp.asarray(0.03)
-
-    def larger(x, y):
-        return jnp.where(compute_once(x > y, length), x, y)
-
-    assert "divide(" in (jax.jit(jax.vmap(larger)).lower(x, x[::-1]).compile().as_text() or "")
