@@ -109,17 +109,9 @@ Given = tuple[Callable[..., dict[str, Any]], Path | None]
 
 
 def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
-    """Return a function whose arguments are the options of a case.
-
-    Args:
-        run: Function that gives the record of the case. Its arguments are options, except `progress` and `keep`, which
-            are called with the number of rows done and their total, and with the record so far.
-
-    Returns:
-        A function of the same arguments, and of `json`. It returns `run` with its arguments except those two, and the
-        file for the record.
-    """
+    """Return a function of the options of `run` and of `json`, which returns `run` with them bound, and the file."""
     signature = inspect.signature(run)
+    # `progress` and `keep` are callbacks, not options: of rows done and their total, and of the record so far.
     parameters = [
         each.replace(default=PICTURES) if each.name == "out" else each
         for each in signature.parameters.values()
@@ -138,13 +130,7 @@ def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
 
 
 def main(arguments: list[str]) -> None:
-    """Run the command line.
-
-    Bad input ends with one line on standard error and exit status 1.
-
-    Args:
-        arguments: Arguments of the command, without the name of the program.
-    """
+    """Run the command line; bad input ends with one line on standard error and exit status 1."""
     if not arguments:
         print(listing())
         return

@@ -26,35 +26,19 @@ def fitted(block: pj.Polygon, dtype: Any) -> pj.Quartic:
 
 
 class Case(NamedTuple):
-    """Random pushes or grasps to differentiate.
+    """Random pushes or grasps to differentiate."""
 
-    Attributes:
-        end: Function from the inputs of one push, (inputs,), to the final pose, (3,), and the kind of the push. Inputs
-            and pose are scaled to numbers of order one. The kind is an array of whatever must be equal for two pushes
-            to be compared; it begins with the status of each step.
-        inputs: Inputs of all pushes, (pushes, inputs).
-        along: Directions in which the pushes are differentiated, by name, (inputs,) each.
-        size: Number of pushes in a batch.
-        steps: Number of steps of each push.
-    """
-
+    # From the inputs of one push, (inputs,), to its final pose, (3,), and its kind. Inputs and pose are scaled to order
+    # one. The kind, an array that begins with the status of each step, must be equal for two pushes to be compared.
     end: Callable
-    inputs: np.ndarray
-    along: dict[str, np.ndarray]
-    size: int
-    steps: int
+    inputs: np.ndarray  # (pushes, inputs)
+    along: dict[str, np.ndarray]  # directions of differentiation by name, (inputs,) each
+    size: int  # number of pushes in a batch
+    steps: int  # number of steps of each push
 
 
 def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
-    """Return the surfaces of `n` pushes: every second one is the mean, the others are drawn around it.
-
-    Args:
-        mean: Mean of the surfaces.
-        n: Number of pushes.
-
-    Returns:
-        Coefficients, (n, 15), in units of the mean's largest coefficient.
-    """
+    """Return coefficients (n, 15) in units of the mean's largest: every second row is the mean, the rest random."""
     model = pj.FrictionModel(dof=20.0, friction=0.3)
     drawn: Any = jax.jit(jax.vmap(model.around(mean).sample))(jax.random.split(jax.random.key(3), n)).surface
     each = np.where(np.arange(n)[:, None] % 2, drawn.coefficients, mean.coefficients)
@@ -62,16 +46,7 @@ def surfaces(mean: pj.Quartic, n: int) -> np.ndarray:
 
 
 def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[str, np.ndarray]:
-    """Return the directions in which pushes are differentiated.
-
-    Args:
-        names: Names of the first inputs. Each of these inputs is a direction.
-        width: Number of inputs.
-        drawn: Groups of inputs by name. Two random directions are drawn within each group.
-
-    Returns:
-        The directions by name, (width,) each.
-    """
+    """Return unit vectors (width,) of the first inputs, and two random directions in each slice of `drawn`, by name."""
     rng, found = np.random.default_rng(4), dict(zip(names, np.eye(width), strict=False))
     for name, where in drawn.items():
         for k in (1, 2):
@@ -81,14 +56,7 @@ def directions(names: list[str], width: int, drawn: dict[str, slice]) -> dict[st
 
 
 def one_finger(n: int, steps: int = 60) -> Case:
-    """Return pushes of random pentagons by one finger: 60 mm, from any side toward any place in the pentagon.
-
-    Some fingers slip off, some miss.
-
-    Args:
-        n: Number of pushes.
-        steps: Number of steps of each push.
-    """
+    """Return 60 mm pushes of random pentagons by one finger, from any side toward any point; some slip off or miss."""
     rng, mean = np.random.default_rng(2), fitted(pj.Polygon.rectangle(0.09, 0.09), float)
     scale, hand_names = float(jnp.max(mean.coefficients)), ["start x", "start y", "direction", "travel"]
 
@@ -122,18 +90,9 @@ def scaled(run: pj.Trajectory) -> jax.Array:
 
 
 def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
-    """Return the edge or vertex that is touched in each step.
-
-    It is found from the direction of the contact's normal, by the rotation between the contact's force (normal,
-    tangential) and the force of the wrench.
-
-    Args:
-        run: A push by one finger.
-        vertices: Vertices of the slider, (vertices, 2), m.
-
-    Returns:
-        Numbers, (steps,): 2 k for edge k, 2 k + 1 for the vertex after it, -1 for no contact.
-    """
+    """Return what each step touches, (steps,): 2 k for edge k, 2 k + 1 for the vertex after it, -1 for nothing."""
+    # The normal's direction follows from the rotation between the contact's force (normal, tangential) and the force of
+    # the wrench.
     (a, b), (x, y) = run.force[:, 0].T, run.wrench[:, :2].T
     outward = -jnp.stack([x * a + y * b, y * a - x * b], axis=-1)
     outward = outward / jnp.maximum(jnp.linalg.norm(outward, axis=-1, keepdims=True), 1e-300)
@@ -148,15 +107,8 @@ def touched(run: pj.Trajectory, vertices: jax.Array) -> jax.Array:
 
 
 def of_hand(hand: pj.Hand, block: pj.Polygon, steps: int, given: list[np.ndarray], size: int) -> Case:
-    """Return pushes or grasps of `block` by a hand of two fingers.
-
-    Args:
-        hand: The hand.
-        block: Outline of the slider.
-        steps: Number of steps.
-        given: Friction (n, 2), start pose (n, 3), first and last configuration (n, 4).
-        size: Number of pushes in a batch.
-    """
+    """Return pushes or grasps of `block` by a hand of two fingers."""
+    # given: friction (n, 2), start poses (n, 3), first and last configurations (n, 4) each
     mean = fitted(block, float)
     scale, unit = float(jnp.max(mean.coefficients)), np.array([LENGTH, LENGTH, 1.0, LENGTH])
 
@@ -188,12 +140,7 @@ def two_fingers(n: int) -> Case:
 
 
 def grasps(jaw: bool, n: int) -> Case:
-    """Return `n` grasps of a 50 x 35 mm rectangle by two fingers, or by a jaw, that close and shift until they hold it.
-
-    Args:
-        jaw: Whether the hand is a parallel jaw with two pads instead of two round fingers.
-        n: Number of grasps.
-    """
+    """Return `n` grasps of a 50 x 35 mm rectangle by two round fingers or a parallel jaw, which close and shift."""
     rng, zero = np.random.default_rng(6), np.zeros(n)
     pose = np.stack([*rng.uniform(-0.005, 0.005, (2, n)), rng.uniform(-3, 3, n)], axis=-1)
     hand = pj.Hand.parallel_jaw(0.027, 0.01) if jaw else pj.Hand.two_fingers(RADIUS)
@@ -223,22 +170,14 @@ class Batched:
 
 
 class Compared(NamedTuple):
-    """The result of `compare`.
+    """Agreement of derivatives with central differences."""
 
-    Attributes:
-        same: Whether the pushes on both sides are of the same kind as the push itself, (pushes, directions).
-        error: Relative error against extrapolated differences where `same`, else zero, (pushes, directions).
-        fine: Relative error against differences of width FINE where `error` exceeds TOLERANCE, else zero, (pushes,
-            directions).
-        finite: Whether all derivatives are finite, (pushes,).
-        status: Status of each step, (pushes, steps).
-    """
-
-    same: np.ndarray
-    error: np.ndarray
+    same: np.ndarray  # (pushes, directions), whether the pushes on both sides are of the same kind as the push itself
+    error: np.ndarray  # (pushes, directions), relative, against extrapolated differences; zero where not `same`
+    # (pushes, directions), relative, against differences of width FINE; zero unless `error` > TOLERANCE
     fine: np.ndarray
-    finite: np.ndarray
-    status: np.ndarray
+    finite: np.ndarray  # (pushes,), whether all derivatives are finite
+    status: np.ndarray  # (pushes, steps)
 
 
 def compare(case: Case) -> Compared:

@@ -22,16 +22,7 @@ RADII, STEPS = (0.00475, 0.001, 0.0), (10, 25, 50, 100, 200)
 
 
 def fan(slider: pj.Slider, radius: float, steps: int) -> tuple[np.ndarray, float]:
-    """Simulate the fan of pushes.
-
-    Args:
-        slider: The square.
-        radius: Radius of the finger, m.
-        steps: Number of steps of each push.
-
-    Returns:
-        The final poses, (pushes, 3), and the largest penetration depth at the end of any step, m.
-    """
+    """Simulate the fan of pushes; return final poses (pushes, 3) and the largest penetration after any step, m."""
     offsets, angles = np.meshgrid(np.linspace(-0.04, 0.04, 17), np.radians(np.linspace(-60, 60, 13)))
 
     def one(offset, angle):

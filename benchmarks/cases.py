@@ -20,42 +20,22 @@ PAIRS = 400  # wrench-twist pairs of a fit
 
 
 class Work(NamedTuple):
-    """One program to time.
+    """One program to time."""
 
-    Attributes:
-        case: Name of the row.
-        dtype: Floating type, "float32" or "float64".
-        batch: Number of pushes, grasps, problems, surfaces or fits.
-        steps: Mean number of steps in contact of each of the batch; one where there are no steps.
-        function: Function of `args`.
-        args: Its arguments.
-        error_mm: Largest error of the final poses of the fan at this number of steps, mm, or None.
-        host: Whether `function` is called as it is, instead of being compiled.
-    """
-
-    case: str
-    dtype: str
-    batch: int
-    steps: float
-    function: Callable
+    case: str  # name of the row
+    dtype: str  # "float32" or "float64"
+    batch: int  # number of pushes, grasps, problems, surfaces or fits
+    steps: float  # mean number of steps in contact of each of the batch; one where there are no steps
+    function: Callable  # of `args`
     args: tuple
-    error_mm: float | None = None
-    host: bool = False
+    error_mm: float | None = None  # largest error of the final poses of the fan at this number of steps
+    host: bool = False  # whether `function` is called as it is, instead of being compiled
 
 
 def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = None) -> Work:
-    """Make a program for the final poses of random pushes in the range of the fan.
-
-    Each push has its own surface and friction.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of pushes.
-        model: "quartic" or "ellipsoid".
-        steps: Number of steps. Default: as few as keep the error within `tasks.ALLOWED_MM`.
-    """
+    """Make a program for random pushes in the range of the fan, each with its own surface and friction."""
     by_steps = tasks.errors(model, dtype)
-    steps = tasks.fewest_steps(by_steps) if steps is None else steps
+    steps = tasks.fewest_steps(by_steps) if steps is None else steps  # within `tasks.ALLOWED_MM`
     one, args = each_push(model, dtype, batch, steps)
 
     modes = jax.vmap(lambda *each: one(*each).mode)(*jax.tree.map(lambda leaf: leaf[: min(batch, 500)], args))
@@ -71,14 +51,7 @@ def gradient(dtype: str, batch: int) -> Work:
 
 
 def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False) -> Work:
-    """Make a program for the final poses of random grasps: two fingers close on the askew square and turn it.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of grasps.
-        steps: Number of steps. Default: as few as keep the error within `tasks.ALLOWED_MM`.
-        varied: Whether each grasp has its own surface.
-    """
+    """Make a program for random grasps with one surface or `varied` ones: two fingers turn the askew square."""
     by_steps = grasps.errors(dtype) if steps is None else {}
     steps = tasks.fewest_steps(by_steps) if steps is None else steps
     one, args = each_grasp(grasps.hand(dtype), dtype, batch, steps)
@@ -91,19 +64,12 @@ def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False
 
 
 def push_t(dtype: str, batch: int, where: str = "side") -> Work:
-    """Make a program for the final poses of random pushes of a T by 50 mm, each with its own path and friction.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of pushes.
-        where: "side" for the pushes of the square, here on the bar of the T. "hull" for the same on the convex hull of
-            the T. "corner" for pushes into an inner corner, where every finger touches bar and stem.
-    """
+    """Make a program for random 50 mm pushes of a T on its bar ("side"), of its convex hull or into an inner corner."""
     here = tasks.task("quartic", dtype)
     block = tasks.cast(tasks.t_block(hull=where == "hull"), dtype)
     here = here._replace(slider=pj.Slider(block, here.slider.surface))
-    _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)
-    if where == "corner":
+    _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)  # the pushes of the square
+    if where == "corner":  # where every finger touches bar and stem
         start = jnp.array([-tasks.SIDE / 4 + tasks.RADIUS, tasks.SIDE / 8 + tasks.RADIUS], dtype)
         diagonal = jnp.array([[-1, -1], [1, -1]], dtype) / 2**0.5  # from the normal of the side to that of the corner
         path = start[None, None] + (path - path[:, :1]) @ diagonal
@@ -113,12 +79,7 @@ def push_t(dtype: str, batch: int, where: str = "side") -> Work:
 
 
 def push_two_fingers(dtype: str, batch: int) -> Work:
-    """Make a program for the final poses of random pushes of the square by two fingers side by side, by 50 mm.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of pushes.
-    """
+    """Make a program for the final poses of random pushes of the square by two fingers side by side, by 50 mm."""
     here = tasks.task("quartic", dtype)._replace(hand=grasps.hand(dtype))
     _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)
     path = path.at[..., 1].multiply(0.5)  # both fingers stay on the side
@@ -129,14 +90,8 @@ def push_two_fingers(dtype: str, batch: int) -> Work:
 
 
 def grasp_jaw(dtype: str, batch: int) -> Work:
-    """Make a program for the final poses of random grasps of the askew square by a parallel jaw.
-
-    Each grasp begins where the first pad touches. It ends 1 mm before the straight square would be held, as `grasp`.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of grasps.
-    """
+    """Make a program for the final poses of random grasps of the askew square by a parallel jaw."""
+    # Each begins where the first pad touches, and ends 1 mm before the straight square would be held, as in `grasp`.
     one, (pose, path) = each_grasp(grasps.jaw(dtype), dtype, batch, MANY_STEPS)
     diameter, share = 2 * tasks.RADIUS, jnp.linspace(0, 1, MANY_STEPS + 1, dtype=dtype)
     centers = grasps.opening_at(grasps.touching_jaw(pose)[:, None] + diameter, share[None])  # as of round fingers
@@ -169,13 +124,7 @@ def sampling(dtype: str, batch: int) -> Work:
 
 
 def fit(dtype: str, batch: int, degree: int) -> Work:
-    """Make a program that fits surfaces to `PAIRS` wrench-twist pairs each, as a user does: with checks and a report.
-
-    Args:
-        dtype: Floating type.
-        batch: Number of fits.
-        degree: Degree of the surfaces, 2 or 4.
-    """
+    """Make a program that fits surfaces to `PAIRS` pairs each, as a user does: with checks and a report."""
 
     def surfaces(*args):
         return jax.vmap(lambda *each: pj.fit_limit_surface(*each, degree=degree, report=True))(*args)
@@ -206,12 +155,7 @@ def monte_carlo(dtype: str, batch: int) -> Work:
 
 
 def final_poses(rollout: Callable[..., pj.Trajectory], batch: int) -> Callable[..., Array]:
-    """Return the function from the arguments of a batch to its final poses, (batch, 3).
-
-    Args:
-        rollout: Function of the arguments of one push or grasp.
-        batch: Size of the batch.
-    """
+    """Return the function from the arguments of a batch to its final poses, (batch, 3)."""
 
     def final(*args):
         return in_tiles(lambda *each: rollout(*each).pose[-1], args, batch)
@@ -220,23 +164,15 @@ def final_poses(rollout: Callable[..., pj.Trajectory], batch: int) -> Callable[.
 
 
 def in_tiles(function: Callable, args: tuple, batch: int) -> Any:
-    """Apply `vmap` to at most TILE of the batch at once on a CPU, and to the whole batch on an accelerator.
-
-    Args:
-        function: Function of one of the batch.
-        args: Arguments with a leading axis of the batch.
-        batch: Size of the batch.
-    """
+    """Apply `vmap` to at most TILE of the batch at once on a CPU, and to the whole batch on an accelerator."""
     if batch <= TILE or not on_cpu():
         return jax.vmap(function)(*args)
     return jax.lax.map(lambda each: function(*each), args, batch_size=TILE)
 
 
 def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
-    """Return the function of one push, and the surface, path and friction of each push.
-
-    All of these differ between pushes, so that no work can be shared.
-    """
+    """Return the function of one push, and the surface, path and friction of each push."""
+    # All of these differ between pushes, so that no work can be shared.
     here = tasks.task(model, dtype)
     keys = jax.random.split(jax.random.key(0), 4)
 
@@ -254,16 +190,8 @@ def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[
 
 
 def each_grasp(hand: pj.Hand, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
-    """Return the function of one grasp, and the pose and path of each grasp.
-
-    The function uses the same surface for all grasps, unless its third argument gives another.
-
-    Args:
-        hand: A hand whose last coordinate is the opening.
-        dtype: Floating type.
-        batch: Number of grasps.
-        steps: Number of steps.
-    """
+    """Return the function of one grasp by a hand with an opening, and the pose and path of each grasp."""
+    # All grasps have the same surface, unless the function's third argument gives another.
     slider, friction = tasks.task("quartic", dtype).slider, jnp.asarray(grasps.FRICTION, dtype)
 
     def one(pose: Any, path: Any, surface: Any = slider.surface) -> pj.Trajectory:

@@ -119,18 +119,7 @@ def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int, 
 def judge(
     batch: ProblemBatch, motion: pj.Motion, dtype: str, starts: int, seed: int = 0
 ) -> tuple[dict[str, int], float]:
-    """Judge the answers to a batch of problems.
-
-    Args:
-        batch: The problems.
-        motion: Their answers.
-        dtype: Floating type in which they were solved.
-        starts: Starts of the different solver on each jam.
-        seed: Seed of these starts.
-
-    Returns:
-        The number of problems with each outcome, and the largest violation by a MOVING or FREE answer.
-    """
+    """Check a batch of answers; return the number of each outcome and the largest violation by a MOVING or FREE one."""
     status = np.asarray(motion.status)
     answered = (status == pj.Status.MOVING) | (status == pj.Status.FREE)
     twist, force, wrench = (np.asarray(part) for part in (motion.twist, motion.force, motion.wrench))

@@ -49,15 +49,10 @@ MANY, FEW, GRASPS, JAWS, QUICK = 10_000, 1000, 300, 100, 40
 
 
 class Timed(NamedTuple):
-    """Pushes in float32 and a scalar of each.
+    """Pushes in float32 and a scalar of each."""
 
-    Attributes:
-        scalar: Function from the friction, start pose and coefficients of one push to a scalar.
-        inputs: The inputs by which it is differentiated, with a leading axis of the batch.
-    """
-
-    scalar: Callable
-    inputs: tuple
+    scalar: Callable  # of the friction, start pose and coefficients of one push
+    inputs: tuple  # of `scalar`, with a leading axis of the batch; it is differentiated by all
 
     def total(self, *inputs):
         """Return the sum of the scalars of all pushes."""
@@ -65,15 +60,9 @@ class Timed(NamedTuple):
 
 
 def pushes(fingers: int, batch: int, steps: int, stretch: int | None = None) -> Timed:
-    """Return pushes of a square by one or two fingers.
-
-    Args:
-        fingers: Number of fingers, 1 or 2.
-        batch: Number of pushes.
-        steps: Number of steps of each push.
-        stretch: Number of steps between two poses that are stored; reverse mode recomputes the steps between them.
-            Default: reverse mode stores what it needs of every step.
-    """
+    """Return pushes of a square by one or two fingers, with `jax.checkpoint` of each stretch of steps if given."""
+    # Then reverse mode stores one pose of each stretch and recomputes its steps. Otherwise it stores what it needs of
+    # every step.
     block, key = pj.Polygon.rectangle(0.09, 0.09), jax.random.key(1)
     mean = fitted(block, jnp.float32)
     one, two = jnp.array([-0.06, 0.01]), jnp.array([-0.06, 0.01, 0.0, 0.05])
@@ -180,10 +169,7 @@ def judged(cases: dict[str, Case]) -> list[Row]:
 
 
 def random(quick: bool) -> list[Row]:
-    """Compare derivatives of three means with differences of means, for pushes of the README's square.
-
-    The means are those of x / LENGTH, theta and (theta + 0.4 rad)^2 of the final pose.
-    """
+    """Compare derivatives of means over random friction with differences of means, for the README's square."""
     block, hand, n, rows = pj.Polygon.rectangle(0.09, 0.09), pj.Hand.finger(RADIUS), 1000 if quick else 20_000, []
     slider, path = pj.Slider(block, fitted(block, float)), pj.line((-0.06, 0.01), (-0.01, 0.01), 50)
     names, keys = ["dof", "lowest mu", "highest mu"], jax.random.split(jax.random.key(7), n)

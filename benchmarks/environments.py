@@ -90,12 +90,7 @@ def summary(record: dict[str, Any]) -> str:
 
 
 def throughput(env: Environment, batch: int, actions: str = "steered", seed: int = 0) -> dict[str, Any]:
-    """Return the control steps per second of a batch in the median of several runs, one after another.
-
-    Returns:
-        "batch", "actions", "dtype", "first_call_s", "steps_per_second" (control steps), and "statuses": the share of
-        each status among the substeps of the last run.
-    """
+    """Return the control steps per second of a batch in the median of several runs, its first call and its statuses."""
     clock = time.process_time if on_cpu() else time.perf_counter
     params = env.default_params
     advance = control_steps(env, batch, actions, params)
@@ -113,15 +108,13 @@ def throughput(env: Environment, batch: int, actions: str = "steered", seed: int
         "dtype": str(states.pose.dtype),
         "first_call_s": seconds[0],
         "steps_per_second": batch * CONTROL_STEPS / float(np.median(seconds[WARM_UP:])),
+        # shares among the substeps of the last run
         "statuses": {status.name: float(share) for status, share in zip(pj.Status, shares, strict=True)},
     }
 
 
 def control_steps(env: Environment, batch: int, actions: str, params: Any) -> Callable[[PRNGKeyArray, TaskState], Any]:
-    """Return the compiled program of `CONTROL_STEPS` control steps of a batch.
-
-    It takes a key and the states, and returns the states and sums of everything that a control step returns.
-    """
+    """Compile `CONTROL_STEPS` control steps of a batch, from a key and states to states and sums of all results."""
 
     @jax.jit
     def program(key: PRNGKeyArray, states: TaskState):

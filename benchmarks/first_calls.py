@@ -109,15 +109,7 @@ def _in_process_of_its_own(case: str, settings: dict[str, Any]) -> Figures:
 
 
 def _checked(command: list[str], folder: str) -> tuple[str, float]:
-    """Run a command, and stop this process with its error output if it fails.
-
-    Args:
-        command: The command.
-        folder: Folder in which it runs.
-
-    Returns:
-        What the command prints, and the processor time that it took, in s.
-    """
+    """Run a command in `folder`; return what it prints and its processor time, s, or exit with its error output."""
     before = os.times()
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -224,13 +216,7 @@ def _in_session(case: str) -> Figures:
 
 
 def work(case: str, dtype: str, batch: int) -> tuple:
-    """Return the function of a program and its arguments.
-
-    Args:
-        case: Name of the program.
-        dtype: Floating type.
-        batch: Number of pushes or grasps.
-    """
+    """Return the function of a program and its arguments."""
     import jax
     import jax.numpy as jnp
 

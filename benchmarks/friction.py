@@ -1,7 +1,7 @@
 """Convexity, mean and repairs of a million random surfaces of each sampler.
 
-Convexity is judged in float64 by a sweep of the Hessian that does not use the sampler's certificate. For a few surfaces
-a semi-definite program also searches for a Gram matrix that proves it (needs cvxpy).
+Convexity is checked in float64 by a sweep of the Hessian that does not use the sampler's certificate. For a few
+surfaces a semidefinite program also searches for a Gram matrix that proves it (needs cvxpy).
 """
 
 import time
@@ -33,20 +33,10 @@ def drawn(around, keys):
 
 
 def draw(model: pj.FrictionModel, surface: pj.LimitSurface, n: int):
-    """Draw random surfaces in chunks.
-
-    Args:
-        model: Distribution of the friction.
-        surface: Mean of the surfaces.
-        n: Number of samples.
-
-    Returns:
-        The coefficients, (n, 15), and the shrinkage, (n,), in float64, and the time that sampling took without
-        compiling, in s.
-    """
+    """Draw `n` surfaces in chunks; return coefficients (n, 15) and shrinkage (n,) in float64, and the time, s."""
     around = model.around(surface)
     keys = jax.random.split(jax.random.key(1), n)
-    jax.block_until_ready(drawn(around, keys[:CHUNK]))
+    jax.block_until_ready(drawn(around, keys[:CHUNK]))  # compiles
     begun, parts = time.perf_counter(), []
     for first in range(0, n, CHUNK):
         parts.append([np.asarray(x, np.float64) for x in drawn(around, keys[first : first + CHUNK])])
@@ -55,13 +45,8 @@ def draw(model: pj.FrictionModel, surface: pj.LimitSurface, n: int):
 
 
 def certified(coefficients: np.ndarray) -> int:
-    """Count the quartics for which a semi-definite program proves that they are convex.
-
-    The proof is a Gram matrix of z' hess H(F) z that is positive semi-definite to 1e-6.
-
-    Args:
-        coefficients: Coefficients, (n, 15).
-    """
+    """Count the quartics (n, 15) that a semidefinite program proves to be convex."""
+    # The proof is a Gram matrix of z' hess H(F) z that is positive semidefinite to 1e-6.
     cp, rng, found = fits.cvxpy(), np.random.default_rng(0), 0
     f, z = rng.normal(size=(2, 120, 3))
     y = np.einsum("ni,nj->nij", z, f).reshape(120, 9)
@@ -120,20 +105,7 @@ def run(
 
 
 def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certificates: int) -> dict[str, Any]:
-    """Draw `count` quartics, and compare their moments with those of the distribution.
-
-    Args:
-        surface: Mean of the surfaces.
-        sampler: Name of the sampler.
-        dof: Degrees of freedom.
-        count: Number of samples.
-        certificates: Number of samples, half of them repaired ones, for which a semi-definite program is solved.
-
-    Returns:
-        The row. `mean_off` is the largest deviation of a mean coefficient, in standard errors, before repairs, and
-        `mean_shift` that after them, relative to the largest coefficient. `variance` is the relative variance of H,
-        divided by 2 / dof.
-    """
+    """Draw `count` quartics around `surface`; return the row with their convexity and moments."""
     mean = np.asarray(surface.coefficients, np.float64)
     c, pull, seconds = draw(pj.FrictionModel(dof=dof, friction=0.3, sampler=sampler), surface, count)
     raw = (c - pull[:, None] * mean) / (1 - pull[:, None])
@@ -144,7 +116,7 @@ def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certifica
     begun = time.perf_counter()
     curvature = least_curvatures(c)
     swept = time.perf_counter() - begun
-    few = np.concatenate([c[pull > 0][: certificates // 2], c[pull == 0]])[:certificates]
+    few = np.concatenate([c[pull > 0][: certificates // 2], c[pull == 0]])[:certificates]  # half of them repaired
     return {
         "sampler": sampler,
         "dof": dof,
@@ -155,8 +127,9 @@ def _quartics(surface: pj.Quartic, sampler: Any, dof: int, count: int, certifica
         "sweep_s": swept,
         "repaired": np.mean(pull > 0),
         "shrinkage": pull[pull > 0].mean() if (pull > 0).any() else 0.0,
-        "mean_off": off.max(),
-        "mean_shift": np.abs(shift).max(),
+        "mean_off": off.max(),  # of a mean coefficient before repairs, in standard errors
+        "mean_shift": np.abs(shift).max(),  # after repairs, relative to the largest coefficient
+        # relative variance of H, in units of 2 / dof
         "variance": np.mean(values.var(axis=0) / values.mean(axis=0) ** 2) * dof / 2,
         "certified": [certified(few), len(few)] if certificates else None,
     }

@@ -38,14 +38,7 @@ def jaw(dtype: str) -> pj.Hand:
 
 
 def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
-    """Return the opening at which the first finger touches the square at `pose`, on a side.
-
-    Args:
-        pose: Poses of the square.
-
-    Returns:
-        Distances between the fingers' centers, m.
-    """
+    """Return the opening, m, at which the first finger touches a side of the square at `pose`."""
     x, y, theta = pose.T
     cos, sin = jnp.cos(theta), jnp.sin(theta)
     upper, lower = (sign * y + (STRAIGHT_OPENING / 2 - sign * x * sin) / cos for sign in (1, -1))
@@ -53,16 +46,9 @@ def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
 
 
 def touching_jaw(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
-    """Return the opening at which the first pad of the parallel jaw touches the square at `pose`.
-
-    Either a corner of the pad touches a side of the square, or a corner of the square touches the face of the pad.
-
-    Args:
-        pose: Poses of the square, turned by less than a quarter of a right angle.
-
-    Returns:
-        Distances between the faces of the pads, m.
-    """
+    """Return the opening between the faces, m, at which the first pad of the jaw touches the square at `pose`."""
+    # Either a corner of the pad touches a side of the square, or a corner of the square touches the face of the pad.
+    # The square must be turned by less than 45 degrees.
     x, y, theta = pose.T
     cos, sin, turn = jnp.cos(theta), jnp.sin(theta), jnp.sign(theta)
     half, edge = tasks.SIDE / 2, PAD[0] / 2
@@ -76,38 +62,19 @@ def touching_jaw(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
 
 
 def openings(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1"]:
-    """Return the openings of each grasp, from the first touch to the end, m.
-
-    The excess over STRAIGHT_OPENING shrinks by the same factor in every step. The angle of the square goes with the
-    square root of that excess, so the square turns faster the straighter it is.
-
-    Args:
-        pose: Start poses of the square.
-        steps: Number of steps.
-    """
+    """Return the openings of each grasp, from the first touch to the end, m."""
+    # The excess over STRAIGHT_OPENING shrinks by the same factor in every step. The angle of the square goes with the
+    # square root of that excess, so the square turns faster the straighter it is.
     return opening_at(touching(pose)[:, None], jnp.linspace(0, 1, steps + 1, dtype=pose.dtype)[None])
 
 
 def opening_at(first: Float[Array, "..."], share: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the opening after a fraction of the steps.
-
-    Args:
-        first: Opening at which the grasp begins, m.
-        share: Fraction of the steps, from 0 to 1.
-
-    Returns:
-        Openings, m.
-    """
+    """Return the opening, m, after a fraction (0 to 1) of the steps of a grasp that begins at the opening `first`."""
     return STRAIGHT_OPENING + (first - STRAIGHT_OPENING) * (CLEARANCE / (first - STRAIGHT_OPENING)) ** share
 
 
 def paths(pose: Float[Array, "n 3"], steps: int) -> Float[Array, "n steps+1 4"]:
-    """Return the path of each grasp, as configurations of `Hand.two_fingers`.
-
-    Args:
-        pose: Start poses of the square.
-        steps: Number of steps.
-    """
+    """Return the path of each grasp, as configurations of `Hand.two_fingers`."""
     opening = openings(pose, steps)
     still = jnp.zeros_like(opening)
     return jnp.stack([still, still, still, opening], axis=-1)

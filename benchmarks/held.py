@@ -17,21 +17,12 @@ FINER = 256  # parts into which the step of a jam is divided to confirm it
 
 
 def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
-    """Find pushes that end GRASPED or JAMMED although the slider is not held.
-
-    GRASPED promises that every finger is within reach of the slider: within four times the largest displacement in the
-    step, or 1e-4 of the surface's length. A jam needs forces at the places in reach, inside their friction cones, that
-    balance each other and on which the hand does work. A linear program searches for them, for polygons only.
-
-    A hand that jams stops at the start of that step. If nothing holds the slider there yet, the step is repeated in
-    `FINER` parts. It has to jam in one of them, with such forces.
-
-    Args:
-        survey: The pushes.
-
-    Returns:
-        The number of each such push, and the reason.
-    """
+    """Return the index of each push that ends GRASPED or JAMMED although the slider is not held, and the reason."""
+    # GRASPED promises that every finger is within reach of the slider: within four times the largest displacement in
+    # the step, or 1e-4 of the surface's length. A jam needs forces at the places in reach, inside their friction cones,
+    # that balance each other and on which the hand does work. A linear program searches for them, for polygons only. A
+    # hand that jams stops at the start of that step. If nothing holds the slider there yet, the step is repeated in
+    # `FINER` parts. It has to jam in one of them, with such forces.
     status = survey.push.status[:, -1]
     ended = np.flatnonzero((status == pj.Status.GRASPED) | (status == pj.Status.JAMMED)).tolist()
     body, found = outline_of(survey.shape), []
@@ -80,30 +71,17 @@ def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: f
 
 
 class Disk(NamedTuple):
-    """A round finger in the body frame of the slider.
+    """A round finger in the body frame of the slider."""
 
-    Attributes:
-        center: Center, (2,), m.
-        radius: Radius, m.
-    """
-
-    center: np.ndarray
-    radius: float
+    center: np.ndarray  # (2,), m
+    radius: float  # m
 
     def away(self, body: shapely.Polygon) -> float:
         """Return the distance from the body, m; not more than -radius if the center lies inside the body."""
         return body.distance(shapely.Point(self.center)) - self.radius
 
     def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Find the edges and vertices of the body that are within reach.
-
-        Args:
-            body: Outline of the slider.
-            reach: Largest distance from the finger, m.
-
-        Returns:
-            For each of them the closest point, (2,), m, and the normal from there into the body, (2,).
-        """
+        """Return the closest point (2,), m, and inward normal (2,) of each edge and vertex of the body within reach."""
         found = []
         for a, b in pairwise(_ring(body)):
             length = np.linalg.norm(b - a)
@@ -140,15 +118,8 @@ def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list
 
 
 def _jams(body: shapely.Polygon, fingers: list[Disk | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:
-    """Return whether forces at the places in reach can balance each other while the fingers do work on them.
-
-    Args:
-        body: Outline of the slider.
-        fingers: Fingers and fixtures in the body frame.
-        steps: Displacements of the fingers in the body frame, (fingers, 2), m; fixtures have none.
-        mu: Friction coefficient, which limits the forces to their friction cones.
-        reach: Distance within which a place counts as a contact, m.
-    """
+    """Return whether forces at the places in reach can balance each other while the fingers do work on them."""
+    # steps: displacements of the fingers, (fingers, 2), m, body frame; the fixtures at the end of `fingers` have none
     wrenches, works = [], []
     still = np.zeros((len(fingers) - len(steps), 2))
     for finger, step in zip(fingers, np.concatenate([steps, still]), strict=True):

@@ -29,17 +29,11 @@ _ROUNDS = re.compile(r'known_trip_count":\{"n":"(\d+)"')
 
 
 class Traffic(NamedTuple):
-    """What one run of a program computes and moves.
+    """What one run of a program computes and moves."""
 
-    Attributes:
-        flops: Number of floating-point operations.
-        bytes: Number of bytes that its kernels read and write.
-        kernels: Number of different kernels.
-    """
-
-    flops: float
-    bytes: float
-    kernels: int
+    flops: float  # number of floating-point operations
+    bytes: float  # number that the kernels read and write
+    kernels: int  # number of different kernels
 
     def times(self, count: int) -> "Traffic":
         """Return the traffic of `count` runs."""
@@ -47,29 +41,18 @@ class Traffic(NamedTuple):
 
 
 class _Instruction(NamedTuple):
-    """One instruction of a computation, with the names of its operands and of the computations that it calls.
-
-    Attributes:
-        rounds: How often a loop runs, if the compiler knows it, else one.
-    """
+    """One instruction of a computation, with the names of its operands and of the computations that it calls."""
 
     root: bool
     shape: str
     opcode: str
     operands: tuple[str, ...]
     called: tuple[str, ...]
-    rounds: int
+    rounds: int  # how often a loop runs, if the compiler knows it, else one
 
 
 def traffic(text: str) -> Traffic:
-    """Count what a compiled program computes and moves.
-
-    Args:
-        text: Text of the program, from `Compiled.as_text()`.
-
-    Returns:
-        The traffic of one run.
-    """
+    """Count what one run of a compiled program computes and moves, given the text of `Compiled.as_text()`."""
     computations, entry = _parsed(text)
 
     @cache
@@ -109,10 +92,7 @@ def _of_one(each: _Instruction, operands: list[str]) -> int:
 
 
 def _of_kernel(inside: dict[str, _Instruction]) -> int:
-    """Return the bytes that a kernel moves.
-
-    Of an array that is only sliced, the slices are read; of one that is only updated, the updated part is written.
-    """
+    """Return the bytes that a kernel moves; an array that it only slices or updates counts with that part alone."""
     users: dict[str, list[tuple[int, _Instruction]]] = {}
     for each in inside.values():
         for place, operand in enumerate(each.operands):

@@ -24,15 +24,7 @@ UNKNOWNS = pj.Unknowns((0.0, 1.0), surface_dof=50, pressure_center=0.003, inset=
 
 
 def random_pushes(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[jax.Array, jax.Array]:
-    """Draw random pushes of the square.
-
-    Args:
-        rng: Generator of the pushes.
-        shape: Shape of the array of pushes.
-
-    Returns:
-        Start poses, (*shape, 3), and paths of the finger, (*shape, STEPS + 1, 2), in float32.
-    """
+    """Draw start poses (*shape, 3) and paths of the finger (*shape, STEPS + 1, 2), in float32."""
     pose = np.concatenate([rng.uniform(-0.1, 0.1, (*shape, 2)), rng.uniform(-3, 3, (*shape, 1))], axis=-1)
     side = pose[..., 2] + rng.integers(4, size=shape) * np.pi / 2
     along = side + rng.uniform(-0.6, 0.6, shape)

@@ -24,28 +24,14 @@ from pushjax.experiments._record import result_record
 
 def one_run(
     n: int,
-    steps: int,
-    checkpoint: str | None = None,
-    kill_after: int | None = None,
-    process: int = 0,
-    processes: int = 1,
-    port: int = 0,
+    steps: int,  # of each push
+    checkpoint: str | None = None,  # folder in which the run is kept
+    kill_after: int | None = None,  # number of pushes after which the process kills itself
+    process: int = 0,  # which of the processes this is
+    processes: int = 1,  # number of processes that share the run
+    port: int = 0,  # at which they meet
 ) -> dict[str, Any]:
-    """Do one run in this process.
-
-    Args:
-        n: Number of pushes.
-        steps: Number of steps of each.
-        checkpoint: Folder in which the run is kept.
-        kill_after: Number of pushes after which the process kills itself.
-        process: Which of the processes this is.
-        processes: Number of processes that share the run.
-        port: Port at which they meet.
-
-    Returns:
-        Seconds of the run, seconds of 2000 pushes (where the run is of one process and not kept), peak memory in MB, a
-        digest of every bit of the result, a digest of the friction that was drawn, and the number of failed pushes.
-    """
+    """Do one run in this process; return times, peak memory, digests of its results, and failures."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -76,9 +62,10 @@ def one_run(
             found.update(name.encode() + np.ascontiguousarray(value).tobytes())
     return {
         "run_s": result.seconds,
-        "run_s_of_2000": small,
+        "run_s_of_2000": small,  # 0 with several processes or a checkpoint
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "digest": found.hexdigest()[:12],
+        "digest": found.hexdigest()[:12],  # of every bit of the result
+        # of the random friction only
         "draws": hashlib.sha256(result.friction.tobytes() + result.shrinkage.tobytes()).hexdigest()[:12],
         "failed": int(result.outcomes()["failed"]),
     }

@@ -131,14 +131,7 @@ def judged(survey: Survey, steps: int) -> dict[str, Any]:
 
 
 def penetration_depths(survey: Survey) -> np.ndarray:
-    """Return the largest penetration depth of any finger or fixture at each pose, by shapely.
-
-    Args:
-        survey: The pushes.
-
-    Returns:
-        Depths, (starts, steps + 1), m.
-    """
+    """Return the largest penetration depth of any finger or fixture at each pose by shapely, (starts, steps + 1), m."""
     body = outline_of(survey.shape)
     shapely.prepare(body)
     edge = body.exterior
@@ -159,11 +152,9 @@ def penetration_depths(survey: Survey) -> np.ndarray:
 
 
 def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
-    """Return the penetration depths of pads with these corners, (…, corners, 2).
-
-    The depth is that of a corner of the body in the pad, or of the pad in the body. Where no corner lies in the other,
-    it is the width of their intersection.
-    """
+    """Return the penetration depths of pads with these corners, (…, corners, 2), m."""
+    # The depth is that of a corner of the body in the pad, or of the pad in the body. Where no corner lies in the
+    # other, it is the width of their intersection.
     shape = corners.shape[:-2]
     flat = corners.reshape(-1, *corners.shape[-2:])
     pads = np.asarray(shapely.polygons(flat))

@@ -30,21 +30,13 @@ LIMITS = {"free": (1.5, 1.0), "walls": (3.0, np.inf)}  # px and degrees
 
 
 class Recorded(NamedTuple):
-    """Episodes of gym-pusht.
+    """Episodes of gym-pusht."""
 
-    Attributes:
-        start: Rows as in its "state" observations, (episodes, 5).
-        actions: Actions, (steps, episodes, 2).
-        rows: Rows after each control step, (steps, episodes, 5).
-        coverage: Coverage after each control step, (steps, episodes).
-        at_wall: Whether the T has been within `REACH` of a wall, (episodes,).
-    """
-
-    start: np.ndarray
-    actions: np.ndarray
-    rows: np.ndarray
-    coverage: np.ndarray
-    at_wall: np.ndarray
+    start: np.ndarray  # rows as in its "state" observations, (episodes, 5)
+    actions: np.ndarray  # (steps, episodes, 2)
+    rows: np.ndarray  # after each control step, (steps, episodes, 5)
+    coverage: np.ndarray  # after each control step, (steps, episodes)
+    at_wall: np.ndarray  # whether the T has been within `REACH` of a wall, (episodes,)
 
 
 def run(
@@ -161,18 +153,8 @@ def _near_wall(env: Any) -> bool:
 
 @partial(jax.jit, static_argnums=0)
 def replayed(env: PushT, states: TaskState, actions: Array, params: Any) -> tuple[TaskState, Any]:
-    """Take the control steps of a batch of episodes, with automatic resets.
-
-    Args:
-        env: The environment.
-        states: States at the start.
-        actions: Actions, (steps, batch, 2).
-        params: Its parameters.
-
-    Returns:
-        The state after each control step, and all that `step` returned.
-    """
-    keys = jax.random.split(jax.random.key(0), actions.shape[:2])
+    """Take control steps of a batch with automatic resets; return each step's state and all that `step` returned."""
+    keys = jax.random.split(jax.random.key(0), actions.shape[:2])  # of actions (steps, batch, 2)
 
     def one_step(states: TaskState, at: tuple[Array, Array]):
         out = jax.vmap(env.step, in_axes=(0, 0, 0, None))(at[0], states, at[1], params)

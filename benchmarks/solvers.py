@@ -75,16 +75,7 @@ def run(
 
 
 def _one_contact(count: int, degree: int) -> dict[str, Any]:
-    """Compare the two solvers of a single contact.
-
-    Args:
-        count: Number of problems.
-        degree: Degree of the limit surface.
-
-    Returns:
-        Quantiles of the iterations of `HessianIteration`, the number of problems in which the two differ in the mode,
-        and the number that each does not solve.
-    """
+    """Return how the two solvers of a single contact differ, and the iterations of `HessianIteration`."""
     problems = jax.jit(jax.vmap(lambda key: random_contact_problem(key, degree=degree)))(
         jax.random.split(jax.random.key(degree), count)
     )

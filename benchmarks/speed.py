@@ -37,42 +37,22 @@ SAME = ("case", "dtype", "batch")  # rows that agree in these are compared with 
 def run(
     case: Sequence[str] = tuple(CASES),
     dtype: Sequence[str] = ("float32", "float64"),
-    batch: Sequence[int] | None = None,
+    batch: Sequence[int] | None = None,  # default: BATCH, or BATCHES for the cases named there
+    # That may be used (Linux); default: all. It must be set before JAX starts. With several cores, the threads that
+    # share a program wait for each other, so the cost per core has to be measured with 1.
     cores: int | None = None,
-    peers: bool = False,
-    baseline: Path | None = None,
-    seed: int = 0,
-    out: Path | None = None,
-    progress: ProgressCallback = no_progress,
-    keep: Callable[[dict[str, Any]], None] = lambda record: None,
+    peers: bool = False,  # also time the same work by other programs, and pushes with several numbers of steps
+    baseline: Path | None = None,  # file of an earlier record, made with the same number of cores
+    seed: int = 0,  # only for the settings of the record
+    out: Path | None = None,  # folder for a picture of pushes beside peers; default: no picture
+    progress: ProgressCallback = no_progress,  # called with the number of rows done and their total
+    keep: Callable[[dict[str, Any]], None] = lambda record: None,  # called with the record so far
 ) -> dict[str, Any]:
-    """Time the cases, with one row for each case, floating type and batch.
-
-    Args:
-        case: Names of cases.
-        dtype: Floating types.
-        batch: Sizes of the batch. Default: BATCH, or BATCHES for the cases named there.
-        cores: Number of CPU cores that may be used (Linux). It must be set before JAX starts. With several cores the
-            threads that share a program wait for each other, so the cost per core has to be measured with 1. Default:
-            all.
-        peers: Whether to time the same work by other programs, for the cases that have such (`peers.rows`). Pushes are
-            then also timed for several numbers of steps.
-        baseline: File of an earlier record, made with the same number of cores.
-        seed: Seed in the settings of the record.
-        out: Folder for a picture of pushes beside peers. Default: no picture.
-        progress: Called with the number of rows done and their total.
-        keep: Called with the record so far.
-
-    Returns:
-        The record. Each row has the time to compile and to run in seconds (wall and processor time, medians of up to
-        seven runs after a first one), steps in contact per second, what the compiler counts, and the cost of a step in
-        multiply-adds of one processor at its best. With a baseline, `slower` has the rows that cost more than SLOWER
-        times what they did there, both in units of the multiply-add kernel, and `new` those that are not in it.
-
-    Raises:
-        ValueError: If a batch is not positive, the cores do not exist, the peers are not installed or no case has any,
-            or the baseline is not a record.
-    """
+    """Time the cases, with one row for each case, floating type and batch."""
+    # A row has the time to compile and to run in s (wall and processor time, medians of up to seven runs after a first
+    # one), steps in contact per second, what the compiler counts, and the cost of a step in multiply-adds of one
+    # processor at its best. With a baseline, `slower` has the rows that cost more than SLOWER times what they did
+    # there, both in units of the multiply-add kernel, and `new` those that are not in it.
     for number in batch or ():
         if number < 1:
             raise ValueError(f"batch must be positive; got {number}")
@@ -158,7 +138,7 @@ def _figures(work: cases.Work, program: Program, mine: Timing, top: dict[str, fl
         "bytes_per_step": made and made.bytes / steps,
         "kernels": made and made.kernels,
         "near_copy_fraction": made and 1e-9 * made.bytes / mine.processor / top["near_copy_gbytes"],
-        # the cost of a step in multiply-adds, by which regressions are judged
+        # the cost of a step in multiply-adds, by which regressions are detected
         "multiply_adds_per_step": mine.processor / steps / multiply_add,
         "pose_error_mm": work.error_mm,
         "peer": None,
@@ -167,15 +147,7 @@ def _figures(work: cases.Work, program: Program, mine: Timing, top: dict[str, fl
 
 
 def read_baseline(path: Path, cores: int | None) -> dict[str, Any]:
-    """Read an earlier record of `run`.
-
-    Args:
-        path: File of the record.
-        cores: Number of cores with which it has to be made; None for all.
-
-    Raises:
-        ValueError: If the file has anything else, or a record made with another number of cores.
-    """
+    """Read an earlier record of `run`, or raise ValueError if it is not one made with this number of cores."""
     try:
         record = json.loads(path.read_text())
         if record["experiment"] != "bench" or not isinstance(record["rows"], list):
@@ -189,20 +161,8 @@ def read_baseline(path: Path, cores: int | None) -> dict[str, Any]:
 
 
 def slower(rows: list[dict[str, Any]], before: dict[str, Any]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Compare rows with those of an earlier record.
-
-    Costs are multiply-adds for one of the batch, so a row may take another number of steps than before.
-
-    Args:
-        rows: Rows.
-        before: The earlier record.
-
-    Returns:
-        The rows that cost more than SLOWER times what they did, and the rows that are not in the earlier record.
-
-    Raises:
-        ValueError: If none of the rows is in the earlier record.
-    """
+    """Return the rows that cost more than SLOWER times what they did before, and the rows that are new."""
+    # Costs are multiply-adds for one of the batch, so a row may take another number of steps than before.
 
     def name(row: dict[str, Any]) -> dict[str, Any]:
         return {key: row[key] for key in SAME}

@@ -82,7 +82,7 @@ def shape_of(name: str) -> pj.Polygon | pj.Curve | pj.Ellipse | pj.Disk:
 
 
 def outline_of(shape) -> shapely.Polygon:
-    """Return the outline as a polygon of shapely, which judges overlaps."""
+    """Return the outline as a polygon of shapely."""
     points = shape.vertices if isinstance(shape, pj.Polygon) else shape.boundary(FINE)
     return shapely.Polygon(np.asarray(points, float))
 
@@ -98,16 +98,7 @@ def hand_of(name: str) -> pj.Hand:
 
 
 def ends_of(name: str, rng: np.random.Generator, starts: int) -> np.ndarray:
-    """Return the first and the last configuration of each push.
-
-    Args:
-        name: Name of the hand.
-        rng: Generator of the pushes.
-        starts: Number of pushes.
-
-    Returns:
-        Configurations, (starts, 2, dof).
-    """
+    """Return the first and the last configuration of each push by the named hand, (starts, 2, dof)."""
     if name == "one":
         angle, aside = rng.uniform(-np.pi, np.pi, starts), rng.uniform(-0.04, 0.04, starts)
         along, across = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)
@@ -119,25 +110,15 @@ def ends_of(name: str, rng: np.random.Generator, starts: int) -> np.ndarray:
 
 
 class Survey(NamedTuple):
-    """The pushes of one outline by one hand, and their trajectories.
-
-    Attributes:
-        hand: The hand.
-        slider: The slider.
-        path: Configurations of the hand, (starts, steps + 1, dof).
-        pose: Start poses of the slider, (starts, 3).
-        friction: Friction coefficients, (starts,).
-        push: Trajectories, with a leading axis (starts,).
-        scene: Name of the fixtures.
-    """
+    """The pushes of one outline by one hand, and their trajectories."""
 
     hand: pj.Hand
     slider: pj.Slider
-    path: np.ndarray
-    pose: np.ndarray
-    friction: np.ndarray
-    push: pj.Trajectory
-    scene: str = "free"
+    path: np.ndarray  # configurations of the hand, (starts, steps + 1, dof)
+    pose: np.ndarray  # start poses of the slider, (starts, 3)
+    friction: np.ndarray  # coefficients, (starts,)
+    push: pj.Trajectory  # with a leading axis (starts,)
+    scene: str = "free"  # name of the fixtures
 
     @property
     def shape(self):
@@ -154,17 +135,7 @@ def surface_of(shape, key) -> pj.LimitSurface:
 def simulate(
     shape_name: str, hand_name: str, starts: int, steps: int, dtype, seed: int = 0, scene: str = "free"
 ) -> Survey:
-    """Simulate random pushes of one outline by one hand.
-
-    Args:
-        shape_name: One of `SHAPES`.
-        hand_name: One of `HANDS`.
-        starts: Number of pushes.
-        steps: Number of steps of each push.
-        dtype: Floating type.
-        seed: Seed of the pushes.
-        scene: One of `SCENES`.
-    """
+    """Simulate random pushes of one of `SHAPES` by one of `HANDS` in one of `SCENES`."""
     shape, hand = shape_of(shape_name), hand_of(hand_name)
     seeds = (seed, SHAPES.index(shape_name), HANDS.index(hand_name))
     rng = np.random.default_rng(seeds)
@@ -202,16 +173,9 @@ def rollout(slider, hand, path, pose, friction, scene="free") -> pj.Trajectory:
 
 
 def fixtures_seen_by_slider(scene: str, poses: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Return the place of each fixture in the body frame of the slider.
-
-    Args:
-        scene: Name of the fixtures.
-        poses: Poses of the slider, (..., 3).
-
-    Returns:
-        For each fixture a radius, m, and its center, (..., 1, 2); for a rectangle, or a wall as a rectangle of 2 m by
-        1 m, zero and the corners, (..., 4, 2), m.
-    """
+    """Return the radius and place of each fixture in the body frame of the slider, at poses (..., 3)."""
+    # A disk has its radius, m, and its center, (..., 1, 2). A rectangle, or a wall as a rectangle of 2 m by 1 m, has
+    # zero and its corners, (..., 4, 2), m.
     c, s = np.cos(poses[..., None, 2]), np.sin(poses[..., None, 2])
     found = []
     for kind, first, second in SCENES[scene]:
@@ -232,19 +196,7 @@ def fixtures_seen_by_slider(scene: str, poses: np.ndarray) -> list[tuple[float, 
 
 
 def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
-    """Return the place of each finger in the body frame of the slider.
-
-    Args:
-        hand: The hand.
-        poses: Poses of the slider, (..., 3).
-        configurations: Configurations of the hand, (..., dof).
-
-    Returns:
-        For each finger its center, (..., 1, 2), or the corners of a pad, (..., corners, 2), m.
-
-    Raises:
-        TypeError: If a finger is neither a `RoundFinger` nor a `Pad`.
-    """
+    """Return the center of each finger or the corners of a pad, (..., points, 2), m, in the slider's body frame."""
     where = np.asarray(hand.poses(jnp.asarray(configurations)), float)
     c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
     found = []

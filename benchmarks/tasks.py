@@ -24,13 +24,7 @@ STEPS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64)
 
 
 class Task(NamedTuple):
-    """Slider, hand and start pose of a push, all in one floating type.
-
-    Attributes:
-        slider: The slider.
-        hand: The hand.
-        pose: Start pose of the slider.
-    """
+    """Slider, hand and start pose of a push, all in one floating type."""
 
     slider: pj.Slider
     hand: pj.Hand
@@ -68,16 +62,8 @@ def cast(tree: Any, dtype: str) -> Any:
 
 
 def paths(offset: Float[Array, "n"], angle: Float[Array, "n"], steps: int) -> Float[Array, "n steps+1 2"]:
-    """Return the paths of tips that touch the side x = -SIDE / 2 at the start.
-
-    Args:
-        offset: Distances of the start from the middle of the side, along y, m.
-        angle: Angles of the paths from the inward normal of the side, rad.
-        steps: Number of steps.
-
-    Returns:
-        Paths of the tip's center, m.
-    """
+    """Return the paths (m) of the centers of tips that touch the side x = -SIDE / 2 at the start."""
+    # offset: of the start from the middle of the side, along y, m; angle: of the path from the inward normal, rad
     start = jnp.stack([jnp.full_like(offset, -SIDE / 2 - RADIUS), offset], axis=-1)
     along = TRAVEL * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
     share = jnp.linspace(0, 1, steps + 1, dtype=offset.dtype)
@@ -119,16 +105,7 @@ def reference(model: str) -> np.ndarray:
 
 
 def error_mm(pose: np.ndarray, other: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """Return the error of poses: the larger of the distance and of `length` times the angle between two poses.
-
-    Args:
-        pose: Poses, (n, 3).
-        other: Poses that they are compared with, (n, 3).
-        length: Length that makes angles commensurate with positions, m.
-
-    Returns:
-        Errors, (n,), mm.
-    """
+    """Return the larger of the distance and of `length` times the angle between poses (n, 3), as errors (n,), mm."""
     apart = np.abs(pose - other)
     return 1e3 * np.maximum(np.hypot(apart[:, 0], apart[:, 1]), length * apart[:, 2])
 
@@ -142,15 +119,7 @@ def errors(model: str, dtype: str) -> dict[int, float]:
 
 
 def fewest_steps(by_steps: dict[int, float], allowed_mm: float = ALLOWED_MM) -> int:
-    """Return the fewest steps from which on the error stays within what is allowed.
-
-    Args:
-        by_steps: Errors by number of steps, mm.
-        allowed_mm: Largest error that is allowed, mm.
-
-    Raises:
-        ValueError: If no number of steps comes within it.
-    """
+    """Return the fewest steps from which on the error stays at most `allowed_mm`, or raise ValueError."""
     fine = [steps for steps in by_steps if all(e <= allowed_mm for n, e in by_steps.items() if n >= steps)]
     if not fine:
         raise ValueError(f"no number of steps up to {max(by_steps)} comes within {allowed_mm} mm")

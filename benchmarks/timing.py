@@ -24,21 +24,13 @@ CHAINS, LINKS, ROUNDS = 8, 16, 200  # size of the FMA kernel, which is compute-b
 
 
 class Sizes(NamedTuple):
-    """Sizes of the kernels of `Ceiling`.
+    """Sizes of the kernels of `Ceiling`."""
 
-    Attributes:
-        lanes: Number of lanes of the FMA kernel.
-        copied: Count of numbers that exceeds every cache.
-        passes: How often they are copied.
-        near: Count of numbers that fits the second-level cache.
-        near_passes: How often these are copied.
-    """
-
-    lanes: int
-    copied: int
-    passes: int
-    near: int
-    near_passes: int
+    lanes: int  # of the FMA kernel
+    copied: int  # count of numbers that exceeds every cache
+    passes: int  # how often they are copied
+    near: int  # count of numbers that fits the second-level cache
+    near_passes: int  # how often these are copied
 
 
 # On a CPU the lanes fit the first-level cache, and the second-level cache also holds the data of a tile of pushes.
@@ -49,19 +41,12 @@ ACCELERATOR = Sizes(lanes=1 << 22, copied=1 << 28, passes=20, near=1 << 22, near
 
 
 class Program(NamedTuple):
-    """A compiled program with its arguments.
-
-    Attributes:
-        call: The program.
-        args: Its arguments.
-        compile_s: Time to trace and compile, in s.
-        traffic: What one run computes and moves, or None if there is not one program with a text.
-    """
+    """A compiled program with its arguments."""
 
     call: Callable
     args: tuple
-    compile_s: float
-    traffic: Traffic | None
+    compile_s: float  # time to trace and compile
+    traffic: Traffic | None  # of one run, or None if there is not one program with a text
 
     def run(self) -> Any:
         """Run the program, and return its results when they are ready."""
@@ -69,32 +54,20 @@ class Program(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """Times of one run, in s.
+    """Times of one run, in s."""
 
-    Attributes:
-        median: Median of the wall time.
-        low: Lower quartile of the wall time.
-        high: Upper quartile of the wall time.
-        processor: Median of the processor time of all threads of the process, which other programs on the machine
-            change least. On an accelerator it is the median of the wall time.
-    """
-
-    median: float
-    low: float
-    high: float
+    median: float  # wall time
+    low: float  # lower quartile of the wall time
+    high: float  # upper quartile of the wall time
+    # Median of the processor time of all threads of the process, which other programs on the machine change least. On
+    # an accelerator it is the median of the wall time.
     processor: float
 
 
 def compiled(function: Callable, *args: Any) -> Program:
-    """Trace and compile `jit(function)` for these arguments.
-
-    If the process has a cache of compiled programs, the program may be loaded from there; the command turns the cache
-    off.
-
-    Args:
-        function: Function to compile.
-        args: Its arguments.
-    """
+    """Trace and compile `jit(function)` for these arguments."""
+    # If the process has a cache of compiled programs, the program may be loaded from there; the command turns the cache
+    # off.
     begin = time.perf_counter()
     call = jax.jit(function).lower(*args).compile()
     compile_s = time.perf_counter() - begin
@@ -103,14 +76,7 @@ def compiled(function: Callable, *args: Any) -> Program:
 
 
 def called(function: Callable, *args: Any) -> Program:
-    """Return a program for a function that compiles by itself, as far as it does.
-
-    Its `compile_s` is the time of the first call less that of the second.
-
-    Args:
-        function: Function to call.
-        args: Its arguments.
-    """
+    """Call a function that compiles by itself; `compile_s` is the time of the first call less that of the second."""
     begin = time.perf_counter()
     jax.block_until_ready(function(*args))
     middle = time.perf_counter()
@@ -122,19 +88,10 @@ def called(function: Callable, *args: Any) -> Program:
 def alternate(
     programs: dict[str, Callable[[], Any]], repeats: int = REPEATS, most_s: float = math.inf
 ) -> dict[str, Timing]:
-    """Time programs that are run in turns, so that a slow spell of the machine meets all of them.
-
-    In each turn a program first runs once without being timed, because the program before it has left its own data in
-    the caches. A short program then runs several times.
-
-    Args:
-        programs: Programs by name.
-        repeats: Number of turns.
-        most_s: Largest time of all turns together, in s. If necessary, there are fewer turns, but at least one.
-
-    Returns:
-        Timings by name.
-    """
+    """Time programs that are run in turns, so that a slow spell of the machine meets all of them."""
+    # In each turn a program first runs once without being timed, because the program before it has left its own data in
+    # the caches. A short program then runs several times. If `most_s` (s, of all turns together) requires it, there are
+    # fewer turns, but at least one.
     once = {name: max(_seconds(run)[0], 1e-9) for name, run in programs.items()}
     counts = {name: max(1, round(LEAST_S / seconds)) for name, seconds in once.items()}
     turn = sum(seconds * (counts[name] + 1) for name, seconds in once.items())
@@ -167,10 +124,8 @@ def on_cpu() -> bool:
 
 @contextmanager
 def both_dtypes() -> Iterator[None]:
-    """Allow float64 within the context, whatever the process has set.
-
-    The library computes in the dtype of its arguments, so float32 is still possible.
-    """
+    """Allow float64 within the context, whatever the process has set."""
+    # The library computes in the dtype of its arguments, so float32 is still possible.
     before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_x64", True)
     try:
@@ -185,19 +140,12 @@ def sizes() -> Sizes:
 
 
 class Ceiling(NamedTuple):
-    """Kernels that compute and move data as fast as the machine can.
+    """Kernels that compute and move data as fast as the machine can."""
 
-    Attributes:
-        multiply_add: The FMA kernel.
-        flops: Number of floating-point operations in one run of it.
-        copied: Copy of data that fits no cache.
-        near: Copy of data that fits the second-level cache.
-    """
-
-    multiply_add: Program
-    flops: float
-    copied: Program
-    near: Program
+    multiply_add: Program  # FMA kernel
+    flops: float  # floating-point operations in one run of it
+    copied: Program  # copy of data that fits no cache
+    near: Program  # copy of data that fits the second-level cache
 
     def runs(self) -> dict[str, Callable[[], Any]]:
         """Return the kernels by name, as `alternate` takes them."""
@@ -232,13 +180,7 @@ def ceiling(dtype: str) -> Ceiling:
 
 
 def rates(top: Ceiling, dtype: str, timings: dict[str, Timing]) -> dict[str, float]:
-    """Return the ceilings of one processor, in GFLOP/s and GB/s (read and written).
-
-    Args:
-        top: The kernels.
-        dtype: Their floating type.
-        timings: Timings of `Ceiling.runs`.
-    """
+    """Return the ceilings of one processor, in GFLOP/s and GB/s (read and written), from timings of `Ceiling.runs`."""
     each, size = 2e-9 * jnp.dtype(dtype).itemsize, sizes()
     return {
         "multiply_add_gflops": top.flops / timings["multiply_add"].processor / 1e9,

@@ -32,25 +32,15 @@ RESIDUAL = 1e-6  # largest error of the equations at which a problem counts as s
 
 
 class Fitted(NamedTuple):
-    """Results of the fits.
+    """Results of the fits."""
 
-    Attributes:
-        loss: Loss of each set of pairs, (sets,), as in `pushjax.friction.fit.FitReport`.
-        steps: Number of steps of each fit, (sets,).
-        processor: CPU time of all fits together, s, without compiling.
-    """
-
-    loss: np.ndarray
-    steps: np.ndarray
-    processor: float
+    loss: np.ndarray  # of each set of pairs, (sets,), as in `pushjax.friction.fit.FitReport`
+    steps: np.ndarray  # number of steps of each fit, (sets,)
+    processor: float  # CPU time of all fits together, s, without compiling
 
 
 def jaxopt() -> Any:
-    """Import and return the package jaxopt.
-
-    Raises:
-        ValueError: If it is not installed.
-    """
+    """Import and return the package jaxopt, or raise ValueError if it is not installed."""
     try:
         with warnings.catch_warnings():
             # jaxopt warns on import that it is no longer maintained, which whoever measures it knows
@@ -62,20 +52,8 @@ def jaxopt() -> Any:
 
 
 def fit(wrench: np.ndarray, twist: np.ndarray, length: np.ndarray, degree: int) -> Fitted:
-    """Fit a limit surface to each set of pairs, all sets in one batch.
-
-    Args:
-        wrench: Wrenches, (sets, pairs, 3), in SI units.
-        twist: Twists, (sets, pairs, 3), in SI units.
-        length: Characteristic lengths, (sets,), m.
-        degree: 2 for ellipsoids, 4 for quartics.
-
-    Returns:
-        The losses, the numbers of steps, and the CPU time.
-
-    Raises:
-        ValueError: If jaxopt is not installed.
-    """
+    """Fit a limit surface to each set of pairs, all sets in one batch."""
+    # wrench and twist: (sets, pairs, 3), SI units; length: (sets,), m; degree: 2 for ellipsoids, 4 for quartics
     search = _fits(degree)
     jax.block_until_ready(search(*_quadratics(wrench, twist, length, degree)))  # compiles at the first call
     busy = time.process_time()
@@ -84,19 +62,8 @@ def fit(wrench: np.ndarray, twist: np.ndarray, length: np.ndarray, degree: int) 
 
 
 def solve(coefficients, length, problems) -> contacts.Solved:
-    """Solve a batch of contact problems, all at once.
-
-    Args:
-        coefficients: Coefficients of the quartic limit surfaces, (n, 15).
-        length: Their characteristic lengths, (n,), m.
-        problems: Batched `pj.Contacts` of shape (n, contacts, ...). All contacts must be active.
-
-    Returns:
-        The twists and the CPU time, without compiling.
-
-    Raises:
-        ValueError: If jaxopt is not installed.
-    """
+    """Solve a batch of contact problems, all at once."""
+    # coefficients: of quartics, (n, 15); length: (n,), m; problems: batched `pj.Contacts`, all contacts active
     point = jnp.asarray(problems.point)
     friction, gap = (jnp.broadcast_to(jnp.asarray(part), point.shape[:2]) for part in (problems.friction, problems.gap))
     args = jnp.asarray(coefficients), jnp.asarray(length), point, problems.normal, problems.displacement, friction, gap
@@ -109,15 +76,7 @@ def solve(coefficients, length, problems) -> contacts.Solved:
 
 
 def nearest_in_cone(force, friction):
-    """Return the nearest force in the friction cone.
-
-    Args:
-        force: Normal and tangential force, (2,).
-        friction: Coefficient of friction.
-
-    Returns:
-        The force, (2,): its normal part is not negative, its tangential part at most friction times that.
-    """
+    """Return the projection of a force (normal, tangential), (2,), onto the friction cone."""
     normal, tangential = force[0], jnp.abs(force[1])
     along = jnp.maximum((normal + friction * tangential) / (1 + friction**2), 0.0)
     inside = tangential <= friction * normal
@@ -178,19 +137,12 @@ def _contacts():
 
 
 class _Problem(NamedTuple):
-    """One contact problem without units, as `contacts.Problem`.
+    """One contact problem without units, as `contacts.Problem`."""
 
-    Attributes:
-        curvature: Second derivatives of the quartic, (9, 9): see `contacts.CURVATURE`.
-        rows: Wrenches of unit normal and tangential forces, (contacts, 2, 3).
-        away: Displacements of the hand along the same directions, the first less the gap, (contacts, 2).
-        friction: Coefficients of friction, (contacts,).
-    """
-
-    curvature: jax.Array
-    rows: jax.Array
-    away: jax.Array
-    friction: jax.Array
+    curvature: jax.Array  # second derivatives of the quartic, (9, 9): see `contacts.CURVATURE`
+    rows: jax.Array  # wrenches of unit normal and tangential forces, (contacts, 2, 3)
+    away: jax.Array  # displacements of the hand along the same directions, the first less the gap, (contacts, 2)
+    friction: jax.Array  # coefficients of friction, (contacts,)
 
 
 def _without_units(coefficients, length, point, normal, displacement, friction, gap) -> tuple[_Problem, jax.Array]:
@@ -204,12 +156,8 @@ def _without_units(coefficients, length, point, normal, displacement, friction, 
 
 
 def _residual(force, problem: _Problem):
-    """Return the residual of the equations, (contacts, 2), and the twist without units, (3,).
-
-    Args:
-        force: Normal and tangential force of each contact, (contacts, 2).
-        problem: The contact problem.
-    """
+    """Return the residual of the equations, (contacts, 2), and the twist without units, (3,)."""
+    # force: normal and tangential force of each contact, (contacts, 2)
     wrench = jnp.einsum("ca,cax->x", force, problem.rows)
     twist = (problem.curvature @ jnp.outer(wrench, wrench).ravel()).reshape(3, 3) @ wrench / 3
     motion = problem.rows @ twist - problem.away

@@ -23,15 +23,10 @@ CURVATURE = np.stack([gram(unit, 4).reshape(9, 9) for unit in np.eye(15)], axis=
 
 
 class Solved(NamedTuple):
-    """Solutions of a batch of contact problems.
+    """Solutions of a batch of contact problems."""
 
-    Attributes:
-        twist: Twists, (n, 3), body frame. NaN where no solution was found.
-        processor: CPU time of all problems together, s.
-    """
-
-    twist: np.ndarray
-    processor: float
+    twist: np.ndarray  # (n, 3), body frame; NaN where no solution was found
+    processor: float  # CPU time of all problems together, s
 
     @property
     def found(self) -> np.ndarray:
@@ -40,18 +35,8 @@ class Solved(NamedTuple):
 
 
 def solve(coefficients, length, contacts, starts: int = STARTS, seed: int = 0) -> Solved:
-    """Solve a batch of contact problems, one after another.
-
-    Args:
-        coefficients: Coefficients of the quartic limit surfaces, (n, 15).
-        length: Their characteristic lengths, (n,), m.
-        contacts: Batched `pj.Contacts` of shape (n, contacts, ...). All contacts must be active.
-        starts: Number of random starts after which a problem is given up.
-        seed: Seed of the random starts.
-
-    Returns:
-        The twists and the CPU time.
-    """
+    """Solve a batch of contact problems, one after another, each from at most `starts` random starts."""
+    # coefficients: of quartics, (n, 15); length: (n,), m; contacts: batched `pj.Contacts`, all active
     parts = [np.asarray(part, float) for part in (contacts.point, contacts.normal, contacts.displacement)]
     for scalar in (contacts.friction, contacts.gap):
         parts.append(np.broadcast_to(np.asarray(scalar, float), parts[0].shape[:2]))
@@ -82,26 +67,15 @@ class Problem:
         self.curvature = CURVATURE @ coefficients
 
     def twist(self, force):
-        """Return the scaled twist and its derivative by the forces.
-
-        H is homogeneous of degree 4, so its gradient is its Hessian times F / 3.
-
-        Args:
-            force: Normal forces, then tangential forces, (2 contacts,).
-
-        Returns:
-            The twist, (3,), and its Jacobian, (3, 2 contacts).
-        """
+        """Return the scaled twist, (3,), and its derivative by the forces, (3, 2 contacts)."""
+        # The forces, (2 contacts,), are first all normal, then all tangential ones. H is homogeneous of degree 4, so
+        # its gradient is its Hessian times F / 3.
         wrench = force @ self.rows
         hessian = (self.curvature @ np.outer(wrench, wrench).ravel()).reshape(3, 3)
         return hessian @ wrench / 3, hessian @ self.rows.T
 
     def residual(self, force):
-        """Return the residual of the equations, (2 contacts,), and its Jacobian, (2 contacts, 2 contacts).
-
-        Args:
-            force: Normal forces, then tangential forces, (2 contacts,).
-        """
+        """Return the residual of the equations, (2 contacts,), and its Jacobian, for forces as in `twist`."""
         m = self.m
         v, by_force = self.twist(force)
         motion, slope = self.rows @ v - self.away, self.rows @ by_force
@@ -118,15 +92,7 @@ class Problem:
         return left, np.concatenate([upper, np.where(sticks[:, None], slope[m:], sliding)])
 
     def root(self, rng, starts: int):
-        """Search for a solution from random starts.
-
-        Args:
-            rng: Source of the random starts.
-            starts: Number of starts after which the search gives up.
-
-        Returns:
-            The twist, (3,), in SI units, or None if no start led to a solution.
-        """
+        """Return the twist, (3,), in SI units, of a solution found from random starts, or None if there is none."""
         from scipy.optimize import root
 
         for _ in range(starts):

@@ -19,45 +19,23 @@ ITERATIONS = 60
 
 
 def loads(supports: np.ndarray) -> np.ndarray:
-    """Return the share of the load that each support carries, with the weight above the origin.
-
-    For three supports, statics determines the loads. For more, they are as even as statics allows, which corresponds to
-    supports of equal stiffness.
-
-    Args:
-        supports: Positions of the supports, (points, 2), m, body frame.
-
-    Returns:
-        Shares of the load, (points,).
-    """
+    """Return the share of the load on each support, (points,), with the weight above the origin."""
+    # For three supports, statics determines the loads. For more, the solution of least norm is as even as statics
+    # allows, which corresponds to supports of equal stiffness.
     balance = np.vstack([np.ones(len(supports)), supports.T])
     return np.linalg.lstsq(balance, np.array([1.0, 0.0, 0.0]), rcond=None)[0]
 
 
 def push(
-    supports: np.ndarray,
-    start: np.ndarray,
-    end: np.ndarray,
-    friction: float = 0.25,
-    side: float = 0.09,
-    radius: float = 0.00475,
+    supports: np.ndarray,  # (points, 2), m, body frame
+    start: np.ndarray,  # of the tip's center, (2,), m
+    end: np.ndarray,  # of the tip's center, (2,), m
+    friction: float = 0.25,  # coefficient between tip and square
+    side: float = 0.09,  # m
+    radius: float = 0.00475,  # m; not used: on a straight side the result does not depend on it
     steps: int = STEPS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Push a square that starts at pose zero, by a round tip on its left side that moves in a straight line.
-
-    Args:
-        supports: Positions of the supports, (points, 2), m, body frame.
-        start: Position of the tip's center at the start, (2,), m.
-        end: Position of the tip's center at the end, (2,), m.
-        friction: Coefficient of friction between tip and square.
-        side: Side of the square, m.
-        radius: Radius of the tip, m. Not used: on a straight side the result does not depend on it.
-        steps: Number of steps.
-
-    Returns:
-        The final pose, (3,), m and rad, and the mode of the contact at each step, (steps,): 0 where it sticks,
-        otherwise the sign of the tangential force.
-    """
+    """Push a square from pose zero, by a round tip on its left side that moves in a straight line."""
     points, limit = np.asarray(supports, float), loads(np.asarray(supports, float))
     tip, step, pose = np.array(start, float), (np.array(end) - start) / steps, np.zeros(3)
     modes = np.zeros(steps, int)
@@ -74,7 +52,7 @@ def push(
         first, modes[k] = moved(tip, pose)
         pose = pose + moved(tip + step / 2, pose + first / 2)[0]
         tip = tip + step
-    return pose, modes
+    return pose, modes  # (3,), m and rad; (steps,), 0 where the contact sticks, else the sign of the tangential force
 
 
 def _twist(points, limit, contact, velocity, friction: float) -> tuple[np.ndarray, int]:
@@ -91,11 +69,7 @@ def _twist(points, limit, contact, velocity, friction: float) -> tuple[np.ndarra
 
 
 def _least(points, limit, rows, values) -> tuple[np.ndarray, np.ndarray]:
-    """Minimize the dissipation over twists V with rows V = values, by Newton's method with a line search.
-
-    Returns:
-        The twist, (3,), and its wrench, (3,).
-    """
+    """Return the twist V, (3,), of least dissipation with rows V = values, and its wrench, (3,), by Newton's method."""
     twist, free = np.linalg.lstsq(rows, values, rcond=None)[0], np.linalg.svd(rows)[2][len(rows) :].T
     for rounding in ROUNDING:
         for _ in range(ITERATIONS):

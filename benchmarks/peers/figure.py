@@ -9,15 +9,7 @@ from pushjax.plot.style import STYLE, curve_styles
 
 
 def speed_figure(curves: Mapping[str, Sequence[tuple[float, float]]], allowed_mm: float) -> Figure:
-    """Plot the time of a push against the error of its final pose, with a dashed line at the error that is allowed.
-
-    Args:
-        curves: For each name, points of CPU time per push (s) and error (mm).
-        allowed_mm: The error that is allowed, mm.
-
-    Returns:
-        The figure.
-    """
+    """Plot the time of a push (s) against the error of its final pose (mm), with a line at the allowed error."""
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(6.8, 3.8), layout="constrained")
         for name, points, look in curve_styles(curves):

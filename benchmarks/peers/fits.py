@@ -21,35 +21,18 @@ from pushjax.friction.quartic import MONOMIALS
 
 
 class Fitted(NamedTuple):
-    """Results of the fits.
+    """Results of the fits."""
 
-    Attributes:
-        loss: Loss of each set of pairs, (sets,), as in `pushjax.friction.fit.FitReport`.
-        clipped: Number of pairs, over all sets, whose scale came out negative. If there are any, the program is not the
-            one that `pushjax.friction.fit` solves.
-        processor: CPU time of all fits together, s, without building the program.
-    """
-
-    loss: np.ndarray
+    loss: np.ndarray  # of each set of pairs, (sets,), as in `pushjax.friction.fit.FitReport`
+    # Number of pairs, over all sets, whose scale came out negative. If there are any, the program is not the one that
+    # `pushjax.friction.fit` solves.
     clipped: int
-    processor: float
+    processor: float  # CPU time of all fits together, s, without building the program
 
 
 def fit(wrench: np.ndarray, twist: np.ndarray, length: np.ndarray, degree: int) -> Fitted:
-    """Fit a limit surface to each set of pairs.
-
-    Args:
-        wrench: Wrenches, (sets, pairs, 3), in SI units.
-        twist: Twists, (sets, pairs, 3), in SI units.
-        length: Characteristic lengths, (sets,), m.
-        degree: 2 for ellipsoids, 4 for quartics.
-
-    Returns:
-        The losses, the number of negative scales, and the CPU time.
-
-    Raises:
-        ValueError: If cvxpy is not installed.
-    """
+    """Fit a limit surface to each set of pairs, one after another."""
+    # wrench and twist: (sets, pairs, 3), SI units; length: (sets,), m; degree: 2 for ellipsoids, 4 for quartics
     program = Program(degree)
     program.solve(*quadratic(wrench[0], twist[0], float(length[0]), degree)[:2])  # compiles at the first solve
     losses, clipped = [], 0
@@ -63,11 +46,7 @@ def fit(wrench: np.ndarray, twist: np.ndarray, length: np.ndarray, degree: int) 
 
 
 def cvxpy() -> Any:
-    """Import and return the package cvxpy.
-
-    Raises:
-        ValueError: If it is not installed.
-    """
+    """Import and return the package cvxpy, or raise ValueError if it is not installed."""
     try:
         import cvxpy
     except ImportError as missing:
@@ -76,11 +55,7 @@ def cvxpy() -> Any:
 
 
 class Program:
-    """The convex program: minimize |factor a|^2 - 2 slope . a over the coefficients `a` of convex surfaces.
-
-    Args:
-        degree: 2 for ellipsoids, 4 for quartics.
-    """
+    """The convex program: minimize |factor a|^2 - 2 slope . a over the coefficients `a` of convex surfaces."""
 
     def __init__(self, degree: int):
         cp = cvxpy()
@@ -107,20 +82,10 @@ def monomials(degree: int) -> np.ndarray:
 
 
 def quadratic(wrench, twist, length: float, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the loss of `pushjax.friction.fit` at the optimal scales s_i, as a quadratic function of the coefficients.
-
-    The loss is |factor a|^2 - 2 slope . a + constant, where a is the vector of the n coefficients.
-
-    Args:
-        wrench: Wrenches, (pairs, 3), in SI units.
-        twist: Twists, (pairs, 3), in SI units.
-        length: Characteristic length, m.
-        degree: 2 for ellipsoids, 4 for quartics.
-
-    Returns:
-        `factor`, (n, n); `slope`, (n,); and a matrix, (pairs, n), whose product with a gives the scales
-        s_i = grad H(F_i) . V_i.
-    """
+    """Return the loss of `pushjax.friction.fit` at the optimal scales s_i, as a quadratic of the n coefficients a."""
+    # The loss is |factor a|^2 - 2 slope . a + constant. Returned are factor, (n, n), slope, (n,), and a matrix, (pairs,
+    # n), whose product with a gives the scales s_i = grad H(F_i) . V_i. Wrenches and twists, (pairs, 3), are in SI
+    # units.
     powers = monomials(degree)
     f, v = wrench / [1, 1, length], twist * [1, 1, length]
     f, v = f / np.mean(np.linalg.norm(f, axis=1)), v / np.linalg.norm(v, axis=1, keepdims=True)
@@ -136,17 +101,9 @@ def quadratic(wrench, twist, length: float, degree: int) -> tuple[np.ndarray, np
 
 
 def gram(a: np.ndarray, degree: int) -> np.ndarray:
-    """Return the Hessian of H as a symmetric tensor, a form in y = z (x) F.
-
-    Its first two indices are those of the second derivative. The rest are those of the products of F that remain.
-
-    Args:
-        a: Coefficients of H, (n,).
-        degree: 2 for ellipsoids, 4 for quartics.
-
-    Returns:
-        The tensor, (3, 3) for degree 2, (3, 3, 3, 3) for degree 4.
-    """
+    """Return the Hessian of H, given its n coefficients, as a symmetric tensor, (3, 3) or (3, 3, 3, 3)."""
+    # It is a form in y = z (x) F. Its first two indices are those of the second derivative, the rest those of the
+    # products of F that remain.
     tensor = np.zeros((3,) * degree)
     for index in np.ndindex(*tensor.shape):
         counts = np.bincount(index, minlength=3)
@@ -162,11 +119,9 @@ def gram(a: np.ndarray, degree: int) -> np.ndarray:
 
 
 def _classes(basis: np.ndarray, degree: int):
-    """Return the linear conditions that tie the positive semidefinite matrix to the coefficients `a`.
-
-    Each condition is a pair: entries of the matrix, and a row. The sum of the entries is the coefficient of one
-    monomial of the form, z_i z_j or z_i z_j F_k F_l. The product of the row with `a` is the same coefficient.
-    """
+    """Return the linear conditions that tie the positive semidefinite matrix to the coefficients `a`."""
+    # Each condition is a pair: entries of the matrix, and a row. The sum of the entries is the coefficient of one
+    # monomial of the form, z_i z_j or z_i z_j F_k F_l. The product of the row with `a` is the same coefficient.
     if degree == 2:
         return [([(i, j)], basis[i, j]) for i in range(3) for j in range(i, 3)]
     found = []

@@ -39,53 +39,28 @@ TIMESTEPS = (0.000625, 0.00125, 0.0025, 0.0035, 0.005, 0.006, 0.007, 0.0085, 0.0
 
 @dataclass(frozen=True)
 class Fingers:
-    """Parameters of the two fingers.
+    """Parameters of the two fingers."""
 
-    Attributes:
-        normal: Time constant of a finger's normal contact, s, as in `Settings`.
-        sliding: Time constant of a finger's friction, s, as in `Settings`.
-        impedance: Least and greatest impedance of a finger's contact, as in `Settings`.
-        mass: Mass of a finger, kg.
-        stiffness: Stiffness of the spring that moves a finger, N/m.
-        lead: Number of timesteps by which the spring's rest position is ahead.
-        speed: Speed of each finger, m/s.
-    """
-
-    normal: float = 0.0075
-    sliding: float = 0.050
-    impedance: tuple[float, float] = (0.98, 0.98)
-    mass: float = 1.0
-    stiffness: float = 1e8
-    lead: float = 0.75
-    speed: float = 0.007
+    normal: float = 0.0075  # time constant of a finger's normal contact, s, as in `Settings`
+    sliding: float = 0.050  # time constant of a finger's friction, s, as in `Settings`
+    impedance: tuple[float, float] = (0.98, 0.98)  # least and greatest, of a finger's contact, as in `Settings`
+    mass: float = 1.0  # of a finger, kg
+    stiffness: float = 1e8  # of the spring that moves a finger, N/m
+    lead: float = 0.75  # number of timesteps by which the spring's rest position is ahead
+    speed: float = 0.007  # of each finger, m/s
 
 
 class Grasped(NamedTuple):
-    """Results of the grasps.
+    """Results of the grasps."""
 
-    Attributes:
-        pose: Final poses of the square, (n, 3), m and rad.
-        processor: CPU time of all grasps together, s.
-    """
-
-    pose: np.ndarray
-    processor: float
+    pose: np.ndarray  # final poses of the square, (n, 3), m and rad
+    processor: float  # CPU time of all grasps together, s
 
 
 def build(scene: Scene, settings: Settings, fingers: Fingers, timestep: float) -> Any:
-    """Build the MjModel of a grasp, in the world frame of `benchmarks.grasps`.
-
-    Its qpos holds the slider's free joint (7 numbers), then the position of each finger along its direction of closing.
-
-    Args:
-        scene: The slider and its supports.
-        settings: How MuJoCo computes, and the contacts of the supports.
-        fingers: The fingers and their contacts.
-        timestep: Timestep, s.
-
-    Returns:
-        The MjModel.
-    """
+    """Build the MjModel of a grasp, in the world frame of `benchmarks.grasps`."""
+    # Its qpos holds the slider's free joint (7 numbers), then the position of each finger along its direction of
+    # closing.
     contact = scene.friction_tip, fingers.normal, fingers.sliding, fingers.impedance
     body, mesh = slider_body(scene)
     ways = {"lower": 1, "upper": -1}
@@ -108,18 +83,7 @@ def build(scene: Scene, settings: Settings, fingers: Fingers, timestep: float) -
 
 
 def grasp(scene: Scene, settings: Settings, fingers: Fingers, timestep: float, poses: np.ndarray) -> Grasped:
-    """Simulate grasps of the square. Each begins at the opening at which a finger first touches the square.
-
-    Args:
-        scene: The slider and its supports.
-        settings: How MuJoCo computes, and the contacts of the supports.
-        fingers: The fingers and their contacts.
-        timestep: Upper limit of the timestep, s. It is reduced so that each grasp takes a whole number of steps.
-        poses: Initial poses of the square, (n, 3), m and rad, world frame.
-
-    Returns:
-        The final poses and the CPU time.
-    """
+    """Simulate grasps of the square from poses (n, 3), m and rad, each from the first touch of a finger."""
     mujoco = engine()
     model = build(scene, settings, fingers, timestep)
     data = mujoco.MjData(model)
@@ -128,7 +92,7 @@ def grasp(scene: Scene, settings: Settings, fingers: Fingers, timestep: float, p
     found, processor = [], 0.0
     for (x, y, theta), (first, last) in zip(poses, ends, strict=True):
         steps = max(1, int(np.ceil((first - last) / (fingers.speed * timestep) - 1e-9)))
-        model.opt.timestep = (first - last) / (fingers.speed * steps)
+        model.opt.timestep = (first - last) / (fingers.speed * steps)  # at most `timestep`, for whole steps
         mujoco.mj_resetData(model, data)
         data.qpos[:] = (x, y, height, np.cos(theta / 2), 0, 0, np.sin(theta / 2), -first, -first)
         data.qvel[6:] = data.ctrl[:] = fingers.speed
@@ -150,17 +114,7 @@ def _settled(model: Any, data: Any) -> float:
 def accuracy(
     scene: Scene, settings: Settings, fingers: Fingers, timesteps: tuple[float, ...] = TIMESTEPS
 ) -> tuple[list[StepError], np.ndarray]:
-    """Return `mujoco.by_timestep` for the fan of grasps of `benchmarks.grasps`.
-
-    Args:
-        scene: The slider and its supports.
-        settings: How MuJoCo computes, and the contacts of the supports.
-        fingers: The fingers and their contacts.
-        timesteps: Timesteps to try, s. The smallest one gives the converged answer.
-
-    Returns:
-        The error at each timestep, and the final poses, (n, 3), of the converged answer.
-    """
+    """Return `mujoco.by_timestep` for the fan of grasps of `benchmarks.grasps`."""
     poses = grasps.fan()
 
     def run(timestep: float) -> tuple[np.ndarray, float]:

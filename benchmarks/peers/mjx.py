@@ -66,35 +66,18 @@ CONVERGED = 0.00125  # s
 
 
 class Batch:
-    """A batch of pushes, compiled for any number of steps. `pushed` runs it.
+    """A batch of pushes of a square, compiled for any number of steps and run by `pushed`."""
 
-    All pushes of a batch have the same number of steps, so shorter pushes have shorter timesteps.
-
-    Args:
-        scene: What is pushed: a square, no other outline.
-        settings: How MJX computes.
-        timestep: Upper limit of the timestep of the longest push, s.
-        starts: Start positions of the tip's center, (n, 2), m, as for `mujoco.push`.
-        ends: End positions of the tip's center, (n, 2), m.
-        double: Whether to compute in float64 whatever JAX's default is. Otherwise JAX's default type is used.
-
-    Attributes:
-        program: The compiled program.
-        compile_seconds: Wall time of building and compiling, s.
-
-    Raises:
-        ValueError: If the scene has an outline, if the normal time constant is under two timesteps, or if the package
-            is not installed.
-    """
+    # All pushes have the same number of steps, so shorter pushes have shorter timesteps.
 
     def __init__(
         self,
         scene: Scene,
         settings: Settings,
-        timestep: float,
-        starts: np.ndarray,
-        ends: np.ndarray,
-        double: bool = True,
+        timestep: float,  # upper limit of that of the longest push, s
+        starts: np.ndarray,  # of the tip's center, (n, 2), m, as for `mujoco.push`
+        ends: np.ndarray,  # of the tip's center, (n, 2), m
+        double: bool = True,  # whether to compute in float64 whatever JAX's default is
     ):
         if scene.outline:
             raise ValueError("mjx pushes squares only; the scene has an outline")
@@ -105,21 +88,10 @@ class Batch:
         with self._numbers():
             rollout = _rollout(build(scene, settings, timestep, conveyor=False), scene.speed)
             self.program = jax.jit(jax.vmap(rollout, in_axes=(0, 0, None, None))).lower(*arguments).compile()
-        self.compile_seconds = time.perf_counter() - begin
+        self.compile_seconds = time.perf_counter() - begin  # wall time of building and compiling
 
     def pushed(self, timestep: float | None = None, settings: Settings | None = None) -> Pushed:
-        """Run the pushes, with the program that is already compiled.
-
-        Args:
-            timestep: Another timestep than that of the batch, s.
-            settings: Settings with other time constants and impedances than those of the batch.
-
-        Returns:
-            The final poses, the slips and the times.
-
-        Raises:
-            ValueError: If the normal time constant is under two timesteps.
-        """
+        """Run the compiled program, with another timestep (s), time constants and impedances if given."""
         frames, arguments = self._at(timestep or self.timestep, settings or self.settings)
         begin, busy = time.perf_counter(), time.process_time()
         qpos = np.asarray(jax.block_until_ready(self.program(*arguments)), float)
@@ -185,13 +157,8 @@ def softened(timestep: float) -> Settings:
 
 
 def accuracy(batch: Batch) -> list[StepError]:
-    """Return error and cost by timestep, as `mujoco.by_timestep` does, for the pushes of `mujoco.fan`.
-
-    Each timestep is compared with its own converged answer, computed with the same `softened` settings.
-
-    Args:
-        batch: The pushes that are timed.
-    """
+    """Return error and cost by timestep, as `mujoco.by_timestep` does, for the pushes of `mujoco.fan`."""
+    # Each timestep is compared with its own converged answer, computed with the same `softened` settings.
     few = Batch(batch.scene, SETTINGS, CONVERGED, *fan(batch.scene))
 
     def at(timestep: float) -> StepError:
@@ -204,16 +171,5 @@ def accuracy(batch: Batch) -> list[StepError]:
 
 
 def push(scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray) -> Pushed:
-    """Compile and run pushes once, as `mujoco.push` does. For timings, keep a `Batch`.
-
-    Args:
-        scene: What is pushed: a square.
-        settings: How MJX computes.
-        timestep: Upper limit of the timestep, s.
-        starts: Start positions of the tip's center, (n, 2), m.
-        ends: End positions of the tip's center, (n, 2), m.
-
-    Returns:
-        The final poses, the slips and the times, which do not include compilation.
-    """
+    """Compile and run pushes once, as `mujoco.push` does; the times do not include compiling."""
     return Batch(scene, settings, timestep, starts, ends).pushed()

@@ -41,61 +41,36 @@ BISECTIONS = 4  # between the largest good timestep and the first bad one: a fac
 
 
 class Pushed(NamedTuple):
-    """Results of the pushes.
+    """Results of the pushes."""
 
-    Attributes:
-        pose: Final poses of the slider, (n, 3), m and rad, in the frame of its start pose.
-        slip: Distance that the tip's contact has slid along the slider's side, (n,), m. Positive to the left of the
-            inward normal.
-        seconds: Wall time of the pushes, s, without building and settling.
-        processor: CPU time of the pushes, summed over threads, s.
-    """
-
-    pose: np.ndarray
+    pose: np.ndarray  # final poses of the slider, (n, 3), m and rad, in the frame of its start pose
+    # Distance that the tip's contact has slid along the slider's side, (n,), m; positive to the left of the inward
+    # normal.
     slip: np.ndarray
-    seconds: float
-    processor: float
+    seconds: float  # wall time of the pushes, s, without building and settling
+    processor: float  # CPU time of the pushes, s, summed over threads
 
 
 class StepError(NamedTuple):
-    """Error and cost at one timestep.
+    """Error and cost at one timestep."""
 
-    Attributes:
-        timestep: Timestep, s.
-        error_mm: Largest deviation of a final pose from that of the smallest timestep, mm.
-        us_per_push: CPU time per push, µs.
-    """
-
-    timestep: float
-    error_mm: float
-    us_per_push: float
+    timestep: float  # s
+    error_mm: float  # largest deviation of a final pose from that of the smallest timestep
+    us_per_push: float  # CPU time, µs
 
 
 class Frame(NamedTuple):
-    """The world frame in which MuJoCo computes a push, and the timestep.
+    """The world frame in which MuJoCo computes a push, and the timestep."""
 
-    Attributes:
-        rotation: Rotation from the slider's start frame to the world frame, (2, 2).
-        angle: Angle of the same rotation, rad.
-        steps: Number of steps.
-        timestep: Timestep, s.
-    """
-
-    rotation: np.ndarray
-    angle: float
+    rotation: np.ndarray  # from the slider's start frame to the world frame, (2, 2)
+    angle: float  # of the same rotation, rad
     steps: int
-    timestep: float
+    timestep: float  # s
 
 
 def fan(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """Return the paths of `PUSHES`: on the square's left side, just touching it at the start.
-
-    Args:
-        scene: The square, the tip and the length of the pushes.
-
-    Returns:
-        Start and end positions of the tip's center, both (n, 2), m, in the slider's start frame.
-    """
+    """Return the paths of `PUSHES`: on the square's left side, just touching it at the start."""
+    # They are start and end positions of the tip's center, both (n, 2), m, in the slider's start frame.
     offset, angle = np.array(PUSHES).T
     starts = np.stack([np.full(len(PUSHES), -scene.side / 2 - scene.tip_radius), offset], axis=1)
     return starts, starts + scene.travel * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -104,19 +79,7 @@ def fan(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 def push(
     scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray, threads: int = 1
 ) -> Pushed:
-    """Push a slider that starts at pose zero, by a tip that moves in a straight line.
-
-    Args:
-        scene: What is pushed.
-        settings: How MuJoCo computes.
-        timestep: Upper limit of the timestep, s. It is reduced so that each push takes a whole number of steps.
-        starts: Start positions of the tip's center, (n, 2), m.
-        ends: End positions of the tip's center, (n, 2), m.
-        threads: Number of threads that share the pushes.
-
-    Returns:
-        The final poses, the slips and the times.
-    """
+    """Push a slider that starts at pose zero, by a tip whose center moves from start to end, both (n, 2), m."""
     starts, ends = np.asarray(starts, float).reshape(-1, 2), np.asarray(ends, float).reshape(-1, 2)
     model = build(scene, settings, timestep)
     settled = settle(model, settings)
@@ -141,12 +104,7 @@ def push(
 
 
 def settle(model: Any, settings: Settings) -> np.ndarray:
-    """Return the slider at rest on the table: position and orientation of its free joint, (7,), m and quaternion.
-
-    Args:
-        model: The MjModel.
-        settings: Its settings, for the time that settling takes.
-    """
+    """Return the slider at rest on the table, (7,): position (m) and quaternion of its free joint."""
     mujoco = engine()
     data, moving = mujoco.MjData(model), model.geom_surfacevel.copy()
     data.qpos[0] = AWAY
@@ -157,14 +115,7 @@ def settle(model: Any, settings: Settings) -> np.ndarray:
 
 
 def frame(scene: Scene, timestep: float, start: np.ndarray, end: np.ndarray) -> Frame:
-    """Return the world frame in which the push is along x, with its number of steps.
-
-    Args:
-        scene: What is pushed.
-        timestep: Upper limit of the timestep, s.
-        start: Start position of the tip's center, (2,), m.
-        end: End position of the tip's center, (2,), m.
-    """
+    """Return the world frame in which a push from `start` to `end`, (2,), m, is along x, with its number of steps."""
     along = end - start
     distance = np.hypot(*along)
     steps = max(1, int(np.ceil(distance / (scene.speed * timestep) - 1e-9)))
@@ -173,14 +124,7 @@ def frame(scene: Scene, timestep: float, start: np.ndarray, end: np.ndarray) -> 
 
 
 def initial(model: Any, settled: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
-    """Return the initial qpos, (nq,): the tip's center is at the world's origin, and at `start` in the slider's frame.
-
-    Args:
-        model: The MjModel.
-        settled: The slider at rest, (7,), from `settle`.
-        frame: The world frame of the push.
-        start: Start position of the tip's center, (2,), m.
-    """
+    """Return the initial qpos, (nq,), with the tip at the world's origin and at `start` in the slider's frame."""
     qpos = np.zeros(model.nq)
     qpos[:2] = -frame.rotation @ start
     qpos[2] = settled[2]
@@ -202,30 +146,16 @@ def _run(model, data, scene: Scene, frames: list[Frame], qpos: np.ndarray, share
 
 
 def final_pose(frame: Frame, qpos: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    """Return the slider's final pose, (3,), m and rad, in the frame of its start pose.
-
-    Args:
-        frame: The world frame of the push.
-        qpos: Final positions in MuJoCo's world.
-        origin: Final position of the world's origin in the frame of the start pose, (2,), m. With a conveyor, the world
-            moves with the tip.
-    """
+    """Return the slider's final pose, (3,), m and rad, in the frame of its start pose."""
+    # origin: final position of the world's origin in that frame, (2,), m; with a conveyor, the world moves with the tip
     w, x, y, z = qpos[3:7]
     theta = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - frame.angle
     return np.append(frame.rotation.T @ qpos[:2] + origin, (theta + np.pi) % (2 * np.pi) - np.pi)
 
 
 def slip(scene: Scene, pose: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return how far the tips slip, (n,), m, along the edge that faces their start.
-
-    A tip that sticks rolls on the edge: its center moves by the radius times the angle. That is not counted as slip.
-
-    Args:
-        scene: The slider and the tip.
-        pose: Final poses, (n, 3), m and rad, in the frame of the start pose.
-        starts: Start positions of the tip's center, (n, 2), m.
-        ends: End positions of the tip's center, (n, 2), m.
-    """
+    """Return how far the tips slip, (n,), m, along the edge that faces their start, for final poses (n, 3)."""
+    # A tip that sticks rolls on the edge: its center moves by the radius times the angle. That is not counted as slip.
     corner = scene.vertices
     edge = np.roll(corner, -1, axis=0) - corner
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
@@ -242,17 +172,8 @@ def slip(scene: Scene, pose: np.ndarray, starts: np.ndarray, ends: np.ndarray) -
 
 
 def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) -> list[StepError]:
-    """Return `by_timestep` for the pushes of `fan`.
-
-    Args:
-        scene: What is pushed.
-        settings: How MuJoCo computes.
-        timesteps: Timesteps to try, s. By default they go from `COARSEST` down to 2^-`REFINEMENTS` time constants of
-            normal contact, by factors of √2.
-
-    Returns:
-        The error and the cost at each timestep, from the largest to the smallest.
-    """
+    """Return `by_timestep` for the pushes of `fan`, from the largest timestep to the smallest."""
+    # down by factors of √2 from `COARSEST` to 2^-`REFINEMENTS` time constants of normal contact
     exponents = np.arange(np.log2(COARSEST), -REFINEMENTS - 0.5, -0.5)
     chosen = [float(each) for each in (timesteps or settings.normal * 2.0**exponents)]
     starts, ends = fan(scene)
@@ -267,21 +188,8 @@ def accuracy(scene: Scene, settings: Settings, timesteps: Sequence[float] = ()) 
 def by_timestep(
     run: Callable[[float], tuple[np.ndarray, float]], timesteps: Sequence[float], allowed: float = 1e-4
 ) -> tuple[list[StepError], np.ndarray]:
-    """Compare the final poses at each timestep with those at the smallest, and refine the list by `refined`.
-
-    Args:
-        run: Function from a timestep (s) to final poses, (n, 3), and the CPU time of all pushes, s.
-        timesteps: Timesteps to try, s. The smallest one gives the converged answer.
-        allowed: Allowed error, m, for `refined`.
-
-    Returns:
-        The error and the cost at each timestep but the smallest, from the largest down; and the final poses, (n, 3), at
-        the smallest.
-
-    Raises:
-        ValueError: As `largest` does.
-    """
-    *coarse, finest = sorted(timesteps, reverse=True)
+    """Compare final poses with those at the smallest timestep, refine the rows by `refined`, and return both."""
+    *coarse, finest = sorted(timesteps, reverse=True)  # `run` returns final poses, (n, 3), and the CPU time of all, s
     exact, _ = run(finest)
 
     def at(timestep: float) -> StepError:
@@ -292,19 +200,8 @@ def by_timestep(
 
 
 def refined(rows: Sequence[StepError], at: Callable[[float], StepError], allowed: float = 1e-4) -> list[StepError]:
-    """Insert rows by bisection, so that the result of `largest` does not depend on the grid.
-
-    Args:
-        rows: Rows with falling timesteps.
-        at: Function that makes the row of a timestep (s).
-        allowed: Allowed error, m.
-
-    Returns:
-        The old and the new rows, with falling timesteps.
-
-    Raises:
-        ValueError: As `largest` does.
-    """
+    """Insert rows by bisection, so that the result of `largest` does not depend on the grid."""
+    # The timesteps (s) of the rows fall. `at` computes the row of a timestep. `allowed` is the allowed error, m.
     found = list(rows)
     for _ in range(BISECTIONS):
         good = found.index(largest(found, allowed))
@@ -315,15 +212,7 @@ def refined(rows: Sequence[StepError], at: Callable[[float], StepError], allowed
 
 
 def largest(rows: Sequence[StepError], allowed: float = 1e-4) -> StepError:
-    """Return the row of the largest timestep up to which all final poses are within `allowed` of the converged ones.
-
-    Args:
-        rows: Rows with falling timesteps.
-        allowed: Allowed error, m.
-
-    Raises:
-        ValueError: If the error of the smallest timestep is already larger.
-    """
+    """Return the row of the largest timestep up to which all errors are at most `allowed` (m), or raise ValueError."""
     good = None
     for row in reversed(rows):
         if not row.error_mm <= 1e3 * allowed:
@@ -335,16 +224,6 @@ def largest(rows: Sequence[StepError], allowed: float = 1e-4) -> StepError:
 
 
 def timed(scene: Scene, settings: Settings, timestep: float, n: int = 40) -> Pushed:
-    """Compute `n` pushes, the pushes of `fan` repeated, to time them.
-
-    Args:
-        scene: What is pushed.
-        settings: How MuJoCo computes.
-        timestep: Upper limit of the timestep, s.
-        n: Number of pushes.
-
-    Returns:
-        The final poses, the slips and the times.
-    """
+    """Compute `n` pushes, the pushes of `fan` repeated, to time them."""
     starts, ends = (np.resize(each, (n, 2)) for each in fan(scene))
     return push(scene, settings, timestep, starts, ends)

@@ -33,14 +33,7 @@ ALIKE = {"grasp_surfaces": "grasp_two_fingers"}  # cases that are the same probl
 
 
 def check(case: Sequence[str]) -> None:
-    """Check that the cases can be compared with other programs.
-
-    Args:
-        case: Names of the cases.
-
-    Raises:
-        ValueError: If none of the cases has a peer, or if a program that is needed is not installed.
-    """
+    """Raise ValueError if none of the cases has a peer, or if a program that is needed is not installed."""
     if not set(case) & set(PEERS):
         raise ValueError(f"--peers is for {', '.join(PEERS)}; got it with {' '.join(case)}")
     if {"push", "grasp"} & set(case):
@@ -52,17 +45,9 @@ def check(case: Sequence[str]) -> None:
 
 
 def rows(case: Sequence[str]) -> list[dict[str, Any]]:
-    """Run the other programs on the cases, and return one row for each program.
-
-    Each row has `of`, the name of the rows that it is compared with, and the CPU time of one problem in s: the median
-    of `REPEATS` runs (`processor_s_each`) and their range (`processor_s_range`).
-
-    Args:
-        case: Names of the cases. Those without a peer are skipped.
-
-    Returns:
-        The rows.
-    """
+    """Run the other programs on those of the cases that they have, and return one row for each program."""
+    # `of` names the rows that it is compared with. `processor_s_each` is the CPU time of one problem in s, the median
+    # of `REPEATS` runs, and `processor_s_range` the range of the runs.
     return [found for name in case if name in PEERS for found in PEERS[name]()]
 
 
@@ -73,16 +58,13 @@ def _pushes() -> list[dict[str, Any]]:
 
 
 def _grasps() -> list[dict[str, Any]]:
-    """Return the row of MuJoCo on four supports, with its error against rigid contact.
-
-    In rigid contact, geometry alone determines the final angle.
-    """
+    """Return the row of MuJoCo on four supports, with its error against rigid contact."""
     scene = Scene(SUPPORTS["four"], friction_tip=grasps.FRICTION)
     table, pose = grasp.accuracy(scene, grasp.SUPPORTED, grasp.Fingers())
     at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
     poses = np.resize(grasps.fan(), (TIMED, 3))
     _, each = _repeated(lambda: grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses), TIMED)
-    both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])
+    both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])  # geometry determines the rigid angle
     return [
         {
             "of": "grasp_two_fingers",
@@ -130,15 +112,7 @@ def _problems() -> list[dict[str, Any]]:
 
 
 def _repeated(run: Callable[[], Any], count: int) -> tuple[Any, dict[str, Any]]:
-    """Run a function `REPEATS` times and measure its CPU time per item.
-
-    Args:
-        run: Function that returns a result with the attribute `processor`, its CPU time in s.
-        count: Number of items that one run computes.
-
-    Returns:
-        The result of the first run, and the CPU time per item: median and range.
-    """
+    """Run a function `REPEATS` times; return its first result, and median and range of the CPU time per item."""
     found = [run() for _ in range(REPEATS)]
     each = [one.processor / count for one in found]
     return found[0], {"processor_s_each": float(np.median(each)), "processor_s_range": [min(each), max(each)]}
@@ -192,11 +166,8 @@ def _mjx(name: str) -> dict[str, Any]:
 
 
 def _exact_error_mm(name: str, pose: np.ndarray) -> float:
-    """Return the largest error (mm) of the final poses of `mujoco.fan`, (n, 3), against exact Coulomb friction.
-
-    Only the first poses are used, one for each push of the fan.
-    """
-    exact = _exact(name)
+    """Return the largest error (mm) of the final poses of `mujoco.fan`, (n, 3), against exact Coulomb friction."""
+    exact = _exact(name)  # once for each push of the fan, which `pose` repeats
     return float(tasks.error_mm(pose[: len(exact)], exact).max())
 
 
@@ -209,19 +180,7 @@ def _exact(name: str) -> np.ndarray:
 
 @cache
 def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) -> list[float]:
-    """Return the slip along the side (µm) of the tip in straight pushes by pushjax, without the distance it rolls.
-
-    Args:
-        dtype: "float32" or "float64".
-        offsets: Offsets of the tip from the middle of the side, m.
-        steps: Number of steps of each push.
-
-    Returns:
-        The slip at each offset, µm.
-
-    Raises:
-        ValueError: If the contact does not stick at one of the offsets.
-    """
+    """Return the slip (µm) along the side, without rolling, of the tip in straight sticking pushes by pushjax."""
     here = tasks.task("quartic", dtype)
     offset = jnp.asarray(offsets, dtype)
     push = jax.jit(jax.vmap(here.push))(tasks.paths(offset, jnp.zeros_like(offset), steps))
@@ -234,14 +193,7 @@ def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) ->
 
 @cache
 def same_fan_error_mm(dtype: str, steps: int) -> float:
-    """Return pushjax's largest error (mm) over the same pushes as MuJoCo's, on the same four supports.
-
-    The error is the difference from pushjax's converged answer.
-
-    Args:
-        dtype: "float32" or "float64".
-        steps: Number of steps of each push.
-    """
+    """Return pushjax's largest error (mm) over MuJoCo's pushes on four supports, against its converged answer."""
     return float(tasks.error_mm(_same_fan(dtype, steps), _same_fan("float64", tasks.REFERENCE_STEPS)).max())
 
 
@@ -270,22 +222,14 @@ def _um(slip: np.ndarray) -> list[float]:
 
 
 def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
-    """Write the comparison with the fastest other program into the rows of pushjax.
-
-    Of the programs that solve contact problems, it is the one that finds the most motions.
-
-    Each row that has a peer gets `peer`, its name, and `peer_ratio`, how many times as many problems pushjax solves in
-    the same CPU time. Rows of pushes also get `slip_um`, the slip of a sticking finger in the same number of steps, and
-    `same_fan_error_mm`, the error over the same pushes as MuJoCo's.
-
-    Args:
-        rows: Rows of pushjax; changed in place.
-        peers: Rows of the other programs.
-    """
+    """Add the comparison with the fastest other program to the rows of pushjax, in place."""
+    # A row that has a peer gets `peer`, its name, and `peer_ratio`, how many times as many problems pushjax solves in
+    # the same CPU time. Rows of pushes also get `slip_um`, the slip of a sticking finger in the same number of steps,
+    # and `same_fan_error_mm`, the error over MuJoCo's pushes.
     for row in rows:
         same = [peer for peer in peers if peer["of"] == ALIKE.get(row["case"], row["case"])]
         if same:
-            # a program that misses many motions does less work
+            # the one that finds the most motions, because a program that misses many does less work
             best = min(same, key=lambda peer: (-peer.get("found", 1.0), peer["processor_s_each"]))
             row["peer"] = best["peer"]
             row["peer_ratio"] = best["processor_s_each"] * row["batch"] / row["processor_s"]
@@ -296,15 +240,7 @@ def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
 
 
 def draw(record: dict[str, Any], out: Path) -> str:
-    """Draw computing time against error for pushes with different numbers of steps.
-
-    Args:
-        record: Record of the benchmark, with `by_steps` and `peers`.
-        out: Folder for the picture.
-
-    Returns:
-        Path of the picture.
-    """
+    """Draw computing time against error of pushes by number of steps; save to the folder `out` and return the path."""
     from benchmarks.peers.figure import speed_figure
     from pushjax import plot
 
@@ -321,12 +257,7 @@ def draw(record: dict[str, Any], out: Path) -> str:
 
 
 def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
-    """Return the lines that the command prints.
-
-    Args:
-        peers: Rows of the other programs.
-        rows: Rows of pushjax, after `compare`.
-    """
+    """Return the lines that the command prints, from the peers' rows and pushjax's after `compare`."""
     lines = ["", f"the same by others; simulators within {tasks.ALLOWED_MM} mm of their own converged answer:"]
     for peer in peers:
         each = f"{1e3 * peer['processor_s_each']:.2f} ms of CPU time"

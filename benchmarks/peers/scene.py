@@ -51,34 +51,19 @@ TIP_MASS = 1e3
 
 @dataclass(frozen=True)
 class Scene:
-    """A slider on point supports, and the round tip that pushes it. SI units, the slider's body frame.
+    """A slider on point supports, and the round tip that pushes it, in SI units and the slider's body frame."""
 
-    Attributes:
-        supports: Positions of the supports, m. The loads follow from statics for three supports, and from equal
-            stiffness for more.
-        side: Side of the square, m.
-        outline: Vertices of a convex polygon about the center of mass, m; a square of `side` unless given.
-        tip_radius: Radius of the tip, m.
-        friction_tip: Coefficient of friction between tip and slider.
-        friction_table: Coefficient of friction between supports and table.
-        mass: Mass of the slider, kg.
-        speed: Speed of the tip, m/s.
-        travel: Length of the pushes of `mujoco.fan`, m.
-
-    Raises:
-        ValueError: If there are fewer than three supports, or if one of `side`, `tip_radius`, `friction_table`, `mass`,
-            `speed` and `travel` is not positive.
-    """
-
+    # Loads follow from statics for three supports, and from equal stiffness for more.
     supports: tuple[tuple[float, float], ...]
-    side: float = 0.09
+    side: float = 0.09  # of the square
+    # vertices of a convex polygon about the center of mass; else a square
     outline: tuple[tuple[float, float], ...] = ()
     tip_radius: float = 0.00475
-    friction_tip: float = 0.25
-    friction_table: float = 0.3
-    mass: float = 1.0
-    speed: float = 0.007
-    travel: float = 0.05
+    friction_tip: float = 0.25  # coefficient between tip and slider
+    friction_table: float = 0.3  # coefficient between supports and table
+    mass: float = 1.0  # of the slider
+    speed: float = 0.007  # of the tip
+    travel: float = 0.05  # length of the pushes of `mujoco.fan`
 
     def __post_init__(self):
         if len(self.supports) < 3:
@@ -96,43 +81,24 @@ class Scene:
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of MuJoCo; the module header gives the reasons for the defaults.
+    """Settings of MuJoCo; the module header gives the reasons for the defaults."""
 
-    Attributes:
-        cone: Type of friction cone.
-        solver: Constraint solver.
-        integrator: Time integrator.
-        impratio: Ratio of frictional to normal impedance.
-        normal: Time constant of normal contact, s.
-        sliding: Time constant of the supports' friction, s; 0 uses `normal`.
-        tip_sliding: Time constant of the tip's friction, s; 0 uses `normal`.
-        impedance: Least and greatest impedance (solimp).
-        iterations: Largest number of solver iterations.
-        line_search: Largest number of line search iterations.
-        tolerance: Tolerance of the solver.
-        noslip: Number of noslip iterations.
-    """
-
-    cone: str = "elliptic"
+    cone: str = "elliptic"  # type of friction cone
     solver: str = "CG"
     integrator: str = "discrete"
-    impratio: float = 170.0
-    normal: float = 0.010
-    sliding: float = 0.050
-    tip_sliding: float = 0.013
-    impedance: tuple[float, float] = (0.86, 0.86)
-    iterations: int = 100
-    line_search: int = 50
-    tolerance: float = 1e-6
-    noslip: int = 0
+    impratio: float = 170.0  # ratio of frictional to normal impedance
+    normal: float = 0.010  # time constant of normal contact, s
+    sliding: float = 0.050  # time constant of the supports' friction, s; 0 uses `normal`
+    tip_sliding: float = 0.013  # time constant of the tip's friction, s; 0 uses `normal`
+    impedance: tuple[float, float] = (0.86, 0.86)  # least and greatest (solimp)
+    iterations: int = 100  # largest number of the solver
+    line_search: int = 50  # largest number of iterations
+    tolerance: float = 1e-6  # of the solver
+    noslip: int = 0  # number of iterations
 
 
 def engine() -> Any:
-    """Import and return the package mujoco.
-
-    Raises:
-        ValueError: If it is not installed.
-    """
+    """Import and return the package mujoco, or raise ValueError if it is not installed."""
     try:
         import mujoco
     except ImportError as missing:
@@ -143,21 +109,10 @@ def engine() -> Any:
 def build(
     scene: Scene, settings: Settings, timestep: float, conveyor: bool = True, fixtures: tuple[str, ...] = ()
 ) -> Any:
-    """Build the MjModel of a push.
-
-    In its world frame x is along the push, and the tip's center is at the origin when the push begins. Its qpos holds
-    the slider's free joint (7 numbers), then the position of the tip along x if the tip has a joint.
-
-    Args:
-        scene: What is pushed.
-        settings: How MuJoCo computes.
-        timestep: Timestep, s.
-        conveyor: Whether the table moves under a tip that stands still. Otherwise the tip has a joint.
-        fixtures: Attributes of geoms that the slider touches, with the friction and the settings of the tip.
-
-    Returns:
-        The MjModel.
-    """
+    """Build the MjModel of a push, with x along the push and the tip's center at the world's origin at the start."""
+    # Its qpos holds the slider's free joint (7 numbers), then the position of the tip along x if the tip has a joint.
+    # With a conveyor, the table moves under a tip that stands still; otherwise the tip has a joint. `fixtures` are
+    # attributes of geoms that the slider touches, with the friction and the settings of the tip.
     mujoco = engine()
     table = f'surfacevel="{-scene.speed:.9g} 0 0"' if conveyor else ""
     joint = '<joint type="slide" axis="1 0 0"/>' if not conveyor else ""
@@ -198,19 +153,7 @@ def feet(scene: Scene) -> str:
 
 
 def pair(one: str, other: str, friction: float, normal: float, sliding: float, impedance: tuple[float, float]) -> str:
-    """Return the XML of a contact between two geoms.
-
-    Args:
-        one: Name of the first geom.
-        other: Name of the second geom.
-        friction: Coefficient of friction.
-        normal: Time constant of the normal contact, s.
-        sliding: Time constant of the friction, s; 0 uses `normal`.
-        impedance: Least and greatest impedance.
-
-    Returns:
-        The XML.
-    """
+    """Return the XML of a contact between two geoms with time constants in s; `sliding` 0 uses `normal`."""
     rest = f'solreffriction="{sliding} 1"' if sliding else ""
     return (
         f'<pair geom1="{one}" geom2="{other}" condim="3" friction="{friction} {friction} 0 0 0" '
