@@ -65,7 +65,6 @@ def timed(
     peers: bool = False,
     baseline: Annotated[Path | None, cli_option("FILE")] = None,
     out: Path = PICTURES,
-    seed: int = 0,
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
@@ -80,7 +79,6 @@ def timed(
         baseline: A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did
             there.
         out: Folder for pictures.
-        seed: Seed of everything random.
         progress: Called with the number of rows done and their total.
         keep: Called with the record so far.
 
@@ -90,7 +88,7 @@ def timed(
     import jax
 
     jax.config.update("jax_enable_compilation_cache", False)  # so that programs are compiled, not loaded
-    return speed.run(case, dtype, batch, cores, peers, baseline, seed, out, progress, keep)
+    return speed.run(case, dtype, batch, cores, peers, baseline, out, progress, keep)
 
 
 def listing() -> str:

@@ -43,7 +43,6 @@ def run(
     cores: int | None = None,
     peers: bool = False,  # also time the same work by other programs, and pushes with several numbers of steps
     baseline: Path | None = None,  # file of an earlier record, made with the same number of cores
-    seed: int = 0,  # only for the settings of the record
     out: Path | None = None,  # folder for a picture of pushes beside peers; default: no picture
     progress: ProgressCallback = no_progress,  # called with the number of rows done and their total
     keep: Callable[[dict[str, Any]], None] = lambda record: None,  # called with the record so far
@@ -73,7 +72,7 @@ def run(
     total = len(todo) + (1 if peers else 0)
     rows: list[dict[str, Any]] = []
     settings = {"cases": list(case), "dtypes": list(dtype), "batches": None if batch is None else list(batch)}
-    settings |= {"cores": cores, "seed": seed}
+    settings |= {"cores": cores}
     record = result_record("bench", settings, rows=rows, ceilings={}, slower=[], new=[])
     with both_dtypes():  # the errors of float32 too are those against float64
         for done, work in enumerate(todo):

@@ -32,7 +32,6 @@ def push(
     end: np.ndarray,  # of the tip's center, (2,), m
     friction: float = 0.25,  # coefficient between tip and square
     side: float = 0.09,  # m
-    radius: float = 0.00475,  # m; not used: on a straight side the result does not depend on it
     steps: int = STEPS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Push a square from pose zero, by a round tip on its left side that moves in a straight line."""

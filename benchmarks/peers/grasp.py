@@ -62,7 +62,7 @@ def build(scene: Scene, settings: Settings, fingers: Fingers, timestep: float) -
     # Its qpos holds the slider's free joint (7 numbers), then the position of each finger along its direction of
     # closing.
     contact = scene.friction_tip, fingers.normal, fingers.sliding, fingers.impedance
-    body, mesh = slider_body(scene)
+    body = slider_body(scene)
     ways = {"lower": 1, "upper": -1}
     moving = "".join(
         f'<body name="{name}"><joint name="{name}" type="slide" axis="0 {way} 0"/>'
@@ -74,7 +74,6 @@ def build(scene: Scene, settings: Settings, fingers: Fingers, timestep: float) -
     touching = "".join(pair(name, "slider", *contact) for name in ways)
     return engine().MjModel.from_xml_string(f"""<mujoco>
       {options(settings, timestep)}
-      <asset>{mesh}</asset>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
       <worldbody><geom name="table" type="plane" size="1 1 .1"/>{body}{moving}</worldbody>
       <contact>{supported(scene, settings)}{touching}</contact>

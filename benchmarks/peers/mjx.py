@@ -79,8 +79,6 @@ class Batch:
         ends: np.ndarray,  # of the tip's center, (n, 2), m
         double: bool = True,  # whether to compute in float64 whatever JAX's default is
     ):
-        if scene.outline:
-            raise ValueError("mjx pushes squares only; the scene has an outline")
         self.scene, self.settings, self.timestep = scene, settings, timestep
         self.starts, self.ends, self.double = np.asarray(starts, float), np.asarray(ends, float), double
         _, arguments = self._at(timestep, settings)
@@ -168,8 +166,3 @@ def accuracy(batch: Batch) -> list[StepError]:
         return StepError(timestep, float(error_mm(pose, exact).max()), 1e6 * processor)
 
     return refined([at(each) for each in sorted(TIMESTEPS, reverse=True)], at)
-
-
-def push(scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray) -> Pushed:
-    """Compile and run pushes once, as `mujoco.push` does; the times do not include compiling."""
-    return Batch(scene, settings, timestep, starts, ends).pushed()

@@ -160,8 +160,6 @@ def slip(scene: Scene, pose: np.ndarray, starts: np.ndarray, ends: np.ndarray) -
     edge = np.roll(corner, -1, axis=0) - corner
     edge /= np.linalg.norm(edge, axis=1, keepdims=True)
     inward = np.stack([-edge[:, 1], edge[:, 0]], axis=1)
-    if np.sum(inward * (corner.mean(axis=0) - corner)) < 0:  # the outline runs clockwise
-        inward = -inward
     outside = np.sum(inward[None] * (corner[None] - starts[:, None]), axis=-1)
     normal = inward[np.argmax(outside, axis=1)]
     left = np.stack([-normal[:, 1], normal[:, 0]], axis=1)

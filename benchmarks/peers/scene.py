@@ -56,8 +56,6 @@ class Scene:
     # Loads follow from statics for three supports, and from equal stiffness for more.
     supports: tuple[tuple[float, float], ...]
     side: float = 0.09  # of the square
-    # vertices of a convex polygon about the center of mass; else a square
-    outline: tuple[tuple[float, float], ...] = ()
     tip_radius: float = 0.00475
     friction_tip: float = 0.25  # coefficient between tip and slider
     friction_table: float = 0.3  # coefficient between supports and table
@@ -74,9 +72,9 @@ class Scene:
 
     @property
     def vertices(self) -> np.ndarray:
-        """Vertices of the outline, (vertices, 2), m, body frame."""
+        """Vertices of the square, counterclockwise, (4, 2), m, body frame."""
         half = self.side / 2
-        return np.array(self.outline or ((-half, -half), (half, -half), (half, half), (-half, half)), float)
+        return np.array(((-half, -half), (half, -half), (half, half), (-half, half)), float)
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,6 @@ class Settings:
     iterations: int = 100  # largest number of the solver
     line_search: int = 50  # largest number of iterations
     tolerance: float = 1e-6  # of the solver
-    noslip: int = 0  # number of iterations
 
 
 def engine() -> Any:
@@ -116,7 +113,7 @@ def build(
     mujoco = engine()
     table = f'surfacevel="{-scene.speed:.9g} 0 0"' if conveyor else ""
     joint = '<joint type="slide" axis="1 0 0"/>' if not conveyor else ""
-    body, mesh = slider_body(scene)
+    body = slider_body(scene)
     of_tip = scene.friction_tip, settings.normal, settings.tip_sliding, settings.impedance
     contacts = "".join(
         pair(name, "slider", *of_tip) for name in ("tip", *(f"fixture{k}" for k in range(len(fixtures))))
@@ -124,7 +121,6 @@ def build(
     geoms = "".join(f'<geom name="fixture{k}" {each}/>' for k, each in enumerate(fixtures))
     text = f"""<mujoco>
       {options(settings, timestep)}
-      <asset>{mesh}</asset>
       <default><geom contype="0" conaffinity="0" mass="0"/></default>
       <worldbody>
         <geom name="table" type="plane" size="1 1 .1" {table}/>
@@ -136,14 +132,6 @@ def build(
       <contact>{supported(scene, settings)}{contacts}</contact>
     </mujoco>"""
     return mujoco.MjModel.from_xml_string(text)
-
-
-def _slider(scene: Scene) -> tuple[str, str]:
-    """Return the slider's geom and the mesh that it needs. A box is faster than a mesh, and exact in MJX."""
-    if not scene.outline:
-        return f'type="box" size="{scene.side / 2} {scene.side / 2} {HALF_HEIGHT}"', ""
-    corners = " ".join(f"{x} {y} {z}" for x, y in scene.vertices for z in (-HALF_HEIGHT, HALF_HEIGHT))
-    return 'type="mesh" mesh="slider"', f'<mesh name="slider" vertex="{corners}"/>'
 
 
 def feet(scene: Scene) -> str:
@@ -173,16 +161,15 @@ def options(settings: Settings, timestep: float) -> str:
         f'<option timestep="{timestep:.12g}" integrator="{settings.integrator}" cone="{settings.cone}" '
         f'jacobian="dense" solver="{settings.solver}" iterations="{settings.iterations}" '
         f'tolerance="{settings.tolerance}" ls_iterations="{settings.line_search}" '
-        f'noslip_iterations="{settings.noslip}" impratio="{settings.impratio}" gravity="0 0 {-GRAVITY}"/>'
+        f'impratio="{settings.impratio}" gravity="0 0 {-GRAVITY}"/>'
     )
 
 
-def slider_body(scene: Scene) -> tuple[str, str]:
-    """Return the XML of the slider, a free body on its supports, and of the mesh that it needs."""
+def slider_body(scene: Scene) -> str:
+    """Return the XML of the slider, a free body on its supports."""
     inertia = scene.mass * np.mean(np.sum(scene.vertices**2, axis=1)) / 3
-    shape, mesh = _slider(scene)
-    body = f"""<body name="slider"><freejoint/>
+    size = f"{scene.side / 2} {scene.side / 2} {HALF_HEIGHT}"
+    return f"""<body name="slider"><freejoint/>
           <inertial mass="{scene.mass}" pos="0 0 0" diaginertia="{inertia / 2} {inertia / 2} {inertia}"/>
-          <geom name="slider" {shape}/>{feet(scene)}
+          <geom name="slider" type="box" size="{size}"/>{feet(scene)}
         </body>"""
-    return body, mesh
