@@ -50,11 +50,7 @@ class Cost(eqx.Module):
 
 
 class Sum(Cost):
-    """The sum of several costs.
-
-    Attributes:
-        costs: The costs.
-    """
+    """The sum of several costs."""
 
     costs: tuple[Cost, ...]
 
@@ -63,12 +59,7 @@ class Sum(Cost):
 
 
 class Scaled(Cost):
-    """A cost times a number.
-
-    Attributes:
-        cost: The cost.
-        factor: The number.
-    """
+    """A cost times a number."""
 
     cost: Cost
     factor: Float[Array, ""]
@@ -192,23 +183,14 @@ class Clearance(Cost):
 
 
 class HandClearance(Cost):
-    """Penalty for a hand of round fingers that comes nearer to walls and fixtures than a distance that it should keep.
+    """Penalty for a hand of round fingers that comes nearer to walls and fixtures than a distance."""
 
-    It is the square of what is missing, as a fraction of the distance to keep, for the finger and the point of the path
-    that are nearest to a wall or fixture. So it is above one if the hand runs into one.
-
-    Args:
-        hand: The hand.
-        fixtures: Walls and fixtures to stay away from.
-        distance: Distance to keep, m.
-
-    Raises:
-        ValueError: For a distance that is not positive, not finite or not a single number.
-    """
+    # The square of what is missing, as a fraction of the distance, for the finger and the point of the path that are
+    # nearest to a wall or fixture: above one if the hand runs into one.
 
     hand: Hand
     fixtures: Fixtures
-    distance: Float[Array, ""]
+    distance: Float[Array, ""]  # to keep, m
 
     def __init__(self, hand: Hand, fixtures: Fixtures, distance: ArrayLike):
         self.hand, self.fixtures = hand, tuple(fixtures)
@@ -242,7 +224,7 @@ def _shape_distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Arr
 
 
 def _poses(push: Trajectory) -> Float[Array, "poses 3"]:
-    """Return the poses of a push, or of several pushes in a row."""
+    """Return the poses of a push or of several pushes in a row as one array."""
     return push.pose.reshape(-1, 3)
 
 

@@ -13,21 +13,8 @@ from pushjax.simulation.random_rollout import Draws, draw
 
 
 def draw_friction(key: PRNGKeyArray, surface: LimitSurface, model: FrictionModel, samples: int) -> Draws:
-    """Sample limit surface and contact friction of many pushes, each of which keeps its friction.
-
-    Args:
-        key: PRNG key. Sample i has the key `fold_in(key, i)`.
-        surface: Mean of the limit surfaces.
-        model: Distribution of friction; its `resample_every` must be None.
-        samples: Number of samples.
-
-    Returns:
-        The samples, whose arrays have the leading axes (samples, 1).
-
-    Raises:
-        ValueError: If `samples` is less than one, or the model samples again during a push.
-        TypeError: If `key` is not a key, or `model` is not a `FrictionModel`.
-    """
+    """Sample limit surfaces of mean `surface` and contact friction, with the leading axes (samples, 1)."""
+    # Each push keeps its friction.
     check_key(key)
     check_type("model", model, FrictionModel)
     check_count("samples", samples)
@@ -42,11 +29,6 @@ def _draw(key: PRNGKeyArray, surfaces: SurfaceDistribution, model: FrictionModel
 
 
 def mean_friction(surface: LimitSurface, model: FrictionModel) -> Draws:
-    """Return the mean of a distribution of friction as a single sample, with the leading axes (1, 1).
-
-    Args:
-        surface: Mean of the limit surfaces.
-        model: Distribution of friction.
-    """
+    """Return the mean of the friction that `draw_friction` samples, with the leading axes (1, 1)."""
     mean = Draws(surface, jnp.mean(model.friction), jnp.zeros_like(surface.length))
     return jax.tree.map(lambda leaf: leaf[None, None], mean)

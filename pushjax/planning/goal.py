@@ -152,16 +152,7 @@ def _absolute(angle: Array) -> Array:
 
 
 def symmetric_turns(symmetry: int | ArrayLike, dtype: Any = None) -> Float[Array, "turns"]:
-    """Return the turns after which a slider looks the same, (turns,), rad.
-
-    Args:
-        symmetry: Number of angles in a full turn at which it looks the same, or the turns, zero among them.
-        dtype: Dtype of the result; by default that of `symmetry`.
-
-    Raises:
-        ValueError: For a number below one, and for turns of a wrong shape, that are not finite, or of which there are
-            none.
-    """
+    """Return the turns after which a slider looks the same, (turns,), rad, given as such or as their number."""
     if np.ndim(symmetry) == 0:  # pyright: ignore[reportArgumentType]
         check_count("symmetry", symmetry)
         symmetry = 2 * np.pi * np.arange(symmetry) / symmetry  # pyright: ignore

@@ -20,32 +20,17 @@ POSES_AT_A_TIME = 4000  # poses whose distances are computed together, so that t
 
 
 class Obstacles(NamedTuple):
-    """What neither a finger nor the slider may run into.
+    """Walls, convex polygons and disks that neither a finger nor the slider may run into."""
 
-    Attributes:
-        bodies: Vertices of convex polygons, counterclockwise, each (vertices, 2), m.
-        points: A point on each wall, (walls, 2), m.
-        normals: Unit vector from each wall into the free space, (walls, 2).
-        centers: Centers of disks, (disks, 2), m.
-        radii: Radii of disks, (disks,), m.
-    """
-
-    bodies: tuple[np.ndarray, ...] = ()
-    points: np.ndarray = np.zeros((0, 2))
-    normals: np.ndarray = np.zeros((0, 2))
-    centers: np.ndarray = np.zeros((0, 2))
-    radii: np.ndarray = np.zeros(0)
+    bodies: tuple[np.ndarray, ...] = ()  # vertices of convex polygons, counterclockwise, each (vertices, 2), m
+    points: np.ndarray = np.zeros((0, 2))  # (walls, 2), a point on each wall, m
+    normals: np.ndarray = np.zeros((0, 2))  # (walls, 2), unit vectors from the walls into the free space
+    centers: np.ndarray = np.zeros((0, 2))  # (disks, 2), m
+    radii: np.ndarray = np.zeros(0)  # (disks,), m
 
     @staticmethod
     def of(fixtures: Sequence[Wall | Fixture]) -> "Obstacles":
-        """Return walls and fixed bodies as obstacles, in the world frame.
-
-        Args:
-            fixtures: The walls and fixed bodies.
-
-        Raises:
-            TypeError: For anything else than a sequence of `Wall` and `Fixture`.
-        """
+        """Return walls and fixed bodies as obstacles, in the world frame."""
         fixed = checked_fixtures(fixtures, jnp.result_type(float))
         walls = [(each.point, each.normal) for each in fixed if isinstance(each, Wall)]
         points, normals = np.moveaxis(np.array(walls, float).reshape(-1, 2, 2), 1, 0)
@@ -79,13 +64,9 @@ class Obstacles(NamedTuple):
         return found
 
     def segment_clearance(self, start: np.ndarray, end: np.ndarray, enough: float = np.inf) -> np.ndarray:
-        """Return the distance of segments from the nearest obstacle, zero or negative where they touch it, (...,).
-
-        Args:
-            start: First points, (..., 2), m.
-            end: Last points, (..., 2), m.
-            enough: Distances larger than this, m, may be too small in the result, but not smaller than this.
-        """
+        """Return the distance of segments from the nearest obstacle, not positive where they touch it, (...,)."""
+        # The ends have shape (..., 2), m. Distances larger than `enough`, m, may be too small in the result, but not
+        # smaller than it.
         found = np.minimum(self._wall_clearance(start), self._wall_clearance(end))
         for center, radius in zip(self.centers, self.radii, strict=True):
             found = np.minimum(found, _distance_from_point(center, start, end) - radius)
@@ -99,18 +80,16 @@ class Obstacles(NamedTuple):
             found = np.minimum(found, apart)
         return found
 
-    def slider_clearance(self, vertices: np.ndarray, poses: np.ndarray, enough: float, tolerance: float) -> np.ndarray:
-        """Return the distance of a slider from the nearest obstacle, for each pose, (...,), m.
-
-        Where they overlap by more than the tolerance it is negative: minus a distance by which the slider can be moved
-        out of the obstacle, not always the least. For a disk in a reflex corner of the slider it may be too small.
-
-        Args:
-            vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame.
-            poses: Poses, (..., 3), world, m and rad.
-            enough: Distances larger than this, m, may be too small in the result, but not smaller than this.
-            tolerance: Overlap that counts as touching, m.
-        """
+    def slider_clearance(
+        self,
+        vertices: np.ndarray,  # (vertices, 2), of the slider, counterclockwise, body frame, m
+        poses: np.ndarray,  # (..., 3), world, m and rad
+        enough: float,  # larger distances, m, may be too small in the result, but not smaller than this
+        tolerance: float,  # overlap that counts as touching, m
+    ) -> np.ndarray:
+        """Return the distance of a slider from the nearest obstacle at poses (..., 3), (...,), m."""
+        # Where they overlap by more than `tolerance` it is negative: minus a distance by which the slider can be moved
+        # out of the obstacle, not always the least. For a disk in a reflex corner of the slider it may be too small.
         flat = np.asarray(poses, float).reshape(-1, 3)
         found = np.full(len(flat), np.inf)
         for point, normal in zip(self.points, self.normals, strict=True):

@@ -21,22 +21,15 @@ LEG = 32  # steps of a leg
 
 
 def simulate_pushes(
-    slider: Slider, hand: Hand, paths: np.ndarray, poses: np.ndarray, friction: np.ndarray | float
+    slider: Slider,  # leaves of its surface may have a leading axis of pushes
+    hand: Hand,
+    paths: np.ndarray,  # (pushes, steps + 1, dof), world; steps are not divided, so their size sets the accuracy
+    poses: np.ndarray,  # (pushes, 3), of the slider at the start, world, m and rad
+    friction: np.ndarray | float,  # of the contacts; one for all pushes or (pushes,)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate pushes of one slider.
-
-    Args:
-        slider: The slider. Leaves of its surface may have a leading axis of pushes.
-        hand: The hand.
-        paths: Paths of the hand's configurations, (pushes, steps + 1, dof), world. They are simulated step by step as
-            they are, so the size of the steps sets the accuracy.
-        poses: Poses of the slider at the start, (pushes, 3), world, m and rad.
-        friction: Coefficient of contact friction, one for all pushes or (pushes,).
-
-    Returns:
-        Poses of the slider along each path, (pushes, steps + 1, 3), world, m and rad, and the number of steps before
-        the first one that failed or stopped, (pushes,).
-    """
+    """Simulate pushes of one slider along paths."""
+    # Returns poses of the slider along each path, (pushes, steps + 1, 3), world, m and rad, and the number of steps
+    # before the first one that failed or stopped, (pushes,).
     count, steps = len(paths), paths.shape[1] - 1
     dtype = np.dtype(jnp.result_type(float))
     mu = np.broadcast_to(np.asarray(friction, dtype), (count,))

@@ -19,26 +19,15 @@ from pushjax._internal.checks import check_count
 
 
 class Objective(NamedTuple):
-    """What a search minimizes.
+    """What a search minimizes."""
 
-    Attributes:
-        cost: Function of parameters (n, size) that returns their costs (n,).
-        cost_and_gradient: The same with the gradients, (n,) and (n, size).
-        scale: Change of each parameter that matters, (size,).
-    """
-
-    cost: Callable[[np.ndarray], np.ndarray]
-    cost_and_gradient: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    scale: np.ndarray
+    cost: Callable[[np.ndarray], np.ndarray]  # of parameters (n, size), (n,)
+    cost_and_gradient: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # also the gradients, (n, size)
+    scale: np.ndarray  # (size,), change of each parameter that matters
 
 
 class Candidates(NamedTuple):
-    """Parameters and their costs, the best first.
-
-    Attributes:
-        parameters: Parameters, (candidates, size).
-        cost: Their costs, (candidates,).
-    """
+    """Parameters and their costs, the best first."""
 
     parameters: Float[np.ndarray, "candidates size"]
     cost: Float[np.ndarray, "candidates"]

@@ -73,12 +73,7 @@ class Workspace(NamedTuple):
 
 
 class Extent:
-    """How far a slider reaches beyond its origin along the world's axes, as a function of its angle.
-
-    Args:
-        vertices: Vertices of the slider, (vertices, 2), body frame, m.
-        angles: Number of angles in the table. The table holds the largest reach between neighboring angles.
-    """
+    """Table over the angle of how far a slider, (vertices, 2), reaches beyond its origin along the world's axes."""
 
     def __init__(self, vertices: np.ndarray, angles: int = 720):
         self.angles = angles
@@ -87,18 +82,13 @@ class Extent:
         c, s = np.cos(theta)[:, None], np.sin(theta)[:, None]
         x, y = c * vertices[:, 0] - s * vertices[:, 1], s * vertices[:, 0] + c * vertices[:, 1]
         reach = np.stack([-x.min(1), -y.min(1), x.max(1), y.max(1)], axis=1)  # toward -x, -y, +x and +y
+        # the largest reach between neighboring angles
         around = np.maximum(np.maximum(np.roll(reach, 1, axis=0), reach), np.roll(reach, -1, axis=0))
         self.reach = around[::2].astype(np.float32)
 
     def outside(self, poses: np.ndarray, workspace: Workspace) -> np.ndarray:
-        """Return the largest distance along x or y by which the slider is beyond its limits, (...,), m.
-
-        It is zero within the limits. Obstacles are not considered.
-
-        Args:
-            poses: Poses of the slider, (..., 3), world, m and rad.
-            workspace: The limits.
-        """
+        """Return the largest distance along x or y by which the slider is beyond its limits, zero within, (...,), m."""
+        # Poses are (..., 3), world, m and rad. Obstacles are not considered.
         cell = np.round(poses[..., 2] * (self.angles / (2 * np.pi))).astype(np.int32) % self.angles
         reach = self.reach[cell]
         (x, y), low, high = (poses[..., 0], poses[..., 1]), workspace.slider_low, workspace.slider_high

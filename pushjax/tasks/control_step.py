@@ -33,17 +33,11 @@ NEGLIGIBLE = 1e-3
 
 
 class ControlStepResult(NamedTuple):
-    """Where slider and hand are after a control step, and how its steps went.
+    """Where slider and hand are after a control step, and how its steps went."""
 
-    Attributes:
-        pose: Pose of the slider, (3,), world, m and rad.
-        configuration: Configuration of the hand, (dof,), world, m and rad.
-        status: `Status` of each of the steps of the path, (steps,).
-    """
-
-    pose: Float[Array, "3"]
-    configuration: Float[Array, "dof"]
-    status: Int[Array, "steps"]
+    pose: Float[Array, "3"]  # of the slider, world, m and rad
+    configuration: Float[Array, "dof"]  # of the hand, world, m and rad
+    status: Int[Array, "steps"]  # `Status` of each step of the path
 
     @staticmethod
     def of(push: Trajectory) -> "ControlStepResult":
@@ -64,30 +58,15 @@ class _TouchedOnce(Polygon):
 def control_step(
     polygon: Polygon,
     surface: LimitSurface,
-    friction: Float[Array, ""] | None,
+    friction: Float[Array, ""] | None,  # None: none, on an ellipsoid; the program is smaller and faster
     hand: Hand,
     walls: tuple[Wall, ...],
-    path: Float[Array, "steps+1 dof"],
-    pose: Float[Array, "3"],
+    path: Float[Array, "steps+1 dof"],  # of the hand, world, m and rad
+    pose: Float[Array, "3"],  # of the slider at the start, world, m and rad
 ) -> ControlStepResult:
-    """Push a slider along a short path, among walls.
-
-    If the hand is one round finger, a slider that overlaps the finger or a wall deeply at the start is pushed out
-    (`separation`), and the status of all steps is then OVERLAPPING.
-
-    Args:
-        polygon: Outline of the slider.
-        surface: Its limit surface.
-        friction: Coefficient of friction between fingers and slider. None if there is none, and the surface is an
-            ellipsoid: programs are then smaller and faster.
-        hand: The hand.
-        walls: Walls, which the slider cannot pass.
-        path: Configurations of the hand, world, m and rad.
-        pose: Pose of the slider at the start, world, m and rad.
-
-    Returns:
-        Where slider and hand end, and the status of each step of the path.
-    """
+    """Push a slider along a short path of the hand, among walls."""
+    # If the hand is one round finger, a slider that overlaps the finger or a wall deeply at the start is pushed out
+    # (`separation`), and the status of all steps is then OVERLAPPING.
     args = polygon, surface, friction, hand, walls, path, pose
     in_rounds = Rounds(_begin, _advance, _is_ongoing, _finish)
     if not _is_finger(hand):
@@ -104,18 +83,18 @@ def control_step(
 
 
 def _is_finger(hand: Hand) -> bool:
-    """Whether a hand is one round finger."""
+    """Return whether a hand is one round finger."""
     return len(hand.fingers) == 1 and isinstance(hand.fingers[0], RoundFinger)
 
 
 def _simulated(shape, surface, friction, hand, walls, path, pose) -> Trajectory:
-    """The push along the path. Arguments as in `control_step`."""
+    """Return the push along the path, with arguments as in `control_step`."""
     solver, friction_at = _contact_model(shape, surface, friction, hand, path)
     return simulate(shape, hand, path, pose, solver, friction_at, walls)
 
 
 def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless | None, FrictionAt]:
-    """The solver of contact problems, and limit surface and friction of a step. Arguments as in `control_step`."""
+    """Return the contact solver, and limit surface and friction of a step, with arguments as in `control_step`."""
     mu = jnp.zeros_like(path[0, 0]) if friction is None else friction
     form = form_and_friction(surface, jnp.broadcast_to(mu, (len(hand.fingers),)))
     # None: the default solver. It has a closed form for one contact, so `Frictionless` would not be faster there.
@@ -126,7 +105,7 @@ def _contact_model(shape, surface, friction, hand, path) -> tuple[Frictionless |
 def _is_valid(
     push: Trajectory, polygon: Polygon, surface: LimitSurface, walls: tuple[Wall, ...], allowed: Scalar
 ) -> Bool[Array, ""]:
-    """Whether a push with one contact and without walls is what it would be with all of them."""
+    """Return whether a push with one contact and without walls is the same as with all of them."""
     valid = jnp.all((push.status == Status.MOVING) | (push.status == Status.FREE)) & jnp.all(push.overlap <= allowed)
     for wall in walls:
         valid &= overlap_of_wall(polygon, wall, Vec3.of(push.pose[-1])).depth <= NEGLIGIBLE * surface.length
@@ -134,19 +113,19 @@ def _is_valid(
 
 
 def _allowed_overlap(surface: LimitSurface, path: Float[Array, "steps+1 dof"]) -> Scalar:
-    """Depth of an overlap that a step of the path may leave, m."""
+    """Return the depth of an overlap that a step of the path may leave, m."""
     displacement = jnp.sqrt(jnp.max(jnp.sum(jnp.diff(path, axis=0) ** 2, axis=1)))
     return jnp.maximum(NEGLIGIBLE * surface.length, DEPTH_PER_DISPLACEMENT * displacement)
 
 
 @jax.jit  # saves tracing time: loops trace their bodies several times
 def _with_all_contacts(*args) -> ControlStepResult:
-    """The control step with all contacts. Arguments as in `control_step`, like those of the functions that follow."""
+    """Return the control step with all contacts, with arguments as in `control_step`, like the functions below."""
     return ControlStepResult.of(_simulated(*args))
 
 
 def _depth_at_start(polygon, surface, friction, hand, walls, path, pose) -> Scalar:
-    """Depth of the deepest overlap at the start, m."""
+    """Return the depth of the deepest overlap at the start, m."""
     start = Vec3.of(pose)
     depth = overlap_of_finger(polygon, hand.fingers[0].radius, Vec2.of(path[0]), start).depth
     for wall in walls:
@@ -155,27 +134,21 @@ def _depth_at_start(polygon, surface, friction, hand, walls, path, pose) -> Scal
 
 
 def _separated(polygon, surface, friction, hand, walls, path, pose) -> ControlStepResult:
-    """The control step of a slider that overlaps something deeply."""
+    """Return the control step of a slider that overlaps something deeply."""
     end = separate(polygon, surface.length, hand.fingers[0].radius, walls, path, pose)
     return ControlStepResult(end, path[-1], jnp.full(len(path) - 1, Status.OVERLAPPING, jnp.int8))
 
 
 class _Progress(NamedTuple):
-    """State of a control step between two trials of parts of its steps.
-
-    Attributes:
-        push: State of the push.
-        trials_left: Number of trials that may follow.
-        status: Status of the steps that are done, (steps,); -1 for the others.
-    """
+    """State of a control step between two trials of parts of its steps."""
 
     push: PushState
-    trials_left: Int[Array, ""]
-    status: Int[Array, "steps"]
+    trials_left: Int[Array, ""]  # trials that may follow
+    status: Int[Array, "steps"]  # of the steps that are done; -1 for the others
 
 
 def _divided(polygon, surface, friction, hand, walls, path, pose) -> tuple[PreparedPush, Array]:
-    """The push with all contacts, and the pose at its start."""
+    """Return the push with all contacts, and the pose at its start."""
     solver, friction_at = _contact_model(polygon, surface, friction, hand, path)
     return prepared_push(polygon, hand, path, pose, solver, friction_at, walls)
 
@@ -199,12 +172,12 @@ def _advance(progress: _Progress, *args) -> _Progress:
 
 
 def _is_ongoing(progress: _Progress, *args) -> Bool[Array, ""]:
-    """Whether another trial follows."""
+    """Return whether another trial follows."""
     return (progress.push.step < len(progress.status)) & (progress.trials_left > 0)
 
 
 def _finish(progress: _Progress, *args) -> ControlStepResult:
-    """Return the result. Steps that were not done have the status that stopped the hand, or NOT_CONVERGED."""
+    """Return the result, in which steps not done have the status that stopped the hand, or NOT_CONVERGED."""
     path, last, steps = args[-2], progress.push, len(progress.status)
     unfinished = jnp.where(last.stop_status != 0, last.stop_status, Status.NOT_CONVERGED)
     status = jnp.where(progress.status < 0, unfinished, progress.status).astype(jnp.int8)

@@ -18,7 +18,7 @@ from pushjax.tasks.environment import Environment, TaskState
 
 @quick_jit
 def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, ...]:
-    """Start an episode, at `task.state_of(row)` if a row is given. Return the next key, observation, state and info."""
+    """Start an episode, at `task.state_of(row)` if given, and return the next key, observation, state and info."""
     key, start_key, noise_key, _ = jax.random.split(key, 4)  # the last is that of the steps
     observation, state = task.reset_env(start_key, params)
     if row is not None:
@@ -32,7 +32,7 @@ def start(task: Any, key: Array, params: Any, row: Array | None) -> tuple[Any, .
 
 @quick_jit
 def step(task: Environment, key: Array, state: TaskState, action: Any, params: Any) -> tuple[Any, ...]:
-    """Take a step. Return the key, observation, state, reward, terminated, truncated and info."""
+    """Take a step and return the key, observation, state, reward, terminated, truncated and info."""
     step_key = jax.random.fold_in(jax.random.split(key, 4)[3], state.time)
     observation, state, reward, terminated, info = task.step_env(step_key, state, action, params)
     return key, observation, state, reward, terminated, task.is_truncated(state, params), info
@@ -40,28 +40,22 @@ def step(task: Environment, key: Array, state: TaskState, action: Any, params: A
 
 @jit
 def start_all(task: Environment, keys: np.ndarray, params: Any, rows: Array | None) -> tuple[Any, ...]:
-    """Start all episodes, as `start`."""
+    """Start all episodes, as `start` does."""
     return jax.vmap(lambda key, row: start(task, key, params, row))(keys, rows)
 
 
 @jit
 def step_all(
-    task: Environment, mode: str, keys: Array, states: TaskState, ended: Any, actions: Any, params: Any
+    task: Environment,
+    mode: str,  # when episodes that have ended are reset: value of Gymnasium's `AutoresetMode`
+    keys: Array,  # of the environments
+    states: TaskState,
+    ended: Any,  # (environments,), whether the step before ended the episode
+    actions: Any,  # (environments, ...)
+    params: Any,
 ) -> tuple[tuple[Any, ...], tuple[Any, Any] | None]:
-    """Take a step in all environments, and reset those that need it.
-
-    Args:
-        task: The task.
-        mode: When episodes that have ended are reset: value of an `AutoresetMode` of Gymnasium.
-        keys: Keys of the environments.
-        states: Their states.
-        ended: Whether the step before ended their episodes, (environments,).
-        actions: The actions, (environments, ...).
-        params: Parameters of the task.
-
-    Returns:
-        What `step` returns. And if the mode is "SameStep", observations and info before the resets, else None.
-    """
+    """Take a step in all environments, as `step` does, and reset those that need it."""
+    # Returns also observations and info before the resets if the mode is "SameStep", else None.
 
     def restart(key: Array, params: Any) -> tuple[Any, ...]:
         return start(task, key, params, None)

@@ -295,7 +295,8 @@ def _task(task: str | Environment, options: dict[str, Any]) -> Environment:
 
 
 def _check_process() -> None:
-    """Raise an error in a forked process, where JAX would wait forever. Gymnasium passes it on from a `reset`."""
+    """Raise an error in a forked process, where JAX would wait forever."""
+    # Gymnasium passes it on from a `reset`.
     if _processes and os.getpid() != _processes[0]:
         raise RuntimeError(
             "JAX cannot be used in a process that was forked after it had run: use gymnasium.make_vec without "
@@ -320,7 +321,7 @@ def _space(space: Space) -> Any:
 
 
 def _keys(seeds: Sequence[int]) -> np.ndarray:
-    """Return a PRNG key for each seed, as raw integers, which can be pickled. Seeds count modulo 2^32."""
+    """Return a PRNG key for each seed modulo 2^32, as raw integers, which can be pickled."""
     return np.asarray(jax.vmap(jax.random.PRNGKey)(np.array([int(seed) % 2**32 for seed in seeds], np.uint32)))
 
 
@@ -337,7 +338,7 @@ def _row(task: Any, options: dict[str, Any] | None) -> Array | None:
 
 
 def _reset_mask(options: dict[str, Any] | None, num_envs: int) -> np.ndarray:
-    """Return the option "reset_mask"; all True if it is not given."""
+    """Return the option "reset_mask", all True if it is not given."""
     given = None if options is None else options.get("reset_mask")
     if given is None:
         return np.ones(num_envs, bool)
@@ -368,10 +369,8 @@ def _single_info(info: dict[str, Array]) -> dict[str, Any]:
 
 
 def _vector_info(info: dict[str, Array], mask: np.ndarray) -> dict[str, Any]:
-    """Return `info` as Gymnasium's vector environments do.
-
-    Each entry is zero where `mask` does not hold, and has the mask beside it, under the same name with "_" in front.
-    """
+    """Return `info` in the form of Gymnasium's vector environments."""
+    # Each entry is zero where `mask` does not hold, and has the mask beside it, under the same name with "_" in front.
     result: dict[str, Any] = {}
     for name, value in info.items():
         array = np.array(value)

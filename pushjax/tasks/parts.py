@@ -14,29 +14,14 @@ from pushjax.simulation.slider import Slider
 
 def shared_params(
     slider: Slider,
-    goal: ArrayLike,
-    friction: ArrayLike | None,
-    model: FrictionModel | None,
-    noise: dict[str, ArrayLike | None],
-    success_coverage: ArrayLike,
-    max_steps_in_episode: int,
+    goal: ArrayLike,  # (3,), pose of the slider at the goal
+    friction: ArrayLike | None,  # coefficient at the fingers; None for no friction
+    model: FrictionModel | None,  # distribution of the friction; None for none
+    noise: dict[str, ArrayLike | None],  # standard deviations by the name of their field; None for none
+    success_coverage: ArrayLike,  # coverage of the goal above which an episode terminates
+    max_steps_in_episode: int,  # control steps after which an episode is truncated
 ) -> dict[str, Any]:
-    """Return the fields of `TaskParams`, checked.
-
-    Args:
-        slider: The slider, m.
-        goal: Pose at the goal, (3,).
-        friction: Coefficient of friction between fingers and slider; None for no friction.
-        model: Distribution of the friction; None for none.
-        noise: Standard deviations by the name of their field; None for none.
-        success_coverage: Coverage of the goal above which an episode terminates.
-        max_steps_in_episode: Number of control steps after which an episode is truncated.
-
-    Raises:
-        ValueError: For a wrong shape, a value that is not finite, a value outside `goal` that is negative, a limit of
-            steps that is not positive, or a model that the limit surface does not allow (`FrictionModel.around`).
-        TypeError: If `model` is no `FrictionModel`.
-    """
+    """Return the fields of `TaskParams`, checked."""
     check_count("max_steps_in_episode", max_steps_in_episode)
     if model is not None:
         check_type("model", model, FrictionModel)

@@ -298,7 +298,7 @@ class PushT(Environment):
 
 @cache
 def _default_params(dtype: Any) -> PushTParams:
-    """The parameters of gym-pusht, in the given floating dtype, which is the default one at the time of the call."""
+    """Return the parameters of gym-pusht in a floating dtype, which is the default one at the time of the call."""
     with eager_context():
         return PushT().params()
 
@@ -306,12 +306,8 @@ def _default_params(dtype: Any) -> PushTParams:
 def _block(
     block: Polygon | None, center: ArrayLike | None, length: ArrayLike | None, physics: Physics, meters: float
 ) -> tuple[Slider, Array, Array]:
-    """Make the slider from a block (None: the T); the other arguments are those of `PushT.params`.
-
-    Returns:
-        The slider, m; and in its frame, px, the origin of the block's own frame, (2,), and the observed points,
-        (points, 2).
-    """
+    """Make the slider, m, and in its frame the block's origin, (2,), and the observed points, (points, 2), px."""
+    # From a block (None: the T). The other arguments are those of `PushT.params`.
     if block is None:
         vertices, middle, keypoints = np.array(T_VERTICES, float), np.array(T_CENTER), np.array(T_KEYPOINTS, float)
     else:
@@ -332,7 +328,7 @@ def _block(
 
 
 def _gyration_radius(shape: Polygon) -> float:
-    """Radius of gyration of a polygon about the origin, m."""
+    """Return the radius of gyration of a polygon about the origin, m."""
     x, y = np.asarray(shape.vertices, float).T
     next_x, next_y = np.roll(x, -1), np.roll(y, -1)
     cross = x * next_y - next_x * y

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_shape, common_dtype
 from pushjax._internal.jit import quick_jit
@@ -101,22 +101,15 @@ def _render(
 
 @quick_jit
 def render_table(
-    vertices: Array, goal: Array, hand: Hand, configuration: Array, walls: tuple[Wall, ...], width: float, size: int
-) -> Array:
-    """Draw a table from above, with x to the right and y up, and its origin in the middle.
-
-    Args:
-        vertices: Vertices of the block, shape (vertices, 2), m.
-        goal: Vertices of the goal, shape (goal_vertices, 2), m.
-        hand: The hand.
-        configuration: Its configuration, shape (dof,), m.
-        walls: The walls. What is behind them is drawn gray.
-        width: Width and height of the part of the table that is drawn, m.
-        size: Width and height of the picture in pixels.
-
-    Returns:
-        The picture, shape (size, size, 3), RGB, rows from the top.
-    """
+    vertices: Float[Array, "vertices 2"],  # of the block, m
+    goal: Float[Array, "goal_vertices 2"],  # its vertices at the goal, m
+    hand: Hand,
+    configuration: Float[Array, "dof"],  # of the hand, m and rad
+    walls: tuple[Wall, ...],  # what is behind them is drawn gray
+    width: float,  # width and height of the part of the table that is drawn, m
+    size: int,  # width and height of the picture in pixels
+) -> UInt8[Array, "size size 3"]:
+    """Draw a table from above in RGB, rows from the top, with x to the right, y up and the origin in the middle."""
     pixels, scale = _Pixels.of(size, vertices.dtype), WORKSPACE / width
 
     def drawn(points: Array) -> Array:
@@ -139,15 +132,10 @@ def render_table(
 
 
 class _Pixels(NamedTuple):
-    """Centers of all pixels in the workspace.
+    """Centers of all pixels in the workspace, px."""
 
-    Attributes:
-        x: Of shape (1, size), px.
-        y: Of shape (size, 1), px.
-    """
-
-    x: Array
-    y: Array
+    x: Float[Array, "1 size"]
+    y: Float[Array, "size 1"]
 
     @staticmethod
     def of(size: int, dtype: jnp.dtype) -> "_Pixels":
@@ -161,17 +149,12 @@ class _Pixels(NamedTuple):
         return jnp.abs(jnp.maximum(jnp.abs(self.x - middle), jnp.abs(self.y - middle)) - half)
 
 
-def _outline(pixels: _Pixels, vertices: Array, seams: tuple[tuple[int, int], ...] = ()) -> tuple[Array, Array]:
-    """Return which pixels are inside a polygon, and how far each is from its outline.
-
-    Args:
-        pixels: The pixels.
-        vertices: Vertices of the polygon, shape (vertices, 2), px.
-        seams: Pairs of vertices with a line between them.
-
-    Returns:
-        Whether each pixel is inside, and its distance from the nearest edge or seam, px. Both have shape (size, size).
-    """
+def _outline(
+    pixels: _Pixels,
+    vertices: Float[Array, "vertices 2"],  # px
+    seams: tuple[tuple[int, int], ...] = (),  # pairs of vertices with a line between them
+) -> tuple[Bool[Array, "size size"], Float[Array, "size size"]]:
+    """Return which pixels are inside a polygon, and the distance of each from the nearest edge or seam, px."""
     corners = [(vertex[0], vertex[1]) for vertex in vertices]
     edges = list(zip(corners, corners[1:] + corners[:1], strict=True))
     inside, squared = jnp.zeros((), bool), jnp.asarray(jnp.inf, vertices.dtype)
@@ -204,18 +187,16 @@ class _Picture(NamedTuple):
     def blank(size: int, dtype: jnp.dtype) -> "_Picture":
         return _Picture(*(jnp.full((size, size), channel, dtype) for channel in WHITE))
 
-    def layer(self, color: Color, depth: Array) -> "_Picture":
-        """Draw a color on the picture.
-
-        Args:
-            color: The color.
-            depth: How far inside the drawn area each pixel is, px of the workspace, negative outside.
-        """
+    def layer(self, color: Color, depth: Float[Array, "size size"]) -> "_Picture":
+        """Draw a color on the picture."""
+        # `depth` is how far inside the drawn area each pixel is, px of the workspace, negative outside.
         alpha = jnp.clip(depth + 0.5, 0, 1)
         return _Picture(*(old + (new - old) * alpha for old, new in zip(self, color, strict=True)))
 
-    def polygon(self, pixels: _Pixels, vertices: Array, color: Color, line: Color | None = None) -> "_Picture":
-        """Draw a polygon, with an outline of another color if that is given. The vertices have shape (vertices, 2)."""
+    def polygon(
+        self, pixels: _Pixels, vertices: Float[Array, "vertices 2"], color: Color, line: Color | None = None
+    ) -> "_Picture":
+        """Draw a polygon, with an outline of another color if that is given."""
         inside, from_line = _outline(pixels, vertices)
         picture = self.layer(color, jnp.where(inside, from_line, -from_line) + 0.5)
         return picture if line is None else picture.layer(line, LINE_HALF_WIDTH - from_line)

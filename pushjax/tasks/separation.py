@@ -27,17 +27,11 @@ OPENING = 1 - 0.9**0.6  # fraction of the depth that pymunk removes in 0.01 s: a
 
 
 class Overlap(NamedTuple):
-    """The deepest point of a contact.
+    """The deepest point of a contact."""
 
-    Attributes:
-        depth: Depth of the overlap, m; negative where the bodies are apart.
-        point: The point, relative to the slider's origin but in the world's axes, m.
-        normal: Unit normal into the slider, world.
-    """
-
-    depth: Scalar
-    point: Vec2
-    normal: Vec2
+    depth: Scalar  # m; negative where the bodies are apart
+    point: Vec2  # relative to the slider's origin, but in the world's axes, m
+    normal: Vec2  # unit, into the slider, world
 
 
 def overlap_of_finger(polygon: Polygon, radius: Scalar, center: Vec2, pose: Vec3) -> Overlap:
@@ -57,36 +51,22 @@ def overlap_of_wall(polygon: Polygon, wall: Wall, pose: Vec3) -> Overlap:
 
 
 def separate(
-    polygon: Polygon,
-    length: Scalar,
-    radius: Scalar,
+    polygon: Polygon,  # outline of the slider
+    length: Scalar,  # of the limit surface, m
+    radius: Scalar,  # of the finger, m
     walls: tuple[Wall, ...],
-    path: Float[Array, "steps+1 2"],
-    pose: Float[Array, "3"],
+    path: Float[Array, "steps+1 2"],  # of the finger's center, world, m
+    pose: Float[Array, "3"],  # of the slider at the start, world, m and rad
 ) -> Float[Array, "3"]:
-    """Move a slider that overlaps a finger or walls, over one control step.
-
-    Args:
-        polygon: Outline of the slider.
-        length: Characteristic length of the limit surface, m.
-        radius: Radius of the finger, m.
-        walls: The walls.
-        path: Path of the finger's center, world, m.
-        pose: Pose of the slider at the start, world, m and rad.
-
-    Returns:
-        The pose of the slider at the end.
-    """
+    """Return the pose of a slider that overlaps a finger or walls, after one control step."""
     steps = len(path) - 1
     times = jnp.arange(ROUNDS + 1, dtype=path.dtype) * (steps / ROUNDS)
     old_times = jnp.arange(steps + 1, dtype=path.dtype)
     centers = jnp.stack([jnp.interp(times, old_times, column) for column in path.T], axis=1)  # of the finger
 
     def open_contact(pose: Vec3, overlap: Overlap, approach: Scalar) -> Vec3:
-        """Return the pose after a round: the contact opens by a fraction of its depth, and by `approach`, m.
-
-        That is how far the finger came nearer, or how much deeper the slider was pushed into the wall.
-        """
+        """Return the pose after a round, in which the contact opens by a fraction of its depth and by `approach`, m."""
+        # `approach` is how far the finger came nearer, or how much deeper the slider was pushed into the wall.
         touches = overlap.depth > 0
         opening = jnp.where(touches, jnp.maximum(approach, 0) + OPENING * jnp.maximum(overlap.depth, 0), 0.0)
         lever = overlap.point.cross(overlap.normal) / length

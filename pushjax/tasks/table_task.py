@@ -230,7 +230,7 @@ def draw_pose(key: PRNGKeyArray, low: tuple[float, float], high: tuple[float, fl
 
 @cache
 def _default_params(task: type[TableTask], dtype: Any) -> TableParams:
-    """The default parameters of a task in a floating dtype, which is the default one at the time of the call."""
+    """Return the default parameters of a task in a floating dtype, the default one at the time of the call."""
     with eager_context():
         return task().params()
 

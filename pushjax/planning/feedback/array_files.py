@@ -22,7 +22,7 @@ def save_arrays(path: str | Path, version: int, arrays: dict[str, Any]) -> None:
 
 
 def load_arrays(path: str | Path, content: str, version: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read what `save_arrays` wrote; `content` is what the file should hold, in words."""
+    """Read what `save_arrays` wrote, where `content` is what the file should hold, in words."""
     try:
         with np.load(Path(path).expanduser()) as file:
             found = {name: file[name] for name in ("format_version", *names)}
@@ -36,7 +36,8 @@ def load_arrays(path: str | Path, content: str, version: int, names: Iterable[st
 
 
 def check_arrays(path: str | Path, content: str, arrays: dict[str, np.ndarray], shapes: dict[str, tuple]) -> None:
-    """Raise ValueError unless the arrays have these shapes and are finite. Equal words in shapes are equal sizes."""
+    """Raise ValueError unless the arrays have these shapes and are finite."""
+    # Equal words in shapes are equal sizes.
     sizes: dict[str, int] = {}
     for name, shape in shapes.items():
         array = arrays[name]

@@ -60,39 +60,22 @@ class Observation(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the controller remembers between control steps.
+    """What the controller remembers between control steps."""
 
-    Attributes:
-        push: The push that is going on, or None.
-        pushing: Whether the finger is in the push, not on the way to it.
-        pose: Pose of the slider when the push was planned.
-        end: Where the push ends, as corrected, (2,), world, m.
-        along: How far along the transit the finger is, m.
-        speed: Length of the last control step, m.
-        velocity: Velocity of the finger by its own model, (2,), m/s.
-        taken: Number of control steps of the push that is going on.
-        pushes: Number of pushes so far.
-        waited: Number of control steps in which there was no push to make.
-        status: Status of the last plan.
-        belief: Belief about friction, or None.
-        last: What was seen one control step ago, if the finger was pushing then, or else None.
-        path: Path of the finger since then by its own model, (points, 2), world, m.
-    """
-
-    push: PlannedPush | None
-    pushing: bool
-    pose: np.ndarray
-    end: np.ndarray
-    along: float
-    speed: float
-    velocity: np.ndarray
-    taken: int
-    pushes: int
-    waited: int
-    status: PlanStatus
-    belief: FrictionBelief | None = None
-    last: Observation | None = None
-    path: np.ndarray | None = None
+    push: PlannedPush | None  # the current push
+    pushing: bool  # whether the finger is in the push, not on the way to it
+    pose: np.ndarray  # (3,), of the slider when the push was planned, world, m and rad
+    end: np.ndarray  # (2,), where the push ends, as corrected, world, m
+    along: float  # how far along the transit the finger is, m
+    speed: float  # length of the last control step, m
+    velocity: np.ndarray  # (2,), of the finger by its own model, m/s
+    taken: int  # control steps of the current push
+    pushes: int  # pushes so far
+    waited: int  # control steps in which there was no push to make
+    status: PlanStatus  # of the last plan
+    belief: FrictionBelief | None = None  # about friction
+    last: Observation | None = None  # one control step ago, if the finger was pushing then
+    path: np.ndarray | None = None  # (points, 2), of the finger since then by its own model, world, m
 
 
 class PushController:
@@ -278,11 +261,7 @@ class PushController:
     def _corrected(
         self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
     ) -> np.ndarray:
-        """Return the best of the ends around `end`, (2,), world, m.
-
-        That is the one whose final pose is nearest to the push's target, or, if the push is to reach the goal, the one
-        whose final pose has the best score.
-        """
+        """Return the best of the ends around `end`, (2,), world, m."""
         ahead = end - finger
         remaining = float(np.linalg.norm(ahead))
         along = ahead / remaining if remaining > 1e-9 else np.array([1.0, 0.0])
@@ -297,6 +276,7 @@ class PushController:
         poses, _ = simulate_pushes(slider, self.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
         final = poses[:, -1].astype(float)
         features = self.planner.library.features
+        # least distance from the push's target, or, if the push is to reach the goal, largest score
         missed = np.linalg.norm(features(final) - features(push.target), axis=1)
         cost = (missed + SHIFT_WEIGHT * np.linalg.norm(ends - end, axis=1)) / self.length
         if push.status == PlanStatus.ONE_PUSH:

@@ -38,11 +38,7 @@ class CostToGo(PoseGrid):
 
     @staticmethod
     def load(path: str | Path) -> "CostToGo":
-        """Read what `save` wrote.
-
-        Raises:
-            ValueError: If the file does not hold a cost to go.
-        """
+        """Read what `save` wrote, or raise ValueError if the file does not hold a cost to go."""
         found = load_arrays(path, "a cost to go", FORMAT, CostToGo._fields)
         shapes = {"origin": (2,), "spacing": (), "values": ("positions", "positions", "angles")}
         check_arrays(path, "a cost to go", found, shapes)
@@ -51,34 +47,19 @@ class CostToGo(PoseGrid):
 
 def cost_to_go(
     library: PushLibrary,
-    goal: np.ndarray,
+    goal: np.ndarray,  # (3,), world, m and rad
     workspace: Workspace,
-    push_time: np.ndarray,
+    push_time: np.ndarray,  # (entries,), control steps of each entry of the library
     *,
-    usable: np.ndarray,
-    tolerance: float,
-    between: float,
-    low: np.ndarray,
-    high: np.ndarray,
-    vertices: np.ndarray,
-    space: FreeSpace | None = None,
+    usable: np.ndarray,  # (pushes,), whether the finger can get to the start of each push
+    tolerance: float,  # of final poses that reach the goal, m, in the metric of `pose_features`
+    between: float,  # control steps between two pushes
+    low: np.ndarray,  # (2,), lowest position of the slider's origin on the grid, m
+    high: np.ndarray,  # (2,), highest; the grid is square, so along the narrower axis it reaches beyond
+    vertices: np.ndarray,  # (vertices, 2), of the slider, body frame, m
+    space: FreeSpace | None = None,  # built with the same `low` and `high`; None: no obstacles
 ) -> CostToGo:
-    """Compute the cost to go by value iteration.
-
-    Args:
-        library: Outcomes of pushes.
-        goal: The goal, (3,), world, m and rad.
-        workspace: Limits of finger and slider.
-        push_time: Control steps of each entry of the library, (entries,).
-        usable: Whether the finger can get to the start of each push, (pushes,).
-        tolerance: A push reaches the goal if its final pose is within this distance, m, in the metric of
-            `pose_features`.
-        between: Control steps between two pushes.
-        low: Lowest position of the slider's origin on the grid, (2,), m.
-        high: Highest position, (2,), m. The grid is square, so along the narrower axis it reaches beyond this.
-        vertices: Vertices of the slider, (vertices, 2), body frame, m.
-        space: Free space among the obstacles, built with the same `low` and `high`. None: there are no obstacles.
-    """
+    """Compute the cost to go by value iteration."""
     spacing = grid_spacing(low, high)
     axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
     theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -123,17 +104,11 @@ def digest_of_costs(
 
 
 class _Moves(NamedTuple):
-    """Pushes from one angle, the best one into each cell.
+    """The cheapest push from one angle into each cell."""
 
-    Attributes:
-        shift: Whole cells by which the slider moves, (moves, 3).
-        cost: Control steps, (moves,).
-        entry: The entries of the library, (moves,).
-    """
-
-    shift: np.ndarray
-    cost: np.ndarray
-    entry: np.ndarray
+    shift: np.ndarray  # (moves, 3), whole cells by which the slider moves
+    cost: np.ndarray  # (moves,), control steps
+    entry: np.ndarray  # (moves,), entries of the library
 
 
 def _last_push(library, goal, cells, push_time, usable, tolerance, between, space) -> np.ndarray:
@@ -172,7 +147,7 @@ def _least_around(values: np.ndarray) -> np.ndarray:
 
 
 def _codes(shift: np.ndarray) -> np.ndarray:
-    """Return one number for each different row of whole numbers."""
+    """Return one integer for each distinct row of integers."""
     wide = 2 * int(np.abs(shift).max(initial=0)) + 1
     return (shift[:, 0] * wide + shift[:, 1]) * wide + shift[:, 2]
 

@@ -29,36 +29,17 @@ MAX_VERTICES = 24  # number of vertices of the slider for the grid
 
 
 class FreeSpace:
-    """Where one slider and one finger may be among obstacles, and which pushes of a library keep them there.
-
-    Args:
-        workspace: The obstacles, and limits of the finger.
-        roadmap: Vertices of the slider, radius of the finger, and as goals the points where each push of the library
-            begins with its run-up.
-        library: Pushes of the slider. The libraries that the methods take may have other outcomes, but must have the
-            same starts, directions and lengths.
-        clearance: Distance that slider and finger keep from obstacles, m.
-        goal: The goal, (3,), world. If it is nearer to an obstacle, the slider keeps only the distance it has there.
-        low: Lowest position of the slider on the grid of the cost to go and on that of `distances`, (2,), world, m.
-        high: Highest position, (2,), world, m.
-
-    Attributes:
-        clearance: Distance that the finger keeps from obstacles, m.
-        slider_clearance: Distance that the slider keeps from obstacles, m: the same, or less if the goal is nearer.
-
-    Raises:
-        ValueError: For a goal at which the slider overlaps an obstacle.
-    """
+    """Collision checks of one slider and one finger among obstacles, and of the pushes of a library."""
 
     def __init__(
         self,
-        workspace: Workspace,
-        roadmap: Roadmap,
-        library: PushLibrary,
-        clearance: float,
-        goal: np.ndarray,
-        low: np.ndarray,
-        high: np.ndarray,
+        workspace: Workspace,  # obstacles, and limits of the finger
+        roadmap: Roadmap,  # vertices, radius, and as goals the points where the library's pushes begin with run-ups
+        library: PushLibrary,  # the methods take other outcomes too, of the same starts, directions and lengths
+        clearance: float,  # that slider and finger keep from obstacles, m
+        goal: np.ndarray,  # (3,), world; if it is nearer to an obstacle, the slider keeps only its distance there
+        low: np.ndarray,  # (2,), lowest position of the slider on the grids here and of the cost to go, world, m
+        high: np.ndarray,  # (2,), highest
     ):
         self.workspace, self.roadmap, self.length = workspace, roadmap, library.length
         self.obstacles, self.vertices, self.radius = workspace.obstacles, roadmap.vertices, roadmap.radius
@@ -66,14 +47,14 @@ class FreeSpace:
         self.positions = SUBDIVISIONS * (POSITIONS - 1) + 1
         reach = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
         self.padding = int(np.ceil(reach / self.spacing)) + 1  # cells beyond the grid that a push may lead to
-        self.clearance = clearance
+        self.clearance = clearance  # of the finger, m
         at_goal = float(self.slider_distance(goal))
         if at_goal < -OVERLAP_TOLERANCE * self.length:
             raise ValueError(
                 f"goal must be a pose at which the slider overlaps no fixture; got {np.asarray(goal).tolist()}, where "
                 "it does"
             )
-        self.slider_clearance = min(clearance, max(at_goal, 0.0))
+        self.slider_clearance = min(clearance, max(at_goal, 0.0))  # of the slider, m
 
     def slider_distance(self, poses: np.ndarray) -> np.ndarray:
         """Return the distance of the slider from obstacles at poses (..., 3), as `Obstacles.slider_clearance` does."""
@@ -97,11 +78,9 @@ class FreeSpace:
 
     @cached_property
     def _free_cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Cells that are free, on the grid of `distances` with `padding` more cells on each side.
-
-        A tuple of three: those of the slider, (angles, cells, cells), those of the finger during a push, (cells,
-        cells), and those of the finger at the start of a run-up, (cells, cells).
-        """
+        """Free cells of slider and finger on the grid of `distances` with `padding` more cells on each side."""
+        # Of the slider, (angles, cells, cells); of the finger during a push, and at the start of a run-up, (cells,
+        # cells).
         side = (self.padding, self.padding)
         slider = np.pad(
             np.moveaxis(self.distances.values, 2, 0) >= self.slider_clearance,
@@ -119,21 +98,13 @@ class FreeSpace:
         return self.workspace.allows_finger(points) & (distance >= self.roadmap.min_obstacle_distance)
 
     def probably_free(self, library: PushLibrary, pose: np.ndarray, pushes: np.ndarray) -> np.ndarray:
-        """Return which pushes from one pose are free by the grid, each up to every `GRID_STRIDE`-th length.
-
-        Poses outside of the grid count as free of obstacles for the slider.
-
-        Args:
-            library: The pushes.
-            pose: Pose of the slider, (3,), world.
-            pushes: Indices of the pushes that are checked; the others are not free.
-
-        Returns:
-            Whether they are free, (pushes, checked lengths).
-        """
+        """Return which pushes from one pose, (3,), are free by the grid, (pushes, checked lengths)."""
+        # Only the pushes with the indices `pushes` are checked, each up to every `GRID_STRIDE`-th length; the others
+        # are not free.
         found = np.zeros((len(library.starts), len(range(0, len(library.travel), GRID_STRIDE))), bool)
         poses = compose(pose, library.outcomes[0][pushes, ::GRID_STRIDE])
         distance = self.distances(poses)
+        # poses outside of the grid count as free of obstacles for the slider
         last = self.low + self.spacing * (self.positions - 1)
         in_grid = np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1)
         ends = library.starts[pushes, None, :2] + library.travel[::GRID_STRIDE, None] * library.directions[pushes, None]
@@ -144,13 +115,7 @@ class FreeSpace:
         return found
 
     def free(self, library: PushLibrary, poses: np.ndarray, entries: np.ndarray) -> np.ndarray:
-        """Return whether pushes are free, by exact distances at every `EXACT_STRIDE`-th length, (entries,).
-
-        Args:
-            library: The pushes.
-            poses: Pose of the slider before each, (entries, 3), world.
-            entries: Entries of the library, (entries,).
-        """
+        """Return whether pushes `entries` from poses (entries, 3), world, are free by exact distances, (entries,)."""
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, index.max(initial=0) + EXACT_STRIDE, EXACT_STRIDE), index[:, None])
         ends = library.starts[push, :2] + library.travel[index, None] * library.directions[push]
@@ -159,15 +124,10 @@ class FreeSpace:
         return self._run_up_may_start(starts) & self._keeps_distance(reached, starts, to_world(poses, ends))
 
     def _keeps_distance(self, poses: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return whether slider and finger keep their distance from obstacles in pushes, (pushes,).
-
-        A slider that is too near to an obstacle at first must come no nearer, and must be farther away at the end.
-
-        Args:
-            poses: Poses of the slider along each push, (pushes, poses, 3), world.
-            start: Where the finger starts, (pushes, 2), world, m.
-            end: Where it ends, (pushes, 2), world, m.
-        """
+        """Return whether slider and finger keep their distance from obstacles in pushes, (pushes,)."""
+        # `poses` (pushes, poses, 3) are those of the slider; the finger moves from `start` to `end`, (pushes, 2), all
+        # in the world. A slider that is too near to an obstacle at first must come no nearer, and must be farther away
+        # at the end.
         distance = self.slider_distance(poses)
         before, required = distance[:, 0], self.slider_clearance
         kept = distance.min(1) >= np.minimum(required, before - OVERLAP_TOLERANCE * self.length)
@@ -180,18 +140,9 @@ class FreeSpace:
         return self.obstacles.segment_clearance(start, end, enough) >= enough
 
     def free_from_grid(self, library: PushLibrary, angle: float, entries: np.ndarray) -> np.ndarray:
-        """Return whether pushes are free by the grid, from every position on the grid of the cost to go.
-
-        Poses on the way and positions of the finger are rounded to the nearest cell.
-
-        Args:
-            library: The pushes.
-            angle: Angle of the slider before each push, rad.
-            entries: Entries of the library, (entries,).
-
-        Returns:
-            Whether they are free, (entries, rows, columns).
-        """
+        """Return whether pushes from an angle, rad, are free by the grid, (entries, rows, columns)."""
+        # From every position on the grid of the cost to go. Poses on the way and positions of the finger are rounded to
+        # the nearest cell.
         slider, finger, run_up = self._free_cells
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, len(library.travel) + GRID_STRIDE, GRID_STRIDE), index[:, None])

@@ -207,22 +207,20 @@ def _effective(weight: Float[Array, "samples"]) -> Float[Array, ""]:
 def _squared_errors(
     settings: FrictionFilter, belief: FrictionBelief, before: Array, path: Array, after: Array
 ) -> Float[Array, "samples"]:
-    """Return the squared distance of the simulated from the seen pose under each sample, in scales of the error.
-
-    It is infinite where the simulation failed.
-    """
+    """Return the squared pose error of the simulation under each sample, in scales of the error."""
     length = settings.slider.surface.length
     scale = settings.error**2 + settings.relative_error**2 * _distance_squared(before, after, length)
 
     def squared_error(surface: LimitSurface, mu: Array) -> Float[Array, ""]:
         push = rollout(Slider(settings.slider.shape, surface), settings.hand, path, pose=before, friction=mu)
+        # a sample whose simulation failed explains nothing
         return jnp.where(jnp.any(push.failed), jnp.inf, _distance_squared(push.pose[-1], after, length) / scale)
 
     return jax.vmap(squared_error)(belief.surface, belief.friction)
 
 
 def _distance_squared(a: Float[Array, "3"], b: Float[Array, "3"], length: Array) -> Float[Array, ""]:
-    """Return the squared distance of two poses, m^2; an angle counts with its smaller way round."""
+    """Return the squared distance of two poses, m^2, with the angle between them wrapped to [-pi, pi]."""
     x, y, theta = a - b
     return x**2 + y**2 + (length * wrap_to_pi(theta)) ** 2
 

@@ -35,29 +35,20 @@ class PlanStatus(IntEnum):
 
 
 class PlannedPush(NamedTuple):
-    """The next push.
+    """The next push."""
 
-    Attributes:
-        status: What the push is for, or why there is none.
-        transit: Transit of the finger to where the run-up begins, world. Without a push it has infinite length.
-        start: Where the finger is about to touch the slider, (2,), world, m.
-        end: Where the push ends, (2,), world, m.
-        target: Pose of the slider that the push is for, (3,), world, m and rad.
-        cost: Predicted number of control steps to the goal.
-    """
-
-    status: PlanStatus
-    transit: Transit
-    start: np.ndarray
-    end: np.ndarray
-    target: np.ndarray
-    cost: float
+    status: PlanStatus  # what the push is for, or why there is none
+    transit: Transit  # of the finger to where the run-up begins, world; without a push its length is infinite
+    start: np.ndarray  # (2,), where the finger is about to touch the slider, world, m
+    end: np.ndarray  # (2,), where the push ends, world, m
+    target: np.ndarray  # (3,), pose of the slider that the push is for, world, m and rad
+    cost: float  # predicted control steps to the goal
 
 
 class PushChoice(NamedTuple):
-    """A push that may come next: its kind, its entry in the library, the pose it is for, and its predicted cost."""
+    """A push that may come next."""
 
-    status: PlanStatus
-    entry: int
-    target: np.ndarray
-    cost: float
+    status: PlanStatus  # its kind
+    entry: int  # of the library
+    target: np.ndarray  # (3,), pose of the slider that it is for, world, m and rad
+    cost: float  # predicted control steps to the goal

@@ -8,20 +8,13 @@ POSITIONS = 36  # cells along x and y each, of the cost to go
 
 
 class PoseGrid(NamedTuple):
-    """Values of the poses on a grid, and of poses between them by interpolation.
+    """Values of poses on a regular grid, with linear interpolation."""
 
-    Positions are at equal spacing, and angles, which are periodic, are all around. A position outside of the grid has
-    the value of the nearest one on its border.
+    # Angles are periodic over a full turn. Positions beyond the border have the value of the nearest one on it.
 
-    Attributes:
-        origin: Position of the first cell, (2,), m.
-        spacing: Distance between neighboring cells, m.
-        values: Values, (positions, positions, angles).
-    """
-
-    origin: np.ndarray
-    spacing: float
-    values: np.ndarray
+    origin: np.ndarray  # (2,), position of the first cell, m
+    spacing: float  # of neighboring cells, m
+    values: np.ndarray  # (positions, positions, angles)
 
     def nearest(self, poses: np.ndarray) -> np.ndarray:
         """Return the value at the nearest cell of poses (..., 3), (...,)."""

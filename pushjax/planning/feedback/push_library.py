@@ -308,16 +308,10 @@ class PushLibrary:
 
 
 def pose_features(poses: np.ndarray, center: np.ndarray, length: float) -> np.ndarray:
-    """Return four numbers of each pose whose Euclidean distance is a distance of poses, (..., 4), m.
-
-    They are the position of the center, and `length` times cosine and sine of the angle. So angles that differ by a
-    full turn are the same, and for small differences the distance is sqrt(dx^2 + dy^2 + (length dtheta)^2).
-
-    Args:
-        poses: Poses, (..., 3), m and rad.
-        center: The slider's center, (2,), body frame, m.
-        length: What an angle of one radian counts, m.
-    """
+    """Return four features of poses (..., 3) whose Euclidean distance is a distance of poses, (..., 4), m."""
+    # They are the position of `center`, (2,), body frame, and `length`, m, times cosine and sine of the angle. So
+    # angles that differ by a full turn are the same, and for small differences the distance is sqrt(dx^2 + dy^2 +
+    # (length dtheta)^2).
     theta = poses[..., 2]
     center_position = to_world(poses, np.asarray(center, poses.dtype))
     return np.concatenate(
@@ -327,23 +321,14 @@ def pose_features(poses: np.ndarray, center: np.ndarray, length: float) -> np.nd
 
 
 def fan(
-    slider: Slider, radius: float, contacts: int = 240, angles: int = 9, max_angle: float = np.pi / 3
+    slider: Slider,
+    radius: float,  # of the finger, m
+    contacts: int = 240,  # places around the slider at equal spacing; in reflex corners some are left out
+    angles: int = 9,  # directions at each place
+    max_angle: float = np.pi / 3,  # between a direction and the inward normal, rad
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the starts and the directions of straight pushes of a round finger from all around a slider.
-
-    Args:
-        slider: The slider.
-        radius: Radius of the finger, m.
-        contacts: Number of places around the slider, at equal spacing; in reflex corners some are left out.
-        angles: Number of directions at each place.
-        max_angle: Largest angle between a direction and the inward normal, rad, less than pi / 2.
-
-    Returns:
-        Centers of the finger (pushes, 2), m, a small gap away from the slider, and unit vectors (pushes, 2).
-
-    Raises:
-        ValueError: If a number is out of its range.
-    """
+    """Return starts and directions of straight pushes of a round finger all around a slider, (pushes, 2) each."""
+    # The starts are centers of the finger, m, a small gap away from the slider; the directions are unit vectors.
     check_count("contacts", contacts)
     check_count("angles", angles)
     if not radius >= 0:
@@ -359,7 +344,7 @@ def fan(
 
 
 def _numbers(slider: Slider) -> np.ndarray:
-    """Return all numbers of a slider, (numbers,)."""
+    """Return all leaves of a slider as one vector, (numbers,)."""
     return np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in jax.tree.leaves(slider)])
 
 

@@ -267,14 +267,10 @@ class PushPlanner:
         return PushChoice(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
     def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, must_reach: bool) -> np.ndarray:
-        """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost.
-
-        Args:
-            spent: Control steps without the risk, which is never negative, (pushes,).
-            back: Pose of the slider before each push, relative to the goal, (pushes, 3).
-            entries: The pushes, (pushes,).
-            must_reach: Whether the cost of pushes that cannot reach the goal is infinite.
-        """
+        """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost."""
+        # `spent` are the control steps without the risk, which is never negative, (pushes,). `back` are the poses of
+        # the slider before the pushes, relative to the goal, (pushes, 3). With `must_reach`, pushes that cannot reach
+        # the goal have infinite cost.
         cost = np.full(len(entries), np.inf)
         order = np.argsort(spent, kind="stable")
         order = order[np.isfinite(spent[order])]
@@ -287,12 +283,7 @@ class PushPlanner:
         return cost
 
     def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the control steps that stand for the risk of missing the goal, and whether the goal may be reached.
-
-        Args:
-            back: Pose of the slider before each push, relative to the goal, (pushes, 3).
-            entries: Last pushes, (pushes,).
-        """
+        """Return the risk of missing the goal, in control steps, and whether it may be reached, as `_with_risk`."""
         enough = self.measure.enough
         score = self.measure(compose(back, self.library.relative[entries]))
         if len(self.sampled.outcomes) == 1:
@@ -371,14 +362,9 @@ class PushPlanner:
         return PushChoice(PlanStatus.TWO_PUSHES, int(entries[best]), reached[best].astype(float), float(total[k]))
 
     def _least(self, cost: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]) -> int | None:
-        """Return the index of the least finite cost of a choice whose pushes run into no fixture.
-
-        Only the `CHECKED` choices of least cost are considered. The result is None if none of them is free.
-
-        Args:
-            cost: Costs, (choices,).
-            *pushes: Pushes of each choice: poses of the slider before them, (choices, 3), and entries, (choices,).
-        """
+        """Return the index of the least finite cost of a choice whose pushes are all free, or None."""
+        # `pushes` are the poses of the slider before each push, (choices, 3), and its entries, (choices,). Only the
+        # `CHECKED` choices of least cost are considered.
         if self.space is None:
             best = int(np.argmin(cost))
             return best if np.isfinite(cost[best]) else None

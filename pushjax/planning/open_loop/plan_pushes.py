@@ -266,7 +266,7 @@ def _check_poses(problem: PushProblem, goal: Goal) -> None:
 
 
 def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarray | None:
-    """Return where the finger is at first, after checks; None if that is free."""
+    """Return where the finger is at first, after checks, or None if that is free."""
     if finger is None:
         return None
     if not _is_one_finger(problem.hand):

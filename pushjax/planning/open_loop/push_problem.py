@@ -53,42 +53,24 @@ class Outcomes(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a candidate does under one sample of friction.
-
-    Attributes:
-        cost: Its cost.
-        failed: Whether a rollout failed.
-        poses: Poses of the slider before the first push and after each, (pushes + 1, 3), world.
-    """
+    """What a candidate does under one sample of friction."""
 
     cost: Float[Array, ""]
-    failed: Bool[Array, ""]
-    poses: Float[Array, "pushes+1 3"]
+    failed: Bool[Array, ""]  # whether a rollout failed
+    poses: Float[Array, "pushes+1 3"]  # of the slider before the first push and after each, world, m and rad
 
 
 class PushProblem(eqx.Module):
-    """What candidates are evaluated on.
-
-    Attributes:
-        pushes: Turns the parameters of a candidate into paths of the hand.
-        slider: The slider.
-        hand: The hand.
-        start: Poses of the slider at the start, (samples, 3), world, m and rad.
-        mean: Mean friction. Under it the slider is moved to where the path of each later push is laid out.
-        draws: Sampled friction, one for each start.
-        cost: Cost of one sample.
-        risk: Makes one number of the costs of all samples.
-        fixtures: What the slider may run into.
-    """
+    """What candidates are evaluated on."""
 
     pushes: Any  # `PushSequence`; None where nothing is searched, as for cost and risk
     slider: Slider
     hand: Hand
-    start: Float[Array, "samples 3"]
-    mean: Draws
-    draws: Draws
-    cost: Any
-    risk: Any
+    start: Float[Array, "samples 3"]  # of the slider, world, m and rad
+    mean: Draws  # friction under which the slider is moved to where the path of each later push is laid out
+    draws: Draws  # sampled friction, one for each start
+    cost: Any  # `Cost` of one sample
+    risk: Any  # `Risk` of the costs of all samples
     fixtures: Fixtures
 
     def lay_out(self, parameters: Array) -> tuple[Float[Array, "pushes steps+1 dof"], Float[Array, "pushes+1 3"]]:
@@ -179,12 +161,12 @@ def samples_of(paths: np.ndarray, problem: PushProblem) -> Sample:
 
 
 def _without_samples(problem: PushProblem) -> PushProblem:
-    """Return the problem with what does not depend on the number of samples: the same for all stages of a search."""
+    """Return the problem without its samples, which is the same for all stages of a search."""
     return replace(problem, draws=None, start=mean_pose(problem.start)[None])
 
 
 def _in_batches(count: int, size: int) -> list[np.ndarray]:
-    """Return the indices below `count` in arrays of one size; the last array is filled up with indices from zero on."""
+    """Return the indices below `count` in arrays of one size, the last one filled up with indices from zero on."""
     batches = -(-count // size)
     return np.split(np.arange(batches * size) % count, batches)
 
@@ -250,12 +232,9 @@ def push_problem(
     model: FrictionModel,
     samples: int,
     fixtures: Fixtures,
-    criteria: tuple[PushSequence, Cost, Risk] | None,
+    criteria: tuple[PushSequence, Cost, Risk] | None,  # of a search; None where nothing is searched
 ) -> PushProblem:
-    """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction.
-
-    `criteria` says what candidates are and what they cost; it is None where nothing is searched.
-    """
+    """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction."""
     check_key(key)
     dtype = common_dtype(slider, hand, start)
     poses = as_float(start, dtype, "start")

@@ -275,21 +275,16 @@ def _checked(key: PRNGKeyArray, slider: Slider, hand: Hand, belief: ArrayLike) -
 
 
 def _squeezed(
-    slider: Slider, hand: Hand, squeezes: Squeezes, draws: Draws, poses: np.ndarray, jaws: np.ndarray
+    slider: Slider,
+    hand: Hand,
+    squeezes: Squeezes,
+    draws: Draws,  # friction of each sample
+    poses: np.ndarray,  # (..., samples, 3)
+    jaws: np.ndarray,  # poses of the jaw, (..., 3), the same for all samples
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Squeeze once, in batches of one size.
-
-    Args:
-        slider: The slider.
-        hand: The jaw.
-        squeezes: How the jaw closes.
-        draws: Friction of each sample.
-        poses: Poses of the samples, (..., samples, 3). The leading axes are broadcast with those of `jaws`.
-        jaws: Poses of the jaw, (..., 3), which is the same for all samples.
-
-    Returns:
-        Poses afterwards (..., samples, 3), whether they are held, and whether the simulation failed, (..., samples).
-    """
+    """Squeeze once, in batches of one size, and return the poses afterwards, whether held, and whether failed."""
+    # The results have the shape (..., samples, 3) of `poses`, and (..., samples). The leading axes of poses and jaws
+    # are broadcast.
     poses, jaws = np.broadcast_arrays(poses, jaws[..., None, :])
     shape, dtype = poses.shape[:-1], np.dtype(common_dtype(slider, hand))
     count, samples = int(np.prod(shape)), shape[-1]

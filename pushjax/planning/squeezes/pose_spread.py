@@ -15,17 +15,12 @@ of the number of samples. So its exponential is the number of poses that can be 
 import numpy as np
 
 
-def distances(poses: np.ndarray, turns: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances between samples, of their positions and of their angles.
-
-    Args:
-        poses: Samples of poses, (..., samples, 3), m and rad.
-        turns: Turns after which the slider looks the same, (turns,), rad.
-        length: Distance that counts as much as an angle of one radian, m.
-
-    Returns:
-        The distances of the positions, and of the angles times `length`, both (..., samples, samples), m.
-    """
+def distances(
+    poses: np.ndarray,  # (..., samples, 3), m and rad
+    turns: np.ndarray,  # (turns,), after which the slider looks the same, rad
+    length: float,  # distance that counts as much as an angle of one radian, m
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances of positions, and of angles times `length`, between samples, (..., samples, samples), m."""
     difference = poses[..., :, None, :] - poses[..., None, :, :]
     position_distance = np.hypot(difference[..., 0], difference[..., 1])
     angles = difference[..., 2, None] - turns
@@ -33,32 +28,21 @@ def distances(poses: np.ndarray, turns: np.ndarray, length: float) -> tuple[np.n
     return position_distance, length * angles
 
 
-def entropy(poses: np.ndarray, turns: np.ndarray, length: float, width: float) -> np.ndarray:
-    """Return the entropy of samples of poses, (...,), in nats.
-
-    Args:
-        poses: Samples of poses, (..., samples, 3), m and rad.
-        turns: Turns after which the slider looks the same, (turns,), rad.
-        length: Distance that counts as much as an angle of one radian, m.
-        width: Width of the kernel, m: poses that are nearer than about this are the same.
-    """
+def entropy(
+    poses: np.ndarray,
+    turns: np.ndarray,
+    length: float,
+    width: float,  # of the kernel, m: poses that are nearer than about this are the same
+) -> np.ndarray:
+    """Return the entropy of samples of poses, (...,), in nats, with `poses`, `turns` and `length` as in `distances`."""
     position_distance, angle_distance = distances(poses, turns, length)
     kernel = np.exp(-(position_distance**2 + angle_distance**2) / (4 * width**2))
     return -np.log(kernel.mean(axis=-1)).mean(axis=-1)
 
 
 def most_likely(poses: np.ndarray, turns: np.ndarray, max_distance: float, max_angle: float) -> tuple[int, np.ndarray]:
-    """Return the sample that has the most other samples near it, and which samples those are.
-
-    Args:
-        poses: Samples of poses, (samples, 3), m and rad.
-        turns: Turns after which the slider looks the same, (turns,), rad.
-        max_distance: Largest distance that counts as near, m.
-        max_angle: Largest angle that counts as near, rad.
-
-    Returns:
-        Index of the sample, and whether each sample is near to it, (samples,).
-    """
+    """Return the index of the sample with the most others near it, and whether each is near it, (samples,)."""
+    # Near are poses within `max_distance`, m, and `max_angle`, rad.
     position_distance, angle_distance = distances(poses, turns, 1.0)  # with this length the second one is in rad
     near = (position_distance <= max_distance) & (angle_distance <= max_angle)
     best = int(np.argmax(near.sum(axis=1)))

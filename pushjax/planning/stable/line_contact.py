@@ -47,53 +47,32 @@ POINTS = 25  # points that are tried for the one that follows the path
 
 
 class LineContact(NamedTuple):
-    """A hand against an edge of a slider, in the slider's body frame.
+    """A hand against an edge of a slider, in the slider's body frame."""
 
-    Attributes:
-        edge: Index of the edge, from vertex `edge` to the next one.
-        hand: Pose of the hand, (3,), m and rad.
-        frame: Pose of the pushing frame, (3,), m and rad.
-        half_width: Half of the distance between the two contacts, m.
-        heading: Direction in which the hand moves straight ahead, rad, in the pushing frame.
-        depth: Extent of the slider along the inward normal, m.
-    """
-
-    edge: int
-    hand: np.ndarray
-    frame: np.ndarray
-    half_width: float
-    heading: float
-    depth: float
+    edge: int  # its index, from vertex `edge` to the next one
+    hand: np.ndarray  # (3,), pose of the hand, m and rad
+    frame: np.ndarray  # (3,), pose of the pushing frame, m and rad
+    half_width: float  # half of the distance between the two contacts, m
+    heading: float  # direction in which the hand moves straight ahead, rad, in the pushing frame
+    depth: float  # extent of the slider along the inward normal, m
 
 
 class HandFront(NamedTuple):
-    """The foremost part of a hand, along the x axis of its frame.
+    """The foremost part of a hand, along the x axis of its frame."""
 
-    Attributes:
-        x: How far it reaches along x, m.
-        low: Smallest y of the points that reach that far, m.
-        high: Largest y of them, m.
-        is_flat: Whether it is the face of a pad, which may be longer than the edge. Round fingers must both touch it.
-    """
-
-    x: float
-    low: float
-    high: float
+    x: float  # how far it reaches along x, m
+    low: float  # smallest y of the points that reach that far, m
+    high: float  # largest y of them, m
+    # whether it is the face of a pad, which may be longer than the edge; round fingers must both touch it
     is_flat: bool
 
 
-def hand_front(hand: Hand, opening: np.ndarray, length: float) -> HandFront:
-    """Find the foremost points of a hand along the x axis of its frame.
-
-    Args:
-        hand: A hand whose configuration begins with its pose (x, y, theta).
-        opening: The other numbers of the configuration, (dof - 3,).
-        length: Length of the limit surface, m, which says what is flat.
-
-    Raises:
-        ValueError: If the hand does not move like a rigid body with the first three numbers of its configuration, or
-            its foremost part is a single point.
-    """
+def hand_front(
+    hand: Hand,  # its configuration begins with its pose (x, y, theta)
+    opening: np.ndarray,  # (dof - 3,), the other numbers of the configuration
+    length: float,  # of the limit surface, m; it says what is flat
+) -> HandFront:
+    """Find the foremost points of a hand along the x axis of its frame."""
     if hand.dof < 3 or opening.shape != (hand.dof - 3,):
         raise ValueError(
             f"opening has shape {opening.shape}; expected ({max(hand.dof - 3, 0)},), what a configuration of the hand "
@@ -120,24 +99,17 @@ def hand_front(hand: Hand, opening: np.ndarray, length: float) -> HandFront:
 
 
 def line_contacts(slider: Slider, front: HandFront) -> list[LineContact]:
-    """Place a hand on every edge of a slider on which it fits, where it can push straight ahead.
-
-    A normal force moves the slider without turning it if its torque makes H least. The middle of the contact is put
-    where the force has this torque, or as near as the edge allows, and the heading is the direction of that motion.
-
-    Args:
-        slider: The slider, a polygon. Its surface is the mean of the sampled surfaces.
-        front: Foremost points of the hand.
-
-    Returns:
-        The contacts, one an edge at most. Only edges with the whole slider behind them are used.
-    """
+    """Place a hand on every edge of a slider, a polygon, on which it fits and can push straight ahead."""
+    # A normal force moves the slider without turning it if its torque makes H least. The middle of the contact is put
+    # where the force has this torque, or as near as the edge allows, and the heading is the direction of that motion.
+    # The slider's surface is the mean of the sampled surfaces.
     vertices, found = np.asarray(slider.shape.vertices, np.float64), []  # pyright: ignore[reportAttributeAccessIssue]
     for edge, (start, end) in enumerate(zip(vertices, np.roll(vertices, -1, axis=0), strict=True)):
         edge_length = float(np.hypot(*(end - start)))
         along = (end - start) / edge_length
         normal = np.array([-along[1], along[0]])
         inward = (vertices - start[None]) @ normal
+        # only edges with the whole slider behind them
         if inward.min() < -FLAT * edge_length or (front.high - front.low > edge_length and not front.is_flat):
             continue
         torque, motion = _straight_push(slider.surface, normal)
@@ -153,10 +125,8 @@ def line_contacts(slider: Slider, front: HandFront) -> list[LineContact]:
 
 
 def _straight_push(surface: LimitSurface, force: np.ndarray) -> tuple[float, np.ndarray]:
-    """Find the torque with which a force moves the slider without turning it, N m, and the direction of the motion.
-
-    The angular velocity is zero where H is least over the torque. H is a convex polynomial of the torque.
-    """
+    """Find the torque with which a force moves the slider without turning it, N m, and the direction of the motion."""
+    # The angular velocity is zero where H is least over the torque. H is a convex polynomial of the torque.
     form, one = surface.form(), jnp.ones_like(surface.length)
     push, torque = Vec3(one * force[0], one * force[1], 0 * one), Vec3(0 * one, 0 * one, one)
     polynomial = np.polynomial.Polynomial([float(c) for c in form.restrict(push, torque)])
@@ -167,17 +137,11 @@ def _straight_push(surface: LimitSurface, force: np.ndarray) -> tuple[float, np.
 
 
 class Turn(NamedTuple):
-    """How tightly a line contact can turn without slip.
+    """How tightly a line contact can turn without slip."""
 
-    Attributes:
-        point: Distance ahead of the pushing frame's origin of the point that follows the path, m.
-        left: Largest curvature of its path to the left, 1/m.
-        right: Largest curvature of its path to the right, 1/m.
-    """
-
-    point: float
-    left: float
-    right: float
+    point: float  # distance ahead of the pushing frame's origin of the point that follows the path, m
+    left: float  # largest curvature of its path to the left, 1/m
+    right: float  # largest curvature of its path to the right, 1/m
 
     @property
     def radii(self) -> tuple[float, float]:
@@ -185,18 +149,13 @@ class Turn(NamedTuple):
         return 1 / self.left if self.left > 0 else np.inf, 1 / self.right if self.right > 0 else np.inf
 
 
-def tightest_turn(contact: LineContact, surfaces: LimitSurface, friction: Array, margin: float) -> Turn | None:
-    """Find the tightest turns of a line contact at which both of its ends stick, for all sampled surfaces.
-
-    Args:
-        contact: The contact.
-        surfaces: Limit surfaces, with a leading axis of samples. All have one length.
-        friction: Coefficient of friction of each sample, (samples,).
-        margin: Fraction by which friction and width are reduced.
-
-    Returns:
-        The turns with the smallest sum of the radii, or None if not even a straight push is stable.
-    """
+def tightest_turn(
+    contact: LineContact,
+    surfaces: LimitSurface,  # with a leading axis of samples, all of one length
+    friction: Float[Array, "samples"],
+    margin: float,  # fraction by which friction and width are reduced
+) -> Turn | None:
+    """Find the tightest turns of a line contact without slip, or None if not even a straight push is stable."""
     points = np.linspace(0, contact.depth, POINTS)
     numbers = (contact.frame, contact.half_width, contact.heading, points, margin)
     numbers = (jnp.asarray(number, friction.dtype) for number in numbers)
@@ -206,33 +165,22 @@ def tightest_turn(contact: LineContact, surfaces: LimitSurface, friction: Array,
     turns = [
         Turn(float(point), float(left), float(right)) for point, (left, right) in zip(points, curvatures, strict=True)
     ]
+    # the smallest sum of the radii
     return min(turns, key=lambda each: sum(each.radii))
 
 
 @quick_jit
 def _stable_curvatures(
-    surfaces: LimitSurface,
+    surfaces: LimitSurface,  # with a leading axis of samples
     friction: Float[Array, "samples"],
-    frame: Float[Array, "3"],
-    half_width: Float[Array, ""],
-    heading: Float[Array, ""],
-    points: Float[Array, "points"],
-    margin: Float[Array, ""],
+    frame: Float[Array, "3"],  # pose of the pushing frame in the body frame, m and rad
+    half_width: Float[Array, ""],  # half of the distance between the two contacts, m
+    heading: Float[Array, ""],  # straight ahead, rad, in the pushing frame
+    points: Float[Array, "points"],  # distances ahead of the pushing frame's origin, m
+    margin: Float[Array, ""],  # fraction by which friction and width are reduced
 ) -> Float[Array, "points 2"]:
-    """Find the largest curvatures of the path of each point, to the left and to the right, (points, 2), 1/m.
-
-    Args:
-        surfaces: Limit surfaces, with a leading axis of samples.
-        friction: Coefficient of friction of each sample.
-        frame: Pose of the pushing frame in the body frame.
-        half_width: Half of the distance between the two contacts, m.
-        heading: Direction straight ahead, rad, in the pushing frame.
-        points: Distances ahead of the pushing frame's origin of the point that follows the path, m.
-        margin: Fraction by which friction and width are reduced.
-
-    Returns:
-        The curvatures. NaN if not even the straight push is stable.
-    """
+    """Find the largest curvatures of the path of each point, to the left and to the right, 1/m."""
+    # NaN if not even the straight push is stable.
     length, to_frame = surfaces.length[0], se2.inverse(frame)
     ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 

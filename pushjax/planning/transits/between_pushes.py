@@ -29,15 +29,10 @@ TOUCH = 1e-4  # overlap that does not count as touching, in units of the finger'
 
 
 class Transits(NamedTuple):
-    """Transits of a finger before, between and after pushes.
+    """Transits of a finger before, between and after pushes."""
 
-    Attributes:
-        transits: A transit to the start of each push, and the retreat after the last one, (pushes + 1).
-        touched: Whether the finger touches the slider in any transit that was found, for each sample of the
-            prediction, (samples,).
-    """
-
-    transits: tuple[Transit, ...]
+    transits: tuple[Transit, ...]  # to the start of each push, and the retreat after the last one
+    # (samples,), whether the finger touches the slider in any transit that was found, for each predicted sample
     touched: np.ndarray
 
     @property
@@ -63,31 +58,17 @@ class FingerMotion(NamedTuple):
 
 
 def transits_between(
-    vertices: np.ndarray,
-    radius: float,
-    clearance: float,
-    paths: np.ndarray,
-    predicted: np.ndarray,
-    samples: np.ndarray,
-    start: np.ndarray | None = None,
+    vertices: np.ndarray,  # (vertices, 2), of the slider, counterclockwise, body frame, m
+    radius: float,  # of the finger, m
+    clearance: float,  # that the finger keeps from slider and fixtures, m
+    paths: np.ndarray,  # (pushes, steps + 1, 2), world, m
+    predicted: np.ndarray,  # (pushes + 1, 3), slider poses before the first push and after each, world, m and rad
+    samples: np.ndarray,  # (samples, pushes + 1, 3), of these poses
+    start: np.ndarray | None = None,  # (2,), of the finger, world, m; None: where the first run-up begins
     fixtures: Fixtures = (),
 ) -> Transits:
-    """Find the transits of a finger to the start of each push, and away from the slider after the last one.
-
-    Args:
-        vertices: Vertices of the slider, counterclockwise, (vertices, 2), body frame, m.
-        radius: Radius of the finger, m.
-        clearance: Distance that the finger keeps from slider and fixtures, m.
-        paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
-        predicted: Predicted poses of the slider before the first push and after each, (pushes + 1, 3), world, m and
-            rad.
-        samples: Samples of these poses, (samples, pushes + 1, 3), world, m and rad.
-        start: Where the finger is at first, (2,), world, m. None: where the run-up of the first push begins.
-        fixtures: Walls and fixed bodies that the finger stays out of.
-
-    Returns:
-        The transits. There are none if there is neither a push nor a start.
-    """
+    """Find the transits of a finger to the start of each push, and away from the slider after the last one."""
+    # There are none if there is neither a push nor a start.
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
         return Transits((), np.zeros(len(samples), bool))
@@ -138,12 +119,12 @@ def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: flo
 
 
 class _Scene(NamedTuple):
-    """What transits are planned in: the slider's vertices, radius and clearance of the finger, and the fixtures."""
+    """What transits are planned in."""
 
-    vertices: np.ndarray
-    radius: float
-    clearance: float
-    workspace: Workspace
+    vertices: np.ndarray  # (vertices, 2), of the slider, body frame, m
+    radius: float  # of the finger, m
+    clearance: float  # of the finger, m
+    workspace: Workspace  # with the fixtures
 
     def roadmap(self, margin: float, goals: np.ndarray) -> Roadmap:
         """Return the roadmap for a distance from the slider, m; from fixtures no more than the clearance is kept."""
@@ -201,13 +182,11 @@ def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -
 
 
 def _touches(vertices: np.ndarray, radius: float, points: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """Return whether a finger touches the slider along a transit, for each sample of its pose, (samples,).
-
-    A finger that has just pushed touches the slider, so there only what comes nearer counts.
-    """
+    """Return whether a finger touches the slider along a transit, for each sample of its pose, (samples,)."""
     placed = to_body(samples[:, None], points[None])  # (samples, points, 2)
     apart = segment_distances(vertices, placed[:, :-1], placed[:, 1:])
     at_start = signed_distances(vertices, placed[:, 0])
+    # a finger that has just pushed touches the slider, so there only what comes nearer counts
     allowed = np.full(apart.shape, radius)
     if apart.shape[1]:
         allowed[:, 0] = np.minimum(at_start, radius)

@@ -36,105 +36,61 @@ RETREATS = 24  # directions in which a retreat is tried
 
 
 class TransitStatus(IntEnum):
-    """Whether there is a transit, or why not.
-
-    Attributes:
-        FOUND: There is one.
-        START_IN_SLIDER: The center of the finger is inside the polygon at the start.
-        NO_RETREAT: The finger is too near to the polygon or to an obstacle at the start, and no segment leads out.
-        GOAL_BLOCKED: The end of the transit, or each run-up to the push, is too near to the polygon or to an obstacle.
-        NO_TRANSIT: No path leads from start to end.
-        START_IN_FIXTURE: The center of the finger is inside an obstacle at the start.
-    """
+    """Whether there is a transit, or why not."""
 
     FOUND = 0
-    START_IN_SLIDER = 1
-    NO_RETREAT = 2
-    GOAL_BLOCKED = 3
-    NO_TRANSIT = 4
-    START_IN_FIXTURE = 5
+    START_IN_SLIDER = 1  # the center of the finger is inside the polygon at the start
+    NO_RETREAT = 2  # the finger is too near to the polygon or to an obstacle at the start, and no segment leads out
+    GOAL_BLOCKED = 3  # the end, or each run-up to the push, is too near to the polygon or to an obstacle
+    NO_TRANSIT = 4  # no path leads from start to end
+    START_IN_FIXTURE = 5  # the center of the finger is inside an obstacle at the start
 
 
 class Transit(NamedTuple):
-    """A transit of the finger's center.
+    """A transit of the finger's center."""
 
-    Attributes:
-        points: Its corners, (points, 2), world, m; only the start if there is no transit.
-        length: Its length, m; infinite if there is no transit.
-        status: Whether there is a transit, and why not.
-    """
-
-    points: np.ndarray
-    length: float
-    status: TransitStatus
+    points: np.ndarray  # (points, 2), its corners, world, m; only the start if there is no transit
+    length: float  # m; infinite if there is no transit
+    status: TransitStatus  # whether there is a transit, and why not
 
 
 class ShortestTransits(NamedTuple):
-    """Shortest transits from one start to many goals; `Roadmap.transit` traces one of them.
+    """Shortest transits from one start to many goals, one of which `Roadmap.transit` traces."""
 
-    Attributes:
-        lengths: Length of the transit to each goal, (goals,), m, infinite where there is none.
-        status: FOUND, or why no goal can be reached at all.
-        points: The corners that transits may have, (nodes, 2), body frame, m. The first one is the start. If the finger
-            must retreat, the first one is where the retreat ends, and the last one is the start.
-        previous: For each of these, the index of the one before it on the shortest transit, (nodes,); negative for the
-            start.
-        last: For each goal, the index of the last of the corners before it, (goals,).
-        blocked: Whether a goal itself is too near to the polygon or an obstacle, (goals,).
-    """
-
-    lengths: np.ndarray
-    status: TransitStatus
+    lengths: np.ndarray  # (goals,), of the transit to each goal, m, infinite where there is none
+    status: TransitStatus  # FOUND, or why no goal can be reached at all
+    # (nodes, 2), corners that transits may have, body frame, m. The first one is the start. If the finger must retreat,
+    # the first one is where the retreat ends, and the last one is the start.
     points: np.ndarray
-    previous: np.ndarray
-    last: np.ndarray
-    blocked: np.ndarray
+    previous: np.ndarray  # (nodes,), index of the point before each on the shortest transit; negative for the start
+    last: np.ndarray  # (goals,), index of the last of the points before each goal
+    blocked: np.ndarray  # (goals,), whether a goal itself is too near to the polygon or an obstacle
 
 
 class Roadmap:
-    """Points around a polygon and the segments between them that a round finger can move along.
-
-    Args:
-        vertices: Vertices of the polygon, counterclockwise, (vertices, 2), m.
-        radius: Radius of the finger, m.
-        clearance: Distance that the finger keeps from the polygon on its way, m, positive.
-        goals: Ends of the transits, (goals, 2), body frame of the polygon, m. Those nearer than the clearance are not
-            reached.
-        obstacle_clearance: Distance that the finger keeps from obstacles, m. None: as from the polygon.
-
-    Attributes:
-        min_distance: Distance of the finger's center from the polygon that a transit keeps, m.
-        min_obstacle_distance: Distance of the finger's center from obstacles that a transit keeps, m.
-        nodes: Points around the corners of the polygon, (nodes, 2), body frame, m.
-        links: Lengths of the segments from nodes to goals, (nodes, goals), m, infinite where they come too near.
-        goal_clearance: Signed distances of the goals from the polygon, (goals,), m.
-    """
+    """Visibility graph of the center of a round finger around a polygon."""
 
     def __init__(
         self,
-        vertices: np.ndarray,
-        radius: float,
-        clearance: float,
-        goals: np.ndarray,
-        obstacle_clearance: float | None = None,
+        vertices: np.ndarray,  # (vertices, 2), of the polygon, counterclockwise, body frame, m
+        radius: float,  # of the finger, m
+        clearance: float,  # that the finger keeps from the polygon on its way, m
+        goals: np.ndarray,  # (goals, 2), ends of the transits, body frame, m; not reached if nearer than the clearance
+        obstacle_clearance: float | None = None,  # that the finger keeps from obstacles, m; None: as from the polygon
     ):
         check_positive("clearance", clearance)
+        # distances of the finger's center from obstacles and from the polygon that a transit keeps, m
         self.min_obstacle_distance = radius + (clearance if obstacle_clearance is None else obstacle_clearance)
         self.vertices, self.radius, self.min_distance = vertices, radius, radius + clearance
         self.clearance, self.goals = clearance, np.asarray(goals, float)
         points = _corner_points(vertices, self.min_distance * (1 + OUTSIDE))
         self.nodes = points[signed_distances(vertices, points) >= self.min_distance]
         self.goal_clearance = signed_distances(vertices, self.goals)
+        # (nodes, goals), m, infinite where segments come too near
         self.links = self._lengths(self.nodes[:, None], self.goals, end_distance=self.goal_clearance)
 
     def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> ShortestTransits:
-        """Find the shortest transits from one point to all goals.
-
-        Args:
-            start: Center of the finger, (2,), world, m.
-            pose: Pose of the polygon, (3,), m and rad.
-            workspace: Where the finger may be, and the obstacles.
-        """
+        """Find the shortest transits from one point, (2,), world, m, to all goals, for a pose of the polygon, (3,)."""
         body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.in_frame(pose)
         begin, status = self._retreat(body_start, pose, workspace, obstacles)
         if status != TransitStatus.FOUND:
@@ -164,13 +120,7 @@ class Roadmap:
         return ShortestTransits(lengths, status, corners, previous, last, blocked)
 
     def transit(self, transits: ShortestTransits, goal: int, pose: np.ndarray) -> Transit:
-        """Return the shortest transit to one goal.
-
-        Args:
-            transits: Result of `transits`.
-            goal: Index of the goal.
-            pose: Pose of the polygon that `transits` was given.
-        """
+        """Return the shortest transit to one goal, by its index, for the pose that `transits` was given."""
         if not np.isfinite(transits.lengths[goal]):
             status = transits.status if transits.status != TransitStatus.FOUND else TransitStatus.NO_TRANSIT
             is_blocked = status == TransitStatus.NO_TRANSIT and transits.blocked[goal]
@@ -182,28 +132,21 @@ class Roadmap:
             corner = int(transits.previous[corner])
         return Transit(to_world(pose, np.array(points[::-1])), float(transits.lengths[goal]), TransitStatus.FOUND)
 
-    def retreat(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> Transit:
-        """Return the shortest straight transit to where the finger has its clearance; only the start if it has it.
-
-        Args:
-            start: Center of the finger, (2,), world, m.
-            pose: Pose of the polygon, (3,), m and rad.
-            workspace: Where the finger may be.
-        """
+    def retreat(
+        self,
+        start: np.ndarray,  # (2,), center of the finger, world, m
+        pose: np.ndarray,  # (3,), of the polygon, world, m and rad
+        workspace: Workspace,
+    ) -> Transit:
+        """Return the shortest straight transit to where the finger has its clearance, only the start if it has it."""
         obstacles = workspace.obstacles.in_frame(pose)
         points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace, obstacles)
         length = float(np.linalg.norm(points[-1] - points[0])) if status == TransitStatus.FOUND else np.inf
         return Transit(to_world(pose, points), length, status)
 
     def between(self, starts: np.ndarray) -> np.ndarray:
-        """Return the lengths of the shortest transits from points to all goals, without a workspace and obstacles.
-
-        Args:
-            starts: Points that have the clearance, (points, 2), body frame, m.
-
-        Returns:
-            The lengths, (points, goals), m, infinite where there is no transit.
-        """
+        """Return the lengths of the shortest transits from points to all goals, (points, goals), m, inf for none."""
+        # `starts` are points with the clearance, (points, 2), body frame, m. Workspace and obstacles are ignored.
         start_distance = signed_distances(self.vertices, starts)
         direct = self._lengths(starts[:, None], self.goals, start_distance[:, None], self.goal_clearance)
         graph = self._lengths(self.nodes[:, None], self.nodes)
@@ -236,11 +179,9 @@ class Roadmap:
         return obstacles.segment_clearance(start, end, enough) >= enough * (1 - 1e-9)
 
     def _among(self, nodes: np.ndarray, links: np.ndarray, pose, workspace: Workspace, obstacles: Obstacles):
-        """Return nodes and links with those around obstacles.
-
-        All links may run through an obstacle, and those of the new nodes also through the polygon. `_last` excludes
-        them.
-        """
+        """Return nodes and links with those around obstacles."""
+        # All links may run through an obstacle, and those of the new nodes also through the polygon. `_last` excludes
+        # them.
         around = [_corner_points(body, self.min_obstacle_distance * (1 + OUTSIDE)) for body in obstacles.bodies]
         angle, half = np.arange(DISK_POINTS) * (2 * np.pi / DISK_POINTS), np.pi / DISK_POINTS
         circle = (1 + OUTSIDE) / np.cos(half) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -257,14 +198,9 @@ class Roadmap:
         return nodes[is_free], links[is_free]
 
     def _last(self, total: np.ndarray, corners: np.ndarray, obstacles: Obstacles) -> np.ndarray:
-        """Return the last corner before each goal on the shortest transit.
-
-        Args:
-            total: Length of the transit to each goal by each corner, (corners, goals). It becomes infinite where the
-                last segment of a shortest transit does not keep the distances.
-            corners: The corners, (corners, 2).
-            obstacles: The obstacles.
-        """
+        """Return the last corner before each goal on the shortest transit."""
+        # `total` is the length of the transit to each goal by each corner, (corners, goals). It becomes infinite where
+        # the last segment of a shortest transit does not keep the distances.
         if not obstacles.any:
             return np.argmin(total, axis=0)
         open_goals = np.flatnonzero(np.isfinite(total).any(0))
@@ -323,37 +259,29 @@ class Roadmap:
         )
 
 
-def _recedes(start: float, required: float, end: np.ndarray, early: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """Return whether segments end at the required distance or more, and are nowhere nearer than at their start.
-
-    Args:
-        start: Distance at the start, m.
-        required: Distance that is required at the end, m. Where the start has it, all of the segment must.
-        end: Distance at the end of each segment, (segments,), m.
-        early: Distance a little after the start, (segments,), m. It must have grown, which excludes segments that slide
-            along an edge.
-        least: Least distance along each segment, (segments,), m.
-    """
+def _recedes(
+    start: float,  # distance at the start, m
+    required: float,  # at the end, m; where the start has it, all of the segment must
+    end: np.ndarray,  # at the end of each segment, (segments,), m
+    early: np.ndarray,  # a little after the start; must have grown, to exclude segments that slide along an edge
+    least: np.ndarray,  # along each segment, (segments,), m
+) -> np.ndarray:
+    """Return whether segments end at the required distance or more, and are nowhere nearer than at their start."""
     grows = True if start >= required else early > start + 0.02 * (required - start)
     return grows & (least >= min(start, required) * (1 - 1e-9)) & (end >= required)
 
 
 def run_ups(
-    vertices: np.ndarray, radius: float, clearance: float, starts: np.ndarray, directions: np.ndarray, longest: float
+    vertices: np.ndarray,  # (vertices, 2), of the polygon, counterclockwise, m
+    radius: float,  # of the finger, m
+    clearance: float,  # of the finger from the polygon at the beginning, m
+    starts: np.ndarray,  # (pushes, 2), m
+    directions: np.ndarray,  # (pushes, 2), unit vectors
+    longest: float,  # m
 ) -> np.ndarray:
-    """Return how far before its start each push can begin, without touching the polygon and with the clearance there.
-
-    Args:
-        vertices: Vertices of the polygon, counterclockwise, (vertices, 2), m.
-        radius: Radius of the finger, m.
-        clearance: Distance of the finger from the polygon at the beginning, m.
-        starts: Starts of the pushes, (pushes, 2), m.
-        directions: Unit vectors of the pushes, (pushes, 2).
-        longest: Largest run-up, m.
-
-    Returns:
-        The run-ups, (pushes,), m: the longest possible of nine lengths from `longest` to zero. NaN where none is.
-    """
+    """Return how far before its start each push can begin, (pushes,), m, NaN where no run-up is free."""
+    # The longest of nine lengths from `longest` to zero with which the finger does not touch the polygon, and has the
+    # clearance where it begins.
     start_distance = signed_distances(vertices, starts)
     found = np.full(len(starts), np.nan)
     for length in np.linspace(longest, 0.0, 9):
