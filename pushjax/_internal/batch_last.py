@@ -21,12 +21,10 @@ Attempt = Callable[..., tuple[Any, Bool[Array, " batch"]]]
 
 
 def batch_last(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any) -> Any:
-    """Return the results of `attempt` for one example, or for a batch under any nesting of `vmap`; zeros if not needed.
-
-    The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
-    attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
-    cannot be differentiated.
-    """
+    """Return results of `attempt` for one example or a batch, under any nesting of `vmap`; zeros if not needed."""
+    # The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
+    # attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
+    # cannot be differentiated.
     wanted = jnp.stack([needed & has_first, needed & ~has_first])
     structure = jax.tree.structure(args)
 
@@ -114,10 +112,8 @@ def _queued(wanted: Bool[Array, " size"], tile: int) -> tuple[Array, Array]:
 
 
 def in_search_tiles(search: Callable[[Any], Any], count: Int[Array, ""], problem: Any, blank: Any) -> Any:
-    """Return `search(problem)` for the first `count` examples of a batch; those after the tile of the last are `blank`.
-
-    All have the batch last; of an array that all examples share it has length one.
-    """
+    """Return `search(problem)` for the first `count` examples of a batch; those after their last tile are `blank`."""
+    # all arrays have the batch last, of length one in an array that all examples share
     size = jax.tree.leaves(blank)[0].shape[-1]
     tile = min(tile_size(SEARCH_TILE), size)
     if tile == size:  # without a loop, which takes as long as the search of a small batch

@@ -55,7 +55,7 @@ def tile_size(on_cpu: int = TILE) -> int:
 
 
 def flat_batch(size: int, outer_size: int, x: Array, has_inner: bool, has_outer: bool) -> Array:
-    """Return an array of a batch of batches as that of one longer batch, given which of the two axes it has."""
+    """Return an array of a batch of batches as one longer batch, given which of the two axes it has."""
     if not has_inner:
         return jnp.repeat(x, size, axis=0) if has_outer else x
     x = x if has_outer else jnp.broadcast_to(x, (outer_size, *x.shape))

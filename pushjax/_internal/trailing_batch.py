@@ -24,11 +24,9 @@ _with_batch_last_p.multiple_results = True
 
 
 def with_batch_last(function: Callable[..., Any], *args: Any) -> Any:
-    """Return `function(*args)`, a pytree of arrays of floats, for pytrees of arrays of one example.
-
-    `function` must also take arrays with more axes at the end, of which some have length one, and must not close over
-    traced arrays. It is traced in each call, so this is for programs that are compiled as a whole.
-    """
+    """Return `function(*args)`, a pytree of arrays of floats, for pytrees of arrays of one example."""
+    # `function` must also take arrays with more axes at the end, of which some have length one, and must not close over
+    # traced arrays. It is traced in each call, so this is for programs that are compiled as a whole.
     arrays, others = eqx.partition(args, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)
 

@@ -53,11 +53,13 @@ def update_if(condition: Bool[Array, ""], update: Callable, state):
     return jax.lax.while_loop(lambda loop_state: loop_state[0], run_update, (condition, state))[1]
 
 
-def skippable(is_needed: Callable[..., Bool[Array, ""]], body: Callable, state: Any, x: Any) -> Callable:
-    """Return the body of a scan, which leaves the state and gives zeros where none of a batch needs it.
-
-    `state` and `x` are examples of its arguments.
-    """
+def skippable(
+    is_needed: Callable[..., Bool[Array, ""]],
+    body: Callable,
+    state: Any,  # an example of the body's state
+    x: Any,  # an example of its input
+) -> Callable:
+    """Return the body of a scan, which leaves the state and gives zeros where none of a batch needs it."""
     traced_once = jax.jit(body)  # for the shapes and for the loop
     shapes = jax.eval_shape(traced_once, state, x)[1]
     blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

@@ -79,7 +79,7 @@ class LimitCurve(NamedTuple):
         return len(self.c) - 1
 
     def motion(self, s: Scalar) -> Vec2:
-        """grad h at (1, s): how the contact point moves, in (n, t). Two polynomials of degree d - 1."""
+        """grad h at (1, s), the motion of the contact point in (n, t): two polynomials of degree d - 1."""
         d = self.degree
         return Vec2(
             _horner([(d - k) * c for k, c in enumerate(self.c[:-1])], s),

@@ -55,11 +55,10 @@ def _value(c: Array, u: Array) -> Array:
 
 
 class _Search(NamedTuple):
-    """State of the bracketed search for a root, by Laguerre's method with bisection as the safeguard.
+    """State of the bracketed search for a root, by Laguerre's method with bisection as the safeguard."""
 
-    Newton's method is not used: from afar each step reduces the distance by a third only, and near two complex roots a
-    step leads far away again.
-    """
+    # Newton's method is not used: from afar each step reduces the distance by a third only, and near two complex roots
+    # a step leads far away again.
 
     u: Array  # estimate of the root, between `near` and `far`
     near: Array  # one end of the bracket; at first `origin`
@@ -69,11 +68,9 @@ class _Search(NamedTuple):
 
     @staticmethod
     def of(c: Array, low: Array, high: Array, value_low: Array, value_high: Array) -> "_Search":
-        """Begin at the distance from `origin` that the cubic's derivatives there imply for the root.
-
-        That distance is right to a factor of two. It is needed because roots may lie a millionth of the interval from a
-        turning point or from u = 0, where the cubic has its scale.
-        """
+        """Begin at the distance from `origin` that the cubic's derivatives there imply for the root."""
+        # That distance is right to a factor of two. It is needed because roots may lie a millionth of the interval from
+        # a turning point or from u = 0, where the cubic has its scale.
         contains_zero = (low < 0) & (high > 0)
         value_zero = jnp.where(contains_zero, c[0], jnp.inf)
         at_low = jnp.abs(value_low) < jnp.abs(value_high)
@@ -112,10 +109,8 @@ class _Search(NamedTuple):
 
 
 def _approximate_cbrt(x: Array) -> Array:
-    """The cube root of x >= 0 with an error of at most 6 %, by dividing its exponent by three.
-
-    An exact cube root takes as long as the iterations that follow.
-    """
+    """The cube root of x >= 0 with an error of at most 6 %, by dividing its exponent by three."""
+    # an exact cube root takes as long as the iterations that follow
     bits = {4: jnp.int32, 8: jnp.int64}[x.dtype.itemsize]
     one, number = (jax.lax.bitcast_convert_type(v, bits) for v in (jnp.ones_like(x), x))
     three = jnp.full_like(number, 3)

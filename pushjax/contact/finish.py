@@ -117,7 +117,7 @@ class Equations(NamedTuple):
 
 
 def refine(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]) -> Refined:
-    """Solve the equations of a set of cone edges. Where not `moves`, the numbers have no meaning, but are finite."""
+    """Solve the equations of a set of cone edges; where not `moves`, the numbers are finite but have no meaning."""
     equations = Equations.of(problem, chosen, moves)
     used, edges, conditioned, rows, b = equations
     full_edges, edge_basis, axes = equations.bases()
@@ -149,10 +149,8 @@ def refine(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"]
 
 
 def completed(vectors: Array, used: Bool[Array, "3 *batch"], relative: float) -> tuple[Array, Array]:
-    """Three vectors, the unused ones replaced by directions orthogonal to those in use; and the dual basis.
-
-    The dual basis is zero where |det| is at most `relative` times the product of the lengths.
-    """
+    """Three vectors, the unused ones replaced by directions orthogonal to those in use; and the dual basis."""
+    # the dual basis is zero where |det| is at most `relative` times the product of the lengths
     zero = jnp.zeros_like(vectors[0, 0])
     v1 = jnp.where(used[:1], vectors[0], jnp.stack([zero + 1, zero, zero]))
     sideways = jnp.stack([-v1[1], v1[0], zero]), jnp.stack([zero, -v1[2], v1[1]])
@@ -171,12 +169,10 @@ def _rescaled(system: System, beta: Array) -> Array:
 
 
 def check(problem: ScaledProblem, chosen: EdgeSet, moves: Bool[Array, "*batch"], refined: Refined) -> Decided:
-    """Check every condition of the problem.
-
-    No contact is violated, the forces are inside their cones and on the side of the slip, the twist is along grad H and
-    not too fast. A search has checked these conditions before the refinement, which changes its numbers by roundoff
-    only. So the tolerances here are somewhat wider.
-    """
+    """Check every condition of the problem, with somewhat wider tolerances than a search."""
+    # No contact is violated, the forces are inside their cones and on the side of the slip, the twist is along grad H
+    # and not too fast. A search has checked these conditions before the refinement, which changes its numbers by
+    # roundoff only.
     dtype, twist, weight = refined.twist.dtype, refined.twist, refined.weight
     slip_n, slip_t = problem.slips(twist)
     tolerance = kinematic_tolerance(twist)[None]

@@ -34,13 +34,11 @@ def distribute_force(
     chosen: Int[Array, "3 *batch"],
     chosen_weights: Vector,
     f: Vector,
-    start: Vector,
+    start: Vector,  # the shortest y that gives the chosen edges their weights
 ) -> tuple[Weights, Bool[Array, "*batch"], Vector]:
-    """Compute the weight of every cone edge in the wrench f, whether more than the chosen edges share it, and then y.
-
-    Where no more edges are admissible under the motion than were chosen, these are the chosen edges' own weights.
-    `start` is the shortest y that gives the chosen edges their weights. This is not differentiated.
-    """
+    """Compute the weight of every edge in the wrench f, whether more than the chosen edges share it, and then y."""
+    # Where no more edges are admissible under the motion than were chosen, these are the chosen edges' own weights.
+    # This is not differentiated.
     own_weights = of_chosen(edges, chosen, chosen_weights)
     num_admissible, num_chosen = jnp.sum(admissible, axis=0), jnp.sum(chosen >= 0, axis=0)
     # If just three edges are admissible and they are coplanar, the weights are indeterminate too. If they are
@@ -132,10 +130,8 @@ def _reproduces(usable: Array, weights: Weights, target: Vector, roundings: int)
 
 
 def _dual_hessian(usable: Array, loaded: Bool[Array, "edges *batch"]) -> Float[Array, "6 *batch"]:
-    """The Hessian of phi where these edges carry force, with a small multiple of the identity added.
-
-    Without it, coplanar edges leave one direction of y undetermined, which F does not need.
-    """
+    """The Hessian of phi where these edges carry force, with a small multiple of the identity added."""
+    # without it, coplanar edges leave one direction of y undetermined, which F does not need
     chosen = jnp.where(loaded[None], usable, 0.0)
     hessian = summed(jnp.stack([chosen[i] * usable[j] for i, j in ENTRIES]), 1)
     diagonal = _relative_regularization(usable.dtype) * (summed(hessian[:3], 0) + 1e-3)
@@ -149,10 +145,8 @@ def _relative_regularization(dtype) -> float:
 
 
 def _solve_regularized(m: Float[Array, "6 *batch"], v: Vector) -> Vector:
-    """m^-1 v by elimination, with no pivot smaller than half of what was added to the diagonal.
-
-    Where the edges leave one or two directions undetermined, an adjugate would be nothing but roundoff.
-    """
+    """m^-1 v by elimination, with no pivot smaller than half of what was added to the diagonal."""
+    # where the edges leave one or two directions undetermined, an adjugate would be nothing but roundoff
     xx, yy, zz, xy, xz, yz = m
     min_pivot = _relative_regularization(v.dtype) / 2 * (xx + yy + zz)
     l2, l3 = xy / xx, xz / xx

@@ -131,20 +131,17 @@ def search_squeeze(problem: ScaledProblem) -> Squeeze:
 
 
 def squeeze_power(problem: ScaledProblem, edges: Int[Array, "4 *batch"]) -> Float[Array, "*batch"]:
-    """The power of the equilibrium of four edges that `search_squeeze` found; differentiable.
-
-    Whether it exists is not decided again, because with other roundoff the answer could be no.
-    """
+    """The power of the equilibrium of four edges that `search_squeeze` found; differentiable."""
+    # Whether it exists is not decided again, because with other roundoff the answer could be no.
     rows = _Rows.of(problem)
     kinds = jnp.stack(_kinds(edges, 2 * problem.count))
     return _equilibrium(rows.four(selected(rows.stacked(), edges), kinds)).power
 
 
 def _sets(num_edges: int) -> np.ndarray:
-    """All sets of four edges, all of three with `across`, and all of two with the moment and `across`, (n, 4, sets).
-
-    Two edges of one contact come first in their set, because their cross product is exact. The last sets are repeated.
-    """
+    """All sets of four edges, all of three with `across`, and all of two with the moment and `across`, (n, 4, sets)."""
+    # Two edges of one contact come first in their set, because their cross product is exact. The last set is repeated,
+    # to fill the table.
 
     def pair_first(numbers: tuple[int, ...]) -> tuple[int, ...]:
         same_contact = [(a, b) for a, b in pairwise(numbers) if a // 2 == b // 2]
@@ -166,10 +163,8 @@ class _Equilibrium(NamedTuple):
 
 
 def _equilibrium(four: _Four) -> _Equilibrium:
-    """Compute the internal equilibrium of four edges.
-
-    By Cramer's rule, the weight of each edge is the determinant of the other three, with alternating sign.
-    """
+    """Compute the internal equilibrium of four edges."""
+    # by Cramer's rule, the weight of each edge is the determinant of the other three, with alternating sign
     g1, g2, g3, g4 = (four.wrench[:, k] for k in range(4))
     cross12, mu12, size12 = _pair_cross(four, 0, four.same12)
     orthogonal = _orthogonal_direction(cross12, cross(g2, g3), cross(g3, g1))
@@ -203,10 +198,8 @@ def _equilibrium(four: _Four) -> _Equilibrium:
 
 
 def _pair_cross(four: _Four, pair: int, same_contact: Bool[Array, "*rest"]) -> tuple[Array, Array, Array]:
-    """Cross product of the first two edges (pair 0) or of the last two (pair 1).
-
-    It is the product of the vector and the factor that are returned. The last is the size of the vector's terms.
-    """
+    """Vector, factor and size of terms of the cross product of the first two edges (pair 0) or the last two (1)."""
+    # the cross product is the vector times the factor; the size is that of the vector's terms
     g, h = four.wrench[:, 2 * pair], four.wrench[:, 2 * pair + 1]
     edge_cross, friction = four.edge_cross[:, pair], four.friction[pair]
     return (

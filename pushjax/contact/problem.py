@@ -220,18 +220,11 @@ def solve_problem(
     contacts: Contact,  # with an axis for the contacts
     active: Bool[Array, "contacts"],
     solver: ContactSolver | StickingSolver | None,
-    guess: EdgeSet | None,
+    guess: EdgeSet | None,  # edges that carried the force before; the default solver tries them after one contact alone
     *,
     margin: bool = False,
 ) -> ContactSolution:
-    """Solve a contact problem.
-
-    `guess` may be the cone edges that carried the force before; the default solver tries them after one contact
-    alone.
-
-    Raises:
-        ValueError: For more than eight contacts, or for more than one with a solver of one contact.
-    """
+    """Solve a contact problem."""
     count = len(active)
     if not 1 <= count <= MAX_CONTACTS:
         raise ValueError(f"contacts: from one to {MAX_CONTACTS} are supported; got {count}")
@@ -267,6 +260,6 @@ def _is_unit(normal: Float[Array, "contacts 2"]) -> Bool[Array, "contacts"]:
 
 
 def contacts_in_columns(contacts: Contacts, friction: Array) -> Contact:
-    """The contacts with one axis. A contact that is not active is out of reach, whatever its numbers are."""
+    """The contacts with one axis, the inactive ones out of reach whatever their numbers are."""
     point, normal, displacement = (Vec2.of(rows.T) for rows in (contacts.point, contacts.normal, contacts.displacement))
     return Contact(point, normal, displacement, friction, contacts.gap).where(contacts.active)

@@ -177,10 +177,8 @@ def _broadcast(given: ContactArrays) -> ContactArrays:
 
 
 def _displacement_unit(displacement: Array, depth: Array) -> Array:
-    """The longest of the displacements or the largest of the depths, if that is larger; one where all are zero.
-
-    Units are constants to every derivative, because the answer does not depend on them.
-    """
+    """The longest of the displacements or the largest of the depths, if that is larger; one where all are zero."""
+    # units are constants to every derivative, because the answer does not depend on them
     displacement, depth = jax.lax.stop_gradient((displacement, depth))
     # Divide by the largest component first, because the square of a small displacement underflows.
     component = jnp.max(jnp.abs(displacement), axis=(0, 1))
@@ -191,18 +189,14 @@ def _displacement_unit(displacement: Array, depth: Array) -> Array:
 
 
 def selected(values: Array, index: Int[Array, "picks *batch"]) -> Array:
-    """The entries with these numbers along the second axis, (k, n, ...) to (k, picks, ...); zero for `NO_EDGE`.
-
-    A masked sum, because a gather is slow in a batch and its derivative is a scatter.
-    """
+    """The entries with these numbers along the second axis, (k, n, ...) to (k, picks, ...); zero for `NO_EDGE`."""
+    # a masked sum, because a gather is slow in a batch and its derivative is a scatter
     numbers = jnp.arange(values.shape[1]).reshape(1, -1, *(1,) * (index.ndim - 1))
     return summed(jnp.where((index[:, None] == numbers)[None], repeated(values, 1, len(index)), 0), 2)
 
 
 def violation_per_weight(friction: Array) -> Array:
-    """How far a contact's force is outside its friction cone if one of its edges has weight minus one.
-
-    The checks of an edge's weight multiply it by this number. So they allow the same error of the force, whatever the
-    coefficient of friction is.
-    """
+    """How far a contact's force is outside its friction cone if one of its edges has weight minus one."""
+    # The checks of an edge's weight multiply it by this number, to allow the same error of the force at every
+    # coefficient of friction.
     return jnp.maximum(2 * friction, 1)

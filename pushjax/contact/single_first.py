@@ -23,12 +23,7 @@ CLEARANCE = 4
 def solve_most_pressed(
     form: Form, contacts: Contact
 ) -> tuple[Bool[Array, ""], SingleSolution, Bool[Array, "contacts"]]:
-    """Solve the contact that is pressed most, as if it were alone.
-
-    Returns:
-        Whether the motion is an answer: it moves the slider away from all other contacts, or no contact is pressed.
-        Then the motion, and for each contact whether it is the one.
-    """
+    """Return whether the most pressed contact alone gives an answer, its motion, and which contact it is."""
     approach = contacts.approach().x
     is_main = jnp.arange(approach.size) == jnp.argmax(approach)
     one = solve_single(
@@ -39,6 +34,7 @@ def solve_most_pressed(
     size = jnp.abs(twist.x) + jnp.abs(twist.y) + length * jnp.abs(twist.z)
     size = jnp.maximum(size, jnp.max(jnp.maximum(displacement, -contacts.gap)))
     normal_motion = contacts.normal.dot(twist.xy + contacts.point.perp().scale(twist.z))
+    # an answer if it moves the slider away from all other contacts, or if no contact is pressed
     clear = normal_motion - approach > CLEARANCE * relative_tolerance(approach.dtype) * size
     answers = jnp.all(clear | is_main) & (one.status == Status.MOVING)
     suffices = jnp.all(contacts.friction >= 0) & (answers | jnp.all(approach <= 0))

@@ -64,11 +64,9 @@ Problem = tuple[Form, Contact, Bool[Array, "contacts"]]
 
 
 def solve(problem: Problem, guess: EdgeSet | None, solver: ContactSolver, *, margin: bool) -> Answer:
-    """Solve a problem of several contacts, of one example.
-
-    `Continuing` tries one contact alone and then the guess. Without `margin`, the margin is infinite where there is a
-    motion, which saves time.
-    """
+    """Solve a problem of several contacts, of one example."""
+    # `Continuing` tries one contact alone and then the guess. Without `margin`, the margin is infinite where there is a
+    # motion, which saves time.
     return _solve((problem, guess), (solver, margin))
 
 
@@ -199,7 +197,7 @@ def _attempt(
 
 
 def _without_friction(again: Array, given: ContactArrays, guess: None) -> tuple[Answer, Bool[Array, " batch"]]:
-    """Solve a batch of problems without friction, in closed form. A contact without force is SEPARATED."""
+    """Solve a batch of problems without friction in closed form, with contacts without force SEPARATED."""
     problem = nondimensionalize(given)
     problem, none = problem._replace(friction=jnp.zeros_like(problem.friction)), jnp.zeros(problem.unit.shape, bool)
     best, twist, solved = least_violation(problem)

@@ -11,32 +11,26 @@ TOO_FAST = 8
 
 
 def kinematic_tolerance(twist: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
-    """Tolerance on the violation of a kinematic condition, in units of the fastest pusher.
-
-    It is `relative_tolerance` plus the roundoff of the twist, but at most `ill_conditioned_tolerance`. The roundoff
-    matters where the slider moves much faster than its pushers, as when it escapes from a wedge. In float32 the upper
-    bound equals `relative_tolerance`, so nothing is added. For a twist that is too fast to be an answer
-    (`max_twist_ratio`), the tolerance is the roundoff alone.
-    """
+    """Tolerance on the violation of a kinematic condition, in units of the fastest pusher."""
+    # It is `relative_tolerance` plus the roundoff of the twist, but at most `ill_conditioned_tolerance`. The roundoff
+    # matters where the slider moves much faster than its pushers, as when it escapes from a wedge. In float32 the upper
+    # bound equals `relative_tolerance`, so nothing is added. For a twist that is too fast to be an answer
+    # (`max_twist_ratio`), the tolerance is the roundoff alone.
     eps, size = float(jnp.finfo(twist.dtype).eps), summed(jnp.abs(twist), 0)
     usual = jnp.minimum(relative_tolerance(twist.dtype) + 64 * eps * size, ill_conditioned_tolerance(twist.dtype))
     return jnp.where(is_slow(dot(twist, twist)), usual, 8 * eps * size)
 
 
 def ill_conditioned_tolerance(dtype) -> float:
-    """Tolerance where roundoff is magnified, because the slider moves much faster than its pushers: 6e-9 in float64.
-
-    In float32 it is the same as `relative_tolerance`, because there are no digits to spare.
-    """
+    """Tolerance where the slider moves much faster than its pushers, which magnifies roundoff: 6e-9 in float64."""
+    # in float32 it is the same as `relative_tolerance`, because there are no digits to spare
     return relative_tolerance(dtype) * (15 if jnp.finfo(dtype).bits > 32 else 1)
 
 
 def max_twist_ratio(dtype) -> float:
-    """Largest twist that can be an answer, in units of the fastest pusher: 4.5e7 in float64, 840 in float32.
-
-    For a twist of this size roundoff alone violates a condition by 1e-8, or by 1e-4 in float32. `Motion` promises no
-    more than that.
-    """
+    """Largest twist that can be an answer, in units of the fastest pusher: 4.5e7 in float64, 840 in float32."""
+    # For a twist of this size roundoff alone violates a condition by 1e-8, or by 1e-4 in float32. `Motion` promises no
+    # more than that.
     return (1e-8 if jnp.finfo(dtype).bits > 32 else 1e-4) / float(jnp.finfo(dtype).eps)
 
 

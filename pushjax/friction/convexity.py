@@ -72,7 +72,7 @@ class Gram(NamedTuple):
 
     @staticmethod
     def identity(dtype) -> "Gram":
-        """Return the 9 x 9 identity in these blocks. It is no Gram matrix of a quartic."""
+        """Return the 9 x 9 identity in these blocks, which is no Gram matrix of a quartic."""
         return Gram(jnp.diag(jnp.array([1, 1, 1, 2, 2, 2], dtype)), 2 * jnp.eye(3, dtype=dtype))
 
     def plus(self, factor: float | Array, other: "Gram") -> "Gram":

@@ -12,23 +12,21 @@ LENGTHS = (1.0, 0.5, 0.2, 0.06, 0.02, 0.005, 2.0)  # of a step, that are tried
 
 
 def aligned_wrenches(
-    surface: Polynomial, twist: Float[Array, "3 batch"], wanted: Bool[Array, " batch"], tolerance: float
+    surface: Polynomial,
+    twist: Float[Array, "3 batch"],
+    wanted: Bool[Array, " batch"],  # the others do not keep the loop running
+    tolerance: float,
 ) -> tuple[Float[Array, "3 batch"], Bool[Array, " batch"]]:
-    """Find wrenches of arbitrary scale whose grad H is along `twist` to `tolerance`, rad, and whether that succeeded.
-
-    This is Newton's method on grad H(F) = c V, where V is the unit twist. By homogeneity only the direction of F
-    matters. So F is never rescaled to the level set, which would need a d-th root in each round. Instead the factor c =
-    d H / (V . F) is fitted to the current F; d is the degree of H.
-
-    The first rounds are a line search: each takes, out of a few step lengths, the one with the largest merit V . F /
-    H^(1/d). The solution is the maximum of this merit. The line search ends after a full step shorter than
-    `CLOSE_STEP`. The residual would not be a safe criterion: where H is nearly flat, a wrench with a small residual may
-    be far from the solution. A fixed number of full Newton steps follows.
-
-    It converged for all twists tried, in float32 and float64: 20 000 twists of random surfaces with condition numbers
-    up to 1e3, and 20 000 of each of seven fitted surfaces, whose supports range from two points to a rectangle.
-    Examples that are not `wanted` do not keep the loop running.
-    """
+    """Find wrenches of any scale whose grad H is along `twist` to `tolerance`, rad, and whether that succeeded."""
+    # Newton's method on grad H(F) = c V, where V is the unit twist. By homogeneity only the direction of F matters. So
+    # F is never rescaled to the level set, which would need a d-th root in each round. Instead the factor
+    # c = d H / (V . F) is fitted to the current F; d is the degree of H.
+    # The first rounds are a line search: each takes, out of a few step lengths, the one with the largest merit V . F /
+    # H^(1/d), whose maximum is the solution. It ends after a full step shorter than `CLOSE_STEP`. The residual would
+    # not be a safe criterion: where H is nearly flat, a wrench with a small residual may be far from the solution. A
+    # fixed number of full Newton steps follows.
+    # It converged for all twists tried, in float32 and float64: 20 000 twists of random surfaces with condition numbers
+    # up to 1e3, and 20 000 of each of seven fitted surfaces, whose supports range from two points to a rectangle.
     degree, squared = surface.degree, dot(twist, twist)
     unit_twist = twist * jax.lax.rsqrt(jnp.where(squared > 0, squared, 1.0))[None]
     max_searches, full_steps = (0, 2) if degree == 2 else (5, 1 if jnp.finfo(squared.dtype).bits <= 32 else 3)

@@ -41,7 +41,7 @@ class Polynomial(NamedTuple):
         return summed(self._table(f) * repeated(repeated(f, 1, 6) * repeated(_pairs(f), 0, 3), 0, 3), (1, 2)) / 3
 
     def _table(self, f: Float[Array, "3 *rest"]) -> Float[Array, "3 3 products *rest"]:
-        """The table with axes between its own and the batch, like those of wrenches."""
+        """The table with axes between its own and the batch, to broadcast against wrenches."""
         missing = f.ndim + 2 - self.table.ndim
         return jnp.expand_dims(self.table, tuple(range(3, 3 + missing)))
 

@@ -26,38 +26,22 @@ NUMBERS_PER_KIND = PerKind(poses=3, directions=2, gap=1)  # a direction is a uni
 
 
 class Fit(NamedTuple):
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        z: (size,) most probable vector of unknowns.
-        sigma: (3,) standard deviations of poses (m), of directions of motion, and of gaps (m).
-        precision: (size, size) inverse covariance of z.
-        residual: Residuals (conditions, pushes, rows) of each kind, predicted less measured; see `Problem.residuals`.
-        information: (conditions, pushes, size) contribution of each push to the diagonal of the precision.
-        loss: Minimized sum of squares, prior included.
-        steps: Optimizer steps, over all rounds.
-        converged: Whether the optimizer converged in the last round.
-    """
-
-    z: Float[Array, "size"]
-    sigma: Float[Array, "3"]
-    precision: Float[Array, "size size"]
-    residual: PerKind
-    information: Float[Array, "conditions pushes size"]
-    loss: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    z: Float[Array, "size"]  # most probable unknowns
+    sigma: Float[Array, "3"]  # standard deviations of poses (m), of directions of motion, and of gaps (m)
+    precision: Float[Array, "size size"]  # inverse covariance of z
+    residual: PerKind  # (conditions, pushes, rows) of each kind, predicted less measured; see `Problem.residuals`
+    information: Float[Array, "conditions pushes size"]  # contribution of each push to the diagonal of the precision
+    loss: Float[Array, ""]  # minimized sum of squares, prior included
+    steps: Int[Array, ""]  # of the optimizer, over all rounds
+    converged: Bool[Array, ""]  # whether the optimizer converged in the last round
 
 
 class FixedEntries(NamedTuple):
-    """Which entries of z are held fixed, and at which values.
+    """Which entries of z are held fixed, and at which values."""
 
-    Attributes:
-        mask: (size,) True for entries that are fixed.
-        value: (size,) their values.
-    """
-
-    mask: Bool[Array, "size"]
+    mask: Bool[Array, "size"]  # True for fixed entries
     value: Float[Array, "size"]
 
     @staticmethod
@@ -76,21 +60,17 @@ def sum_of_squares(residuals: Any, axis: tuple[int, ...] | None = None) -> Array
 
 
 def push_weights(pushes: Pushes) -> PerKind:
-    """Return the weight (conditions, pushes) of each push for each kind of residual.
-
-    Directions have weight zero in pushes that have no pair of wrench and motion.
-    """
+    """Return the weight (conditions, pushes) of each push for each kind of residual."""
+    # pushes without a pair of wrench and motion have no directions
     directions = jnp.where(jnp.any(pushes.has_pair, axis=-1), pushes.weight, 0.0)
     return PerKind(pushes.weight, directions, pushes.weight)
 
 
-def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Array, robust: float | None) -> PerKind:
-    """Return residuals whose squares add up to the data part of the loss.
-
-    The poses of each push, and its directions, use the pseudo-Huber loss, which is linear beyond `robust` sigma (None:
-    least squares). Gaps use the bounded Geman-McClure loss, so a push whose finger lost the slider has almost no
-    influence.
-    """
+def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Float[Array, "3"], robust: float | None) -> PerKind:
+    """Return residuals whose squares add up to the data part of the loss."""
+    # The poses of each push, and its directions, use the pseudo-Huber loss, which is linear beyond `robust` sigma
+    # (None: least squares). Gaps use the bounded Geman-McClure loss, so a push whose finger lost the slider has almost
+    # no influence.
     weighted = []
     kinds = zip(PerKind._fields, residual, push_weights(pushes), sigma, strict=True)
     for kind, r, weight, std in kinds:
@@ -105,10 +85,8 @@ def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Array, robust: 
 
 
 def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
-    """Return the weight of each push, given its residual of one kind, in iteratively reweighted least squares.
-
-    It is the weight with which the Gauss-Newton approximation of the robust loss counts the push.
-    """
+    """Return each push's weight in iteratively reweighted least squares, for one kind of residual."""
+    # the weight with which the Gauss-Newton approximation of the robust loss counts the push
     squared = jnp.sum((residual / sigma) ** 2, axis=-1)
     if kind == "gap":
         return weight / (1 + squared / GAP_SCALE**2) ** 2
@@ -116,56 +94,35 @@ def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, rob
 
 
 class Schedule(NamedTuple):
-    """How long to fit.
+    """Number of rounds and tolerance of a fit."""
 
-    Attributes:
-        rounds: Number of alternations between z and sigma. One is enough if all of sigma is known.
-        tolerance: Tolerance of z in the last round.
-    """
-
-    rounds: Int[Array, ""]
-    tolerance: Float[Array, ""]
+    rounds: Int[Array, ""]  # alternations between z and sigma; one is enough if all of sigma is known
+    tolerance: Float[Array, ""]  # of z in the last round
 
     @staticmethod
     def of(dtype, rounds: int, tolerance: float | None = None) -> "Schedule":
-        """Return the schedule for a floating dtype.
-
-        Args:
-            dtype: Floating dtype of the fit.
-            rounds: Number of alternations between z and sigma.
-            tolerance: Tolerance of z in the last round. Default: 1e-6 in float64, 1e-4 in float32.
-        """
+        """Return the schedule for a floating dtype; the default tolerance is 1e-6 in float64, 1e-4 in float32."""
         default = 1e-6 if dtype == jnp.float64 else 1e-4
         return Schedule(jnp.asarray(rounds), jnp.asarray(default if tolerance is None else tolerance, dtype))
 
 
 class _Evidence(NamedTuple):
-    """What the residuals at the minimum say about z and about sigma.
+    """Estimates of the precision of z and of sigma from the residuals at the minimum."""
 
-    Attributes:
-        precision: (size, size) inverse covariance of z.
-        information: (conditions, pushes, size) contribution of each push to the diagonal of the precision.
-        new_sigma: Standard deviation of each kind of residual; that of a kind that was not measured is not used.
-    """
-
-    precision: Array
-    information: Array
-    new_sigma: list[Array]
+    precision: Float[Array, "size size"]  # inverse covariance of z
+    information: Float[Array, "conditions pushes size"]  # contribution of each push to the diagonal of the precision
+    new_sigma: list[Array]  # standard deviation of each kind of residual; not used for a kind that was not measured
 
 
 def _evidence(
-    residual: PerKind, jacobian: PerKind, pushes: Pushes, before: Fit, robust: float | None, has_normal_prior
+    residual: PerKind,  # at the minimizer, (conditions, pushes, rows) of each kind
+    jacobian: PerKind,  # its derivatives (conditions, pushes, rows, size) with respect to z
+    pushes: Pushes,
+    before: Fit,  # result of the round before, with whose sigma the minimizer was found
+    robust: float | None,
+    has_normal_prior: Float[Array, "size"],  # 1 for entries of z that have a normal prior, else 0
 ) -> _Evidence:
-    """Return the precision of z, and sigma as the evidence procedure estimates it.
-
-    Args:
-        residual: Residuals (conditions, pushes, rows) of each kind at the minimizer.
-        jacobian: Their derivatives (conditions, pushes, rows, size) with respect to z.
-        pushes: Pushes with a leading axis of conditions.
-        before: Result of the round before. Its sigma is the one with which the minimizer was found.
-        robust: Number of sigma from which a push has less influence. None: least squares.
-        has_normal_prior: (size,) 1 for entries of z that have a normal prior, else 0.
-    """
+    """Return the precision of z, and sigma as the evidence procedure estimates it."""
     by_kind, information, counts_and_squares = [], jnp.zeros_like(before.information), []
     kinds = zip(PerKind._fields, residual, jacobian, push_weights(pushes), before.sigma, strict=True)
     for kind, r, derivatives, weight, std in kinds:
@@ -190,29 +147,15 @@ def _evidence(
 
 def fit(
     problem: Problem,
-    pushes: Pushes,
-    start: Array,
-    sigma: Array,
-    robust: float | None,
-    sigma_is_given: Array,
+    pushes: Pushes,  # with a leading axis of conditions
+    start: Float[Array, "size"],
+    sigma: Float[Array, "3"],  # initial or known standard deviations of poses (m), of directions, and of gaps (m)
+    robust: float | None,  # number of sigma from which a push has less influence; None: least squares
+    sigma_is_given: Bool[Array, "3"],
     fixed: FixedEntries,
-    schedule: Schedule,
+    schedule: Schedule,  # may be traced
 ) -> Fit:
-    """Find the most probable z and the standard deviations of the residuals, in alternation.
-
-    Args:
-        problem: Everything that stays constant.
-        pushes: Pushes with a leading axis of conditions.
-        start: (size,) initial z.
-        sigma: (3,) initial or known standard deviations of poses (m), of directions of motion, and of gaps (m).
-        robust: Number of sigma from which a push has less influence. None: least squares.
-        sigma_is_given: (3,) whether each entry of `sigma` is known.
-        fixed: Entries of z that are not optimized.
-        schedule: How long to fit; may be traced.
-
-    Returns:
-        The result of the last round.
-    """
+    """Find the most probable z and the standard deviations of the residuals, in alternation."""
     has_normal_prior = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
     rounds, last_tolerance = schedule
 
@@ -264,34 +207,22 @@ def compiled_fit(
 
 
 class Minimum(NamedTuple):
-    """Result of `least_squares`.
-
-    Attributes:
-        z: Minimizer.
-        auxiliary: Auxiliary output of the residual function at z.
-        steps: Number of steps.
-        converged: Whether the method converged.
-    """
+    """Result of `least_squares`."""
 
     z: Float[Array, "size"]
-    auxiliary: Any
+    auxiliary: Any  # output of the residual function at z
     steps: Int[Array, ""]
     converged: Bool[Array, ""]
 
 
 class _LevenbergMarquardt(optx.LevenbergMarquardt):
-    """Levenberg-Marquardt method with another stopping rule and another growth of the trust region.
-
-    It also terminates if a step was rejected and the next trial step is within the tolerance, as MINPACK does. At a
-    change of contact mode, or where roundoff hides the improvement, it would reject every further step, up to the last.
-
-    The trust region grows tenfold if a step achieves three quarters of the predicted reduction. The library's default
-    requires nearly all of the predicted reduction, which suits smooth functions. Where contacts change their mode, that
-    default keeps steps small and takes up to half as many steps again.
-    """
+    """Levenberg-Marquardt method with MINPACK's stopping rule and faster growth of the trust region."""
 
     def __init__(self, tolerance: Any):
         super().__init__(rtol=tolerance, atol=tolerance)
+        # Grow tenfold after a step that achieves three quarters of the predicted reduction. The library's default
+        # requires nearly all of it, which suits smooth functions. Where contacts change their mode, it keeps steps
+        # small and takes up to half as many steps again.
         self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, high_constant=10.0)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -301,24 +232,19 @@ class _LevenbergMarquardt(optx.LevenbergMarquardt):
 
     def terminate(self, fn, y, args, options, state, tags):
         converged, result = super().terminate(fn, y, args, options, state, tags)
+        # Also stop if a step was rejected and the next trial step is within the tolerance, as MINPACK does. At a change
+        # of contact mode, or where roundoff hides the improvement, every further step would be rejected.
         next_step_is_small = self.norm((state.y_eval - y) / (self.atol + self.rtol * jnp.abs(y))) < 1
         return converged | (next_step_is_small & (state.num_steps_since_acceptance > 0)), result
 
 
 def least_squares(
-    residuals: Callable[[Array], tuple[Any, Any]], start: Array, max_steps: int, tolerance: Any
+    residuals: Callable[[Array], tuple[Any, Any]],  # of z: a pytree of residual arrays, and an auxiliary output
+    start: Float[Array, "size"],
+    max_steps: int,
+    tolerance: Any,  # relative and absolute
 ) -> Minimum:
-    """Minimize a sum of squares by the Levenberg-Marquardt method.
-
-    Args:
-        residuals: Function of z that returns a pytree of residual arrays and an auxiliary output.
-        start: (size,) initial z.
-        max_steps: Largest number of steps.
-        tolerance: Relative and absolute tolerance.
-
-    Returns:
-        The minimizer, the auxiliary output there, the number of steps, and whether the method converged.
-    """
+    """Minimize a sum of squares by the Levenberg-Marquardt method."""
     solver = _LevenbergMarquardt(tolerance)
     found = optx.least_squares(lambda z, _: residuals(z), solver, start, has_aux=True, max_steps=max_steps, throw=False)
     return Minimum(found.value, found.aux, found.stats["num_steps"], found.result == optx.RESULTS.successful)

@@ -162,13 +162,9 @@ def _check_settings(
     length: Array,
     sigma: Array,
     robust: float | None,
-    needs_round_finger: Mapping[str, bool],
+    needs_round_finger: Mapping[str, bool],  # whether each argument for a single round finger was given
 ) -> None:
-    """Check that the settings fit each other and the hand.
-
-    `needs_round_finger` says of arguments for a single round finger whether they were given. The others are as in
-    `identify`.
-    """
+    """Check that the settings of `identify` fit each other and the hand."""
     if pushes.path.shape[-1] != hand.dof:
         raise ValueError(f"path has {pushes.path.shape[-1]} columns; the hand's configuration has {hand.dof}")
     for name, value in (("length", length), ("sigma", sigma)):
@@ -203,10 +199,7 @@ def _known_friction(friction: ArrayLike, conditions: int, dtype: Any) -> Array:
 
 @quick_jit
 def _best_start(problem: Problem, pushes: Pushes, sigma: Array, *, robust: float | None) -> Array:
-    """Return a start with the friction that explains the pushes best, and all other parameters at their prior mean.
-
-    The friction is chosen for each condition, or for all conditions together if they share it.
-    """
+    """Return the prior mean of z, but with the friction that explains the pushes best."""
     z, layout = problem.prior.mean, problem.prior.layout
     if "friction" not in layout.names:
         return z
@@ -220,6 +213,6 @@ def _best_start(problem: Problem, pushes: Pushes, sigma: Array, *, robust: float
         return sum_of_squares(weighted, axis=(1, 2))
 
     loss = jax.lax.map(push_losses, candidates)
-    if "friction" in layout.shared:
+    if "friction" in layout.shared:  # one friction for all conditions together
         loss = jnp.broadcast_to(jnp.sum(loss, axis=1, keepdims=True), loss.shape)
     return z.at[positions].set(candidates[jnp.argmin(loss, axis=0)])

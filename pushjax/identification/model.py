@@ -30,78 +30,52 @@ DIRECTION_PARTS = 5
 
 
 class PerKind(NamedTuple):
-    """A quantity that exists once for each kind of residual.
-
-    Attributes:
-        poses: Its value for poses.
-        directions: Its value for directions of motion under measured wrenches.
-        gap: Its value for the gap between finger and slider at the end.
-    """
+    """One value for each kind of residual."""
 
     poses: Any
-    directions: Any
-    gap: Any
+    directions: Any  # of motion under measured wrenches
+    gap: Any  # between finger and slider at the end
 
 
 class Problem(eqx.Module):
-    """Everything that stays constant during a fit.
-
-    Attributes:
-        shape: Outline of the slider.
-        hand: The hand that pushes.
-        surface: Limit surface of each condition, with a leading axis of conditions. The fit replaces its coefficients.
-        prior: Prior of the unknowns.
-        length: Length of the metric, m.
-        contact_at_end: Whether the gap at the end of every push is a residual.
-    """
+    """Everything that stays constant during a fit."""
 
     shape: Shape
     hand: Hand
-    surface: LimitSurface
+    surface: LimitSurface  # of each condition, with a leading axis of conditions; the fit replaces its coefficients
     prior: Prior
-    length: Float[Array, ""]
-    contact_at_end: bool = eqx.field(static=True, default=False)
+    length: Float[Array, ""]  # of the metric, m
+    contact_at_end: bool = eqx.field(static=True, default=False)  # whether the gap at the end of a push is a residual
 
     def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> PerKind:
-        """Return the residuals (conditions, pushes, rows) of each kind for all pushes, predicted less measured.
-
-        Poses are x, y, length * theta, in m. They are divided by the root of their number, so that all poses of a push
-        together weigh as much as one. So are directions of motion. A gap, in m, is that between the finger and the
-        slider as it was measured at the end. A kind that was not measured has no rows.
-        """
+        """Return the residuals (conditions, pushes, rows) of each kind for all pushes, predicted less measured."""
+        # Poses are x, y, length * theta, in m. They are divided by the root of their number, so that all poses of a
+        # push together weigh as much as one. So are directions of motion. A gap, in m, separates the finger from the
+        # slider's measured final pose. A kind that was not measured has no rows.
         free, parameters = self._free_and_all(z)
         blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
         return PerKind(*(value for value, _ in blocks))
 
     def linearize(self, z: Float[Array, "size"], pushes: Pushes) -> "Linearized":
-        """Return residuals and their Jacobian with respect to the parameters of each push's own condition.
-
-        A condition has some twenty parameters, however many entries z has. The result is constant in every derivative:
-        gradients do not flow through it.
-
-        The Jacobian uses forward mode, also for the fifteen coefficients of a quartic. This takes half the run time and
-        half the compilation time of three reverse sweeps.
-        """
+        """Return residuals and their Jacobian with respect to the parameters of each push's own condition."""
+        # A condition has some twenty parameters, however many entries z has. The result is constant in every
+        # derivative: gradients do not flow through it. The Jacobian uses forward mode, also for the fifteen
+        # coefficients of a quartic: it takes half the run time and half the compilation time of three reverse sweeps.
         free, parameters = self._free_and_all(jax.lax.stop_gradient(z))
         blocks = self._residual_blocks(lambda f: jax.jacfwd(f, has_aux=True), free, parameters, pushes)
         jacobians, values = zip(*blocks, strict=True)
         return Linearized(PerKind(*values), PerKind(*jacobians), free)
 
     def _residual_blocks(
-        self, transformation: Callable, free: dict[str, Array], parameters: Parameters, pushes: Pushes
+        self,
+        transformation: Callable,  # of the function of each kind: the identity, or `jacfwd`
+        free: dict[str, Array],  # by name, with a leading axis of conditions; what to differentiate with respect to
+        parameters: Parameters,  # `free` replaces some of them
+        pushes: Pushes,
     ) -> PerKind:
-        """Evaluate each kind of residual over all conditions and pushes.
-
-        Args:
-            transformation: Applied to the function of each kind: the identity, or `jacfwd`. The functions return their
-                residual twice, because `jacfwd` drops the value and keeps only an auxiliary output beside the Jacobian.
-            free: Parameters to differentiate with respect to, by name, with a leading axis of conditions.
-            parameters: All parameters; `free` replaces some of them.
-            pushes: Pushes with a leading axis of conditions.
-
-        Returns:
-            For each kind the pair of the residual, or its Jacobian by name of parameter, and the residual.
-        """
+        """Return, for each kind, the transformed residuals and the residuals of all conditions and pushes."""
+        # The functions return their residual twice, because `jacfwd` drops the value and keeps only an auxiliary output
+        # beside the Jacobian by name of parameter.
         steps = tuple(pushes.observed_steps.tolist())
         constants = (Scene(self.shape, self.hand, self.prior.origin), self.length)
         data = _PushData(self.surface, pushes.inputs, pushes.poses)
@@ -119,10 +93,8 @@ class Problem(eqx.Module):
         return PerKind(poses, directions, gap)
 
     def linear_residuals(self, z: Float[Array, "size"], linearized: "Linearized") -> PerKind:
-        """Return the residuals at z, to first order about the point of `linearized`.
-
-        At that point the values and the derivatives with respect to z are exact, and they cost matrix products only.
-        """
+        """Return the residuals at z, to first order about the point of `linearized`."""
+        # At that point the values and the derivatives with respect to z are exact, at the cost of matrix products only.
         free, _ = self._free_and_all(z)
 
         def extrapolate(value: Array, jacobian: dict[str, Array]) -> Array:
@@ -141,62 +113,39 @@ class Problem(eqx.Module):
         return jax.jacfwd(lambda z: self.linear_residuals(z, linearized))(z)
 
     def _free_and_all(self, z: Float[Array, "size"]) -> tuple[dict[str, Array], Parameters]:
-        """Return the free (estimated) parameters by name, and all parameters.
-
-        The center of pressure is not among the free ones, because pushes depend on it through the surface alone.
-        """
+        """Return the free (estimated) parameters by name, and all parameters."""
         parameters = self.prior.parameters(z)
+        # pushes depend on the center of pressure through the surface alone, so it is not free itself
         free = {"surface" if name == "pressure_center" else name for name in self.prior.layout.names}
         return {name: value for name, value in parameters._asdict().items() if name in free}, parameters
 
 
 class Linearized(NamedTuple):
-    """Residuals and their Jacobian at one point z.
+    """Residuals and their Jacobian at one point z."""
 
-    Attributes:
-        value: Residuals (conditions, pushes, rows) of each kind.
-        jacobian: For each kind, derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`.
-        free: Estimated parameters (conditions, ...) by name, at that point.
-    """
-
-    value: PerKind
-    jacobian: PerKind
-    free: dict[str, Array]
+    value: PerKind  # (conditions, pushes, rows) of each kind
+    jacobian: PerKind  # for each kind, derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`
+    free: dict[str, Array]  # estimated parameters (conditions, ...) by name, at that point
 
 
 class Scene(NamedTuple):
-    """The bodies in contact, and the reference point of the table.
+    """The bodies in contact, and the reference point of the table."""
 
-    Attributes:
-        shape: Outline of the slider.
-        hand: The hand that pushes.
-        origin: (2,) world, m, the point about which `Table` describes the friction.
-    """
-
-    shape: Shape
+    shape: Shape  # outline of the slider
     hand: Hand
-    origin: Float[Array, "2"]
+    origin: Float[Array, "2"]  # world, m, the point about which `Table` describes the friction
 
 
 def predict_pushes(parameters: Parameters, surface: LimitSurface, scene: Scene, pushes: Pushes) -> Trajectory:
-    """Predict the pushes of all conditions.
-
-    Args:
-        parameters: Parameters, with a leading axis of conditions.
-        surface: Limit surfaces, with a leading axis of conditions; `parameters` replaces their coefficients.
-        scene: Slider, hand and reference point of the table.
-        pushes: Pushes with a leading axis of conditions.
-
-    Returns:
-        Trajectories with leading axes (conditions, pushes).
-    """
+    """Predict the pushes of all conditions, as trajectories with leading axes (conditions, pushes)."""
+    # `parameters` replaces the coefficients of the surfaces
     over_pushes = jax.vmap(predict_push, in_axes=(None, None, None, 0))
     over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0))
     return over_all(parameters, surface, scene, pushes.inputs)
 
 
 class _PushData(NamedTuple):
-    """What was recorded of one push; the surface is that of its condition."""
+    """Record of one push, with the surface of its condition."""
 
     surface: LimitSurface
     inputs: PushInput
@@ -204,7 +153,7 @@ class _PushData(NamedTuple):
 
 
 class _WrenchMotionPairs(NamedTuple):
-    """Wrenches and motions of one push, and where they exist; the surface is that of its condition."""
+    """Wrenches and motions of one push and where they exist, with the surface of its condition."""
 
     surface: LimitSurface
     wrench: Array
@@ -244,11 +193,9 @@ def _gap_residual(
 def _direction_residual(
     free: dict[str, Array], parameters: Parameters, pairs: _WrenchMotionPairs, constants: tuple[()]
 ) -> tuple[Array, Array]:
-    """Return the direction residuals (3 * pairs,) of one push, as value and again as auxiliary output.
-
-    Directions are unit vectors along (vx, vy, length * omega), so wrenches and motions may have any scale. `constants`
-    is empty, because the table's reference point and the hand do not matter here.
-    """
+    """Return the direction residuals (3 * pairs,) of one push, as value and again as auxiliary output."""
+    # Directions are unit vectors along (vx, vy, length * omega), so wrenches and motions may have any scale.
+    # `constants` is empty, because the table's reference point and the hand do not matter here.
     parameters = parameters._replace(**free)
     surface = with_coefficients(pairs.surface, parameters.surface)
     metric = jnp.stack([jnp.ones_like(surface.length)] * 2 + [surface.length])
@@ -273,7 +220,7 @@ def _over_conditions_and_pushes(
     data: "_PushData | _WrenchMotionPairs",
     constants: tuple,
 ):
-    """Map `function` over conditions and pushes. The pushes of a condition share its parameters and its surface."""
+    """Map `function` over conditions and over the pushes that share a condition's parameters and surface."""
     data_axes: Any = data._replace(**{name: None if name == "surface" else 0 for name in data._fields})
     over_pushes = jax.vmap(function, in_axes=(None, None, data_axes, None))
     return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(free, parameters, data, constants)
@@ -289,18 +236,13 @@ def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurfac
     return eqx.tree_at(coefficients_of, surface, coefficients)
 
 
-def predict_push(parameters: Parameters, surface: LimitSurface, scene: Scene, inputs: PushInput) -> Trajectory:
-    """Predict one push, with the poses that the tracker reports.
-
-    Args:
-        parameters: Parameters of the push's condition.
-        surface: Limit surface; `parameters` replaces its coefficients.
-        scene: Slider, hand and reference point of the table.
-        inputs: Recorded start, path, age and side of the push.
-
-    Returns:
-        The trajectory. Its poses are those of the tracked frame, also if `parameters.frame_offset` is not zero.
-    """
+def predict_push(
+    parameters: Parameters,
+    surface: LimitSurface,  # `parameters` replaces its coefficients
+    scene: Scene,
+    inputs: PushInput,  # recorded start, path, age and side
+) -> Trajectory:
+    """Predict one push, with the poses of the tracked frame, also if `frame_offset` is not zero."""
     shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
     slider = Slider(shape, with_coefficients(surface, parameters.surface))
     path = correct_path(inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
@@ -323,21 +265,14 @@ def predict_push(parameters: Parameters, surface: LimitSurface, scene: Scene, in
 
 
 def overlap_vector(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
-    """Return the shortest displacement (2,) of a round finger, world, m, that moves it out of the slider.
-
-    Its length is the penetration depth; it is zero if finger and slider are apart.
-    """
+    """Return the shortest displacement of a round finger, world, m, out of the slider; zero if they are apart."""
     distance, normal, radius = finger_distance(slider.shape, hand, start, configuration)
     return jnp.maximum(radius - distance, 0.0) * transform(start.at[:2].set(0.0), normal)
 
 
 def finger_distance(shape: Shape, hand: Hand, pose: Array, configuration: Array) -> tuple[Array, Array, Array]:
-    """Measure the distance of a single round finger from the outline.
-
-    Returns:
-        Signed distance of the finger's center from the outline in m, outward normal (2,) at the nearest point in the
-            body frame, and radius of the finger in m.
-    """
+    """Return a round finger's distance to the outline, the outward normal (2,), body frame, and its radius, in m."""
+    # the distance is signed, from the finger's center to the nearest point of the outline
     finger = hand.fingers[0]
     assert isinstance(finger, RoundFinger)  # `identify` checks this
     distance, _, normal = shape.closest(transform(inverse(pose), configuration[:2]))
@@ -345,13 +280,10 @@ def finger_distance(shape: Shape, hand: Hand, pose: Array, configuration: Array)
 
 
 def apply_inset(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
-    """Return slider and hand with an outline that is smaller by `inset`.
-
-    The outline of a polygon moves inwards. For other shapes the radii of the fingers shrink instead. They must be at
-    least as large as `inset`.
-    """
+    """Return slider and hand with an outline that is smaller by `inset`, m."""
     if isinstance(shape, Polygon):
         return shape.inset(inset), hand
+    # instead of the outline, the radii of the fingers shrink; they must be at least as large as `inset`
     fingers = tuple(
         eqx.tree_at(lambda f: f.radius, finger, finger.radius - inset) if isinstance(finger, RoundFinger) else finger
         for finger in hand.fingers
@@ -359,22 +291,16 @@ def apply_inset(shape: Shape, hand: Hand, inset: Array) -> tuple[Shape, Hand]:
     return shape, eqx.tree_at(lambda h: h.fingers, hand, fingers)
 
 
-def correct_path(path: Array, overshoot: Array, lag_distance: Array, hand_offset: Array) -> Array:
-    """Return the true path of the hand, from the logged one.
-
-    The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
-    lag_distance, shifted by `hand_offset`. Arc lengths are those of x and y. Beyond an end of the logged path it goes
-    straight on, in the direction of a fifth of the path: local directions of a recording are mostly roundoff.
-
-    Args:
-        path: (steps + 1, dof) logged path.
-        overshoot: Distance in m that the hand went on after the end of its path.
-        lag_distance: Distance in m by which the hand was behind its logged position.
-        hand_offset: (2,) displacement of the hand, world, m.
-
-    Returns:
-        (steps + 1, dof) true path.
-    """
+def correct_path(
+    path: Array,
+    overshoot: Array,  # distance in m that the hand went on after the end of its path
+    lag_distance: Array,  # distance in m by which the hand was behind its logged position
+    hand_offset: Array,  # (2,), world, m
+) -> Array:
+    """Return the true path (steps + 1, dof) of the hand, from the logged one."""
+    # The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
+    # lag_distance, shifted by `hand_offset`. Arc lengths count x and y only. Beyond an end of the logged path it goes
+    # straight on, in the direction of a fifth of the path: local directions of a recording are mostly roundoff.
     arc = arc_length(path[:, :2])
     length = arc[-1]
     true_arc = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance

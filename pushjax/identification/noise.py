@@ -289,11 +289,7 @@ def _initial_log_noise(found: Identified) -> _LogNoise:
 
 @jit
 def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
-    """Take one optimizer step per key.
-
-    Returns:
-        The last parameters and optimizer state, the scores before each step, and the parameters after each step.
-    """
+    """Take one optimizer step per key; return parameters and state, and the scores before and parameters after each."""
     optimizer = _optimizer(steps)
 
     def step(carry, key):
@@ -310,11 +306,9 @@ def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, 
 def _score(
     log_noise: _LogNoise, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
 ) -> tuple[Array, _LogNoise]:
-    """Return the mean score and its gradient.
-
-    A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
-    forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
-    """
+    """Return the mean score and its gradient."""
+    # A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
+    # forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
 
     def linearize(
         condition: ConditionSampler, key: PRNGKeyArray, parameters: NoiseParameters

@@ -1,8 +1,4 @@
-"""Predictive distribution of pushes under noise.
-
-For each push, a limit surface and a friction are sampled, the hand is displaced, and the final pose has an error that
-grows with how far the slider moved and turned.
-"""
+"""Predictive distribution of pushes under noise; the header of `noise` describes the model."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -28,24 +24,15 @@ PLACEHOLDER_DOF = 60.0  # never used to sample: every sample sets its own dof
 
 
 class NoiseParameters(NamedTuple):
-    """Parameters of the noise.
+    """Parameters of the noise."""
 
-    Attributes:
-        surface_dof: Degrees of freedom of the limit surface.
-        friction: (conditions, 2) range of mu, or (2,) for one condition.
-        hand_offset: Scale of the hand's displacement in x and in y, m.
-        sigma: Scale of the measurement error of a final pose, in x, y and length * theta, m.
-        relative_error: (2,) scale of the error per distance that the slider moved, and per length * angle that it
-            turned.
-        student_dof: Degrees of freedom of Student's distribution of the errors.
-    """
-
-    surface_dof: Float[Array, ""]
-    friction: Float[Array, "*conditions 2"]
-    hand_offset: Float[Array, ""]
-    sigma: Float[Array, ""]
+    surface_dof: Float[Array, ""]  # degrees of freedom of the limit surface
+    friction: Float[Array, "*conditions 2"]  # range of mu
+    hand_offset: Float[Array, ""]  # scale of the hand's displacement in x and in y, m
+    sigma: Float[Array, ""]  # scale of the measurement error of a final pose, in x, y and length * theta, m
+    # scale of the error per distance that the slider moved, and per length * angle that it turned
     relative_error: Float[Array, "2"]
-    student_dof: Float[Array, ""]
+    student_dof: Float[Array, ""]  # degrees of freedom of Student's distribution of the errors
 
     def dof_and_friction(self, inputs: "RandomInputs") -> tuple[Array, Array]:
         """Return dof and friction mu of each sample, (..., pushes, samples), for one condition or for all."""
@@ -55,24 +42,15 @@ class NoiseParameters(NamedTuple):
 
 
 class RandomInputs(NamedTuple):
-    """Random draws of each push, with axes (..., pushes, samples). They do not depend on the noise's parameters.
+    """Random draws of each push, which do not depend on the parameters of the noise."""
 
-    Attributes:
-        surface: Keys of the limit surfaces.
-        error: Keys of the errors, which `unit_errors` turns into numbers.
-        mu: Position of mu in its range, from 0 to 1.
-    """
-
-    surface: PRNGKeyArray
-    error: PRNGKeyArray
-    mu: Float[Array, "*conditions pushes n"]
+    surface: PRNGKeyArray  # (..., pushes, n) keys of the limit surfaces
+    error: PRNGKeyArray  # (..., pushes, n) keys of the errors, which `unit_errors` turns into numbers
+    mu: Float[Array, "*conditions pushes n"]  # position of mu in its range, from 0 to 1
 
     def unit_errors(self, student_dof: Array) -> Float[Array, "*conditions pushes n 5"]:
-        """Sample the errors in units of their scale: two of the hand's position and three of the final pose.
-
-        The five numbers are normal with one common random factor, so that together they have Student's distribution
-        with `student_dof` degrees of freedom.
-        """
+        """Sample the errors in units of their scale: two of the hand's position and three of the final pose."""
+        # The five numbers are normal with one common random factor, so together they have Student's distribution.
 
         def unit_error(key: PRNGKeyArray) -> Float[Array, "5"]:
             first, second = jax.random.split(key)
@@ -87,31 +65,18 @@ class RandomInputs(NamedTuple):
 
 
 class PoseJacobian(NamedTuple):
-    """Derivatives of final poses.
+    """Derivatives of final poses."""
 
-    Attributes:
-        dof: (..., 3) with respect to dof.
-        mu: (..., 3) with respect to mu.
-        hand_shift: (..., 3, 2) with respect to the position of the hand.
-    """
-
-    dof: Array
-    mu: Array
-    hand_shift: Array
+    dof: Float[Array, "*samples 3"]
+    mu: Float[Array, "*samples 3"]
+    hand_shift: Float[Array, "*samples 3 2"]  # with respect to the position of the hand
 
 
 class ConditionSampler(eqx.Module):
-    """Simulation of the pushes of one condition under random draws.
+    """Simulation of the pushes of one condition under random draws."""
 
-    Attributes:
-        distribution: Distribution of the limit surface.
-        parameters: Estimated parameters of the condition.
-        pushes: Pushes of the condition.
-        scene: Slider, hand and reference point of the table.
-    """
-
-    distribution: SurfaceDistribution
-    parameters: Parameters
+    distribution: SurfaceDistribution  # of the limit surface
+    parameters: Parameters  # estimated
     pushes: Pushes
     scene: Scene
 
@@ -122,14 +87,13 @@ class ConditionSampler(eqx.Module):
         mu = jax.random.uniform(third, shape, self.pushes.end.dtype)
         return RandomInputs(jax.random.split(first, shape), jax.random.split(second, shape), mu)
 
-    def poses(self, inputs: RandomInputs, noise: NoiseParameters, hand_shift: Float[Array, "pushes n 2"]) -> Array:
-        """Return the true final poses (pushes, n, 3), without measurement error.
-
-        Args:
-            inputs: Random draws.
-            noise: Parameters of the noise.
-            hand_shift: Displacement of each hand, world, m.
-        """
+    def poses(
+        self,
+        inputs: RandomInputs,
+        noise: NoiseParameters,
+        hand_shift: Float[Array, "pushes n 2"],  # displacement of each hand, world, m
+    ) -> Array:
+        """Return the true final poses (pushes, n, 3), without measurement error."""
         return self._over_samples(self._final_pose, inputs, noise, hand_shift)
 
     def linearize(self, inputs: RandomInputs, noise: NoiseParameters) -> tuple[Array, PoseJacobian]:
@@ -160,21 +124,15 @@ class ConditionSampler(eqx.Module):
 
 
 class PredictiveModel(eqx.Module):
-    """The pushes of all conditions, with everything about them that does not depend on the noise.
+    """The pushes of all conditions, with everything about them that does not depend on the noise."""
 
-    Attributes:
-        distribution: Distribution of the limit surface, with a leading axis of conditions.
-        parameters: Estimated parameters, with a leading axis of conditions.
-        pushes: Pushes, with a leading axis of conditions.
-        scene: Slider, hand and reference point of the table.
-        length: Length in m that makes angles commensurate with positions.
-    """
+    # all but `scene` and `length` have a leading axis of conditions
 
-    distribution: SurfaceDistribution
-    parameters: Parameters
+    distribution: SurfaceDistribution  # of the limit surface
+    parameters: Parameters  # estimated
     pushes: Pushes
     scene: Scene
-    length: Float[Array, ""]
+    length: Float[Array, ""]  # m, makes angles commensurate with positions
 
     @staticmethod
     def of(found: Identified, pushes: Pushes, slider: Slider, hand: Hand, sampler: Sampler) -> "PredictiveModel":
@@ -229,10 +187,7 @@ class PredictiveModel(eqx.Module):
     def log_density(
         self, poses: Float[Array, "*pushes n 3"], pushes: Pushes, noise: NoiseParameters
     ) -> Float[Array, "*pushes"]:
-        """Return the log density of the recorded final poses.
-
-        The density is the mean of Student's densities about `poses`.
-        """
+        """Return the log density of the recorded final poses: the mean of Student's densities about `poses`."""
         difference = poses - pushes.end[..., None, :]
         return log_student_density(difference, self.error_scale(poses, pushes, noise), noise.student_dof, self.length)
 
@@ -256,10 +211,7 @@ def predict(
 def log_density(
     key: PRNGKeyArray, predictive: PredictiveModel, noise: NoiseParameters, n: int
 ) -> Float[Array, "conditions pushes"]:
-    """Return the log density of the recorded final poses.
-
-    The density is the mean of Student's densities about `n` sampled poses of each push.
-    """
+    """Return the log density of the recorded final poses: the mean of Student's densities about `n` samples."""
 
     def density(condition: ConditionSampler, key, noise: NoiseParameters):
         inputs = condition.draw_inputs(key, n)
@@ -270,22 +222,12 @@ def log_density(
 
 
 def log_student_density(
-    difference: Float[Array, "*pushes n 3"],
-    sigma: Float[Array, "*pushes n"],
+    difference: Float[Array, "*pushes n 3"],  # between the poses and the recorded pose: x, y (m), theta (rad)
+    sigma: Float[Array, "*pushes n"],  # scale of the error of each pose, m
     student_dof: Array,
-    length: Float[Array, ""],
+    length: Float[Array, ""],  # m, makes angles commensurate with positions
 ) -> Float[Array, "*pushes"]:
-    """Return the logarithm of the mean of Student's densities about several poses.
-
-    Args:
-        difference: (..., n, 3) differences between the poses and the recorded pose: x, y (m), theta (rad).
-        sigma: (..., n) scale of the error of each pose, m.
-        student_dof: Degrees of freedom.
-        length: Length in m that makes angles commensurate with positions.
-
-    Returns:
-        Log density per cubic meter of (x, y, length * theta).
-    """
+    """Return the log of the mean of Student's densities about poses, per m^3 of (x, y, length * theta)."""
     turn = 2 * jnp.pi
     angle = difference[..., 2] - turn * jax.lax.stop_gradient(jnp.round(difference[..., 2] / turn))
     squared = (difference[..., 0] ** 2 + difference[..., 1] ** 2 + (length * angle) ** 2) / sigma**2

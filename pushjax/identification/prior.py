@@ -36,19 +36,12 @@ ALWAYS_PRESENT = tuple(
 
 
 class Layout(eqx.Module):
-    """Positions of the unknowns in the vector z.
+    """Positions of the unknowns in the vector z."""
 
-    Attributes:
-        names: Names of the unknowns.
-        sizes: How many entries each has per condition.
-        shared: Names that all conditions share.
-        conditions: Number of conditions.
-    """
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    sizes: tuple[int, ...] = eqx.field(static=True)
-    shared: tuple[str, ...] = eqx.field(static=True)
-    conditions: int = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the unknowns
+    sizes: tuple[int, ...] = eqx.field(static=True)  # entries of each, per condition
+    shared: tuple[str, ...] = eqx.field(static=True)  # names that all conditions share
+    conditions: int = eqx.field(static=True)  # number of conditions
 
     @staticmethod
     def of(unknowns: Unknowns, degree: int, conditions: int) -> "Layout":
@@ -100,18 +93,12 @@ class Layout(eqx.Module):
 
 
 class PriorSurface(eqx.Module):
-    """The mean limit surface of every condition, from which identification starts.
+    """The mean limit surface of every condition, from which identification starts."""
 
-    Attributes:
-        factors: (conditions, terms, 3, 3) lower triangular factors L0_k.
-        relative_std: (conditions,) standard deviation of an entry of E_k below the diagonal; zero if the surface is
-            known.
-        length: (conditions,) length of the surface, m.
-    """
-
-    factors: Float[Array, "conditions terms 3 3"]
+    factors: Float[Array, "conditions terms 3 3"]  # lower triangular factors L0_k
+    # standard deviation of an entry of E_k below the diagonal; zero if the surface is known
     relative_std: Float[Array, "conditions"]
-    length: Float[Array, "conditions"]
+    length: Float[Array, "conditions"]  # m
 
     @staticmethod
     def of(surface: LimitSurface, dof: Array | None) -> "PriorSurface":
@@ -136,21 +123,14 @@ def _factors_of(surface: LimitSurface) -> Array:
 
 
 class Prior(eqx.Module):
-    """Prior of the unknowns: everything that converts z to physical parameters.
-
-    Attributes:
-        unknowns: What is estimated, and its prior.
-        known: Parameters that are known, by name, each with a leading axis of conditions. Units are those of
-            `Parameters`. The friction is always among them, and is used unless it is estimated.
-        mean_surface: Mean surfaces, with a leading axis of conditions.
-        origin: (2,) world, m, reference point of the table friction.
-        layout: Positions of the unknowns in z.
-    """
+    """Prior of the unknowns: everything that converts z to physical parameters."""
 
     unknowns: Unknowns
+    # Known parameters by name, with a leading axis of conditions, in the units of `Parameters`. The friction is always
+    # among them, and is used unless it is estimated.
     known: dict[str, Array]
-    mean_surface: PriorSurface
-    origin: Float[Array, "2"]
+    mean_surface: PriorSurface  # with a leading axis of conditions
+    origin: Float[Array, "2"]  # world, m, reference point of the table friction
     layout: Layout = eqx.field(static=True)
 
     @staticmethod
@@ -167,16 +147,14 @@ class Prior(eqx.Module):
         return of_conditions(z[self.layout.positions], self.known, self.mean_surface)
 
     def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
-        """Return the lower triangular factors L_k of every condition's surface.
-
-        A QR decomposition makes them triangular again if the center of pressure is an unknown.
-        """
+        """Return the lower triangular factors L_k of every condition's surface."""
 
         def of_condition(numbers: Array, known: dict[str, Array], mean: PriorSurface) -> Array:
             entries = _entries_by_name(numbers, self.layout)
             return _surface_factors(entries, _values(entries, self.unknowns, known, mean.length), mean)
 
         full = jax.vmap(of_condition)(z[self.layout.positions], self.known, self.mean_surface)
+        # an unknown center of pressure makes them full; the QR decomposition makes them triangular again
         return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
 
     @property
@@ -206,16 +184,12 @@ def _surface_factors(
 
 
 def _condition_parameters(
-    entries: dict[str, Any], unknowns: Unknowns, known: dict[str, Array], mean: PriorSurface
+    entries: dict[str, Any],  # of z, by the name of the unknown
+    unknowns: Unknowns,
+    known: dict[str, Array],  # by name
+    mean: PriorSurface,  # of the condition
 ) -> Parameters:
-    """Return the physical parameters of one condition.
-
-    Args:
-        entries: Entries of z, by the name of the unknown.
-        unknowns: What is estimated, and its prior.
-        known: Known parameters by name.
-        mean: Mean surface of the condition.
-    """
+    """Return the physical parameters of one condition."""
     values = _values(entries, unknowns, known, mean.length)
     factors = _surface_factors(entries, values, mean)
     gram = factors @ jnp.swapaxes(factors, 1, 2)

@@ -188,7 +188,7 @@ class Pushes(eqx.Module):
                 raise ValueError(f"several: the conditions' {name} differ in shape: {sorted(shapes)}")
 
         def padded(name: str) -> Array:
-            """Stack one field of all conditions. The padding repeats a condition's first push."""
+            """Stack one field of all conditions, padded with copies of each condition's first push."""
             rows = []
             for one in several:
                 value = getattr(one, name)

@@ -75,7 +75,8 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> 
 
 
 def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> str | None:
-    """Return why a push is physically impossible, or None. The comparisons are written so that NaN fails them."""
+    """Return why a push is physically impossible, or None."""
+    # the comparisons are written so that NaN fails them
     start, end = push.pose[0], push.pose[-1]
     step_lengths = np.linalg.norm(np.diff(push.hand[:, :2], axis=0), axis=1)
     travel, distance = float(step_lengths.sum()), float(np.linalg.norm(push.hand[:, :2] - start[:2], axis=1).min())
@@ -103,12 +104,9 @@ def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> s
 
 
 def _finger_gaps(shape: Shape, hand: Hand, push: Recording) -> np.ndarray:
-    """Return the gaps (CHECKED_ROWS,) in m from the nearest finger to the initial outline, negative inside.
-
-    The result is empty if a finger is not round.
-    """
+    """Return the gaps (CHECKED_ROWS,) in m from the nearest finger to the initial outline, negative inside."""
     if not all(isinstance(finger, RoundFinger) for finger in hand.fingers):
-        return np.zeros(0)
+        return np.zeros(0)  # not known for fingers that are not round
     rows = np.linspace(0, len(push.hand) - 1, CHECKED_ROWS).round().astype(int)
     centers = np.asarray(hand.poses(jnp.asarray(push.hand[rows])))[..., :2]
     body = (centers - push.pose[0, :2]) @ rotation(push.pose[0, 2])
@@ -122,23 +120,16 @@ def _signed_distances(shape: Shape, points: jax.Array) -> jax.Array:
     return jax.vmap(shape.signed_distance)(points)
 
 
-def push_arrays(recordings: Recordings, steps: int, parts: int, shape: Shape | None) -> dict[str, Floats]:
-    """Return the arrays of `Pushes`, by name.
-
-    Args:
-        recordings: Recorded pushes.
-        steps: Number of steps of each path.
-        parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked during
-            all pushes. Otherwise only the final pose is used.
-        shape: Outline of the slider. If it is given, and the forces of a single finger were recorded, wrenches are used
-            too: the mean of each part. This needs more than one part.
-
-    Returns:
-        Arrays `start`, `path`, `end` and `poses_between`, and `wrench` and `twist` if they are used.
-
-    Raises:
-        ValueError: If `steps` or `parts` is less than one, or if several `parts` are not fewer than `steps`.
-    """
+def push_arrays(
+    recordings: Recordings,
+    steps: int,  # of each path
+    parts: int,
+    shape: Shape | None,  # outline of the slider, for wrenches
+) -> dict[str, Floats]:
+    """Return the arrays `start`, `path`, `end`, `poses_between`, and maybe `wrench` and `twist`, of `Pushes`."""
+    # The slider's pose after each of `parts` equal parts of a push is used, if it was tracked often enough during all
+    # pushes; otherwise only the final pose. With a shape, the mean wrench of each of several parts is used too, if the
+    # forces of a single finger were recorded.
     if steps < 1:
         raise ValueError(f"steps must be at least 1; got {steps}")
     if not 1 <= parts < max(steps, 2):
@@ -198,16 +189,12 @@ def _slider_poses(push: Recording, arc: Floats, query: Floats) -> Floats:
 
 
 def _wrench_motion_pairs(
-    pushes: tuple[Recording, ...], poses: Floats, part_of_sample: list[np.ndarray], shape: Shape
+    pushes: tuple[Recording, ...],
+    poses: Floats,  # (pushes, parts + 1, 3), of the slider, between the parts
+    part_of_sample: list[np.ndarray],  # for each push, the index of the part that each sample is in
+    shape: Shape,
 ) -> dict[str, Floats]:
-    """Return the mean wrench and the displacement in each part of each push, in the body frame; zero where unknown.
-
-    Args:
-        pushes: Recorded pushes.
-        poses: (pushes, parts + 1, 3) slider's poses between the parts.
-        part_of_sample: For each push, the index of the part that each sample is in.
-        shape: Outline of the slider.
-    """
+    """Return the mean wrench and the displacement in each part of each push, body frame; zero where unknown."""
     rows = [np.arange(len(push.hand), dtype=float) for push in pushes]
     all_poses = [
         _interpolated_columns(push.pose[push.seen], row[push.seen], row) for push, row in zip(pushes, rows, strict=True)

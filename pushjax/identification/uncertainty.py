@@ -112,33 +112,21 @@ def profile(
 
 
 class _ProfilePoint(NamedTuple):
-    """A fit with one number held.
+    """A fit with one number of z held fixed."""
 
-    Attributes:
-        distance: Distance of that number from its estimate, in standard deviations.
-        z: All numbers after the fit.
-        loss: Loss of the fit.
-    """
-
-    distance: float
-    z: Array
+    distance: float  # of that number from its estimate, in standard deviations
+    z: Float[Array, "size"]  # after the fit
     loss: float
 
 
 def _profile_side(
+    # fits with the number held at a distance, starting from a point nearby
     refit: Callable[[_ProfilePoint, float], _ProfilePoint],
     estimate: _ProfilePoint,
-    distances: Sequence[float],
-    limit: float,
+    distances: Sequence[float],  # from the estimate outward; more are added where the profile is flat or steep
+    limit: float,  # largest distance
 ) -> list[_ProfilePoint]:
-    """Return the points of a profile on one side of the estimate.
-
-    Args:
-        refit: Fit with the number held at a distance, which starts from a point nearby.
-        estimate: The estimate.
-        distances: Distances, from the estimate outward. More are added where the profile is flat or steep.
-        limit: Largest distance.
-    """
+    """Return the points of a profile on one side of the estimate."""
 
     def rise(point: _ProfilePoint) -> float:
         return (point.loss - estimate.loss) / 2
@@ -162,24 +150,8 @@ def _profile_side(
 def bootstrap(
     key: PRNGKeyArray, found: "Identified", pushes: Pushes, slider: Slider, hand: Hand, n: int
 ) -> tuple[Parameters, Float[Array, "n size"]]:
-    """Identify from `n` sets of pushes that are drawn from the given ones with replacement, in each condition.
-
-    All sets are fitted at once. Each fit starts from the estimate of all pushes.
-
-    Args:
-        key: PRNG key.
-        found: What `identify` returned.
-        pushes: Pushes, as given to `identify`.
-        slider: Slider, as given to `identify`.
-        hand: Hand, as given to `identify`.
-        n: Number of sets.
-
-    Returns:
-        The estimates, with a leading axis (n,), and their z, (n, size).
-
-    Raises:
-        ValueError: If all pushes of a condition have the weight zero.
-    """
+    """Identify from `n` bootstrap samples of the pushes of each condition; return the estimates and their z."""
+    # All samples are fitted at once, each from the estimate of all pushes.
     pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     weights = np.asarray(pushes.weight)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
@@ -214,17 +186,12 @@ def scalar_positions(found: "Identified") -> dict[str, int]:
     return {label: k for k, label in enumerate(found.labels) if not label.startswith("surface")}
 
 
-def normal_interval(found: "Identified", label: str, level: float = 0.9) -> tuple[float, float]:
-    """Compute the interval of one number from the covariance of z.
-
-    Args:
-        found: What `identify` returned.
-        label: One of `found.labels`, except those of the surface.
-        level: Probability that the interval contains.
-
-    Returns:
-        Lowest and highest value, in the number's own unit.
-    """
+def normal_interval(
+    found: "Identified",
+    label: str,  # one of `found.labels`, except those of the surface
+    level: float = 0.9,  # probability that the interval contains
+) -> tuple[float, float]:
+    """Return the interval of one number, in its own unit, from the covariance of z."""
     position = scalar_positions(found)[label]
     reach = float(ndtri(0.5 + level / 2) * np.sqrt(np.asarray(found.covariance)[position, position]))
     low, high = (_physical_value(found, found.z.at[position].add(sign * reach), label) for sign in (-1, 1))

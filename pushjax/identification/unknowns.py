@@ -19,17 +19,15 @@ def _optional_array(value: ArrayLike | None) -> Array | None:
 
 
 def _shared_names(names: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the names of the shared unknowns as a tuple; None stands for those of the calibration."""
+    """Return the names of the shared unknowns as a tuple, or the calibration parameters for None."""
     return CALIBRATION if names is None else tuple(names)
 
 
-def _field_metadata(size: int | None, group: str = "") -> dict[str, Any]:
-    """Return the metadata of a field that stands for an unknown.
-
-    Args:
-        size: Number of scalars that the unknown has; None if it depends on the problem.
-        group: "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither.
-    """
+def _field_metadata(
+    size: int | None,  # number of its scalars; None if it depends on the problem
+    group: str = "",  # "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither
+) -> dict[str, Any]:
+    """Return the metadata of a field that stands for an unknown."""
     return {"size": size, "group": group}
 
 
@@ -168,18 +166,7 @@ TABLE = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "
 def known_parameters(
     known: Mapping[str, ArrayLike], unknowns: Unknowns, conditions: int, dtype: Any
 ) -> dict[str, Array]:
-    """Check the argument `known` of `identify`, and return its values with a leading axis of conditions.
-
-    Args:
-        known: Values of parameters that are not estimated, by name.
-        unknowns: What is estimated.
-        conditions: Number of conditions.
-        dtype: Floating dtype of the result.
-
-    Raises:
-        ValueError: If a name is not that of a parameter or is estimated, or if a value is not finite or has the wrong
-            shape.
-    """
+    """Check the argument `known` of `identify`, and return its values with a leading axis of conditions."""
     values = {}
     for name, value in known.items():
         if name not in NORMAL_PRIORS:

@@ -168,13 +168,7 @@ def animate_cloud(
 
 
 class _Panel:
-    """The artists of one push.
-
-    Args:
-        axes: Axes to draw into.
-        track: The push as it is drawn.
-        largest_force: Largest force of all panels, N, which sets the scale of the arrows.
-    """
+    """The artists of one push, with arrows to the scale of the largest force of all panels, N."""
 
     def __init__(self, axes: Axes, track: DrawnPush, largest_force: float):
         self.track = track

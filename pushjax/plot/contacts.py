@@ -109,17 +109,15 @@ def _allowed_centers(axes: Axes, point: np.ndarray, normal: np.ndarray, box: tup
             axes.fill([], [], color=color, alpha=0.16, label=label)
 
 
-def _labeled_contact(axes: Axes, name: str, point: np.ndarray, normal: np.ndarray, mu: float, reach: float) -> None:
-    """Draw the normal, the friction cone and the closing finger of a contact.
-
-    Args:
-        axes: Axes to draw into.
-        name: Label of the contact.
-        point: The contact point, (2,), mm.
-        normal: Unit normal into the slider, (2,).
-        mu: Coefficient of friction.
-        reach: Length that the lengths of the lines are multiples of, mm.
-    """
+def _labeled_contact(
+    axes: Axes,
+    name: str,
+    point: np.ndarray,  # (2,), mm
+    normal: np.ndarray,  # (2,), unit vector into the slider
+    mu: float,
+    reach: float,  # length that the lengths of the lines are multiples of, mm
+) -> None:
+    """Draw the normal, the friction cone and the closing finger of a contact."""
     axes.plot(*np.array([point - 2 * reach * normal, point + 2 * reach * normal]).T, "--", color=BLUE, lw=0.9)
     tangent = np.array([-normal[1], normal[0]])
     for side in (1, -1):

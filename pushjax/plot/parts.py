@@ -19,24 +19,13 @@ FIXTURE = "0.88"  # color of fixtures
 
 
 def vertices(shape: Shape) -> np.ndarray:
-    """Return an outline as the vertices of a polygon, (vertices, 2), body frame, m.
-
-    They are the vertices of the shape if it is a polygon, else `SMOOTH_OUTLINE_POINTS` points along its boundary.
-    """
+    """Return the vertices (n, 2) of a polygon, or points along a smooth outline, body frame, m."""
     points = getattr(shape, "vertices", None)
     return np.asarray(shape.boundary(SMOOTH_OUTLINE_POINTS) if points is None else points)
 
 
 def placed_outline(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return the closed outline of a body at each of several poses, in mm.
-
-    Args:
-        points: (points, 2), body frame, m.
-        poses: (..., 3), m and rad.
-
-    Returns:
-        (..., points + 1, 2), mm.
-    """
+    """Return the closed outline (..., points + 1, 2), mm, of points (points, 2), m, at poses (..., 3), m and rad."""
     x, y, theta = np.moveaxis(np.asarray(poses)[..., None], -2, 0)
     c, s = np.cos(theta), np.sin(theta)
     body_x, body_y = np.vstack([points, points[:1]]).T
@@ -44,15 +33,7 @@ def placed_outline(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def centroids(shape: Shape, poses: np.ndarray) -> np.ndarray:
-    """Return where the centroid of a body is at each of several poses, in mm.
-
-    Args:
-        shape: The body.
-        poses: (..., 3), m and rad.
-
-    Returns:
-        (..., 2), mm.
-    """
+    """Return the centroids (..., 2), mm, of a body at poses (..., 3), m and rad."""
     return placed_outline(np.asarray(shape.centroid, float)[None], poses)[..., 0, :]
 
 
@@ -93,7 +74,7 @@ def _draw_finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width
 
 
 def draw_fixtures(axes: Axes, fixtures: Sequence[Wall | Fixture]) -> None:
-    """Draw fixtures filled, in mm. Walls go across the picture, and do not extend the range that the axes show."""
+    """Draw fixtures filled, in mm; walls do not extend the data limits of the axes."""
     low, high = (MM * FAR * sign for sign in (-1, 1))
     for fixture in fixtures:
         if isinstance(fixture, Wall):
@@ -108,7 +89,7 @@ def draw_fixtures(axes: Axes, fixtures: Sequence[Wall | Fixture]) -> None:
 
 
 def arrow(axes: Axes, tail: np.ndarray, tip: np.ndarray, color: str, width: float) -> None:
-    """Draw an arrow from one point (2,) to another, in mm. Both points extend the range that the axes show."""
+    """Draw an arrow from one point (2,) to another, in mm, and extend the data limits of the axes to both."""
     shape = {"arrowstyle": "-|>", "color": color, "lw": width, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", (tip[0], tip[1]), (tail[0], tail[1]), arrowprops=shape)
     axes.update_datalim([tail, tip])
@@ -116,12 +97,7 @@ def arrow(axes: Axes, tail: np.ndarray, tip: np.ndarray, color: str, width: floa
 
 
 def center_of_rotation(axes: Axes, twist: np.ndarray) -> None:
-    """Draw the center about which a twist turns the slider, with the sign of the turn.
-
-    Args:
-        axes: Axes to draw into.
-        twist: (3,), body frame. Nothing is drawn for a translation.
-    """
+    """Draw the center of rotation of a twist (3,), body frame, and the sign of the turn; none if it only translates."""
     vx, vy, omega = twist
     if omega == 0:
         return

@@ -113,7 +113,7 @@ def grasp_figure(
 
 
 def _draw_squeeze(axes: Axes, squeeze: SqueezeForces, length: float) -> None:
-    """Draw the forces of a squeeze as arrows that end at the contacts; that of a unit force is `length` (m) long."""
+    """Draw the forces of a squeeze as arrows that end at the contacts, `length` m long per unit force."""
     for tip, tail in zip(MM * squeeze.point, MM * (squeeze.point - length * squeeze.force), strict=True):
         arrow(axes, tail, tip, ORANGE, 2.0)
 

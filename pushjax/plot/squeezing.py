@@ -66,19 +66,14 @@ def _as_poses(fingers) -> np.ndarray:
 
 
 def _contacts(
-    shape: Shape, hand: Hand, pose: np.ndarray, before: np.ndarray, after: np.ndarray
+    shape: Shape,
+    hand: Hand,
+    pose: np.ndarray,  # (3,), of the slider, world, m and rad
+    before: np.ndarray,  # (fingers, 3), poses before the hand's last motion
+    after: np.ndarray,  # (fingers, 3), poses after it
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return points, normals into the slider, and displacements of the fingers at all contacts, (contacts, 2) each.
-
-    Corners of pads and of the slider are compared with the outline of the other.
-
-    Args:
-        shape: Outline of the slider.
-        hand: The hand.
-        pose: (3,), pose of the slider, world, m and rad.
-        before: (fingers, 3), poses of the fingers before the hand's last motion.
-        after: (fingers, 3), poses of the fingers after it.
-    """
+    """Return points, normals into the slider, and displacements of the fingers at all contacts, (contacts, 2) each."""
+    # corners of pads and of the slider are compared with the outline of the other
     outline = vertices(shape)
     size = float(np.ptp(outline, axis=0).max())
     slack = TOUCH * size + float(np.abs(after - before)[:, :2].max())

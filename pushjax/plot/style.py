@@ -45,15 +45,13 @@ STYLE: Any = {
 }
 
 
-def panel_row(panels: int, width: float, height: float, shared: bool = False) -> tuple[Figure, list[Axes]]:
-    """Make a figure with panels side by side, and return it with the axes of the panels.
-
-    Args:
-        panels: Number of panels.
-        width: Width of each panel, inches.
-        height: Height of each panel, inches.
-        shared: Whether the panels show the same range.
-    """
+def panel_row(
+    panels: int,
+    width: float,  # of each panel, inches
+    height: float,  # of each panel, inches
+    shared: bool = False,  # whether the panels show the same range
+) -> tuple[Figure, list[Axes]]:
+    """Make a figure with panels side by side, and return it with the axes of the panels."""
     figure, axes = plt.subplots(
         1, panels, figsize=(width * panels, height), sharex=shared, sharey=shared, layout="constrained", squeeze=False
     )
@@ -61,14 +59,7 @@ def panel_row(panels: int, width: float, height: float, shared: bool = False) ->
 
 
 def curve_styles(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Return for each curve its name, the curve, and its color, dash and marker as arguments of `Axes.plot`.
-
-    Args:
-        curves: Curves by name. The quartic and the ellipsoid have the same style in every picture.
-
-    Raises:
-        ValueError: If there are more curves than one can tell apart.
-    """
+    """Return for each curve its name, the curve, and its color, dash and marker as arguments of `Axes.plot`."""
     if len(curves) > len(SERIES):
         raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
     order = [MODEL_ROWS[name] for name in curves] if MODEL_ROWS.keys() >= curves.keys() else range(len(curves))

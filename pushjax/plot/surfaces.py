@@ -73,17 +73,15 @@ def _draw_level_set(axes: Axes, surface: LimitSurface, load: float, color: str) 
     axes.set_box_aspect((1, 1, 1), zoom=0.88)  # type: ignore[call-arg]
 
 
-def _draw_cut(axes: Axes, surfaces: Mapping[str, LimitSurface], wrench: np.ndarray, load: float, vertical: int) -> None:
-    """Draw a cut through the level sets, and the wrenches near it.
-
-    Args:
-        axes: Axes to draw into.
-        surfaces: Limit surfaces by name.
-        wrench: Wrenches in units of the load, (pairs, 3).
-        load: Total friction limit of the support, N.
-        vertical: Component on the vertical axis: 1 for f_y, 2 for the torque. On the horizontal axis is f_x. The third
-            component, number 3 - vertical, is zero in the cut.
-    """
+def _draw_cut(
+    axes: Axes,
+    surfaces: Mapping[str, LimitSurface],
+    wrench: np.ndarray,  # (pairs, 3), in units of the load
+    load: float,  # total friction limit of the support, N
+    # component on the vertical axis: 1 for f_y, 2 for the torque; f_x is horizontal, the third zero in the cut
+    vertical: int,
+) -> None:
+    """Draw a cut through the level sets, and the wrenches near it."""
     angle = np.linspace(0, 2 * np.pi, 241)
     circle = np.zeros((len(angle), 3))
     circle[:, 0], circle[:, vertical] = np.cos(angle), np.sin(angle)

@@ -38,33 +38,20 @@ class Animatable(Protocol):
 
 
 class DrawnPush(NamedTuple):
-    """A push as it is drawn, in mm and N, world frame.
+    """A push as it is drawn, in mm and N, world frame."""
 
-    Attributes:
-        outline: (points, vertices, 2), outlines of the slider.
-        fingers: For each finger its outlines, (points, vertices, 2).
-        center: (points, 2), centroids of the slider.
-        measured: Measured outlines to draw over it, or None.
-        contact: (points, contacts, 2), contacts of the step that led to each point.
-        force: (points, contacts, 2), forces of that step, N.
-        words: For each point the text that describes that step.
-        failed: The first failed step, or -1.
-        squeeze: The forces that hold the slider from the step at which the hand stops, as the points (contacts, 2) in
-            mm and the forces (contacts, 2) per unit of squeeze; None where it is not held, or if they are not asked
-            for.
-        stopped: The step at which the hand stops, or -1.
-    """
-
-    outline: np.ndarray
-    fingers: list[np.ndarray]
-    center: np.ndarray
-    measured: np.ndarray | None
-    contact: np.ndarray
-    force: np.ndarray
-    words: list[str]
-    failed: int
+    outline: np.ndarray  # (points, vertices, 2), of the slider
+    fingers: list[np.ndarray]  # of each finger the outlines, (points, vertices, 2)
+    center: np.ndarray  # (points, 2), centroids of the slider
+    measured: np.ndarray | None  # outlines to draw over it, or None
+    contact: np.ndarray  # (points, contacts, 2), of the step that led to each point
+    force: np.ndarray  # (points, contacts, 2), of that step, N
+    words: list[str]  # for each point the text that describes that step
+    failed: int  # the first failed step, or -1
+    # Forces that hold the slider once the hand stops: points (contacts, 2), mm, and forces (contacts, 2) per unit of
+    # squeeze. None if it is not held, or if they are not asked for.
     squeeze: tuple[np.ndarray, np.ndarray] | None
-    stopped: int
+    stopped: int  # the step at which the hand stops, or -1
 
     @property
     def largest_force(self) -> float:
@@ -76,23 +63,11 @@ def drawn_push(
     shape: Shape,
     hand: Hand,
     push: Animatable,
-    measured: np.ndarray | None,
-    forces: bool,
-    friction: float | None = None,
+    measured: np.ndarray | None,  # (points, 3), poses to draw over it, world, m and rad
+    forces: bool,  # whether to draw contacts and forces
+    friction: float | None = None,  # at the contacts, to draw the squeeze that holds the slider
 ) -> DrawnPush:
-    """Convert a push to what is drawn.
-
-    Args:
-        shape: Outline of the slider.
-        hand: The hand.
-        push: The push.
-        measured: (points, 3), poses to draw over it, world, m and rad; or None.
-        forces: Whether to draw contacts and forces.
-        friction: Coefficient of friction at the contacts, to draw the squeeze that holds the slider; or None.
-
-    Raises:
-        ValueError: If the push has another number of configurations than of poses.
-    """
+    """Convert a push to its outlines, contacts, forces and texts."""
     pose, outline_points = np.asarray(push.pose, float), vertices(shape)
     fingers = fingers_along(hand, push.configuration)
     if len(fingers[0]) != len(pose):
@@ -152,11 +127,8 @@ def _describe_step(status: int, modes: np.ndarray) -> str:
 
 
 def _plain_name(member: ContactMode | Status) -> str:
-    """Return the name of a mode or status in lower case, with spaces.
-
-    GRASPED is "held by every finger", because the slider may be held flat or wedged.
-    """
-    if member is Status.GRASPED:
+    """Return the name of a mode or status in lower case, with spaces."""
+    if member is Status.GRASPED:  # the slider may be held flat or wedged
         return "held by every finger"
     return member.name.lower().replace("_", " ")
 

@@ -96,7 +96,7 @@ def violations(
 
 
 def level(batch: ProblemBatch, wrench: np.ndarray) -> np.ndarray:
-    """Return H^(1 / degree), (N,), at normalized wrenches (N, 3). It is homogeneous of degree one."""
+    """Return H^(1 / degree), (N,), homogeneous of degree one, at normalized wrenches (N, 3)."""
     largest = np.abs(wrench).max(axis=1)
     unit = wrench / np.where(largest > 0, largest, 1.0)[:, None]
     return largest * np.maximum(batch.value(unit), 0.0) ** (1 / batch.degree)
@@ -113,10 +113,6 @@ def _flow_error(batch: ProblemBatch, v: np.ndarray, wrench: np.ndarray) -> np.nd
 
 
 def closing(batch: ProblemBatch) -> np.ndarray:
-    """Return by how much a slider that does not move would violate the nonpenetration of its contacts.
-
-    Returns:
-        The largest such violation in each problem, (N,), relative to `ProblemBatch.speed`. It is at most zero if the
-        problem is FREE, and -inf without active contacts.
-    """
+    """Return the largest violation of nonpenetration (N,) if the slider does not move, relative to `speed`."""
+    # at most zero if the problem is FREE, and -inf without active contacts
     return np.where(batch.active, batch.approach()[..., 0], -np.inf).max(axis=1, initial=-np.inf) / batch.speed()

@@ -68,21 +68,10 @@ def squeeze_power(batch: ProblemBatch) -> np.ndarray:
 
 
 def squeeze_power_enumerated(batch: ProblemBatch) -> np.ndarray:
-    """Return the squeeze power of a large batch, as the largest over all basic solutions of the linear program.
-
-    Four edges whose wrenches span the space balance in only one way: the weight of each edge is the determinant of the
-    other three. `squeeze_power` solves the problems in which four edges nearly lie in one plane, or in which no four
-    edges span the space (for example without friction anywhere).
-
-    Args:
-        batch: The problems.
-
-    Returns:
-        The squeeze power, (N,), in m, as from `squeeze_power`.
-
-    Raises:
-        RuntimeError: If a linear program cannot be solved.
-    """
+    """Return the squeeze power (N,), m, of a large batch, as the largest over all basic solutions."""
+    # Four edges whose wrenches span the space balance in only one way: the weight of each edge is the determinant of
+    # the other three. `squeeze_power` solves the problems in which four edges nearly lie in one plane, or in which no
+    # four edges span the space (for example without friction anywhere).
     wrenches, powers = _edges(batch)
     on = np.repeat(batch.active, 2, axis=1)
     n, edges = on.shape

@@ -19,47 +19,31 @@ from pushjax.friction.sum_of_squares import squared_quadratics
 
 
 class ContactProblem(NamedTuple):
-    """One contact on a random limit surface, in the body frame.
-
-    Attributes:
-        surface: Limit surface.
-        point: Contact point, (2,), in m.
-        normal: Unit normal that points into the slider, (2,).
-        displacement: Displacement of the pusher, (2,), in m.
-        friction: Friction coefficient mu.
-    """
+    """One contact on a random limit surface, in the body frame."""
 
     surface: LimitSurface
-    point: Float[Array, "2"]
-    normal: Float[Array, "2"]
-    displacement: Float[Array, "2"]
-    friction: Float[Array, ""]
+    point: Float[Array, "2"]  # m
+    normal: Float[Array, "2"]  # unit vector into the slider
+    displacement: Float[Array, "2"]  # of the pusher, m
+    friction: Float[Array, ""]  # mu
 
 
 def random_contact_problem(
-    key: Key[Array, ""], *, degree: int = 4, condition: float = 1e3, friction: float = 3.0
+    key: Key[Array, ""],
+    *,
+    degree: int = 4,  # of the limit surface, 2 or 4
+    # the condition number of the Hessian over the unit sphere is log-uniform up to about this number
+    condition: float = 1e3,
+    friction: float = 3.0,  # mu is uniform from 0 to this number
 ) -> ContactProblem:
-    """Generate a problem with one contact anywhere on a slider of some 0.1 m.
-
-    The direction of the push is uniform over the half plane of directions that push. The length of the displacement is
-    log-uniform from 0.1 to 10 mm.
-
-    Args:
-        key: PRNG key.
-        degree: Degree of the limit surface, 2 or 4.
-        condition: The condition number of the Hessian over the unit sphere is log-uniform up to about this number.
-        friction: mu is uniform from 0 to this number.
-
-    Returns:
-        The problem.
-    """
+    """Generate a problem with one contact anywhere on a slider of some 0.1 m."""
     k_surface, k_point, k_normal, k_push, k_mu, k_speed, k_length = jax.random.split(key, 7)
     length = jax.random.uniform(k_length, minval=0.02, maxval=0.1)
     surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
     point = jax.random.uniform(k_point, (2,), minval=-0.1, maxval=0.1)
     angle = jax.random.uniform(k_normal, maxval=2 * jnp.pi)
     push = angle + jax.random.uniform(k_push, minval=-jnp.pi / 2, maxval=jnp.pi / 2)
-    size = 10 ** jax.random.uniform(k_speed, minval=-4.0, maxval=-2.0)
+    size = 10 ** jax.random.uniform(k_speed, minval=-4.0, maxval=-2.0)  # m
     return ContactProblem(
         surface,
         point,
@@ -70,27 +54,13 @@ def random_contact_problem(
 
 
 def random_surface(
-    key: Key[Array, ""], *, degree: int = 4, condition: float | Array = 1e3, length: float | Array = 0.05
+    key: Key[Array, ""],
+    *,
+    degree: int = 4,  # 2 (an `Ellipsoid`) or 4 (a `Quartic`)
+    condition: float | Array = 1e3,
+    length: float | Array = 0.05,  # characteristic length, m
 ) -> LimitSurface:
-    """Generate a limit surface whose Hessian has a condition number that is log-uniform up to about `condition`.
-
-    A surface of degree 2 has random axes and eigenvalues. A surface of degree 4 is a sum of squares of five quadratics.
-    Some of these are squares of a single linear form, which leaves almost flat directions. The surface also contains a
-    multiple of |F|^4, whose own condition number is 3, so that the condition number over a sweep of the sphere takes
-    its random value.
-
-    Args:
-        key: PRNG key.
-        degree: Degree of the surface, 2 or 4.
-        condition: Upper end of the range of the condition number.
-        length: Characteristic length, in m.
-
-    Returns:
-        An `Ellipsoid` (degree 2) or a `Quartic` (degree 4).
-
-    Raises:
-        ValueError: If the degree is neither 2 nor 4.
-    """
+    """Generate a limit surface whose Hessian has a condition number that is log-uniform up to about `condition`."""
     k_shape, k_rank, k_scale, k_condition = jax.random.split(key, 4)
     drawn_condition = 10 ** jax.random.uniform(k_condition, minval=0.0, maxval=jnp.log10(condition))
     if degree == 2:
@@ -101,6 +71,9 @@ def random_surface(
         return Ellipsoid(q @ jnp.diag(eigenvalues) @ q.T, length)
     if degree != 4:
         raise ValueError(f"degree must be 2 or 4; got {degree}")
+    # A sum of squares of five quadratics. Some of these are squares of a single linear form, which leaves almost flat
+    # directions. A multiple of |F|^4, whose own condition number is 3, is added, so that the condition number over a
+    # sweep of the sphere takes its random value.
     factors = jax.random.normal(k_shape, (5, 3, 3))
     is_rank_one = jax.random.bernoulli(k_rank, 0.5, (5,))
     # A factor of rank one keeps its first column only.
@@ -132,12 +105,7 @@ def _spectrum(c: Float[Array, "15"]) -> tuple[Array, Array]:
 
 
 class ContactsProblem(NamedTuple):
-    """Several contacts on a random limit surface.
-
-    Attributes:
-        surface: Limit surface.
-        contacts: The contacts, in the body frame.
-    """
+    """Several contacts on a random limit surface, in the body frame."""
 
     surface: LimitSurface
     contacts: Contacts
@@ -146,54 +114,19 @@ class ContactsProblem(NamedTuple):
 def random_contacts_problem(
     key: Key[Array, ""],
     *,
-    contacts: int | Int[Array, ""],
+    contacts: int | Int[Array, ""],  # number of active contacts
     degree: int = 4,
-    condition: float | Float[Array, ""] = 1e3,
+    condition: float | Float[Array, ""] = 1e3,  # see `random_surface`
+    # a tenth of the coefficients are zero, a tenth uniform up to four times this number, the others up to it
     friction: float | Float[Array, ""] = 1.5,
-    gaps: float | Float[Array, ""] = 0.5,
+    gaps: float | Float[Array, ""] = 0.5,  # fraction of the problems with gaps
+    # contacts that the arrays hold, the additional ones inactive and at random places; default: `contacts`
     slots: int | None = None,
-    fixtures: int = 0,
+    fixtures: int = 0,  # number of active contacts that do not move, like those of walls
 ) -> ContactsProblem:
-    """Generate a problem with several contacts on a slider of some 0.1 m, from the cases that a solver must handle.
-
-    The contact points and normals are of one of five kinds, with equal probability:
-
-    - anywhere on an ellipse;
-    - anywhere, with any normals;
-    - two or more on one straight edge, the others on the ellipse;
-    - alternating between the flat faces of two parallel jaws, in half of these problems exactly opposite each other;
-    - two that form a wedge at the limit of holding itself, the others on the ellipse: the friction cone of each of the
-      two misses the other contact, or contains it, by 1e-1 to 1e-5 rad.
-
-    The pushers move in one of four ways, with equal probability:
-
-    - as one rigid hand, in half of these problems without rotation;
-    - toward the middle of the slider, in half of these problems exactly and equally fast, in the others unevenly and
-      with some drift;
-    - independently, three quarters of them into the slider;
-    - such that one of them slides along the slider and moves it alone, often while it recedes, and the others stay
-      behind or only just touch.
-
-    The size of the displacements is log-uniform from 0.1 to 10 mm. In half of the problems all contacts have the same
-    friction coefficient. All arguments but `degree`, `slots` and `fixtures` may be traced, so that one compiled program
-    generates all problems.
-
-    Args:
-        key: PRNG key.
-        contacts: Number of active contacts.
-        degree: Degree of the limit surface, see `random_surface`.
-        condition: Upper end of the range of its condition number, see `random_surface`.
-        friction: A tenth of the friction coefficients are zero, a tenth are uniform up to four times this number, and
-            the others are uniform up to this number.
-        gaps: Fraction of the problems with gaps. In these, two fifths of the contacts touch, two fifths are up to 3 mm
-            apart, and a fifth overlap by up to 0.5 mm. In the other problems all contacts touch.
-        slots: Number of contacts that the arrays hold. Default: `contacts`. The additional contacts are inactive, at
-            random places in the arrays, with numbers of their own.
-        fixtures: Number of active contacts that do not move, as those of walls.
-
-    Returns:
-        The problem.
-    """
+    """Generate a problem with several contacts on a slider of some 0.1 m, from the cases that a solver must handle."""
+    # All arguments but `degree`, `slots` and `fixtures` may be traced, so that one compiled program generates all
+    # problems.
     k_surface, k_uniform, k_normal = jax.random.split(key, 3)
     num_slots = int(contacts) if slots is None else slots
     # One call generates all numbers of a kind, because each call takes a quarter of a second to compile.
@@ -203,7 +136,7 @@ def random_contacts_problem(
     surface = random_surface(k_surface, degree=degree, condition=condition, length=length)
     mu = _random_friction(uniform_numbers, num_slots, friction)
     point, normal, middle = _random_points_and_normals(uniform_numbers, mu, contacts)
-    size = 10 ** (2 * uniform_numbers.take() - 4)
+    size = 10 ** (2 * uniform_numbers.take() - 4)  # m
     gap = _random_gaps(uniform_numbers, num_slots, gaps)
     push, dragged = _random_pushes(uniform_numbers, normal_numbers, surface, mu, point, normal, middle)
     # With the gaps added, pushes of the last kind act as they do without gaps.
@@ -273,13 +206,15 @@ def _random_points_and_normals(uniform: _Numbers, mu: Array, contacts: int | Arr
     wedge_normal = side * _unit_vector(lean) @ axes_directions
     wedge_point = middle - axes[0, 0] * side * ahead
 
-    which = jnp.floor(5 * shared[7]).astype(int)
+    which = jnp.floor(5 * shared[7]).astype(int)  # one of five kinds, with equal probability
     points = jnp.stack(
         [
             on_ellipse,
-            anywhere,
-            jnp.where(on_edge, edge_point, on_ellipse),
-            jaw_point,
+            anywhere,  # with any normals
+            jnp.where(on_edge, edge_point, on_ellipse),  # two or more on one straight edge
+            jaw_point,  # on the flat faces of two parallel jaws in turn, in half of the problems exactly opposite
+            # Two form a wedge at the limit of holding itself: the friction cone of each of the two misses the other
+            # contact, or contains it, by 1e-1 to 1e-5 rad.
             jnp.where(in_wedge, wedge_point, on_ellipse),
         ]
     )
@@ -324,6 +259,10 @@ def _random_pushes(
         mover, side * 2 * shared[5] * _perpendicular(normal), free[:, :1] * _perpendicular(normal) - behind * normal
     )
 
+    # The pushers move in one of four ways, with equal probability: as one rigid hand, in half of these problems without
+    # rotation; toward the middle of the slider, in half of these problems exactly and equally fast; independently,
+    # three quarters of them into the slider; or such that one slides along the slider and moves it alone, often while
+    # it recedes, and the others stay behind or just touch.
     kind = jnp.floor(4 * shared[3]).astype(int)
     push = jnp.stack([rigid, closing, independent, drag])[kind]
     return push / jnp.max(jnp.linalg.norm(push, axis=1)), kind == 3
@@ -339,5 +278,6 @@ def _random_friction(uniform: _Numbers, m: int, most: float | Array) -> Array:
 def _random_gaps(uniform: _Numbers, m: int, share: float | Array) -> Array:
     """Return the gaps of `random_contacts_problem`, (m,), m; a fraction `share` of the problems has gaps."""
     has_gaps, (kind, size) = uniform.take(), uniform.take(2, m)
+    # two fifths touch, two fifths are up to 3 mm apart, and a fifth overlap by up to 0.5 mm
     gap = jnp.where(kind < 0.4, 0.0, jnp.where(kind < 0.8, 3e-3 * size, -5e-4 * size))
     return jnp.where(has_gaps < share, gap, 0.0)
