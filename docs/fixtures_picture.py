@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Rectangle
 
 import pushjax as pj
 from pushjax import planning, plot
-from pushjax.planning.se2_numpy import compose, inverse
+from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.plot.parts import draw_fixtures, outline
 from pushjax.plot.style import MM, panel_row
 

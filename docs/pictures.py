@@ -26,6 +26,7 @@ from pushjax import plot
 from pushjax.datasets import find_data
 from pushjax.experiments import demo, squeeze, stochastic_push
 from pushjax.experiments.table2 import conditions
+from pushjax.friction.support import WrenchTwistPairs
 
 PUSHES = 200
 FRICTIONS = {"friction 0.1: it slides": 0.1, "friction 0.6: it sticks": 0.6}
@@ -34,7 +35,7 @@ SHOWN = {"10th percentile": 0.1, "median": 0.5, "90th percentile": 0.9}
 GRASPS = {"held flat": "grasped with offset", "wedged": "jammed"}
 
 
-def square(side: float = 0.09) -> tuple[pj.Support, pj.WrenchTwistPairs, pj.Slider]:
+def square(side: float = 0.09) -> tuple[pj.Support, WrenchTwistPairs, pj.Slider]:
     """Return a square of this side (m) on 64 points: its support, its wrench-twist pairs, and the slider."""
     block = pj.Polygon.rectangle(side, side)
     support = pj.Support.uniform(block, points=64)

@@ -14,8 +14,8 @@ from matplotlib.patches import Polygon as PolygonPatch
 from pushjax import plot
 from pushjax.experiments.pusht_mpc import player, setting
 from pushjax.geometry.polygon_numpy import outline_vertices
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning import Observation
-from pushjax.planning.se2_numpy import to_world
 
 SIDE = 512  # of the workspace, px
 SEED = 1

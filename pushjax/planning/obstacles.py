@@ -11,7 +11,7 @@ import numpy as np
 
 from pushjax.geometry.disk import Disk
 from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
-from pushjax.planning.se2_numpy import to_body, to_world
+from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.simulation.arguments import checked_fixtures
 from pushjax.simulation.fixtures import Fixture, Wall
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pushjax._internal.checks import check_finite
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.se2_numpy import to_world
 from pushjax.simulation.fixtures import Fixture, Wall
 
 ROUNDING = 1e-7  # m, by which a slider at the goal may be out of the workspace

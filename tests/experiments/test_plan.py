@@ -11,8 +11,8 @@ import pytest
 import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.experiments.plan import experiment
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning import Outcomes, PushPlan, PushPlanStatus
-from pushjax.planning.se2_numpy import to_world
 from pushjax.planning.transits.between_pushes import transits_between
 
 RADIUS, FRICTION = 0.005, 0.25

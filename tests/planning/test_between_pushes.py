@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning import finger_motion
-from pushjax.planning.se2_numpy import compose, inverse, to_world
 from pushjax.planning.transits.between_pushes import transits_between
 from pushjax.planning.transits.roadmap import TransitStatus
 

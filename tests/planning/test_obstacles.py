@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning import Workspace
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.se2_numpy import to_body, to_world
 from pushjax.planning.transits.roadmap import Roadmap, TransitStatus
 
 shapely = pytest.importorskip("shapely")

@@ -9,8 +9,7 @@ import pytest
 
 import pushjax as pj
 from pushjax.experiments.pusht_mpc import player
-from pushjax.geometry import se2
-from pushjax.planning import se2_numpy
+from pushjax.geometry import se2, se2_numpy
 from pushjax.planning.feedback.controller import PushController
 from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
 from pushjax.planning.feedback.finger_control import PositionControl

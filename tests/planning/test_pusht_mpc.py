@@ -11,6 +11,7 @@ import pushjax as pj
 from pushjax.experiments import pusht_mpc
 from pushjax.experiments.pusht_mpc import experiment, player, setting
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
 from pushjax.planning.feedback import push_planner
 from pushjax.planning.feedback.controller import Observation, PushController
 from pushjax.planning.feedback.coverage_table import CoverageTable
@@ -21,7 +22,6 @@ from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.feedback.push_planner import PushPlanner
 from pushjax.planning.pace import Pace
 from pushjax.planning.push_batch import LEG, simulate_pushes
-from pushjax.planning.se2_numpy import compose, inverse, to_body, to_world
 from pushjax.planning.workspace import Workspace
 
 RADIUS, ENOUGH = 0.015, 0.95

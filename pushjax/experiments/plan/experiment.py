@@ -21,9 +21,9 @@ from pushjax.experiments._slider_options import expected_surface, parse_shape, p
 from pushjax.experiments.plan.fixtures import parse_fixtures
 from pushjax.experiments.plan.options import Options
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.se2_numpy import to_body
 from pushjax.identification.pushes_of_recordings import MAX_SLIDER_SIZE
 from pushjax.planning import FinalPose, Goal, PushPlan, PushPlanStatus, PushSequence, finger_motion, plan_pushes
-from pushjax.planning.se2_numpy import to_body
 from pushjax.planning.transits.between_pushes import FingerMotion
 from pushjax.planning.transits.roadmap import TransitStatus
 from pushjax.simulation.fixtures import Fixtures

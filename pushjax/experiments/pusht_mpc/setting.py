@@ -9,9 +9,9 @@ finger: the coefficients of the shapes are zero.
 import numpy as np
 
 import pushjax as pj
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.feedback.finger_control import SpringDamper
 from pushjax.planning.pace import Pace
-from pushjax.planning.se2_numpy import to_world
 from pushjax.planning.workspace import Workspace
 from pushjax.tasks.push_t import (
     AGENT_RADIUS,

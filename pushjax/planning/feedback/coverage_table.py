@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from pushjax._internal.jit import quick_jit
 from pushjax.geometry import se2
 from pushjax.geometry.intersection import intersection_area
-from pushjax.planning.se2_numpy import to_world
+from pushjax.geometry.se2_numpy import to_world
 
 POSITIONS, ANGLES = 29, 27  # points of the table along x and y each, and around
 RANGE = 0.26  # of the table to each side: in units of the slider's length, and rad

@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
+from pushjax.geometry.se2_numpy import compose, to_world
 from pushjax.planning.feedback.pose_grid import POSITIONS, PoseGrid, grid_spacing
 from pushjax.planning.feedback.push_library import PushLibrary
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE
-from pushjax.planning.se2_numpy import compose, to_world
 from pushjax.planning.transits.roadmap import Roadmap
 from pushjax.planning.workspace import Workspace
 

@@ -35,7 +35,7 @@ from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import Vec3
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.geometry import se2
-from pushjax.planning.se2_numpy import compose
+from pushjax.geometry.se2_numpy import compose
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
 

@@ -25,8 +25,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from pushjax._internal.checks import check_positive
 from pushjax.geometry.polygon_numpy import exterior_angles, segment_distances, signed_distances
+from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.se2_numpy import to_body, to_world
 from pushjax.planning.workspace import Workspace
 
 ARC_STEP = np.pi / 4  # largest angle between neighboring points around a corner
