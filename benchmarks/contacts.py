@@ -21,6 +21,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
+from pushjax.contact.problem import Motion
 from pushjax.experiments._record import result_record
 from pushjax.testing import ProblemBatch, search, squeeze_power, squeeze_power_enumerated, violations
 from pushjax.testing.problems import random_contacts_problem
@@ -116,9 +117,7 @@ def _row(m: int, model: str, dtype: str, problems: int, starts: int, seed: int, 
     }
 
 
-def judge(
-    batch: ProblemBatch, motion: pj.Motion, dtype: str, starts: int, seed: int = 0
-) -> tuple[dict[str, int], float]:
+def judge(batch: ProblemBatch, motion: Motion, dtype: str, starts: int, seed: int = 0) -> tuple[dict[str, int], float]:
     """Check a batch of answers; return the number of each outcome and the largest violation by a MOVING or FREE one."""
     status = np.asarray(motion.status)
     answered = (status == pj.Status.MOVING) | (status == pj.Status.FREE)

@@ -1,5 +1,6 @@
 """The public names and their modules. At run time, `__init__.py` imports each of them when it is first used."""
 
+from . import metrics as metrics
 from . import planning as planning
 from . import plot as plot
 from . import tasks as tasks
@@ -10,22 +11,17 @@ from .contact.exhaustive import Exhaustive as Exhaustive
 from .contact.paper import HessianIteration as HessianIteration
 from .contact.paper import Projected as Projected
 from .contact.problem import Contacts as Contacts
-from .contact.problem import Motion as Motion
 from .contact.problem import solve_contacts as solve_contacts
-from .contact.scaled_problem import ContactSolver as ContactSolver
 from .contact.status import ContactMode as ContactMode
 from .contact.status import Status as Status
 from .contact.sticking import ScalarRoot as ScalarRoot
 from .friction.ellipsoid import Ellipsoid as Ellipsoid
-from .friction.fit import FitReport as FitReport
 from .friction.fit import fit_limit_surface as fit_limit_surface
 from .friction.fit import mean_twist_angle as mean_twist_angle
 from .friction.friction_model import FrictionModel as FrictionModel
-from .friction.limit_surface import InverseMap as InverseMap
 from .friction.limit_surface import LimitSurface as LimitSurface
 from .friction.quartic import Quartic as Quartic
 from .friction.support import Support as Support
-from .friction.support import WrenchTwistPairs as WrenchTwistPairs
 from .friction.table import Table as Table
 from .geometry import se2 as se2
 from .geometry.curve import Curve as Curve
@@ -39,10 +35,7 @@ from .identification.noise import identify_noise as identify_noise
 from .identification.pushes import Pushes as Pushes
 from .identification.result import Identified as Identified
 from .identification.unknowns import Unknowns as Unknowns
-from .metrics import coverage as coverage
 from .metrics import deviation as deviation
-from .metrics import energy_score as energy_score
-from .metrics import log_density as log_density
 from .simulation.fixtures import Fixture as Fixture
 from .simulation.fixtures import Wall as Wall
 from .simulation.hand import Hand as Hand
@@ -56,7 +49,6 @@ from .simulation.random_rollout import random_rollout as random_rollout
 from .simulation.rollout import rollout as rollout
 from .simulation.rollout import step as step
 from .simulation.slider import Slider as Slider
-from .simulation.trajectory import Step as Step
 from .simulation.trajectory import Trajectory as Trajectory
 
 __version__: str

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.contact.problem import Motion
 from pushjax.experiments._record import result_record
 
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
@@ -84,7 +85,7 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
     return result_record("jam", settings, rows=rows, verdicts=verdicts, pictures=pictures)
 
 
-def _draw(out: Path, block: pj.Polygon, motions: list[pj.Motion]) -> list[str]:
+def _draw(out: Path, block: pj.Polygon, motions: list[Motion]) -> list[str]:
     """Draw the two frictions into the folder `out` and return the path of the picture."""
     from pushjax import plot
 

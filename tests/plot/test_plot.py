@@ -19,6 +19,8 @@ from drawn import MM, RADIUS, SIDE, ends_of, in_world, legend, legible
 
 import pushjax as pj
 from pushjax import plot
+from pushjax.contact.problem import Motion
+from pushjax.friction.support import WrenchTwistPairs
 
 LENGTH = 0.024
 
@@ -139,7 +141,7 @@ def test_limit_surfaces(surface, monkeypatch):
     load = 2.0
     wide = pj.Ellipsoid(jnp.eye(3) / load**2, LENGTH)  # a ball of the load
     size = np.array([1, 1, LENGTH])
-    pairs = pj.WrenchTwistPairs(load * ray * size, ray / size, jnp.asarray(LENGTH))
+    pairs = WrenchTwistPairs(load * ray * size, ray / size, jnp.asarray(LENGTH))
     figure = plot.limit_surfaces({"ball": wide, "small": surface}, pairs, load, arrows=7)
     ball, small, torque, force = figure.axes
     figure.canvas.draw()
@@ -170,7 +172,7 @@ def one_contact(surface, friction=0.5):
     point, normal = jnp.array([[-SIDE / 2, 0.01]]), jnp.array([[1.0, 0.0]])
     contacts = pj.Contacts(point, normal, jnp.array([[1e-3, 2e-4]]), friction)
     zero = jnp.zeros((1, 2))
-    return contacts, pj.Motion(
+    return contacts, Motion(
         jnp.array([1e-3, 2e-4, 0.02]), jnp.zeros(3), zero, zero[:, 0], jnp.int8(0), jnp.inf, jnp.array(True)
     )
 
@@ -209,7 +211,7 @@ def test_jam_figure(block):
     point, normal = jnp.array([[-0.03, -0.012], [0.03, 0.012]]), jnp.array([[1.0, 0.0], [-1.0, 0.0]])
     contacts = pj.Contacts(point, normal, 1e-3 * normal, 0.4)
     zero = jnp.zeros((2, 2))
-    still = pj.Motion(jnp.zeros(3), jnp.zeros(3), zero, zero[:, 0], jnp.int8(2), -1e-3, jnp.array(True))
+    still = Motion(jnp.zeros(3), jnp.zeros(3), zero, zero[:, 0], jnp.int8(2), -1e-3, jnp.array(True))
     figure = plot.jam_figure(block, [(contacts, still)])
     legible(figure)
     (axes,) = figure.axes
