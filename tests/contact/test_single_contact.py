@@ -1,13 +1,14 @@
 """One contact: recorded answers, singular cases, derivatives, bad input."""
 
+import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contact_batches import problems
+from support.slopes import slopes
 
 from pushjax import (
     ContactMode,
@@ -20,13 +21,12 @@ from pushjax import (
     motion_cone,
     solve_contacts,
 )
-from pushjax.contact.sticking import ScalarRoot
-from pushjax.testing.problems import random_contact_problem, random_surface
+from pushjax.friction.sum_of_squares import squared_quadratics
+from pushjax.testing.problems import random_surface
 
-SOLVERS = (ScalarRoot(), HessianIteration())
-DTYPES = (np.float64, np.float32)
-FLOATS = pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])
-EITHER_SOLVER = pytest.mark.parametrize("solver", SOLVERS, ids=["root", "hessian"])
+FLOATS = pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+# The surface and the solver; a surface of degree 2 as its square has the same motion.
+KINDS = ["ellipsoid", "quartic", "hessian", "hessian, ellipsoid"]
 
 # Two algorithms in float64. In float32 the recorded surfaces (condition of the Hessian up to 3e5) amplify 6e-8.
 TWIST_TOLERANCE = {np.float64: 1e-6, np.float32: 1e-3}
@@ -38,6 +38,8 @@ ROUNDING = {np.float64: 1e-13, np.float32: 2e-5}
 GRADIENT_TOLERANCE = 1e-5
 # Second derivatives by differences of the first ones.
 HESSIAN_TOLERANCE = 1e-5
+# Every batch has this many rows, so that each surface and dtype needs one program.
+ROWS = 1152
 
 
 class Problem(NamedTuple):
@@ -53,6 +55,14 @@ class Problem(NamedTuple):
     active: Any
 
 
+class Solved(NamedTuple):
+    """Motions of problems, and derivatives of their (twist, wrench, force) in both modes."""
+
+    motion: Any
+    forward: Any = None
+    reverse: Any = None
+
+
 def surface_of(p: Problem):
     return (Ellipsoid if p.surface.shape[-2:] == (3, 3) else Quartic)(p.surface, p.length)
 
@@ -61,36 +71,40 @@ def coefficients_of(surface) -> jax.Array:
     return surface.A if isinstance(surface, Ellipsoid) else surface.coefficients
 
 
-def contacts_of(p: Problem) -> Contacts:
-    return Contacts(p.point[None], p.normal[None], p.displacement[None], p.friction, p.gap, p.active)
+def outcome(p: Problem, solver=None):
+    contacts = Contacts(p.point[None], p.normal[None], p.displacement[None], p.friction, p.gap, p.active)
+    m = solve_contacts(surface_of(p), contacts, solver=solver)
+    return (m.twist, m.wrench, m.force[0]), m
 
 
-def motion_of(p: Problem, solver=None):
-    return solve_contacts(surface_of(p), contacts_of(p), solver=solver)
+@jax.jit
+@jax.vmap
+def with_slopes(p: Problem, along, weights) -> Solved:
+    return Solved(*slopes(outcome, p, along, weights)[1:])
 
 
-@eqx.filter_jit
-def motions(problems: Problem, solver=None):
-    """A batch of problems through the public interface: vmapped over `Contacts` and surfaces."""
-    surfaces, contacts = jax.vmap(surface_of)(problems), jax.vmap(contacts_of)(problems)
-    return jax.vmap(lambda surface, contact: solve_contacts(surface, contact, solver=solver))(surfaces, contacts)
+by_hessian = jax.jit(jax.vmap(lambda p: Solved(outcome(p, HessianIteration())[1])))
+
+
+def solve(p: Problem, along=None, weights=None, hessian: bool = False) -> Solved:
+    """Solve a batch of problems, with derivatives along `along`, by default ones, and of the weighted outcome."""
+    count = len(p.gap)
+    assert count <= ROWS
+
+    def rows(tree):
+        return jax.tree.map(lambda x: jnp.asarray(np.resize(x, (ROWS, *x.shape[1:]))), tree)
+
+    dtype = p.gap.dtype
+    if along is None:
+        along = p._replace(active=None)
+        along = jax.tree.map(lambda x: np.ones_like(x), along)
+        weights = tuple(np.ones((count, size), dtype) for size in (3, 3, 2))
+    found = by_hessian(rows(p)) if hessian else with_slopes(rows(p), rows(along), rows(weights))
+    return jax.tree.map(lambda x: np.asarray(x)[:count], found)
 
 
 def cast(tree, dtype):
-    def leaf(value):
-        value = jnp.asarray(value)
-        return value.astype(dtype) if jnp.issubdtype(value.dtype, jnp.floating) else value
-
-    return jax.tree.map(leaf, tree)
-
-
-def slips(problems: Problem, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Relative motion of slider and pusher along normal and tangent: J V - displacement."""
-    p = jax.tree.map(np.asarray, problems)
-    moved = twist[:, :2] + twist[:, 2:] * np.stack([-p.point[:, 1], p.point[:, 0]], axis=1)
-    w = moved - p.displacement
-    tangent = np.stack([-p.normal[:, 1], p.normal[:, 0]], axis=1)
-    return np.sum(w * p.normal, axis=1), np.sum(w * tangent, axis=1)
+    return jax.tree.map(lambda x: x if np.asarray(x).dtype == bool else np.asarray(x, dtype), tree)
 
 
 # --- recorded answers ---
@@ -98,56 +112,54 @@ def slips(problems: Problem, twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 @pytest.fixture(scope="module")
 def recorded(oracle):
-    """Return the recorded problems by degree, in our conventions, with true twist (normalized), wrench and mode."""
+    """Return the recorded problems by kind, in our conventions, with true twist (normalized), wrench and mode."""
     d = np.load(oracle / "single_contact.npz")
+    assert len(d["ls_type"]) + len(d["adv_ls_type"]) == 2142
 
-    def column(name):
-        return np.concatenate([d[name], d["adv_" + name]])
+    def columns(degree):
+        rows = np.concatenate([d["ls_type"], d["adv_ls_type"]]) == (0 if degree == 2 else 1)
+        names = "A" if degree == 2 else "coeffs", "rho", "point", "normal", "vel", "mu"
+        given = [np.concatenate([d[name], d["adv_" + name]])[rows] for name in names]
+        given[3] = -given[3]
+        true = [
+            np.concatenate([d[name], d["adv_" + name]])[rows] for name in ("V_true", "F_true_level1", "mode_true_id")
+        ]
+        return Problem(*given, np.zeros(rows.sum()), np.ones(rows.sum(), bool)), *true
 
-    kind = column("ls_type")
-    assert len(kind) == 2142
-    by_degree = {}
-    for degree in (2, 4):
-        rows = kind == (0 if degree == 2 else 1)
-        count = int(rows.sum())
-        problem = Problem(
-            column("A" if degree == 2 else "coeffs")[rows],
-            column("rho")[rows],
-            column("point")[rows],
-            -column("normal")[rows],
-            column("vel")[rows],
-            column("mu")[rows],
-            np.zeros(count),
-            np.ones(count, bool),
-        )
-        by_degree[degree] = (
-            problem,
-            column("V_true")[rows],
-            column("F_true_level1")[rows],
-            column("mode_true_id")[rows],
-        )
-    assert sum(len(v[3]) for v in by_degree.values()) == 2142
-    return by_degree
+    ellipsoid, quartic = columns(2), columns(4)
+    square = ellipsoid[0]._replace(surface=np.asarray(jax.vmap(squared_quadratics)(ellipsoid[0].surface[:, None])))
+    return dict(zip(KINDS, (ellipsoid, quartic, quartic, (square, *ellipsoid[1:])), strict=True))
+
+
+@pytest.fixture(scope="module")
+def answered(recorded):
+    """Return a function from kind and dtype to the recorded problems and our motions."""
+
+    @functools.cache
+    def of(kind, dtype):
+        problem = cast(recorded[kind][0], dtype)
+        return problem, solve(problem, hessian="hessian" in kind).motion
+
+    return of
 
 
 @FLOATS
-@EITHER_SOLVER
-@pytest.mark.parametrize("degree", [2, 4])
-def test_recorded_answers(recorded, degree, solver, dtype):
-    problem, twist, wrench, mode = recorded[degree]
-    motion = motions(cast(problem, dtype), solver)
+@pytest.mark.parametrize("kind", KINDS)
+def test_recorded_answers(recorded, answered, kind, dtype):
+    _, twist, wrench, mode = recorded[kind]
+    _, motion = answered(kind, dtype)
     assert motion.twist.dtype == dtype
     np.testing.assert_array_equal(motion.mode[:, 0], mode)
     expected = np.where(mode == ContactMode.SEPARATED, Status.FREE, Status.MOVING)
     np.testing.assert_array_equal(motion.status, expected)
 
-    length, speed = problem.length[:, None], np.linalg.norm(problem.displacement, axis=1)
-    ours = np.asarray(motion.twist, np.float64) * np.concatenate([0 * length + 1, 0 * length + 1, length], axis=1)
-    error = np.linalg.norm(ours - twist, axis=1) / speed
+    length, speed = recorded[kind][0].length[:, None], np.linalg.norm(recorded[kind][0].displacement, axis=1)
+    unit = np.concatenate([0 * length + 1, 0 * length + 1, length], axis=1)
+    error = np.linalg.norm(motion.twist.astype(float) * unit - twist, axis=1) / speed
     assert error.max() < TWIST_TOLERANCE[dtype]
 
     moves = mode != ContactMode.SEPARATED
-    ours = np.asarray(motion.wrench, np.float64) / np.concatenate([0 * length + 1, 0 * length + 1, length], axis=1)
+    ours = motion.wrench.astype(float) / unit
     assert not ours[~moves].any()
     a, b = ours[moves], wrench[moves]
     angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
@@ -157,52 +169,50 @@ def test_recorded_answers(recorded, degree, solver, dtype):
 
 
 @FLOATS
-@EITHER_SOLVER
-@pytest.mark.parametrize("degree", [2, 4])
-def test_recorded_problems_satisfy_every_condition(recorded, degree, solver, dtype):
+@pytest.mark.parametrize("kind", KINDS)
+def test_recorded_problems_satisfy_every_condition(answered, kind, dtype):
     """Check Coulomb's law, complementarity and dissipation from the numbers of the answer."""
-    problem = cast(recorded[degree][0], dtype)
-    motion = motions(problem, solver)
-    p = jax.tree.map(lambda x: np.asarray(x, np.float64), problem)
-    twist, wrench, force = (np.asarray(x, np.float64) for x in (motion.twist, motion.wrench, motion.force[:, 0]))
-    fn, ft = force[:, 0], force[:, 1]
+    problem, motion = answered(kind, dtype)
+    level = np.asarray(jax.jit(jax.vmap(lambda q, w: surface_of(q).value(w)))(problem, motion.wrench))
+    p, motion = jax.tree.map(lambda x: np.asarray(x, np.float64), (problem, motion))
+    twist, wrench, mode = motion.twist, motion.wrench, motion.mode[:, 0]
+    fn, ft = motion.force[:, 0].T
     eps = ROUNDING[dtype]
+    tangent = np.stack([-p.normal[:, 1], p.normal[:, 0]], axis=1)
 
     # the force sums to the wrench
-    f = fn[:, None] * p.normal + ft[:, None] * np.stack([-p.normal[:, 1], p.normal[:, 0]], axis=1)
+    f = fn[:, None] * p.normal + ft[:, None] * tangent
     summed = np.concatenate([f, (p.point[:, :1] * f[:, 1:] - p.point[:, 1:] * f[:, :1])], axis=1)
     size = np.linalg.norm(f, axis=1, keepdims=True) + 1e-30
     assert np.max(np.abs(summed - wrench) / size) < eps
 
     # on the level set where the slider moves
-    moves = np.asarray(motion.status) == Status.MOVING
-    level = np.asarray(jax.jit(jax.vmap(lambda q, w: surface_of(q).value(w)))(problem, motion.wrench))
+    moves = motion.status == Status.MOVING
     assert np.max(np.abs(level[moves] - 1)) < 10 * eps
 
     # inside the cone, pushing, not penetrating
     assert np.all(fn >= 0)
     assert np.all(np.abs(ft) <= p.friction * fn * (1 + eps))
-    speed = np.linalg.norm(p.displacement, axis=1)
-    wn, wt = slips(p, twist)
-    reach = speed + np.abs(twist[:, 2]) * np.linalg.norm(p.point, axis=1)  # size of the terms that cancel
+    slip = twist[:, :2] + twist[:, 2:] * np.stack([-p.point[:, 1], p.point[:, 0]], axis=1) - p.displacement
+    wn, wt = np.sum(slip * p.normal, axis=1), np.sum(slip * tangent, axis=1)
+    # size of the terms that cancel
+    reach = np.linalg.norm(p.displacement, axis=1) + np.abs(twist[:, 2]) * np.linalg.norm(p.point, axis=1)
     assert np.all(wn >= -eps * reach)
     assert np.all(np.abs(wn[moves]) <= eps * reach[moves])
-    sticks = np.asarray(motion.mode[:, 0]) == ContactMode.STICKING
+    sticks = mode == ContactMode.STICKING
     assert np.all(np.abs(wt[sticks]) <= eps * reach[sticks])
-    left = np.asarray(motion.mode[:, 0]) == ContactMode.SLIDING_LEFT
-    right = np.asarray(motion.mode[:, 0]) == ContactMode.SLIDING_RIGHT
-    assert left.any()
-    assert right.any()
-    assert np.all(wt[left] < 0)
-    assert np.all(wt[right] > 0)
-    np.testing.assert_allclose(ft[left], (p.friction * fn)[left], rtol=10 * eps)
-    np.testing.assert_allclose(ft[right], -(p.friction * fn)[right], rtol=10 * eps)
+    for sliding, sign in ((ContactMode.SLIDING_LEFT, 1), (ContactMode.SLIDING_RIGHT, -1)):
+        slides = mode == sliding
+        assert slides.any()
+        assert np.all(sign * wt[slides] < 0)
+        np.testing.assert_allclose(ft[slides], sign * (p.friction * fn)[slides], rtol=10 * eps)
 
     # friction takes power at the contact and under the slider
     assert np.all(-ft * wt >= -eps * np.abs(ft) * reach)
     assert np.all(np.sum(twist * wrench, axis=1)[moves] > 0)
     assert not twist[~moves].any()
-    assert not force[~moves].any()
+    assert not fn[~moves].any()
+    assert not ft[~moves].any()
 
 
 # --- singular cases ---
@@ -210,21 +220,16 @@ def test_recorded_problems_satisfy_every_condition(recorded, degree, solver, dty
 SCALES = {np.float64: (1e-60, 1e60), np.float32: (1e-14, 1e14)}
 
 
+@functools.cache
 def base(degree: int) -> Problem:
     """Return a well-conditioned problem that sticks."""
-    surface = random_surface(jax.random.key(3), degree=degree, condition=10.0, length=0.03)
-    coefficients = coefficients_of(surface)
-    f = jnp.asarray
-    return Problem(
-        f(coefficients, jnp.float64),
-        f(0.03),
-        f([-0.045, 0.02]),
-        f([1.0, 0.0]),
-        f([1e-3, 2e-4]),
-        f(0.6),
-        f(0.0),
-        f(True),
-    )
+    surface = jax.jit(lambda key: random_surface(key, degree=degree, condition=10.0, length=0.03))(jax.random.key(3))
+    rest = 0.03, [-0.045, 0.02], [1.0, 0.0], [1e-3, 2e-4], 0.6, 0.0, True
+    return Problem(*(np.asarray(value) for value in (coefficients_of(surface), *rest)))
+
+
+def stacked(problems) -> Problem:
+    return Problem(*(np.stack(column) for column in zip(*problems, strict=True)))
 
 
 def singular(degree: int, dtype) -> dict[str, Problem]:
@@ -233,7 +238,6 @@ def singular(degree: int, dtype) -> dict[str, Problem]:
     edges = np.asarray(motion_cone(surface_of(p), p.point, p.normal, p.friction))
     low, high = SCALES[dtype]
     tilt = np.array([0.8, 0.6])
-    p = Problem(*(np.asarray(value) for value in p))
     cases = {
         "sticking": p,
         "zero displacement": p._replace(displacement=np.zeros(2)),
@@ -273,46 +277,29 @@ def singular(degree: int, dtype) -> dict[str, Problem]:
         surface=p.surface, length=p.length
     )
     cases["negative friction"] = p._replace(friction=np.asarray(-0.1))
-    return {name: Problem(*(v.astype(dtype) if v.dtype != bool else v for v in case)) for name, case in cases.items()}
-
-
-@eqx.filter_jit
-def with_derivatives(problems: Problem, solver):
-    """The motion, every forward derivative along ones, and every reverse derivative of the sum."""
-
-    def outputs(p: Problem):
-        m = motion_of(p, solver)
-        return m.twist, m.wrench, m.force
-
-    def one(p: Problem):
-        floats, rest = eqx.partition(p, eqx.is_inexact_array)
-        along = jax.tree.map(jnp.ones_like, floats)
-        _, forward = jax.jvp(lambda q: outputs(eqx.combine(q, rest)), (floats,), (along,))
-        value, pull = jax.vjp(lambda q: outputs(eqx.combine(q, rest)), floats)
-        return motion_of(p, solver), forward, pull(jax.tree.map(jnp.ones_like, value))
-
-    return jax.vmap(one)(problems)
+    return {name: cast(case, dtype) for name, case in cases.items()}
 
 
 @FLOATS
-@pytest.mark.parametrize(("degree", "solver"), [(2, SOLVERS[0]), (4, SOLVERS[0]), (4, SOLVERS[1])])
-def test_singular_cases_are_finite_and_named(degree, solver, dtype):
+@pytest.mark.parametrize(("degree", "hessian"), [(2, False), (4, False), (4, True)])
+def test_singular_cases_are_finite_and_named(degree, hessian, dtype):
+    """Motions, and derivatives in both modes, are finite, and each case has its status."""
     cases = singular(degree, dtype)
-    stacked = jax.tree.map(lambda *rows: jnp.asarray(np.stack(rows)), *cases.values())
-    motion, forward, reverse = with_derivatives(stacked, solver)
+    motion, forward, reverse = solve(stacked(cases.values()), hessian=hessian)
 
     def culprits(tree):
-        leaves = [np.asarray(x).reshape(len(cases), -1) for x in jax.tree.leaves(tree)]
+        leaves = [x.reshape(len(cases), -1) for x in jax.tree.leaves(tree)]
         ok = np.isfinite(np.concatenate(leaves, axis=1)).all(axis=1).tolist()
         return [name for name, fine in zip(cases, ok, strict=True) if not fine]
 
     assert not culprits((motion.twist, motion.wrench, motion.force))
-    assert not culprits(forward)
-    assert not culprits(reverse)
+    if not hessian:
+        assert not culprits(forward)
+        assert not culprits(reverse)
 
-    status = dict(zip(cases, np.asarray(motion.status), strict=True))
-    mode = dict(zip(cases, np.asarray(motion.mode[:, 0]), strict=True))
-    twist = dict(zip(cases, np.asarray(motion.twist), strict=True))
+    status = dict(zip(cases, motion.status, strict=True))
+    mode = dict(zip(cases, motion.mode[:, 0], strict=True))
+    twist = dict(zip(cases, motion.twist, strict=True))
     free = {"zero displacement", "receding", "inactive", "inactive padding", "gap as long as the push"}
     free |= {"grazing left", "grazing right"}
     invalid = {"negative friction", "long normal", "no normal"}
@@ -338,120 +325,101 @@ def test_singular_cases_are_finite_and_named(degree, solver, dtype):
 
 # --- derivatives ---
 
-PER_MODE = 16
+PER_MODE, DIRECTIONS, STEP = 16, 20, 1e-5
 
 
-class Scaled(NamedTuple):
-    """Changes of a problem in units of its own size, so that every derivative is of order one."""
-
-    surface: jax.Array
-    point: jax.Array
-    angle: jax.Array
-    displacement: jax.Array
-    friction: jax.Array
-    gap: jax.Array
-
-
-def changed(p: Problem, by: Scaled) -> Problem:
-    size = jnp.sqrt(jnp.sum(p.displacement**2))
-    c, s = jnp.cos(by.angle), jnp.sin(by.angle)
-    n = p.normal
-    return p._replace(
-        surface=p.surface * (1 + by.surface),
-        point=p.point + 0.05 * by.point,
-        normal=jnp.stack([c * n[0] - s * n[1], s * n[0] + c * n[1]]),
-        displacement=p.displacement + size * by.displacement,
-        friction=p.friction + by.friction,
-        gap=p.gap + size * by.gap,
+def random_changes(p: Problem, rng) -> Problem:
+    """Return random changes of problems, in units of each input's size, so that derivatives are of order one."""
+    count, size = len(p.gap), np.linalg.norm(p.displacement, axis=1)
+    left = np.stack([-p.normal[:, 1], p.normal[:, 0]], axis=1)
+    return Problem(
+        p.surface * rng.normal(size=p.surface.shape),
+        0 * p.length,
+        0.05 * rng.normal(size=(count, 2)),
+        rng.normal(size=(count, 1)) * left,
+        size[:, None] * rng.normal(size=(count, 2)),
+        rng.normal(size=count),
+        size * rng.normal(size=count),
+        None,
     )
 
 
-def outputs(p: Problem, by: jax.Array) -> jax.Array:
-    """Return twist, wrench and force, (8,), of a problem changed by a flat `Scaled`; lengths in units of the push."""
-    blank = Scaled(jnp.zeros_like(p.surface), *(jnp.zeros_like(x) for x in (p.point, p.gap, p.point, p.gap, p.gap)))
-    _, unflatten = jax.flatten_util.ravel_pytree(blank)
-    m = motion_of(changed(p, unflatten(by)))
-    unit = jnp.stack([jnp.ones_like(p.length), jnp.ones_like(p.length), p.length])
-    return jnp.concatenate([m.twist * unit / jnp.sqrt(jnp.sum(p.displacement**2)), m.wrench / unit, m.force[0]])
+def moved(p: Problem, changes: Problem, t) -> Problem:
+    new = Problem(*(a + t * d for a, d in zip(p[:-1], changes[:-1], strict=True)), p.active)
+    return new._replace(normal=new.normal / jnp.linalg.norm(new.normal, axis=-1, keepdims=True))
 
 
-value_batch = jax.jit(jax.vmap(outputs))
-
-
-@jax.jit
-@jax.vmap
-def derivative_batch(p: Problem, by: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return jax.jacfwd(lambda b: outputs(p, b))(by), jax.jacrev(lambda b: outputs(p, b))(by)
-
-
-STEP = 1e-5
-
-
-def nearby(problems: Problem, size: int) -> tuple[Problem, jax.Array]:
-    """Return every problem with every change of +STEP, then with every change of -STEP, for central differences."""
-    count = len(problems.gap)
-    changes = STEP * np.concatenate([np.eye(size), -np.eye(size)])
-    return jax.tree.map(lambda x: jnp.repeat(x, 2 * size, axis=0), problems), jnp.asarray(np.tile(changes, (count, 1)))
-
-
-def central(values: jax.Array, count: int) -> np.ndarray:
-    """Return central differences, (problems, ..., changes), from the values at `nearby` problems."""
-    plus, minus = np.split(np.asarray(values).reshape(count, -1, *values.shape[1:]), 2, axis=1)
-    return np.moveaxis((plus - minus) / (2 * STEP), 1, -1)
+def scaled(parts, p: Problem) -> np.ndarray:
+    """Return (twist, wrench, force) as (rows, 8), with lengths in units of the push."""
+    unit = np.stack([np.ones_like(p.length)] * 2 + [p.length], axis=1)
+    size = np.linalg.norm(p.displacement, axis=1, keepdims=True)
+    return np.concatenate([parts[0] * unit / size, parts[1] / unit, parts[2]], axis=1)
 
 
 @pytest.fixture(scope="module", params=[2, 4], ids=["ellipsoid", "quartic"])
-def smooth(request) -> tuple[Problem, np.ndarray, int]:
-    """Return equally many moderately conditioned problems of each mode, and the number of changes.
+def smooth(request) -> tuple[Problem, np.ndarray]:
+    """Return equally many moderately conditioned problems of each mode, and their modes.
 
     Some problems have a gap, some an overlap.
     """
-    degree = request.param
-
-    @jax.jit
-    @jax.vmap
-    def draw(key, gap):
-        p = random_contact_problem(key, degree=degree, condition=30.0, friction=1.0)
-        surface = coefficients_of(p.surface)
-        gap = gap * jnp.sum(p.displacement * p.normal)
-        f = Problem(surface, p.surface.length, p.point, p.normal, p.displacement, p.friction, gap, jnp.asarray(True))
-        return f, motion_of(f).mode[0]
-
-    problems, modes = draw(jax.random.split(jax.random.key(11), 400), jnp.tile(jnp.array([0.0, 0.3, -0.2, 0.1]), 100))
-    modes = np.asarray(modes)
+    surface, contacts = jax.tree.map(lambda x: np.asarray(x)[:ROWS], problems(1, request.param, 11, condition=30.0))
+    rng, normal = np.random.default_rng(11), contacts.normal[:, 0]
+    push = rng.uniform(0.05, 1, (ROWS, 1)) * normal + rng.uniform(-1, 1, (ROWS, 1)) * normal[:, ::-1] * [-1, 1]
+    push *= 10 ** rng.uniform(-4, -2, (ROWS, 1))
+    gap = np.resize([0.0, 0.3, -0.2, 0.1], ROWS) * np.sum(push * normal, axis=1)
+    rest = contacts.point[:, 0], normal, push, rng.uniform(0, 1, ROWS), gap, np.ones(ROWS, bool)
+    p = Problem(coefficients_of(surface), surface.length, *rest)
+    modes = solve(p).motion.mode[:, 0]
     chosen = np.concatenate([np.flatnonzero(modes == mode)[:PER_MODE] for mode in range(1, 4)])
     assert len(chosen) == 3 * PER_MODE
-    return jax.tree.map(lambda x: x[chosen], problems), modes[chosen], (9 if degree == 2 else 15) + 7
+    return jax.tree.map(lambda x: x[chosen], p), modes[chosen]
 
 
-def test_derivatives_match_central_differences(smooth):
-    problems, modes, size = smooth
-    count = len(modes)
-    # the same number as for the second derivatives, so that both tests share one compiled program
-    tiled = jax.tree.map(lambda x: x[np.arange(2 * size * PER_MODE) % count], problems)
-    jacobians = derivative_batch(tiled, jnp.zeros((2 * size * PER_MODE, size)))
-    forward, reverse = (np.asarray(d)[:count] for d in jacobians)
-    numeric = central(value_batch(*nearby(problems, size)), count)
-    scale = 1 + np.abs(numeric).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(forward / scale, reverse / scale, rtol=0, atol=1e-12)
-    assert np.abs((forward - numeric) / scale).max() < GRADIENT_TOLERANCE
+def test_derivatives_match_central_differences(smooth, rng):
+    """Forward derivatives agree with differences along random directions, and reverse derivatives with forward ones."""
+    p, modes = jax.tree.map(lambda x: np.repeat(x, DIRECTIONS, axis=0), smooth)
+    changes, weights = random_changes(p, rng), rng.normal(size=(len(modes), 8))
+    alone = np.arange(len(modes)) % DIRECTIONS == 0  # the first direction of each problem is friction alone
+    by_friction = Problem(*(0 * d for d in changes[:-1]), None)._replace(friction=np.ones(len(modes)))
+    changes = jax.tree.map(
+        lambda one, d: np.where(alone.reshape(-1, *[1] * (d.ndim - 1)), one, d), by_friction, changes
+    )
 
-    by_friction = forward[:, :, -2]
+    found = solve(p, changes, tuple(np.split(weights, [3, 6], axis=1)))
+    ends = (solve(moved(p, changes, t)).motion for t in (STEP, -STEP))
+    numeric = np.subtract(*(scaled((m.twist, m.wrench, m.force[:, 0]), p) for m in ends)) / (2 * STEP)
+    forward = scaled(found.forward, p)
+    scale = 1 + np.abs(numeric).reshape(3 * PER_MODE, -1).max(axis=1).repeat(DIRECTIONS)
+    assert np.abs((forward - numeric) / scale[:, None]).max() < GRADIENT_TOLERANCE
+
+    one = np.sum(weights * np.concatenate(found.forward, axis=1), axis=1)
+    other = sum(
+        np.sum(g * d, axis=tuple(range(1, g.ndim))) for g, d in zip(found.reverse[:-1], changes[:-1], strict=True)
+    )
+    size = np.sum(np.abs(weights * np.concatenate(found.forward, axis=1)), axis=1)
+    assert np.all(np.abs(one - other) <= 1e-12 * scale * size)
+
     sticks = modes == ContactMode.STICKING
-    assert not by_friction[sticks].any()
-    assert np.abs(by_friction[~sticks]).max(axis=1).min() > 1e-3
+    assert not forward[alone & sticks].any()
+    assert np.abs(forward[alone & ~sticks]).max(axis=1).min() > 1e-3
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("smooth", [4], indirect=True, ids=["quartic"])
-def test_second_derivatives_while_sticking(smooth):
+def test_second_derivatives_while_sticking(smooth, rng):
     """The implicit derivative is itself differentiable: compare `jax.hessian` with differences of the gradient."""
-    problems, modes, size = smooth
-    sticking = jax.tree.map(lambda x: x[modes == ContactMode.STICKING], problems)
-    zero = jnp.zeros(size)
-    exact = np.asarray(jax.jit(jax.vmap(lambda p: jax.hessian(lambda by: outputs(p, by)[2])(zero)))(sticking))
-    _, reverse = derivative_batch(*nearby(sticking, size))
-    numeric = central(reverse[:, 2], PER_MODE)
+    problem, modes = smooth
+    p = jax.tree.map(lambda x: x[modes == ContactMode.STICKING], problem)
+    changes = [random_changes(p, rng) for _ in range(2)]
+
+    def turn(by, p, changes):
+        both = Problem(*(by[0] * a + by[1] * b for a, b in zip(*(c[:-1] for c in changes), strict=True)), None)
+        return outcome(moved(p, both, 1))[0][0][2] * p.length / jnp.linalg.norm(p.displacement)
+
+    curvature, gradient = (jax.jit(jax.vmap(d(turn), (None, 0, 0))) for d in (jax.hessian, jax.grad))
+    exact = np.asarray(curvature(jnp.zeros(2), p, changes))
+    ends = [[gradient(t * e, p, changes) for t in (STEP, -STEP)] for e in np.eye(2)]
+    numeric = np.stack([(ahead - behind) / (2 * STEP) for ahead, behind in ends], axis=1)
     scale = 1 + np.abs(numeric).max(axis=(1, 2), keepdims=True)
     assert np.abs(numeric).max() > 1  # the curvature is not small, so an error would be seen
     assert np.abs((exact - numeric) / scale).max() < HESSIAN_TOLERANCE
@@ -524,20 +492,11 @@ def test_friction_cone_edges():
 @pytest.mark.parametrize("degree", [2, 4])
 def test_pushes_stick_exactly_inside_the_motion_cone(degree):
     p = base(degree)
-    edges = motion_cone(surface_of(p), p.point, p.normal, p.friction)
+    edges = np.asarray(motion_cone(surface_of(p), p.point, p.normal, p.friction))
     np.testing.assert_allclose(np.linalg.norm(edges, axis=1), 1, rtol=1e-15)
-    middle = edges[0] + edges[1]
-    weight = 1e-6
-    pushes = jnp.stack(
-        [
-            (1 - weight) * edges[0] + weight * middle,
-            (1 - weight) * edges[1] + weight * middle,
-            (1 + weight) * edges[0] - weight * middle,
-            (1 + weight) * edges[1] - weight * middle,
-        ]
-    )
-    problems = jax.tree.map(lambda x: jnp.stack([x] * 4), p)._replace(displacement=1e-3 * pushes)
-    modes = motions(problems).mode[:, 0]
+    weight = 1e-6 * np.array([1, 1, -1, -1])[:, None]
+    pushes = edges[[0, 1, 0, 1]] + weight * (edges[[1, 0, 1, 0]])
+    modes = solve(stacked(p._replace(displacement=1e-3 * push) for push in pushes)).motion.mode[:, 0]
     expected = [ContactMode.STICKING, ContactMode.STICKING, ContactMode.SLIDING_LEFT, ContactMode.SLIDING_RIGHT]
     np.testing.assert_array_equal(modes, expected)
 

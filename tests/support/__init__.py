@@ -1,0 +1,1 @@
+"""Programs and problems that many tests share."""
