@@ -1,32 +1,69 @@
 """The command line: `pushjax demo`, `reproduce NAME`, `identify LOG…`, `plan --goal X Y THETA`, `data NAME`.
 
-JAX is imported only once a command runs, so that `--help` and wrong options are answered at once.
+JAX is imported only once a command is known, so that `pushjax --help` and wrong words are answered at once.
 """
 
 import os
-import re
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from importlib import import_module
-from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from types import ModuleType
+from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from pushjax.cli.commands import (
-    COMMAND_CLASSES,
-    COMMANDS,
-    DATA_SETS,
-    EXPERIMENTS,
-    Command,
-    Common,
-    Data,
-    Demo,
-    Reproduce,
-)
+from pushjax._internal.progress import progress_bar
+from pushjax.cli.options import Output, parsed
+from pushjax.experiments._cli_option import cli_option
+
+
+class Command(NamedTuple):
+    """A command that runs an experiment."""
+
+    about: str
+    module: str  # below `pushjax.experiments`; its `run` has the options of the command as arguments
+    fixed: dict[str, Any] = {}  # noqa: RUF012  # arguments of `run` that the command fixes
+
+
+COMMANDS = {
+    "demo": Command("fits limit surfaces to a square, pushes it, and draws the result; 20 s", "demo"),
+    "reproduce table1": Command("eleven objects pushed by a robot, against table I; 11 min on two cores", "table1"),
+    "reproduce table2": Command("a triangle on three points pushed by a robot, against table II; 10 min", "table2"),
+    "reproduce two-finger": Command("the triangle pushed by two fingers, against measurements; 90 s", "two_finger"),
+    "reproduce stochastic-push": Command("a square pushed many times under random friction; 80 s", "stochastic_push"),
+    "reproduce capture": Command("two fingers push a disk: from where they catch it; 70 s", "capture"),
+    "reproduce squeeze": Command("a parallel jaw closes on a rectangle from four start poses; 70 s", "squeeze"),
+    "reproduce jam": Command("two fingers that jam, and the friction from which they jam; 50 s", "jam"),
+    "reproduce grasp-rectangle": Command("a jaw closes on a rectangle; 100 s", "grasps", {"slider": "rectangle"}),
+    "reproduce grasp-butterfly": Command("a jaw closes on a butterfly; 200 s", "grasps", {"slider": "butterfly"}),
+    "reproduce pusht-mpc": Command("PushT of the package gym-pusht, solved by a planner", "pusht_mpc"),
+    "identify": Command("identifies friction, limit surface and calibration from LOG files; 1 min", "identify_logs"),
+    "plan": Command("plans pushes from pose to pose, as way points for a robot; 2 min", "plan"),
+}
+FETCH = "data triangle"
+GROUPS = {"reproduce": "experiment", "data": "data set"}  # first words of commands of two, and what the second one is
+HELP = {"-h", "--help"}
+ABOUT = {name: command.about for name, command in COMMANDS.items()} | {FETCH: "fetches published logs of pushes, 34 MB"}
+USAGE = f"""Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.
+
+{chr(10).join(f"pushjax {name:27}{about}" for name, about in ABOUT.items())}
+
+`pushjax COMMAND --help` lists the options of a command, and `pushjax --version` prints the version. Times are of one
+processor core; most of it is spent to compile, which the next call need not do again."""
+
+
+@dataclass
+class Common(Output):
+    """Options of each command that computes."""
+
+    cache: bool = True
+    """Keep compiled programs in the user's cache folder, or in JAX_COMPILATION_CACHE_DIR, for the next time."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -49,114 +86,84 @@ def _run(given: list[str]) -> None:
 
         print(f"pushjax {__version__}")
         return
-    _check_words(given)
-    _check_counts(given)
-    command = parsed(given)
-    if isinstance(command, Reproduce):
-        command = command.experiment
-    if isinstance(command, Data):
-        _fetch(command)
+    name, options = split(given)
+    if name == FETCH:
+        tyro.cli(_fetch, args=options, prog=f"pushjax {name}")
     else:
-        _compute(command)
+        _compute(name.split()[-1], *parse(name, options))
 
 
-def parsed(arguments: Sequence[str]) -> Any:
-    """Return the command that the arguments say, one of the classes in `Command`."""
-    return tyro.cli(
-        Command,  # pyright: ignore[reportArgumentType]
-        # a shell leaves the home folder in `--out=~/pushes` as it is
-        args=[
-            re.sub(r"^(--[\w-]+=)?~(?=/|$)", lambda begin: (begin[1] or "") + str(Path.home()), a) for a in arguments
-        ],
-        prog="pushjax",
-        description="Quasi-static planar pushing: limit surfaces, frictional contact, pushes, grasps.\n\n"
-        "`pushjax --version` prints the version.",
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
+def split(given: list[str]) -> tuple[str, list[str]]:
+    """Return the command, of one word or two, and its options; end the process if there is no such command."""
+    first = _known_word("command", given[:1], list(dict.fromkeys(name.split()[0] for name in ABOUT)))
+    if first in ABOUT:
+        return first, given[1:]
+    seconds = [name.split()[1] for name in ABOUT if name.split()[0] == first]
+    return f"{first} {_known_word(GROUPS[first], given[1:2], seconds)}", given[2:]
 
 
-def _check_words(given: list[str]) -> None:
-    """End with one line for commands, experiments and data sets that do not exist."""
-    if given[:1] == ["bench"]:
-        print("pushjax: benchmarks are in a clone of the repository: python -m benchmarks", file=sys.stderr)
-        raise SystemExit(1)
-    _check_word("command", given[:1], COMMANDS)
-    if given[:1] == ["reproduce"]:
-        _check_word("experiment", given[1:2], tuple(EXPERIMENTS))
-    if given[:1] == ["data"]:
-        _check_word("data set", given[1:2], DATA_SETS)
+def _known_word(kind: str, given: list[str], known: list[str]) -> str:
+    """Return the given word if it is known; else print a hint, or for an option or nothing the usage, and end."""
+    word = given[0] if given else ""
+    if word in known:
+        return word
+    helps = word in HELP
+    if not word or word.startswith("-"):
+        print(USAGE, file=sys.stdout if helps else sys.stderr)
+    else:
+        close = get_close_matches(word, known, 1)
+        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+        print(f"pushjax: no {kind} {word!r}; {hint}", file=sys.stderr)
+    raise SystemExit(0 if helps else 2)
 
 
-def _check_word(kind: str, given: list[str], known: Sequence[str]) -> None:
-    """End with exit status 2 if a word is given that is no option and is not known."""
-    if not given or given[0].startswith("-") or given[0] in known:
-        return
-    close = get_close_matches(given[0], known, 1)
-    hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
-    print(f"pushjax: no {kind} {given[0]!r}; {hint}", file=sys.stderr)
-    raise SystemExit(2)
-
-
-def _check_counts(given: list[str]) -> None:
-    """End with exit status 2 if an option has fewer or more values than it takes."""
-    # checked here, because tyro's own message lists every type of every value
-    first, second = [*given[:2], "", ""][:2]
-    kind = EXPERIMENTS.get(second) if first == "reproduce" else COMMAND_CLASSES.get(first)
-    options = {} if kind is None else get_type_hints(kind, include_extras=True)
-    for name, hint in options.items():
-        flag, count = "--" + name.replace("_", "-"), _fixed_count(hint)
-        if count is None or flag not in given:
-            continue
-        rest = given[given.index(flag) + 1 :]
-        values = list(takewhile(lambda word: not word.startswith("--"), rest))
-        if len(values) < count or (len(values) > count and first != "identify"):  # its logs may follow
-            words = next((each.metavar for each in get_args(hint)[1:] if getattr(each, "metavar", None)), "")
-            takes = f"{count} values{f' ({words})' if words else ''}"
-            print(f"pushjax: {flag} takes {takes}; got {len(values)}: {' '.join(values)}", file=sys.stderr)
-            raise SystemExit(2)
-
-
-def _fixed_count(hint: Any) -> int | None:
-    """Return how many values an option of this type takes, if it is a tuple of fixed length; else None."""
-    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    tuples = [each for each in (kind, *get_args(kind)) if get_origin(each) is tuple]
-    return next((len(get_args(each)) for each in tuples if Ellipsis not in get_args(each)), None)
-
-
-def _compute(command: Common) -> None:
-    """Run an experiment, print its summary, and write its record and page."""
-    from pushjax._internal.progress import progress_bar
-
-    command.check()
-    settings = command.settings()
-    if "data" in vars(command):
-        settings["folder"] = data_folder(settings.pop("data", None))
-    with progress_bar("importing JAX") as progress:
+def parse(name: str, options: list[str]) -> tuple[ModuleType, partial[Any], Common]:
+    """Return the module of a command, the call that the options ask for, and the options that all commands share."""
+    with nullcontext() if HELP & set(options) else progress_bar("importing JAX"):
         import matplotlib
 
         matplotlib.use("Agg")  # draws to files, because there may be no screen
-        _keep_compiled(command.cache)
-        experiment: Any = import_module(f"pushjax.experiments.{command.module}")
+        experiment = import_module(f"pushjax.experiments.{COMMANDS[name].module}")
+    about = sys.modules[experiment.run.__module__].__doc__
+    return experiment, *parsed(experiment.run, options, f"pushjax {name}", about, Common, **COMMANDS[name].fixed)
+
+
+def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Common) -> None:
+    """Run an experiment, print its summary, and write its record and page."""
+    from pushjax.cli.page import write_page
+    from pushjax.experiments._cell_cache import CellCache
+    from pushjax.experiments._record import write_json
+
+    if "folder" in call.keywords:
+        call.keywords["folder"] = data_folder(call.keywords["folder"])
+    _keep_compiled(common.cache)
+    with progress_bar(f"computing {title}, and compiling what was not compiled before") as progress:
         callbacks = {"progress": progress, "say": progress.say, "note": progress.note}
-        settings |= {name: each for name, each in callbacks.items() if name in experiment.run.__annotations__}
-        progress.say(f"computing {command.title}, and compiling what was not compiled before")
-        record = experiment.run(seed=command.seed, out=command.out, **settings)
+        record = call(**{key: each for key, each in callbacks.items() if key in experiment.run.__annotations__})
     text = experiment.summary(record)
     print(text)
-    in_words = getattr(experiment, "figures", None)
-    _write(record, text, command, None if in_words is None else in_words(record))
+    json = common.json or common.out / f"{title}.json"
+    write_json(record, json)
+    if title != "demo":
+        figures = experiment.figures(record) if hasattr(experiment, "figures") else None
+        print(f"wrote {write_page(record, text, common.out / f'{title}.html', figures)}")
+    print(f"wrote {json}")
+    CellCache.delete(title, common.out)  # what was saved in case of an interruption
 
 
-def _fetch(command: Data) -> None:
-    """Fetch a set of recorded pushes."""
-    from pushjax._internal.progress import progress_bar
+def _fetch(to: Annotated[Path | None, cli_option("FOLDER")] = None) -> None:
+    """Fetch the authors' logs of the triangle, pushed by one finger and by two: 118 files of 34 MB in all.
+
+    Args:
+        to: Where to. Default: pushjax's data folder of this user, where `reproduce table2` and `two-finger` look.
+    """
     from pushjax.datasets.data_folder import ENVIRONMENT_VARIABLE
     from pushjax.datasets.download import fetch_triangle, triangle_files
 
     files = triangle_files()
     size = f"{sum(file.bytes for file in files) / 1e6:.0f} MB"
     with progress_bar(f"fetching {len(files)} files of {size}, without those that are there already") as progress:
-        folder = fetch_triangle(command.to, progress=progress)
+        folder = fetch_triangle(to, progress=progress)
     print(f"the logs are in {folder}")
     elsewhere = os.environ.get(ENVIRONMENT_VARIABLE)
     if elsewhere and Path(elsewhere).resolve() != folder.resolve():
@@ -177,20 +184,6 @@ def data_folder(given: Path | None) -> Path:
     return folder
 
 
-def _write(record: dict[str, Any], text: str, command: Common, figures: Any) -> None:
-    """Write the record and, except for the demo, its page. Then delete what was saved in case of an interruption."""
-    from pushjax.cli.page import write_page
-    from pushjax.experiments._cell_cache import CellCache
-    from pushjax.experiments._record import write_json
-
-    json = command.json or command.out / f"{record['experiment']}.json"
-    write_json(record, json)
-    if not isinstance(command, Demo):
-        print(f"wrote {write_page(record, text, command.out / (record['experiment'] + '.html'), figures)}")
-    print(f"wrote {json}")
-    CellCache.delete(record["experiment"], command.out)
-
-
 def _keep_compiled(cache: bool) -> None:
     """Turn the cache of compiled programs on or off."""
     import jax
@@ -201,14 +194,14 @@ def _keep_compiled(cache: bool) -> None:
         jax.config.update("jax_enable_compilation_cache", False)
         return
     folder = enable_compilation_cache()
-    show, told = warnings.showwarning, []
+    show, printed = warnings.showwarning, []
 
     # the warning that programs cannot be cached is printed once, not for every program
     def show_once(message, *where, **more):
         if "persistent compilation cache" not in str(message):
             show(message, *where, **more)
-        elif not told:
-            told.append(message)
+        elif not printed:
+            printed.append(message)
             print(
                 f"pushjax: compiled programs cannot be kept in {folder} on this machine, and are compiled anew: "
                 f"{message} (--no-cache does without)",

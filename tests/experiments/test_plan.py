@@ -177,7 +177,6 @@ def test_attempts_end_with_the_first_that_is_sure_enough():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "--goal: give the pose that is wanted"),
         (["--goal", "0", "0", "90"], "--goal: the angle is in rad"),
         (["--goal", "0", "nan", "0"], "--goal must be finite"),
         (["--goal", "0", "0", "0", "--pushes", "0"], "--pushes must be at least 1; got 0"),

@@ -5,14 +5,15 @@ one friction, unless they are `separate`. Then each log has its own friction and
 calibration of the setup.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
@@ -35,7 +36,7 @@ POOR, NO_BETTER = 0.4, 0.9
 
 
 def run(
-    logs: list[Path],
+    logs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG …", help_behavior_hint=""), tyro.conf.Positional],
     options: Options,
     seed: int = 0,
     out: Path | None = None,
@@ -46,7 +47,9 @@ def run(
     """Identify from logs, and draw and save the result.
 
     Args:
-        logs: Files of recorded pushes.
+        logs: Files of recorded pushes: CSV with the columns push, hand_x, hand_y, object_x, object_y, object_theta (SI
+            units, world frame; blank where the object was not seen), NPZ with start, path, end, MIT pushing data (JSON,
+            HDF5), or triangle logs (text).
         options: What is known, and what is to be found.
         seed: Seed of the wrench-twist pairs of the expected surfaces, and of the noise.
         out: Folder for the pictures and `identified.json`. None: neither.
@@ -95,7 +98,7 @@ def run(
 
 
 def find(
-    logs: list[Path],
+    logs: Sequence[Path],
     options: Options,
     seed: int,
     progress: ProgressCallback,
@@ -103,8 +106,9 @@ def find(
     note: Callable[[str], None],
 ) -> Findings:
     """Identify from logs, with intervals, predictions and noise; logs that cannot be used become problems."""
-    if not logs:
-        raise ValueError("LOGS: give at least one file of recorded pushes")
+    if not any(log.exists() for log in logs):
+        missing = ", ".join(map(str, logs)) or "file"
+        raise ValueError(f"LOG: give at least one file of recorded pushes; there is no {missing}")
     options.check()
     say(f"reading {len(logs)} {'log' if len(logs) == 1 else 'logs'}")
     recordings, unreadable = _for_each(logs, load_recordings)
@@ -162,7 +166,7 @@ def _check_forces(recordings: list[Recordings], options: Options) -> None:
             raise ValueError(f"--forces: {one.source} does not have the forces of a single finger for every push")
 
 
-def _for_each(items: list, function: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
+def _for_each(items: Sequence, function: Callable[[Any], Recordings]) -> tuple[list[Recordings], list[LogError]]:
     """Apply a function to each item, and return the results and the errors; raise if it fails for all."""
     good, bad = [], []
     for item in items:

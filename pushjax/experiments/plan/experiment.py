@@ -37,7 +37,14 @@ POSSIBLE = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)  # the finger can do 
 def run(
     options: Options, seed: int = 0, out: Path | None = None, progress: ProgressCallback = no_progress
 ) -> dict[str, Any]:
-    """Plan the pushes, write way points and picture into the folder `out`, and return the record."""
+    """Plan the pushes, and write way points and picture into the folder `out`.
+
+    Args:
+        options: What is to be planned.
+        seed: Seed of the surface and of the search.
+        out: Folder for the way points and the picture. None: neither.
+        progress: Called with the number of attempts done and their total.
+    """
     options.check()
     shape, hand, fixtures = parse_shape(options.shape), pj.Hand.finger(options.radius), parse_fixtures(options)
     _check_sizes(shape, options)
@@ -120,7 +127,6 @@ def _max_push_length(options: Options, length: float) -> float:
 
 def _check_distance(options: Options, length: float) -> None:
     """Raise ValueError if the goal is farther away than all pushes together are long."""
-    assert options.goal is not None
     away, longest = math.dist(options.start[:2], options.goal[:2]), _max_push_length(options, length)
     if away > options.pushes * longest + options.tolerance[0]:
         raise ValueError(

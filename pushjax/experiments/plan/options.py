@@ -18,13 +18,13 @@ MAX_ANGLE = 8 * math.pi  # rad; a larger angle is probably in degrees
 class Options:
     """The block, its start and goal, the finger, and what is known of friction."""
 
+    goal: Annotated[Pose, cli_option("X Y THETA")]
+    """Pose of the block that is wanted, m and rad."""
     shape: Annotated[str, cli_option("SHAPE")] = "rectangle:0.09x0.06"
     """The block: rectangle:0.09x0.06, disk:0.05 (radius), ellipse:0.06x0.04 (semi-axes), regular:6x0.05 (corners,
     distance of each), all in m, or a CSV file of vertices. Default: rectangle:0.09x0.06."""
     start: Annotated[Pose, cli_option("X Y THETA")] = (0.0, 0.0, 0.0)
     """Pose of the block now, m and rad. Default: 0 0 0."""
-    goal: Annotated[Pose | None, cli_option("X Y THETA")] = None
-    """Pose of the block that is wanted, m and rad. It must be given."""
     tolerance: Annotated[tuple[float, float], cli_option("M RAD")] = (0.005, 0.0873)
     """Tolerances of the goal: of the position, m, and of the angle, rad. Default: 0.005 0.0873 (5 degrees)."""
     symmetry: int = 1
@@ -64,8 +64,6 @@ class Options:
 
     def check(self) -> None:
         """Raise ValueError for the first invalid option that can be found without JAX."""
-        if self.goal is None:
-            raise ValueError("--goal: give the pose that is wanted, X Y THETA (m and rad)")
         for name in ("start", "goal", "finger"):
             value = getattr(self, name)
             if value is not None and not all(map(math.isfinite, value)):
