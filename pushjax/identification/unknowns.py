@@ -1,7 +1,6 @@
 """The unknowns of identification, and the physical parameters that they stand for."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,22 +12,52 @@ from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_po
 SIDES = 4  # default number of a slider's sides
 
 
+class _Unknown(NamedTuple):
+    """One unknown of identification."""
+
+    size: int | None  # number of its scalars; None if it depends on the problem
+    unit: str = ""
+    kind: str = ""  # "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither
+
+
+UNKNOWNS = {
+    "friction": _Unknown(1),
+    "surface": _Unknown(None),  # the limit surface, whose prior is `Unknowns.surface_dof`
+    "pressure_center": _Unknown(2, "m"),
+    "inset": _Unknown(1, "m", "calibration"),
+    "overshoot": _Unknown(1, "m", "calibration"),
+    "lag_distance": _Unknown(1, "m", "calibration"),
+    "hand_offset": _Unknown(2, "m", "calibration"),
+    "frame_offset": _Unknown(3, "m", "calibration"),
+    "overlap": _Unknown(1, "", "calibration"),
+    "anisotropy": _Unknown(2, "", "table"),
+    "log_gradient": _Unknown(2, "1/m", "table"),
+    "log_hessian": _Unknown(3, "1/m^2", "table"),
+    "friction_drift": _Unknown(1),
+    "friction_by_side": _Unknown(None),
+}
+NAMES = tuple(UNKNOWNS)
+SIZES = {name: each.size for name, each in UNKNOWNS.items()}
+NORMAL_PRIORS = tuple(name for name in NAMES if name not in ("friction", "surface"))
+LENGTHS = tuple(name for name, each in UNKNOWNS.items() if each.unit == "m")
+CALIBRATION, TABLE = (
+    tuple(name for name, each in UNKNOWNS.items() if each.kind == kind) for kind in ("calibration", "table")
+)
+
+
 def _optional_array(value: ArrayLike | None) -> Array | None:
-    """Return the prior of an unknown as an array; None, which stands for a known parameter, stays None."""
+    """Return the prior of an unknown as an array, or None for a parameter that is not estimated."""
     return None if value is None else as_float(value)
+
+
+def _prior(default: Any = None, *, kw_only: bool = True) -> Any:
+    """Return the field of a prior."""
+    return eqx.field(default=default, converter=_optional_array, kw_only=kw_only)
 
 
 def _shared_names(names: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of the shared unknowns as a tuple, or the calibration parameters for None."""
     return CALIBRATION if names is None else tuple(names)
-
-
-def _field_metadata(
-    size: int | None,  # number of its scalars; None if it depends on the problem
-    group: str = "",  # "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither
-) -> dict[str, Any]:
-    """Return the metadata of a field that stands for an unknown."""
-    return {"size": size, "group": group}
 
 
 class Unknowns(eqx.Module):
@@ -70,48 +99,20 @@ class Unknowns(eqx.Module):
             scalar, if `sides` is less than one, if a name in `shared` is unknown, or if everything is None.
     """
 
-    friction: Float[Array, "2"] | None = eqx.field(
-        default=(0.0, 1.0), converter=_optional_array, metadata=_field_metadata(1)
-    )
-    surface_dof: Float[Array, ""] | None = eqx.field(
-        default=50.0, converter=_optional_array, kw_only=True, metadata=_field_metadata(None)
-    )
-    pressure_center: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2)
-    )
-    inset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
-    )
-    overshoot: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
-    )
-    lag_distance: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
-    )
-    hand_offset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "calibration")
-    )
-    frame_offset: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(3, "calibration")
-    )
-    overlap: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1, "calibration")
-    )
-    anisotropy: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "table")
-    )
-    log_gradient: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(2, "table")
-    )
-    log_hessian: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(3, "table")
-    )
-    friction_drift: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(1)
-    )
-    friction_by_side: Float[Array, ""] | None = eqx.field(
-        default=None, converter=_optional_array, kw_only=True, metadata=_field_metadata(None)
-    )
+    friction: Float[Array, "2"] | None = _prior((0.0, 1.0), kw_only=False)
+    surface_dof: Float[Array, ""] | None = _prior(50.0)
+    pressure_center: Float[Array, ""] | None = _prior()
+    inset: Float[Array, ""] | None = _prior()
+    overshoot: Float[Array, ""] | None = _prior()
+    lag_distance: Float[Array, ""] | None = _prior()
+    hand_offset: Float[Array, ""] | None = _prior()
+    frame_offset: Float[Array, ""] | None = _prior()
+    overlap: Float[Array, ""] | None = _prior()
+    anisotropy: Float[Array, ""] | None = _prior()
+    log_gradient: Float[Array, ""] | None = _prior()
+    log_hessian: Float[Array, ""] | None = _prior()
+    friction_drift: Float[Array, ""] | None = _prior()
+    friction_by_side: Float[Array, ""] | None = _prior()
     sides: int = eqx.field(default=SIDES, static=True, kw_only=True)
     shared: tuple[str, ...] = eqx.field(default=None, converter=_shared_names, static=True, kw_only=True)
 
@@ -131,7 +132,7 @@ class Unknowns(eqx.Module):
         if unknown:
             raise ValueError(f"shared: {unknown[0]!r} is not one of {', '.join(NAMES)}")
         if not self.names:
-            raise ValueError(f"friction, surface_dof, {', '.join(NORMAL_PRIORS)}: all None, nothing is to be found")
+            raise ValueError(f"give a prior for at least one of friction, surface_dof, {', '.join(NORMAL_PRIORS)}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -147,20 +148,6 @@ def _check_range(friction: Array) -> None:
     bounds = concrete(friction)
     if bounds is not None and not 0 <= bounds[0] < bounds[1]:
         raise ValueError(f"friction must be (lowest, highest), not negative; got ({bounds[0]:g}, {bounds[1]:g})")
-
-
-# Every unknown is listed once, as a field of `Unknowns`. The field `surface_dof` is only the prior of the limit
-# surface, so the unknown itself has another name: "surface".
-_DESCRIPTIONS = {
-    "surface" if field.name == "surface_dof" else field.name: field.metadata
-    for field in fields(Unknowns)
-    if "size" in field.metadata
-}
-NAMES = tuple(_DESCRIPTIONS)
-SIZES = {name: each["size"] for name, each in _DESCRIPTIONS.items()}
-NORMAL_PRIORS = tuple(name for name in NAMES if name not in ("friction", "surface"))
-CALIBRATION = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "calibration")
-TABLE = tuple(name for name, each in _DESCRIPTIONS.items() if each["group"] == "table")
 
 
 def known_parameters(

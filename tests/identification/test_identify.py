@@ -294,7 +294,7 @@ def test_polygon_inset():
         (lambda: pj.Unknowns(friction=0.3), r"friction has shape \(\); expected \(2,\)"),
         (lambda: pj.Unknowns(inset=-0.001), "inset must be positive"),
         (lambda: pj.Unknowns(shared=("mu",)), "shared: 'mu' is not one of friction, surface"),
-        (lambda: pj.Unknowns(friction=None, surface_dof=None), "nothing is to be found"),
+        (lambda: pj.Unknowns(friction=None, surface_dof=None), "give a prior for at least one of friction, surface_dof, pressure_center"),
         (lambda: pj.Pushes(np.zeros((2, 3)), np.zeros((2, 4, 2)), np.zeros((3, 3))), "end has shape"),
         (lambda: pj.Pushes(np.zeros((2, 3)), np.zeros((2, 1, 2)), np.zeros((2, 3))), "at least one step"),
         (lambda: pj.Pushes(np.full((2, 3), np.nan), np.zeros((2, 4, 2)), np.zeros((2, 3))), "start must be finite"),

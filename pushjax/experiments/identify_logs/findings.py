@@ -10,9 +10,9 @@ import pushjax as pj
 from pushjax.datasets import LogError
 from pushjax.identification.noise import Noise
 from pushjax.identification.uncertainty import Profile, normal_interval, profile_interval
+from pushjax.identification.unknowns import LENGTHS
 
 # unknowns that are lengths, but for one number that is an angle
-LENGTHS = ("pressure_center", "inset", "overshoot", "lag_distance", "hand_offset", "frame_offset")
 ANGLE = "frame_offset.2"
 
 
