@@ -241,23 +241,24 @@ def draw(quick: bool, to: Path) -> list[Row]:
     import matplotlib.pyplot as plt
 
     from pushjax import plot
+    from pushjax.plot.style import BLACK, GRAY, ORANGE, STYLE, legend_below
 
-    with plt.rc_context(plot.STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(2, 3, figsize=(11, 4.8), sharex="col", layout="constrained")
         for (title, axis, angle, at), (above, below) in zip(lines(quick), axes.T, strict=True):
             both = jax.jit(jax.vmap(lambda x, angle=angle: jax.jvp(angle, (x,), (jnp.ones_like(x),))))
             value, slope = both(jnp.asarray(at))
             central = np.gradient(np.asarray(value), at)
-            above.plot(at, value, ".", color=plot.BLACK, markersize=1.5)
-            below.plot(at, central, ".", color=plot.GRAY, markersize=4, label="difference of neighbors")
-            below.plot(at, slope, ".", color=plot.ORANGE, markersize=1.5, label="jax.jvp")
+            above.plot(at, value, ".", color=BLACK, markersize=1.5)
+            below.plot(at, central, ".", color=GRAY, markersize=4, label="difference of neighbors")
+            below.plot(at, slope, ".", color=ORANGE, markersize=1.5, label="jax.jvp")
             low, high = np.quantile(slope, [0.005, 0.995])
             below.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
             above.set_title(title)
             below.set_xlabel(axis)
         axes[0, 0].set_ylabel("final angle, deg")
         axes[1, 0].set_ylabel("its derivative")
-        plot.legend_below(figure, axes[1, 0], columns=2)
+        legend_below(figure, axes[1, 0], columns=2)
         return [{"picture": plot.save(figure, to)}]
 
 

@@ -16,16 +16,14 @@ from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.animation import Animation
+from pushjax.plot.forces import SQUEEZE_LABEL
 from pushjax.plot.parts import centroids, draw_fixtures, placed_outline, vertices
-from pushjax.plot.squeezing import SQUEEZE_LABEL
-from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
-from pushjax.plot.tracks import Animatable, DrawnPush, drawn_push, fingers_along
+from pushjax.plot.push_panel import PushPanel, RecordedPush, fingers_along
+from pushjax.plot.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
+from pushjax.simulation.trajectory import Trajectory
 
-MAX_ARROW_LENGTH = 0.4  # length of the arrow of the largest force, in units of the slider's size
-SQUEEZE_LENGTH = 0.45  # length of the arrow of a unit of squeeze, in units of the slider's size
-MIN_FORCE = 1e-3  # weaker forces are not drawn, in units of the largest
 PANEL_WIDTH, EXTRA_HEIGHT = 3.8, 1.2  # inches: width of a panel, and height of what is above and below it
 LEGEND_ROW_HEIGHT = 0.2  # inches: height of the extra row in the legend below a single panel
 MARGIN = 0.04  # width of the empty margin, in units of what is shown
@@ -34,7 +32,7 @@ MARGIN = 0.04  # width of the empty margin, in units of what is shown
 def animate(
     shape: Shape,
     hand: Hand,
-    pushes: Animatable | Mapping[str, Animatable],
+    pushes: Trajectory | RecordedPush | Mapping[str, Trajectory | RecordedPush],
     *,
     measured: Mapping[str, np.ndarray] | None = None,
     forces: bool = True,
@@ -59,7 +57,7 @@ def animate(
         forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
             the largest force.
         friction: Coefficient of friction at the contacts, to show the forces that hold the slider at the end of a
-            grasp, per unit of squeeze (`pushjax.plot.squeezing`).
+            grasp, per unit of squeeze (`squeeze_forces`).
         fixtures: Walls and bodies that do not move, in every panel.
         frames: Number of frames, equally spaced over the steps.
         seconds: Time that the animation plays, s.
@@ -78,22 +76,22 @@ def animate(
     unknown = sorted(set(measured_by_name) - set(by_name))
     if unknown:
         raise ValueError(f"measured: no push is named {', '.join(map(repr, unknown))}")
-    drawn = [
-        drawn_push(shape, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
+    panels = [
+        PushPanel(shape, hand, push, measured_by_name.get(name), forces, friction) for name, push in by_name.items()
     ]
-    fractions = _frame_fractions(drawn, frames)
-    largest_force = max(track.largest_force for track in drawn)
+    fractions = _frame_fractions(panels, frames)
+    largest_force = max(panel.largest_force for panel in panels)
     with plt.rc_context(STYLE):
-        figure, all_axes = panel_row(len(drawn), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
-        panels = [_Panel(axes, track, largest_force) for axes, track in zip(all_axes, drawn, strict=True)]
-        for axes, name in zip(all_axes, by_name, strict=True):
+        figure, all_axes = panel_row(len(panels), PANEL_WIDTH, PANEL_WIDTH + EXTRA_HEIGHT, shared=True)
+        for axes, name, panel in zip(all_axes, by_name, panels, strict=True):
+            panel.add_artists(axes, largest_force)
             draw_fixtures(axes, fixtures)
             # A name leaves room for the words below it. Without one, a space keeps the room of the words themselves.
             axes.set_title(name or " ", pad=18 if name else 4)
             axes.set(xlabel="x / mm", aspect="equal")
         all_axes[0].set_ylabel("y / mm")
-        _share_limits(figure, all_axes, drawn)
-        held = any(track.squeeze is not None for track in drawn)
+        _share_limits(figure, all_axes, panels)
+        held = any(panel.squeeze is not None for panel in panels)
         _draw_legend(figure, all_axes[0], bool(measured_by_name), largest_force, held)
 
     def draw(frame: int) -> None:
@@ -167,62 +165,12 @@ def animate_cloud(
     return Animation(figure, draw, frames, seconds)
 
 
-class _Panel:
-    """The artists of one push, with arrows to the scale of the largest force of all panels, N."""
-
-    def __init__(self, axes: Axes, track: DrawnPush, largest_force: float):
-        self.track = track
-        size = float(np.ptp(track.outline[0], axis=0).max())
-        self.scale = MAX_ARROW_LENGTH * size / largest_force if largest_force > 0 else 0.0
-        self.weakest = MIN_FORCE * largest_force
-        axes.plot(*track.outline[0].T, color=GRAY, lw=1.0, label="start")
-        (self.outline,) = axes.plot([], [], color=BLACK, lw=1.5, label="slider")
-        (self.trace,) = axes.plot([], [], color=BLUE, lw=1.2, label="its centroid")
-        self.fingers = [axes.plot([], [], color=GREEN, lw=1.8, label="hand")[0] for _ in track.fingers]
-        (self.measured,) = axes.plot([], [], "--", color=RED, lw=1.3, label="measured")
-        (self.contacts,) = axes.plot([], [], "o", color=ORANGE, ms=3.5, zorder=5)
-        zero = np.zeros(track.force.shape[1])
-        arrow_style: dict[str, Any] = {"units": "dots", "width": 2.2, "color": ORANGE, "zorder": 5, "headlength": 4}
-        arrow_style |= {"angles": "xy", "scale_units": "xy", "scale": 1.0, "headaxislength": 4}
-        self.arrows = axes.quiver(zero, zero, zero, zero, **arrow_style) if len(zero) else None
-        self.squeeze = None
-        if track.squeeze is not None:
-            tips, force = track.squeeze
-            force = SQUEEZE_LENGTH * size * force
-            squeeze_style: dict[str, Any] = arrow_style | {"color": PURPLE, "pivot": "tip"}
-            self.squeeze = axes.quiver(*tips.T, *force.T, **squeeze_style)
-        above_axes: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "center"}
-        self.words = axes.annotate("", (0.5, 1), (0, 4), color="0.3", **above_axes)
-
-    def draw(self, fraction: float) -> None:
-        """Show the push at a share of its steps, from 0 to 1."""
-        track = self.track
-        k = round(fraction * (len(track.outline) - 1))
-        self.outline.set_data(*track.outline[k].T)
-        self.trace.set_data(*track.center[: k + 1].T)
-        for line, finger in zip(self.fingers, track.fingers, strict=True):
-            line.set_data(*finger[k].T)
-        if track.measured is not None:
-            self.measured.set_data(*track.measured[round(fraction * (len(track.measured) - 1))].T)
-        self.words.set_text(track.words[k])
-        self.words.set_color(RED if 0 <= track.failed < k else "0.3")
-        is_acting = np.linalg.norm(track.force[k], axis=1) > self.weakest
-        self.contacts.set_data(*track.contact[k][is_acting].T)
-        if self.arrows is not None:
-            # an arrow of length zero would leave a dot
-            tails, force = (np.where(is_acting[:, None], part, np.nan) for part in (track.contact[k], track.force[k]))
-            self.arrows.set_offsets(tails)
-            self.arrows.set_UVC(*(self.scale * force).T)
-        if self.squeeze is not None:
-            self.squeeze.set_visible(k > track.stopped)
-
-
-def _frame_fractions(drawn: list[DrawnPush], frames: int) -> np.ndarray:
+def _frame_fractions(panels: list[PushPanel], frames: int) -> np.ndarray:
     """Return for each frame the fraction of the steps that is done, from 0 to where the last push stops moving."""
     last_fraction = 0.0
-    for push in drawn:
-        steps = len(push.outline) - 1
-        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (push.outline, *push.fingers)]
+    for panel in panels:
+        steps = len(panel.outline) - 1
+        moving = [np.any(np.diff(points, axis=0) != 0, axis=(1, 2)) for points in (panel.outline, *panel.fingers)]
         moving_steps = np.flatnonzero(np.any(moving, axis=0))
         # includes the step whose status says why nothing moves any more
         stop_step = steps if moving_steps.size == 0 else min(moving_steps[-1] + 2, steps)
@@ -237,10 +185,10 @@ def _equally_spaced(end: float, frames: int) -> np.ndarray:
     return np.linspace(0, end, frames)
 
 
-def _share_limits(figure: Figure, all_axes: list[Axes], drawn: list[DrawnPush]) -> None:
+def _share_limits(figure: Figure, all_axes: list[Axes], panels: list[PushPanel]) -> None:
     """Give all panels one range that holds everything at all times, and the figure the proportions of that range."""
-    parts = [part for push in drawn for part in (push.outline, *push.fingers)]
-    parts += [push.measured for push in drawn if push.measured is not None]
+    parts = [part for panel in panels for part in (panel.outline, *panel.fingers)]
+    parts += [panel.measured for panel in panels if panel.measured is not None]
     _set_limits(all_axes[0], [part.reshape(-1, 2) for part in parts])
     wide, high = np.ptp(all_axes[0].get_xlim()), np.ptp(all_axes[0].get_ylim())
     figure.set_layout_engine("compressed", h_pad=0.06)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 
 from pushjax.geometry.shape import Shape
 from pushjax.plot.distributions import density_panel, traces
-from pushjax.plot.parts import centroids, hand_at, outline
+from pushjax.plot.parts import centroids, finger_poses, hand_at, outline
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 from pushjax.simulation.hand import Hand
 
@@ -50,7 +49,7 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
             style, label = ("-", "median end") if quantile == 0.5 else (":", "end, 2.5 and 97.5 % of θ")
             end = trajectories[order[round(quantile * (len(order) - 1))], -1]
             outline(axes, shape, end, RED, 1.2, linestyle=style, label=label)
-        fingers = np.asarray(hand.poses(jnp.asarray(path)))
+        fingers = finger_poses(hand, path)
         hand_at(axes, hand, fingers[0], BLACK, 1.0)
         hand_at(axes, hand, fingers[-1], RED, 1.0)
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=title)
@@ -87,7 +86,7 @@ def capture_figure(
         figure, panels = plt.subplots(
             1, len(ratios), figsize=size, layout="constrained", width_ratios=ratios, squeeze=False
         )
-        fingers = np.asarray(hand.poses(jnp.asarray(path)))
+        fingers = finger_poses(hand, path)
         for axes, (name, (trajectories, wanted)) in zip(panels[0], runs.items(), strict=False):
             _draw_paths(axes, trajectories[:max_paths], wanted[:max_paths])
             hand_at(axes, hand, fingers[0], GRAY, 2.0)

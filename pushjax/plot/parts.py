@@ -3,15 +3,17 @@
 from collections.abc import Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 from matplotlib.patches import Polygon as PolygonPatch
 
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.geometry.shape import Shape
 from pushjax.plot.style import GRAY, MM, PURPLE
 from pushjax.simulation.fixtures import Fixture, Wall
-from pushjax.simulation.hand import Finger, Hand, Pad
+from pushjax.simulation.hand import Hand, Pad
 
 SMOOTH_OUTLINE_POINTS = 200  # points along a smooth outline
 FAR = 10.0  # m; to here a wall is drawn, which is beyond every picture
@@ -26,15 +28,18 @@ def vertices(shape: Shape) -> np.ndarray:
 
 def placed_outline(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return the closed outline (..., points + 1, 2), mm, of points (points, 2), m, at poses (..., 3), m and rad."""
-    x, y, theta = np.moveaxis(np.asarray(poses)[..., None], -2, 0)
-    c, s = np.cos(theta), np.sin(theta)
-    body_x, body_y = np.vstack([points, points[:1]]).T
-    return MM * np.stack([c * body_x - s * body_y + x, s * body_x + c * body_y + y], axis=-1)
+    return MM * to_world(np.asarray(poses)[..., None, :], np.vstack([points, points[:1]]))
 
 
 def centroids(shape: Shape, poses: np.ndarray) -> np.ndarray:
     """Return the centroids (..., 2), mm, of a body at poses (..., 3), m and rad."""
-    return placed_outline(np.asarray(shape.centroid, float)[None], poses)[..., 0, :]
+    return MM * to_world(np.asarray(poses), np.asarray(shape.centroid, float))
+
+
+def finger_poses(hand: Hand, configurations: Any) -> np.ndarray:
+    """Return the poses (..., fingers, 3) of the fingers at configurations (..., dof), m and rad."""
+    poses = np.asarray(hand.poses(jnp.asarray(configurations)), float)
+    return poses if poses.shape[-1] == 3 else np.insert(poses, 2, 0.0, axis=-1)  # a hand that never turns has none
 
 
 def outline(axes: Axes, shape: Shape, pose: np.ndarray, color: str, width: float, **line: Any) -> None:
@@ -62,15 +67,10 @@ def hand_at(axes: Axes, hand: Hand, poses: np.ndarray, color: str, width: float)
         width: Width of the lines, in points.
     """
     for finger, where in zip(hand.fingers, np.asarray(poses), strict=True):
-        _draw_finger(axes, finger, where, color, width)
-
-
-def _draw_finger(axes: Axes, finger: Finger, pose: np.ndarray, color: str, width: float) -> None:
-    """Draw one finger: a pad as its outline, a round finger as a circle."""
-    if isinstance(finger, Pad):
-        outline(axes, finger.shape, pose, color, width)
-    else:
-        axes.add_patch(Circle(tuple(MM * pose[:2]), MM * float(finger.radius), color=color, fill=False, lw=width))
+        if isinstance(finger, Pad):
+            outline(axes, finger.shape, where, color, width)
+        else:
+            axes.add_patch(Circle(tuple(MM * where[:2]), MM * float(finger.radius), color=color, fill=False, lw=width))
 
 
 def draw_fixtures(axes: Axes, fixtures: Sequence[Wall | Fixture]) -> None:

@@ -77,10 +77,3 @@ def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
     """Draw one legend for all panels below them, with the labels of `axes` in `columns` columns."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
-
-
-def start_to_end_legend(figure: Figure, axes: Axes) -> None:
-    """Draw the legend of pictures that show a push at its start, between, and at its end."""
-    for color, label in ((BLACK, "start"), (GRAY, "between"), (RED, "end")):
-        axes.plot([], [], color=color, label=label)
-    legend_below(figure, axes, columns=5 if len(figure.axes) > 1 else 2)

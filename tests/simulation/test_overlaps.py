@@ -427,7 +427,7 @@ def test_pictures_name_the_step_that_failed():
     path = pj.line((0, 0, 0, 0.1), (0, 0, 0, 0.05), 40)
     failing = pj.rollout(SLIDER, TWO, TOO_FAR, pose=(0.002, 0, 0.01), friction=0.3, fixtures=(RAIL,))
     fine = pj.rollout(SLIDER, TWO, path, pose=(0.002, 0, 0.1), friction=0.3)
-    figure = plot.grasp_figure(SLIDER.shape, TWO, {"slippery": failing, "rough": fine})
+    figure = plot.push_figure(SLIDER.shape, TWO, {"slippery": failing, "rough": fine})
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [f"slippery\nNOT_CONVERGED from step {int(failing.first_failure)}", "rough"]
     moving = plot.animate(SLIDER.shape, TWO, {"slippery": failing, "rough": fine}, frames=3)

@@ -9,9 +9,10 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax.experiments.grasps.sliders import Setting
+from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, PURPLE, RED, STYLE
 
-COLORS = {"grasped": plot.RED, "jammed": plot.ORANGE, "free": plot.GRAY, "failed": plot.PURPLE}
-COORDINATES = ((plot.MM, "x / mm"), (plot.MM, "y / mm"), (180 / np.pi, "θ / °"))
+COLORS = {"grasped": RED, "jammed": ORANGE, "free": GRAY, "failed": PURPLE}
+COORDINATES = ((MM, "x / mm"), (MM, "y / mm"), (180 / np.pi, "θ / °"))
 BINS = 60  # of each histogram in the picture; the record has fewer
 
 
@@ -25,13 +26,13 @@ def draw(
     shown: dict[str, tuple[pj.MonteCarlo, np.ndarray]],
 ) -> list[str]:
     """Draw start poses and, for each pressure in `shown`, the final poses by outcome, with histograms."""
-    with plt.rc_context(plot.STYLE):
+    with plt.rc_context(STYLE):
         rows = len(shown) + 1
         figure, axes = plt.subplots(rows, 4, figsize=(14.0, 3.4 * rows), layout="constrained")
         first = axes[0]
-        plot.pose_panel(first[0], starts, plot.BLACK)
-        plot.outline(first[0], setting.shape, np.zeros(3), plot.BLUE, 1.0)
-        plot.hand_at(first[0], hand, np.asarray(hand.poses(path[0])), plot.BLUE, 1.0)
+        plot.pose_panel(first[0], starts, BLACK)
+        plot.outline(first[0], setting.shape, np.zeros(3), BLUE, 1.0)
+        plot.hand_at(first[0], hand, np.asarray(hand.poses(path[0])), BLUE, 1.0)
         first[0].set_title(f"{len(starts)} start poses")
         _histograms(first[1:], starts)
         for row, (pressure, (grasps, outcomes)) in zip(axes[1:], shown.items(), strict=True):
@@ -39,7 +40,7 @@ def draw(
                 which = outcomes == word
                 if which.any():
                     plot.pose_panel(row[0], grasps.pose[which], color, f"{word}: {which.sum()}")
-            ends = plot.MM * np.abs(grasps.pose[:, :2]).max(axis=0) + 4
+            ends = MM * np.abs(grasps.pose[:, :2]).max(axis=0) + 4
             row[0].set(xlim=(-ends[0], ends[0]), ylim=(-ends[1], ends[1]))
             row[0].set(title=f"where they end, pressure: {pressure}", aspect="equal")
             row[0].legend(loc="upper right", markerscale=3, fontsize=7)

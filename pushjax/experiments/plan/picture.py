@@ -12,6 +12,7 @@ from pushjax import plot
 from pushjax.experiments.plan.options import Options
 from pushjax.planning import Goal, PushPlan
 from pushjax.plot.parts import draw_fixtures
+from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, RED, STYLE
 from pushjax.simulation.fixtures import Fixtures
 
 DRAWN = 40  # largest number of predicted ends that are drawn
@@ -19,7 +20,7 @@ DRAWN = 40  # largest number of predicted ends that are drawn
 
 def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, options: Options, path: Path) -> Path:
     """Draw a plan and the errors of its predicted final poses, and return the path of the picture."""
-    with plt.rc_context(plot.STYLE):
+    with plt.rc_context(STYLE):
         figure, panels = plt.subplots(
             1, 3, figsize=(12.5, 4.6), layout="constrained", gridspec_kw={"width_ratios": [2, 1, 1]}
         )
@@ -30,7 +31,7 @@ def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, opti
         plot.histogram_panel(panels[2], np.degrees(errors[:, 2]), "error of the angle / °", bins=30)
         for side, label in ((-1, "tolerance"), (1, None)):
             angle = side * np.degrees(options.tolerance[1])
-            panels[2].axvline(angle, color=plot.BLACK, lw=1, ls="--", label=label)
+            panels[2].axvline(angle, color=BLACK, lw=1, ls="--", label=label)
         panels[2].legend(fontsize=7, loc="upper left")
         panels[0].set_title(f"{plan.status.name.replace('_', ' ').lower()}: {plan.success:.0%} succeed")
         panels[2].set_title("angle at the end")
@@ -39,28 +40,28 @@ def draw(slider: pj.Slider, goal: Goal, fixtures: Fixtures, plan: PushPlan, opti
 
 def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, options: Options) -> None:
     for pose in np.asarray(plan.outcomes.pose)[:DRAWN]:
-        plot.outline(axes, slider.shape, pose, plot.RED, 0.4, alpha=0.5)
-    axes.plot([], [], color=plot.RED, lw=0.8, label="predicted ends")
+        plot.outline(axes, slider.shape, pose, RED, 0.4, alpha=0.5)
+    axes.plot([], [], color=RED, lw=0.8, label="predicted ends")
     for number, pose in enumerate(np.asarray(plan.pose)):
-        color, label = (plot.BLACK, "start") if number == 0 else (plot.GRAY, "after each push" if number == 1 else None)
+        color, label = (BLACK, "start") if number == 0 else (GRAY, "after each push" if number == 1 else None)
         plot.outline(axes, slider.shape, pose, color, 1.2, label=label)
-    plot.outline(axes, slider.shape, np.asarray(goal.pose), plot.GREEN, 1.6, linestyle="--", label="goal")
+    plot.outline(axes, slider.shape, np.asarray(goal.pose), GREEN, 1.6, linestyle="--", label="goal")
     for number, transit in enumerate(plan.transits):
         label = "between pushes" if number == 0 else None
-        axes.plot(*(plot.MM * transit.points.T), color=plot.ORANGE, lw=0.9, ls="--", label=label)
+        axes.plot(*(MM * transit.points.T), color=ORANGE, lw=0.9, ls="--", label=label)
     for number, path in enumerate(np.asarray(plan.path)):
-        points = plot.MM * path
-        axes.plot(*points.T, color=plot.BLUE, lw=1.8, label="pushes of the finger" if number == 0 else None)
+        points = MM * path
+        axes.plot(*points.T, color=BLUE, lw=1.8, label="pushes of the finger" if number == 0 else None)
         axes.annotate(
-            "", points[-1], points[-2], arrowprops={"arrowstyle": "-|>", "color": plot.BLUE, "shrinkA": 0, "shrinkB": 0}
+            "", points[-1], points[-2], arrowprops={"arrowstyle": "-|>", "color": BLUE, "shrinkA": 0, "shrinkB": 0}
         )
-        axes.add_patch(Circle(tuple(points[0]), plot.MM * options.radius, color=plot.BLUE, fill=False, lw=0.9))
+        axes.add_patch(Circle(tuple(points[0]), MM * options.radius, color=BLUE, fill=False, lw=0.9))
         axes.annotate(
             str(number + 1),
             points[0],
             xytext=(7, 7),
             textcoords="offset points",
-            color=plot.BLUE,
+            color=BLUE,
             weight="bold",
             bbox={"boxstyle": "circle,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
             zorder=6,
@@ -71,10 +72,10 @@ def _draw_plan(axes: Axes, slider: pj.Slider, goal: Goal, plan: PushPlan, option
 
 
 def _draw_positions(axes: Axes, errors: np.ndarray, tolerance: float) -> None:
-    points = plot.MM * errors[:, :2]
-    reach = max(1.3 * plot.MM * tolerance, float(np.quantile(np.abs(points), 0.995)) * 1.05)
-    axes.plot(*points[np.all(np.abs(points) <= reach, axis=1)].T, ".", color=plot.RED, ms=3)
-    axes.add_patch(Circle((0, 0), plot.MM * tolerance, color=plot.BLACK, fill=False, ls="--", lw=1))
+    points = MM * errors[:, :2]
+    reach = max(1.3 * MM * tolerance, float(np.quantile(np.abs(points), 0.995)) * 1.05)
+    axes.plot(*points[np.all(np.abs(points) <= reach, axis=1)].T, ".", color=RED, ms=3)
+    axes.add_patch(Circle((0, 0), MM * tolerance, color=BLACK, fill=False, ls="--", lw=1))
     axes.update_datalim([(-reach, -reach), (reach, reach)])
     axes.set(xlabel="error of x / mm", ylabel="error of y / mm")
     axes.set_aspect("equal", adjustable="datalim")

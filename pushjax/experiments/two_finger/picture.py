@@ -9,6 +9,7 @@ import pushjax as pj
 from pushjax import plot
 from pushjax.datasets.two_finger import TwoFingerLog
 from pushjax.experiments.two_finger.predictions import Tested, deviation_mm, per_push
+from pushjax.plot.style import BLACK, BLUE, GRAY, ORANGE, STYLE, legend_below
 
 # name, log, predicted final poses (radii, frictions, n, 3), their deviations (radii, frictions, n), mm, and the splits
 Shown = tuple[str, TwoFingerLog, np.ndarray, np.ndarray, Tested]
@@ -16,7 +17,7 @@ Shown = tuple[str, TwoFingerLog, np.ndarray, np.ndarray, Tested]
 
 def draw(shown: list[Shown], out: Path) -> str:
     """Draw for each object the distribution of deviations, and three test pushes of the first random split."""
-    with plt.rc_context(plot.STYLE):
+    with plt.rc_context(STYLE):
         figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
         for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
             each = per_push(errors, tested)
@@ -29,15 +30,15 @@ def draw(shown: list[Shown], out: Path) -> str:
                 push = order[round(share * (len(order) - 1))]
                 _one_push(panel, log, push, final[at][push])
                 panel.set_title(f"{name}, {word}: {errors[at][push]:.1f} mm")
-        plot.legend_below(figure, axes[0, 1], columns=5)
+        legend_below(figure, axes[0, 1], columns=5)
         return str(plot.save(figure, out / "two_finger.png"))
 
 
 def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray) -> None:
     """Draw the cumulative distributions of the deviations, mm, of the predictions and of the start poses."""
     for values, color, dash, label in (
-        (predicted, plot.BLUE, "-", "predicted"),
-        (no_motion, plot.GRAY, "--", "no motion"),
+        (predicted, BLUE, "-", "predicted"),
+        (no_motion, GRAY, "--", "no motion"),
     ):
         order = np.sort(values)
         axes.step(order, 100 * np.arange(1, len(order) + 1) / len(order), dash, color=color, where="post", label=label)
@@ -50,15 +51,15 @@ def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
     """Draw the start, the measured end and the predicted end of one push, with the fingers."""
     shape = pj.Polygon(log.vertices)
     drawn = (
-        (log.pose_start[push], plot.GRAY, "-", "start"),
-        (log.pose_end[push], plot.BLACK, "-", "measured end"),
-        (final, plot.BLUE, "--", "predicted end"),
+        (log.pose_start[push], GRAY, "-", "start"),
+        (log.pose_end[push], BLACK, "-", "measured end"),
+        (final, BLUE, "--", "predicted end"),
     )
     for pose, color, dash, label in drawn:
         plot.outline(axes, shape, pose, color, 1.5, linestyle=dash, label=label)
     for hand, color, label in (
-        (log.hand_start[push], plot.GRAY, "fingers, start"),
-        (log.hand_end[push], plot.ORANGE, "fingers, end"),
+        (log.hand_start[push], GRAY, "fingers, start"),
+        (log.hand_end[push], ORANGE, "fingers, end"),
     ):
         aside = log.spacing / 2 * np.array([-np.sin(hand[2]), np.cos(hand[2])])
         fingers = 1e3 * np.stack([hand[:2] + aside, hand[:2] - aside])

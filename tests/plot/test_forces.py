@@ -1,4 +1,4 @@
-"""The forces that hold a slider at the end of a grasp: by statics, and against the certificate of the jam."""
+"""Forces of a push, and forces that hold a slider at the end of a grasp: by statics, and against the certificate."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +32,23 @@ def closed(opening, pose=(0.0, 0.0, 0.0), status=pj.Status.GRASPED, before=(0.0,
 
 
 def torque(point, force):
-    return np.sum(point[:, 0] * force[:, 1] - point[:, 1] * force[:, 0])
+    return np.sum(point[..., 0] * force[..., 1] - point[..., 1] * force[..., 0], axis=-1)
+
+
+def test_forces_of_a_finger_add_up_to_the_wrench():
+    """The first number of a force is along the normal, the second along the normal turned by +90 degrees."""
+    side, length = 0.06, 0.024
+    slider, path = pj.Slider(pj.Polygon.rectangle(side, side), pj.Ellipsoid(jnp.eye(3), length)), (-0.042, 0.012)
+    path = pj.line(path, (-0.007, 0.012), 20)
+    push = pj.rollout(slider, pj.Hand.finger(0.005), path, pose=jnp.array([0.0, 0.0, 0.1]), friction=0.15)
+    found, wrench = plot.contact_forces(push), np.asarray(push.wrench)
+    np.testing.assert_allclose(found.force.sum(axis=1), wrench[:, :2], atol=1e-9)
+    np.testing.assert_allclose(torque(found.point, found.force), wrench[:, 2], atol=1e-9 * length)
+    moving, free = (np.asarray(push.status) == status for status in (pj.Status.MOVING, pj.Status.FREE))
+    assert moving.sum() > 10
+    np.testing.assert_allclose(found.point[moving, 0, 0], -side / 2, atol=1e-6)
+    assert free.any()
+    assert not found.force[free].any()
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.6])
@@ -92,11 +108,11 @@ def test_grasps_are_drawn_with_their_squeeze():
     block, jaw = pj.Polygon.rectangle(0.05, 0.03), pj.Hand.parallel_jaw(0.02, 0.01)
     grasp = closed(0.03)
     words = "forces that hold it, per unit of squeeze"
-    figure = plot.grasp_figure(block, jaw, {"flat": grasp}, friction=0.3)
+    figure = plot.push_figure(block, jaw, {"flat": grasp}, friction=0.3)
     legible(figure)
     assert words in legend(figure)
     assert len(figure.axes[0].texts) == 4  # arrows
-    assert words not in legend(plot.grasp_figure(block, jaw, {"flat": grasp}))
+    assert words not in legend(plot.push_figure(block, jaw, {"flat": grasp}))
     moving = plot.animate(block, jaw, grasp, friction=0.3, frames=3)
     (axes,) = moving.figure.axes
     seen = []
@@ -113,7 +129,7 @@ def test_the_trace_is_of_the_centroid():
     """Of a triangle whose body origin is its corner, the center of the area is drawn."""
     triangle = pj.Polygon([(0.0, 0.0), (0.06, 0.0), (0.0, 0.03)])
     grasp = closed(0.2, pose=(0.1, 0.2, np.pi / 2))
-    axes = plot.grasp_figure(triangle, pj.Hand.two_fingers(0.005), {"a": grasp}).axes[0]
+    axes = plot.push_figure(triangle, pj.Hand.two_fingers(0.005), {"a": grasp}).axes[0]
     (trace,) = [line.get_xydata() for line in axes.lines if line.get_label() == "centroid of the slider"]
     np.testing.assert_allclose(trace, np.broadcast_to([90, 220], (3, 2)), atol=1e-3)
     moving = plot.animate(triangle, pj.Hand.two_fingers(0.005), grasp, frames=2)

@@ -11,9 +11,8 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 
-from benchmarks.peers.figure import speed_figure
 from pushjax import plot
-from pushjax.plot.style import SERIES
+from pushjax.plot.style import BLACK, GRAY, RED, SERIES, curve_styles
 
 # Severe protanopia, deuteranopia and tritanopia on linear RGB (Machado, Oliveira & Fernandes 2009)
 BLIND = (
@@ -40,20 +39,34 @@ def seen_by(color, eyes) -> np.ndarray:
 @pytest.mark.parametrize("eyes", [np.eye(3), *BLIND], ids=["full", "protan", "deutan", "tritan"])
 def test_colors_can_be_told_apart(eyes):
     """Colors of curves differ by at least 15, those of a push's moments by 40; a difference of 2.3 is just visible."""
-    for colors, least in (([color for color, _, _ in SERIES], 15), ((plot.BLACK, plot.GRAY, plot.RED), 40)):
+    for colors, least in (([color for color, _, _ in SERIES], 15), ((BLACK, GRAY, RED), 40)):
         for a, b in itertools.combinations(colors, 2):
             assert np.linalg.norm(seen_by(a, eyes) - seen_by(b, eyes)) > least, (a, b)
 
 
 def test_moments_in_grayscale():
-    lightness = sorted(seen_by(color, np.eye(3))[0] for color in (plot.BLACK, plot.RED, plot.GRAY, "white"))
+    lightness = sorted(seen_by(color, np.eye(3))[0] for color in (BLACK, RED, GRAY, "white"))
     assert np.diff(lightness).min() > 20
+
+
+def test_curves_can_be_told_apart():
+    """Color, dash and marker differ between curves. A model has the same ones in every picture."""
+    with pytest.raises(ValueError, match="at most 6 curves can be told apart; got 7: a, b"):
+        curve_styles(dict.fromkeys("abcdefg", 0))
+    looks = [tuple(map(str, look.values())) for _, _, look in curve_styles(dict.fromkeys("abcdef", 0))]
+    for column in zip(*looks, strict=True):
+        assert len(set(column)) == 6
+    one, other = curve_styles({"quartic": 0, "ellipsoid": 0}), curve_styles({"ellipsoid": 0, "quartic": 0})
+    assert one == other[::-1]
+    assert curve_styles({"ellipsoid": 0})[0][2] == one[1][2]
+    assert curve_styles({"ellipsoid": 0, "a": 0})[0][2] == one[0][2]  # with other names, in order
 
 
 @pytest.mark.parametrize("suffix", ["png", "pdf", "svg"])
 def test_save(tmp_path, suffix):
     """Save to a new folder, with the resolution and fonts of the style, also outside of its context."""
-    figure = speed_figure({"a curve": [(2e-6, 0.01), (1e-6, 0.1)]}, 0.1)
+    figure, axes = plt.subplots(layout="constrained")
+    axes.set_title("a curve")
     path = plot.save(figure, tmp_path / "new" / f"picture.{suffix}")
     assert {"png": b"PNG", "pdf": b"%PDF", "svg": b"<svg"}[suffix] in path.read_bytes()[:800]
     assert not plt.fignum_exists(figure.number)
