@@ -133,6 +133,7 @@ def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Com
     from pushjax.cli.page import write_page
     from pushjax.experiments._cell_cache import CellCache
     from pushjax.experiments._record import write_json
+    from pushjax.experiments._report import as_text
 
     if "folder" in call.keywords:
         call.keywords["folder"] = data_folder(call.keywords["folder"])
@@ -140,13 +141,15 @@ def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Com
     with progress_bar(f"computing {title}, and compiling what was not compiled before") as progress:
         callbacks = {"progress": progress, "say": progress.say, "note": progress.note}
         record = call(**{key: each for key, each in callbacks.items() if key in experiment.run.__annotations__})
-    text = experiment.summary(record)
-    print(text)
+    report = experiment.summary(record)
+    report = [report] if isinstance(report, str) else report
+    print(as_text(report))
+    for picture in record.get("pictures", ()):
+        print(f"drew {picture}")
     json = common.json or common.out / f"{title}.json"
     write_json(record, json)
     if title != "demo":
-        figures = experiment.figures(record) if hasattr(experiment, "figures") else None
-        print(f"wrote {write_page(record, text, common.out / f'{title}.html', figures)}")
+        print(f"wrote {write_page(record, report, common.out / f'{title}.html')}")
     print(f"wrote {json}")
     CellCache.delete(title, common.out)  # what was saved in case of an interruption
 

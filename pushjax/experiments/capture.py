@@ -19,11 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.stats
+from matplotlib.figure import Figure
 
 import pushjax as pj
+from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
-from pushjax.experiments._starts import uniform_in_circle
+from pushjax.experiments._report import Table, saved, table, uniform_in_circle
 
 DISK_RADIUS, FINGER_RADIUS, FINGER_SPACING, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
 START_RADIUS = 0.0788  # m, of the circle of start centers
@@ -85,36 +87,27 @@ def run(
             (pushes, has_converged), (_, other_has_converged) = (
                 results[mu, surface_dof, second_draw] for second_draw in (False, True)
             )
-            row = {
-                "friction": mu,
-                "dof": surface_dof,
-                "converged": float(has_converged.mean()),
-                "outcomes": pushes.outcomes(),
-            }
-            row["changed_by_draw_percent"] = 100 * float(np.mean(has_converged != other_has_converged))
-            rows.append(row | {"seconds": pushes.seconds, "settled": np.flatnonzero(has_converged)})
+            rows.append(
+                {
+                    "friction": mu,
+                    "dof": surface_dof,
+                    "converged": float(has_converged.mean()),
+                    "outcomes": pushes.outcomes(),
+                    "changed_by_draw_percent": 100 * float(np.mean(has_converged != other_has_converged)),
+                    "seconds": pushes.seconds,
+                    "settled": np.flatnonzero(has_converged),
+                }
+            )
             progress(len(rows), len(friction) * len(dof))
         with_less_noise, with_more_noise = (results[mu, surface_dof, False][1] for surface_dof in dof)
         for row in rows[-2:]:
             row["difference_percent"] = 100 * abs(float(with_less_noise.mean() - with_more_noise.mean()))
             row["changed_by_noise_percent"] = 100 * float(np.mean(with_less_noise != with_more_noise))
     drawn = {surface_dof: results[friction[0], surface_dof, False] for surface_dof in dof}
-    pictures = [] if out is None else _draw(out, slider, hand, path, drawn)
-    settings = {
-        "seed": seed,
-        "steps": steps,
-        "dof": dof,
-        "friction": friction,
-        "disk_m": DISK_RADIUS,
-        "finger_m": FINGER_RADIUS,
-    }
-    settings |= {
-        "apart_m": FINGER_SPACING,
-        "travel_m": TRAVEL,
-        "circle_m": START_RADIUS,
-        "ahead_m": START_DISTANCE,
-        "near_m": CONVERGED_DISTANCE,
-    }
+    pictures = saved(out, lambda: {"capture.png": _figure(slider, hand, path, drawn)})
+    settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction}
+    settings |= {"disk_m": DISK_RADIUS, "finger_m": FINGER_RADIUS, "apart_m": FINGER_SPACING, "travel_m": TRAVEL}
+    settings |= {"circle_m": START_RADIUS, "ahead_m": START_DISTANCE, "near_m": CONVERGED_DISTANCE}
     return result_record(
         "capture",
         settings,
@@ -139,10 +132,8 @@ def converged(pushes: pj.MonteCarlo) -> np.ndarray:
     return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - resting_y) < CONVERGED_DISTANCE
 
 
-def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, results: dict[float, tuple]) -> list[str]:
-    """Draw the first friction into the folder `out` and return the path of the picture."""
-    from pushjax import plot
-
+def _figure(slider: pj.Slider, hand: pj.Hand, path: jax.Array, results: dict[float, tuple]) -> Figure:
+    """Draw the pushes of the first friction."""
     runs = {
         f"dof {surface_dof:g}: {has_converged.mean():.1%} of {len(has_converged)} converge": (
             pushes.trajectory,
@@ -151,10 +142,8 @@ def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, results:
         for surface_dof, (pushes, has_converged) in results.items()
     }
     pushes, has_converged = list(results.values())[-1]
-    figure = plot.capture_figure(
-        slider.shape, hand, np.asarray(path), runs, _density(pushes.start[has_converged, :2]), max_paths=MAX_DRAWN
-    )
-    return [str(plot.save(figure, out / "capture.png"))]
+    density = _density(pushes.start[has_converged, :2])
+    return plot.capture_figure(slider.shape, hand, np.asarray(path), runs, density, max_paths=MAX_DRAWN)
 
 
 def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray] | None:
@@ -168,19 +157,19 @@ def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.nda
     ) / 1e6
 
 
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    lines = [f"Two fingers push a disk {1e3 * TRAVEL:.1f} mm, {record['n']} start centers:"]
-    for row in record["rows"]:
-        failed = row["outcomes"]["failed"]
-        lines.append(
-            f"  friction {row['friction']:<5g} dof {row['dof']:<5g} {row['converged']:6.1%} converge; another draw "
-            f"changes {row['changed_by_draw_percent']:.1f} % of the verdicts{f'; {failed} failed' if failed else ''}"
-        )
-    for row in record["rows"][::2]:
-        lines.append(
-            f"  friction {row['friction']:g}: the convergent shares differ by {row['difference_percent']:.1f} %, "
-            f"{row['changed_by_noise_percent']:.1f} % of the single verdicts"
-        )
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    return [
+        f"Two fingers push a disk {1e3 * TRAVEL:.1f} mm, {record['n']} start centers. The last three columns: verdicts "
+        "that another sample changes, difference between the two shares, and verdicts that differ between the two dof.",
+        table(
+            record["rows"],
+            ("friction", "friction", "g"),
+            ("dof", "dof", "g"),
+            ("converge", "converged", ".1%"),
+            ("failed", lambda row: row["outcomes"]["failed"]),
+            ("by sample / %", "changed_by_draw_percent", ".1f"),
+            ("difference / %", "difference_percent", ".1f"),
+            ("by dof / %", "changed_by_noise_percent", ".1f"),
+        ),
+    ]

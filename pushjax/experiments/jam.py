@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.contact.problem import Motion
+from pushjax import plot
 from pushjax.experiments._record import result_record
+from pushjax.experiments._report import Table, saved, table
 
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
 CLOSING = 0.001  # displacement of each finger, m
@@ -80,25 +81,22 @@ def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:
         motions[name] = motion_by_friction
     drawn = [jax.tree.map(lambda leaf, k=k: leaf[k], motions["quartic"]) for k in (-2, -1)]
     verdicts = {str(mu): pj.Status(int(m.status)).name for mu, m in zip((BELOW, ABOVE), drawn, strict=True)}
-    pictures = [] if out is None else _draw(out, block, drawn)
+    panels = [(contacts(mu), motion) for mu, motion in zip((BELOW, ABOVE), drawn, strict=True)]
+    pictures = saved(out, lambda: {"jam.png": plot.jam_figure(block, panels)})
     settings = {"seed": seed, "half_width_m": HALF_WIDTH, "half_offset_m": HALF_OFFSET, "closing_m": CLOSING}
     return result_record("jam", settings, rows=rows, verdicts=verdicts, pictures=pictures)
 
 
-def _draw(out: Path, block: pj.Polygon, motions: list[Motion]) -> list[str]:
-    """Draw the two frictions into the folder `out` and return the path of the picture."""
-    from pushjax import plot
-
-    panels = [(contacts(mu), motion) for mu, motion in zip((BELOW, ABOVE), motions, strict=True)]
-    return [str(plot.save(plot.jam_figure(block, panels), out / "jam.png"))]
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    lines = [f"Two fingers close on opposite faces, offset: statics says they jam from mu = {threshold():.4f}."]
-    for row in record["rows"]:
-        jams = "never jams" if row["jams_from"] is None else f"jams from {row['jams_from']:.4f}"
-        lines.append(f"  {row['model']:10} moves up to mu = {row['last_moving']:.4f}, {jams}")
-    lines += [f"  mu = {mu}: {status}" for mu, status in record["verdicts"].items()]
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    verdicts = [{"friction": mu, "status": status} for mu, status in record["verdicts"].items()]
+    return [
+        f"Two fingers close on opposite faces, offset: statics says they jam from a friction of {threshold():.4f}.",
+        table(
+            record["rows"],
+            ("surface", "model"),
+            ("moves up to", "last_moving", ".4f"),
+            ("jams from", "jams_from", ".4f"),
+        ),
+        table(verdicts, ("friction", "friction"), ("status", "status")),
+    ]

@@ -1,0 +1,67 @@
+"""What experiments share: random start positions, saved pictures, and the text of a report."""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich import box
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from pushjax import plot
+
+
+class Table(NamedTuple):
+    """A table of texts."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+class Column(NamedTuple):
+    """A column of a table."""
+
+    head: str
+    value: str | Callable[[dict[str, Any]], Any]  # key of a row, or function of a row
+    form: str = ""  # format of the value
+
+
+def table(rows: Sequence[dict[str, Any]], *columns: tuple[Any, ...]) -> Table:
+    """Return the table of records, from the fields of `Column`; "-" stands for None."""
+
+    def text(row: dict[str, Any], column: Column) -> str:
+        value = row[column.value] if isinstance(column.value, str) else column.value(row)
+        return "-" if value is None else format(value, column.form)
+
+    each = [Column(*column) for column in columns]
+    return Table([column.head for column in each], [[text(row, column) for column in each] for row in rows])
+
+
+def as_text(parts: Sequence[str | Table]) -> str:
+    """Return the paragraphs and tables of a report as text."""
+    console = Console(file=io.StringIO(), width=1000, color_system=None, markup=False, highlight=False, emoji=False)
+    for part in parts:
+        if isinstance(part, str):
+            console.print(part)
+            continue
+        drawn = RichTable(*part.heads, box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False)
+        for k, column in enumerate(drawn.columns):
+            column.justify = "left" if k == 0 else "right"
+        for row in part.rows:
+            drawn.add_row(*row)
+        console.print(drawn)
+    return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
+
+
+def saved(out: Path | None, figures: Callable[[], Mapping[str, Figure]]) -> list[str]:
+    """Draw figures, by the names of their files, into the folder `out`, if there is one, and return their paths."""
+    return [] if out is None else [str(plot.save(figure, out / name)) for name, figure in figures().items()]
+
+
+def uniform_in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:
+    """Sample points (n, 2) uniformly in a circle about the origin, m."""
+    distance, angle = radius * np.sqrt(rng.uniform(size=n)), rng.uniform(0, 2 * np.pi, n)
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)
