@@ -1,5 +1,7 @@
 """Random friction: moments, convexity and its certificate, derivatives, keys, bad input."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,6 @@ import scipy.stats
 
 import pushjax as pj
 from pushjax._math.vec import Vec3
-from pushjax._math.wishart import sample_wishart
 from pushjax.friction.convexity import Gram, antisymmetric_of, coefficients_of, max_feasible_scale
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.quartic import MONOMIALS, least_curvature
@@ -17,6 +18,8 @@ from pushjax.friction.sum_of_squares import decompose, squared_quadratics
 from pushjax.testing.convexity import least_curvatures
 
 DRAWS = 20_000
+# the programs of one dtype see nearly all that those of the other see
+DTYPES = pytest.mark.parametrize("dtype", [pytest.param("float32", marks=pytest.mark.slow), "float64"])
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +41,26 @@ def convex(coefficients: np.ndarray, loose: float = 1e-9) -> np.ndarray:
     return np.array([least_curvature(c / np.abs(c).max()) >= -loose for c in coefficients])
 
 
+around = jax.jit(lambda model, surface: model.around(surface))
+
+
 @jax.jit
-def _sampled(model, surface, keys):
-    drawn = jax.vmap(model.around(surface).sample)(keys)
-    return drawn.surface.coefficients, drawn.shrinkage
+@functools.partial(jax.vmap, in_axes=(None, 0))
+def draw(distribution, key):
+    drawn = distribution.sample(key)
+    return drawn.surface.coefficients, drawn.shrinkage, drawn.surface.is_valid()
 
 
 def sampled(model, surface, keys=None):
-    """Return coefficients and shrinkage of `DRAWS` samples, all computed by one program."""
+    """Return coefficients and shrinkage of `DRAWS` samples, and whether they are valid, all by the same programs."""
     keys = jax.random.split(jax.random.key(1), DRAWS) if keys is None else keys
-    return tuple(np.asarray(x, float) for x in _sampled(model, surface, keys))
+    coefficients, shrinkage, valid = draw(around(model, surface), keys)
+    return np.asarray(coefficients, float), np.asarray(shrinkage, float), np.asarray(valid)
+
+
+def with_coefficients(surface, coefficients):
+    """Return the quartic with coefficients that are checked no more than traced ones."""
+    return eqx.tree_at(lambda s: s.coefficients, surface, jnp.asarray(coefficients, surface.length.dtype))
 
 
 def test_a_gram_matrix_is_one(quartic, rng):
@@ -73,7 +86,7 @@ def test_a_gram_matrix_is_one(quartic, rng):
 @pytest.mark.slow
 def test_certificate_agrees_with_the_sweep(quartic):
     """The certificate agrees with the sweep on Wishart samples before repair, and on the repaired quartics."""
-    c, pull = sampled(FrictionModel(dof=12, friction=0.3), quartic)
+    c, pull, _ = sampled(FrictionModel(dof=12, friction=0.3), quartic)
     c, pull = c[:400], pull[:400, None]
     raw = (c - pull * np.asarray(quartic.coefficients)) / (1 - pull)
     curvature = np.array([least_curvature(x) for x in raw])
@@ -87,10 +100,10 @@ def test_certificate_agrees_with_the_sweep(quartic):
 @pytest.mark.parametrize(
     ("sampler", "dtype"),
     [
-        ("gram", "float32"),
+        pytest.param("gram", "float32", marks=pytest.mark.slow),
         pytest.param("gram", "float64", marks=pytest.mark.long),
         ("sum_of_squares", "float32"),
-        ("sum_of_squares", "float64"),
+        pytest.param("sum_of_squares", "float64", marks=pytest.mark.slow),
     ],
 )
 def test_samples_are_convex_around_their_mean(quartic, sampler, dtype):
@@ -99,7 +112,7 @@ def test_samples_are_convex_around_their_mean(quartic, sampler, dtype):
     rays = np.random.default_rng(0).normal(size=(1000, 3))
     products = np.prod(rays[:, None] ** MONOMIALS, axis=2)
     for dof in (10, 20, 50, 250):
-        c, pull = sampled(FrictionModel(dof=np.float32(dof), friction=0.3, sampler=sampler), surface)
+        c, pull, _ = sampled(FrictionModel(dof=np.float32(dof), friction=0.3, sampler=sampler), surface)
         # in float32 a coefficient is rounded, which also moves the boundary of convexity
         assert np.all(least_curvatures(c[:5000]) >= (-1e-9 if dtype == "float64" else -3e-7))
         raw = (c - pull[:, None] * mean) / (1 - pull[:, None])
@@ -135,23 +148,55 @@ def test_moments_of_the_ellipsoid(rng):
 
 @pytest.mark.slow
 def test_a_mean_that_is_only_just_convex(tripod):
-    c, pull = sampled(FrictionModel(dof=20, friction=0.3), tripod)
+    c, pull, _ = sampled(FrictionModel(dof=20, friction=0.3), tripod)
     assert np.all(convex(c[:300]))
     assert np.mean(pull > 0) > 0.02
     assert np.all(pull <= 1)
 
 
-def test_a_quartic_on_the_border():
+def test_decomposition_of_a_quartic_on_the_border():
     """x^4 + y^4 + z^4 has many flat places: any further and it is not convex."""
-    surface = pj.Quartic([1.0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0], 0.03)
-    found = decompose(surface.coefficients)
-    np.testing.assert_allclose(
-        squared_quadratics(found.lower @ jnp.swapaxes(found.lower, 1, 2)), surface.coefficients, atol=2 * found.error
+    c = jnp.array([1.0, 1, 1] + [0.0] * 12)
+    lower, error = jax.jit(decompose)(c)
+    np.testing.assert_allclose(squared_quadratics(lower @ jnp.swapaxes(lower, 1, 2)), c, atol=2 * error)
+
+
+@DTYPES
+def test_samples_around_means_on_the_border_are_convex(quartic, dtype):
+    """They are pulled toward a quartic that is convex up to roundoff, although the mean has no curvature somewhere."""
+    surface = jax.tree.map(lambda leaf: leaf.astype(dtype), quartic)
+    for c in ([1.0, 1, 0], [1.0, 1, 1], [0, 0, 1.0]):
+        mean = with_coefficients(surface, [*c, *[0.0] * 12])
+        coefficients, pull, _ = sampled(FrictionModel(dof=np.float32(20), friction=0.3), mean)
+        assert np.all(np.isfinite(coefficients))
+        assert np.all(pull <= 1)
+        assert np.all(least_curvatures(coefficients[:300]) >= (-1e-9 if dtype == "float64" else -3e-7))
+
+
+def test_means_without_a_gram_matrix_and_too_few_degrees_of_freedom_give_invalid_steps(quartic):
+    """They can only be traced. No surface is sampled that is not convex without a sign of it."""
+    model = FrictionModel(dof=np.float32(20), friction=0.3)
+    flat = [1e-9, 1e-9, 1e-9, 1.0, *np.zeros(11)]
+    for c in (flat, -np.asarray(quartic.coefficients), np.full(15, np.nan), np.zeros(15)):
+        coefficients, _, valid = sampled(model, with_coefficients(quartic, c))
+        assert np.all(np.isnan(coefficients))
+        assert not valid.any()
+    for dof, enough in ((4.0, False), (5.0, False), (9.0, True)):
+        few = eqx.tree_at(lambda m: m.dof, model, jnp.float32(dof))
+        coefficients, _, valid = sampled(few, quartic)
+        assert np.all(np.isfinite(coefficients) == enough)
+        assert np.all(valid == enough)
+
+
+def test_a_sample_beyond_the_search_is_the_mean(quartic):
+    """A sample so far from convex that no candidate of the search is feasible is replaced, and says so."""
+    distribution = around(FrictionModel(dof=np.float32(20), friction=0.3), quartic)
+    far = eqx.tree_at(
+        lambda d: (d.factor, d.loading), distribution, (0 * distribution.factor, 0 * distribution.loading - 1e9)
     )
-    c, pull = sampled(FrictionModel(dof=20, friction=0.3), surface)
-    assert np.all(np.isfinite(c))
-    assert np.all(pull <= 1)
-    assert np.all(convex(c[:100], 1e-6))
+    coefficients, shrinkage, _ = draw(far, jax.random.split(jax.random.key(0), DRAWS))
+    assert np.all(shrinkage == 1)
+    np.testing.assert_allclose(coefficients[0], quartic.coefficients, atol=1e-5)
 
 
 def test_derivative_by_dof_is_that_of_the_quantile():
@@ -207,22 +252,21 @@ def test_derivatives(quartic, sampler, dtype):
 
 def test_keys(quartic):
     """The same key gives the same bits, also in another batch."""
-    model = FrictionModel(dof=20, friction=(0.15, 0.35))
+    model = FrictionModel(dof=np.float32(20), friction=(0.15, 0.35))
     keys = jax.random.split(jax.random.key(0), DRAWS)
     many, again, back = (sampled(model, quartic, k)[0] for k in (keys, keys, keys[::-1]))
     np.testing.assert_array_equal(many, again)
     np.testing.assert_array_equal(many, back[::-1])
     surface = pj.Ellipsoid(np.diag([1.0, 2.0, 3.0]), 0.03)
-    drawn = jax.jit(jax.vmap(lambda k: model.sample(k, surface)))
-    a, mu = drawn(keys[:5])
+    a, mu = jax.jit(jax.vmap(lambda k: model.sample(k, surface)))(keys[:5])
     assert len(np.unique(np.asarray(mu))) == 5
     assert np.all((np.asarray(mu) >= 0.15) & (np.asarray(mu) <= 0.35))
-    one, its = model.sample(keys[2], surface)
+    # the sampled surface is that of `around` for the first half of the key
+    alone = jax.jit(lambda k: (model.sample(k, surface), model.around(surface).sample(jax.random.split(k)[0]).surface))
+    (one, its), same = alone(keys[2])
     np.testing.assert_allclose(one.A, a.A[2], rtol=1e-12)
     np.testing.assert_allclose(its, mu[2], rtol=1e-12)
-    # the sampled surface is that of `around` for the first half of the key
-    first, _ = jax.random.split(keys[2])
-    np.testing.assert_allclose(model.around(surface).sample(first).surface.A, one.A, rtol=1e-12)
+    np.testing.assert_allclose(same.A, one.A, rtol=1e-12)
 
 
 def test_nothing_random():
@@ -275,18 +319,22 @@ def test_largest_share_of_itself(quartic):
     assert float(again.scale) == pytest.approx(1.0, abs=1e-5)
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@DTYPES
 def test_the_largest_scale_is_that_of_an_eigenvalue(dtype, rng):
-    """It is proved by the Gram matrix, of one example and of batches in batches; minus infinity if there is none."""
+    """It is proved by the Gram matrix, in batches of batches; minus infinity if there is none."""
     c = np.array([1, 1, 1, 0, 0, 0, 0, 0, 0, 2, 2, 2, 0, 0, 0.0]) + 0.4 * rng.normal(size=(2, 150, 15))
     c[0, 0] = 1e9 * c[0, 0] * (-1) ** np.arange(15)
     c, ball = jnp.asarray(c, dtype), jnp.array([0.2, 0.2, 0.2, 0, 0, 0], dtype)
     tolerance = 1e-6 if dtype == "float64" else 1e-3  # less is roundoff
 
+    @jax.jit
     def search(c, enough=np.inf):
-        return max_feasible_scale(Gram.of(c, ball), Gram.identity(dtype), enough=enough, tolerance=tolerance)
+        def one(c):
+            return max_feasible_scale(Gram.of(c, ball), Gram.identity(dtype), enough=enough, tolerance=tolerance)
 
-    found = jax.jit(jax.vmap(jax.vmap(search)))(c)
+        return jax.vmap(jax.vmap(one))(c)
+
+    found = search(c)
     assert found.scale.dtype == found.change.dtype == dtype
     assert found.scale[0, 0] == -np.inf
     assert not found.converged[0, 0]
@@ -299,61 +347,8 @@ def test_the_largest_scale_is_that_of_an_eigenvalue(dtype, rng):
         six, three = np.asarray(gram.symmetric) / np.outer(root, root), np.asarray(gram.antisymmetric) / 2
         least = min(np.linalg.eigvalsh(six)[0], np.linalg.eigvalsh(three)[0])
         assert scale[k] - 1e-6 < least < scale[k] + tolerance
-    one = jax.jit(search)(c[1, 3])
-    np.testing.assert_allclose(one.scale, found.scale[1, 3], atol=2 * tolerance)
     # where zero is enough, the search stops at once or as soon as it is reached
-    stopped = jax.jit(jax.vmap(lambda c: search(c, 0.0)))(c[1])
-    np.testing.assert_array_equal(stopped.scale >= 0, found.scale[1] >= 0)
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_samples_around_means_on_the_border_are_convex(dtype):
-    """They are pulled toward a quartic that is convex up to roundoff, although the mean has no curvature somewhere."""
-    for c in ([1.0, 1, 0], [1.0, 1, 1], [0, 0, 1.0]):
-        c = jnp.asarray([*c] + [0.0] * 12, dtype)
-        around = jax.jit(
-            lambda c: FrictionModel(dof=20, friction=0.3).around(pj.Quartic(c, np.asarray(0.03, c.dtype)))
-        )(c)
-        drawn = jax.jit(jax.vmap(around.sample))(jax.random.split(jax.random.key(0), 300))
-        assert np.all(np.isfinite(drawn.surface.coefficients))
-        assert np.all(drawn.shrinkage <= 1)
-        coefficients = np.asarray(drawn.surface.coefficients, float)
-        assert np.all(least_curvatures(coefficients) >= (-1e-9 if dtype == "float64" else -3e-7))
-
-
-def test_a_mean_without_a_gram_matrix_gives_invalid_steps(quartic):
-    """It can only be traced. No surface is sampled that is not convex without a sign of it."""
-    c = np.array([1e-9, 1e-9, 1e-9, 1.0, *np.zeros(11)])
-
-    @jax.jit
-    def sample(c):
-        return jax.vmap(FrictionModel(dof=20, friction=0.3).around(pj.Quartic(c, 0.03)).sample)(
-            jax.random.split(jax.random.key(0), 20)
-        )
-
-    for bad in (c, -np.asarray(quartic.coefficients), np.full(15, np.nan), 0 * c):
-        drawn = sample(bad).surface
-        assert np.all(np.isnan(drawn.coefficients))
-        assert not np.any(jax.vmap(lambda surface: surface.is_valid())(drawn))
-    assert np.all(np.isfinite(sample(quartic.coefficients).surface.coefficients))
-
-
-def test_a_sample_beyond_the_search_is_the_mean(quartic):
-    """A sample so far from convex that no candidate of the search is feasible is replaced, and says so."""
-    distribution = FrictionModel(dof=20, friction=0.3).around(quartic)
-    far = eqx.tree_at(lambda d: (d.factor, d.loading), distribution, (0 * distribution.factor, jnp.asarray(-1e9)))
-    drawn = jax.jit(lambda key: far.sample(key))(jax.random.key(0))
-    assert drawn.shrinkage == 1
-    np.testing.assert_allclose(drawn.surface.coefficients, quartic.coefficients, atol=1e-5)
-
-
-@pytest.mark.parametrize(("size", "few", "enough"), [(3, [-3.0, 0.0, 1.0, 2.0], [2.1, 20.0]), (6, [4.0, 5.0], [5.1])])
-def test_a_wishart_matrix_of_too_few_degrees_of_freedom_is_nan(size, few, enough):
-    drawn = jax.jit(jax.vmap(lambda dof: sample_wishart(jax.random.key(3), jnp.eye(size), dof)))
-    for row in drawn(jnp.array(few)):
-        assert np.isnan(row).all()
-    for row in drawn(jnp.array(enough)):
-        assert np.isfinite(row).all()
+    np.testing.assert_array_equal(search(c, 0.0).scale >= 0, found.scale >= 0)
 
 
 def test_traced_degrees_of_freedom_that_are_too_few_give_invalid_steps():
