@@ -8,11 +8,12 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from pushjax import plot
 from pushjax.experiments._record import result_record
+from pushjax.experiments._report import Table, saved, table
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
 START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100
-MOTION_CONE = "motion_cone.png"
 
 
 def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lambda words: None) -> dict[str, Any]:
@@ -40,7 +41,7 @@ def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lam
         say(f"demo: fitting the {name}, then pushing with it (the first time this compiles)")
         surface, fit = pj.fit_limit_surface(*pairs, degree=degree, report=True)
         push = pj.rollout(pj.Slider(block, surface), hand, path, pose=start, friction=FRICTION)
-        surfaces[name], pushes[name] = surface, (push, path)
+        surfaces[name], pushes[name] = surface, push
         rows.append(
             {
                 "model": name,
@@ -51,9 +52,16 @@ def run(seed: int = 0, out: Path | None = None, say: Callable[[str], None] = lam
                 "first_failure": int(push.first_failure),
             }
         )
-    apart = pj.deviation(pushes["ellipsoid"][0].pose[-1], pushes["quartic"][0].pose[-1], pairs.length)
+    apart = pj.deviation(pushes["ellipsoid"].pose[-1], pushes["quartic"].pose[-1], pairs.length)
     say("demo: drawing")
-    pictures = [] if out is None else _draw(out, key, block, support, pairs, surfaces, pushes)
+    pictures = saved(
+        out,
+        lambda: {
+            "limit_surfaces.png": plot.limit_surfaces(surfaces, pairs, float(support.load)),
+            "motion_cone.png": plot.motion_cone_figure(*motion_cone_setup(key)),
+            "push.png": plot.push_figure(block, hand, pushes),
+        },
+    )
     settings = {"seed": seed, "side_m": SIDE, "radius_m": RADIUS, "friction": FRICTION, "steps": STEPS, "pairs": 400}
     return result_record("demo", settings, rows=rows, apart_mm=1e3 * float(apart), pictures=pictures)
 
@@ -85,29 +93,19 @@ def motion_cone_setup(key: jax.Array):
     return block, support, surface, contacts, pj.solve_contacts(surface, contacts)
 
 
-def _draw(out: Path, key, block, support, pairs, surfaces, pushes) -> list[str]:
-    """Draw the three pictures into the folder `out` and return their paths."""
-    from pushjax import plot
-
-    drawn = {
-        "limit_surfaces.png": plot.limit_surfaces(surfaces, pairs, float(support.load)),
-        MOTION_CONE: plot.motion_cone_figure(*motion_cone_setup(key)),
-        "push.png": plot.push_figure(block, pushes, RADIUS),
-    }
-    return [str(plot.save(figure, out / name)) for name, figure in drawn.items()]
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    lines = ["A 90 mm square, 64 support points, pushed 18 mm off center over 50 mm (mu = 0.25):"]
-    for row in record["rows"]:
-        x, y, theta = np.asarray(row["pose"], float)
-        modes = ", ".join(f"{count} {name.lower()}" for name, count in row["modes"].items())
-        lines.append(
-            f"  {row['model']:<10} mean error of twists {row['fit_angle_deg']:.1f} deg   ends at x = {1e3 * x:.2f} mm, "
-            f"y = {1e3 * y:.2f} mm, theta = {np.degrees(theta):.2f} deg   steps: {modes}"
-        )
-    lines.append(f"  the two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration)")
-    note = " (the paper's figure 2, with 100 support points)"
-    lines += [f"  drew {path}{note if Path(path).name == MOTION_CONE else ''}" for path in record["pictures"]]
-    return "\n".join(lines)
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    return [
+        f"A 90 mm square, 64 support points, pushed 18 mm off center over 50 mm, friction {FRICTION}:",
+        table(
+            record["rows"],
+            ("surface", "model"),
+            ("mean error of twists / °", "fit_angle_deg", ".1f"),
+            ("x / mm", lambda row: 1e3 * row["pose"][0], ".2f"),
+            ("y / mm", lambda row: 1e3 * row["pose"][1], ".2f"),
+            ("angle / °", lambda row: np.degrees(row["pose"][2]), ".2f"),
+            ("steps", lambda row: ", ".join(f"{count} {mode.lower()}" for mode, count in row["modes"].items())),
+        ),
+        f"The two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration).",
+        "motion_cone.png is the paper's figure 2, with 100 support points." if record["pictures"] else "",
+    ]

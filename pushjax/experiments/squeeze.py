@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax import plot
 from pushjax.experiments._record import result_record
+from pushjax.experiments._report import Table, saved, table
 
 WIDTH, HEIGHT = 0.050, 0.035  # m, of the rectangle
 FRICTION = 0.2
@@ -58,7 +60,7 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
         grasp = jax.tree.map(lambda leaf, k=k: leaf[k], grasps)
         rows.append({"name": name, "start": start, "pose": grasp.pose[-1]} | outcome(grasp))
         drawn[name] = grasp
-    pictures = [] if out is None else _draw(out, block, hand, drawn)
+    pictures = saved(out, lambda: {"squeeze.png": plot.push_figure(block, hand, drawn, friction=FRICTION)})
     settings = {"seed": seed, "steps": steps, "friction": FRICTION, "slider_m": (WIDTH, HEIGHT)}
     settings |= {"pad_m": (PAD, THICKNESS), "opening_m": (OPENING, CLOSED)}
     return result_record("squeeze", settings, rows=rows, pictures=pictures)
@@ -81,21 +83,17 @@ def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
     }
 
 
-def _draw(out: Path, block: pj.Polygon, hand: pj.Hand, grasps: dict[str, pj.Trajectory]) -> list[str]:
-    """Draw the four closings into the folder `out` and return the path of the picture."""
-    from pushjax import plot
-
-    return [str(plot.save(plot.grasp_figure(block, hand, grasps, friction=FRICTION), out / "squeeze.png"))]
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    lines = [f"A jaw with {1e3 * PAD:.0f} mm pads closes on a 50 x 35 mm rectangle (mu = {FRICTION}):"]
-    for row in record["rows"]:
-        x, y, theta = np.asarray(row["pose"], float)
-        lines.append(
-            f"  {row['name']:30} {row['outcome']:12} x = {1e3 * x:6.2f} mm, y = {1e3 * y:5.2f} mm, theta = "
-            f"{np.degrees(theta):6.2f} deg, opening {row['opening_mm']:5.2f} mm"
-        )
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    return [
+        f"A jaw with {1e3 * PAD:.0f} mm pads closes on a 50 x 35 mm rectangle, friction {FRICTION}:",
+        table(
+            record["rows"],
+            ("start that ends", "name"),
+            ("outcome", "outcome"),
+            ("x / mm", lambda row: 1e3 * row["pose"][0], ".2f"),
+            ("y / mm", lambda row: 1e3 * row["pose"][1], ".2f"),
+            ("angle / °", lambda row: np.degrees(row["pose"][2]), ".2f"),
+            ("opening / mm", "opening_mm", ".2f"),
+        ),
+    ]

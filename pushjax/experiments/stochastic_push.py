@@ -14,12 +14,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
+from matplotlib.figure import Figure
 
 import pushjax as pj
+from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
+from pushjax.experiments._report import Table, saved, table
+from pushjax.plot.style import STYLE
 from pushjax.simulation.monte_carlo_result import COORDINATES
 from pushjax.testing.convexity import least_curvatures
 
@@ -89,12 +94,15 @@ def run(
     first_run = pj.monte_carlo(*arguments, **options, progress=progress)  # includes compiling
     pushes = pj.monte_carlo(*arguments, **options)
     delta = np.asarray(pushes.delta, np.float64)
-    pictures = []
-    if out is not None:
-        options["trajectories"] = True
+
+    def figures() -> dict[str, Figure]:
         # with the same key, fewer pushes are the first ones
-        drawn = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **options)
-        pictures = _draw(out, slider, hand, path, pushes, drawn.trajectory)
+        shown = {**options, "trajectories": True}
+        drawn = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **shown)
+        title = f"{n} pushes" + ("" if all_plotted else f", {MAX_PLOTTED} drawn")
+        cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), drawn.trajectory, title)
+        return {"stochastic_push.png": cloud, "stochastic_push_histograms.png": _histograms(pushes)}
+
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction, "side_m": SIDE, "radius_m": RADIUS}
     settings |= {"along_m": ALONG, "travel_m": TRAVEL, "support_points": SUPPORT_POINTS, "pairs": PAIRS}
     return result_record(
@@ -109,18 +117,18 @@ def run(
         outcomes=pushes.outcomes(),
         run_s=pushes.seconds,
         compile_s=first_run.seconds - pushes.seconds,
-        pictures=pictures,
+        pictures=saved(out, figures),
     )
 
 
 def _describe_coordinate(values: np.ndarray) -> dict[str, Any]:
     """Return the moments, the histogram and a test of normality of one coordinate (n,) of the displacement."""
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS)
-    description: dict[str, Any] = {"mean": values.mean(), "std": values.std(ddof=1), "edges": edges, "counts": counts}
     test = scipy.stats.normaltest(values)
     normality = {"skewness": scipy.stats.skew(values), "excess_kurtosis": scipy.stats.kurtosis(values)}
-    description["normality"] = normality | {"statistic": test.statistic, "p_value": test.pvalue}
-    return {name: float(v) if np.ndim(v) == 0 and not isinstance(v, dict) else v for name, v in description.items()}
+    normality |= {"statistic": test.statistic, "p_value": test.pvalue}
+    moments = {"mean": values.mean(), "std": values.std(ddof=1)}
+    return moments | {"edges": edges, "counts": counts, "normality": normality}
 
 
 def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -> np.ndarray:
@@ -137,48 +145,38 @@ def _curvatures(key: jax.Array, model: pj.FrictionModel, surface: Any, n: int) -
     return np.concatenate(curvatures)
 
 
-def _draw(out: Path, slider: pj.Slider, hand: pj.Hand, path: jax.Array, pushes: pj.MonteCarlo, trajectory) -> list[str]:
-    """Draw the pushes and the histograms into the folder `out` and return the paths of the pictures."""
-    import matplotlib.pyplot as plt
-
-    from pushjax import plot
-
-    title = f"{len(pushes)} pushes" + (f", {len(trajectory)} drawn" if len(trajectory) < len(pushes) else "")
-    cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), trajectory, title)
-    with plt.rc_context(plot.STYLE):
-        histograms, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
+def _histograms(pushes: pj.MonteCarlo) -> Figure:
+    """Draw the histogram of each coordinate of the displacement, with the Gaussian of the same moments."""
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, 3, figsize=(10.5, 3.0), layout="constrained")
         for k, (axes, name) in enumerate(zip(panels, COORDINATES, strict=True)):
             scale, label = LABELS[name]
             values = scale * np.asarray(pushes.delta[:, k], np.float64)
-            test = scipy.stats.normaltest(values)
             gaussian = values.mean(), values.std(ddof=1)
             plot.histogram_panel(axes, pushes.histogram(values, HISTOGRAM_BINS), label, gaussian=gaussian)
-            unit = label.split(" / ")[1]
-            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f} {unit}; normal: p = {test.pvalue:.1g}")
+            p = scipy.stats.normaltest(values).pvalue
+            axes.set_title(f"{gaussian[0]:.2f} ± {gaussian[1]:.2f} {label.split(' / ')[1]}; normal: p = {p:.1g}")
         panels[0].legend()
-        pictures = (cloud, "stochastic_push.png"), (histograms, "stochastic_push_histograms.png")
-        return [str(plot.save(figure, out / name)) for figure, name in pictures]
+        return figure
 
 
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    settings, delta = record["settings"], record["delta"]
-    lines = [
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    settings, failed = record["settings"], record["outcomes"]["failed"]
+    rows = [record["delta"][name] | {"scale": scale, "label": label} for name, (scale, label) in LABELS.items()]
+    return [
         f"{record['n']} pushes of a 90 mm square over {1e3 * TRAVEL:.0f} mm, dof {settings['dof']:g}, friction "
-        f"{settings['friction'][0]:g} to {settings['friction'][1]:g}:"
+        f"{settings['friction'][0]:g} to {settings['friction'][1]:g}:",
+        table(
+            rows,
+            ("motion", "label"),
+            ("mean", lambda row: row["scale"] * row["mean"], ".2f"),
+            ("deviation", lambda row: row["scale"] * row["std"], ".2f"),
+            ("skewness", lambda row: row["normality"]["skewness"], ".2f"),
+            ("excess kurtosis", lambda row: row["normality"]["excess_kurtosis"], ".2f"),
+            ("normal: p", lambda row: row["normality"]["p_value"], ".2g"),
+        ),
+        f"Surfaces: {record['nonconvex']} not convex by an independent sweep, {record['repaired']:.1%} had been "
+        f"repaired{f'; {failed} pushes failed' if failed else ''}.",
+        f"Ran in {record['run_s']:.2f} s, after {record['compile_s']:.1f} s of compiling.",
     ]
-    for name, (scale, label) in LABELS.items():
-        row = delta[name]
-        test = row["normality"]
-        lines.append(
-            f"  {label:9} {scale * row['mean']:8.2f} ± {scale * row['std']:.2f}   skewness {test['skewness']:5.2f},"
-            f" excess kurtosis {test['excess_kurtosis']:5.2f}, normal: p = {test['p_value']:.2g}"
-        )
-    failed = record["outcomes"]["failed"]
-    lines.append(
-        f"  surfaces: {record['nonconvex']} not convex by an independent sweep, {record['repaired']:.1%} had been "
-        f"repaired{f'; {failed} pushes failed' if failed else ''}"
-    )
-    lines.append(f"  ran in {record['run_s']:.2f} s, after {record['compile_s']:.1f} s of compiling")
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
