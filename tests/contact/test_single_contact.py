@@ -404,6 +404,25 @@ def test_derivatives_match_central_differences(smooth, rng):
     assert np.abs(forward[alone & ~sticks]).max(axis=1).min() > 1e-3
 
 
+def test_the_motion_is_continuous_across_sticking_and_its_derivative_jumps():
+    """By friction: twist and wrench are continuous, and constant once the contact sticks."""
+    p = stacked([base(4)._replace(displacement=np.array([1e-3, 8e-4]))] * 101)
+    along = Problem(*(0 * a for a in p[:-1]), None)._replace(friction=np.ones(101))
+    weights = tuple(np.ones((101, size)) for size in (3, 3, 2))
+    low, high = 0.0, 3.0  # slides, sticks
+    for _ in range(6):  # refine the interval in which the mode changes
+        mu = np.linspace(low, high, 101)
+        motion, slope, _ = solve(p._replace(friction=mu), along, weights)
+        change = int(np.argmax(motion.mode[:, 0] == ContactMode.STICKING))
+        low, high = mu[change - 1], mu[change]
+    assert high - low < 1e-11
+    assert motion.mode[change - 1, 0] == ContactMode.SLIDING_LEFT
+    value, slope = scaled((motion.twist, motion.wrench, motion.force[:, 0]), p)[:, :6], scaled(slope, p)[:, :6]
+    np.testing.assert_allclose(value[change - 1], value[change], rtol=0, atol=1e-9)
+    assert np.all(slope[change:] == 0)
+    assert np.abs(slope[change - 1]).max() > 0.1
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("smooth", [4], indirect=True, ids=["quartic"])
 def test_second_derivatives_while_sticking(smooth, rng):
