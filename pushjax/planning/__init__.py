@@ -1,16 +1,11 @@
 """Plans of pushes and grasps that reach a goal, also where friction is not known."""
 
-from pushjax.planning.costs import Clearance as Clearance
 from pushjax.planning.costs import Cost as Cost
 from pushjax.planning.costs import CVaR as CVaR
 from pushjax.planning.costs import FinalPose as FinalPose
 from pushjax.planning.costs import Mean as Mean
 from pushjax.planning.costs import Missed as Missed
 from pushjax.planning.costs import Risk as Risk
-from pushjax.planning.costs import Travel as Travel
-from pushjax.planning.costs import WayPoints as WayPoints
-from pushjax.planning.costs import Work as Work
-from pushjax.planning.costs import Worst as Worst
 from pushjax.planning.feedback.controller import Observation as Observation
 from pushjax.planning.feedback.controller import PushController as PushController
 from pushjax.planning.feedback.coverage_table import CoverageTable as CoverageTable
@@ -33,9 +28,7 @@ from pushjax.planning.open_loop.push_problem import Outcomes as Outcomes
 from pushjax.planning.open_loop.push_problem import push_outcomes as push_outcomes
 from pushjax.planning.open_loop.push_sequence import PushSequence as PushSequence
 from pushjax.planning.pace import Pace as Pace
-from pushjax.planning.search import MPPI as MPPI
 from pushjax.planning.search import CrossEntropy as CrossEntropy
-from pushjax.planning.search import GradientRefinement as GradientRefinement
 from pushjax.planning.search import Search as Search
 from pushjax.planning.search import Selection as Selection
 from pushjax.planning.squeezes.plan_squeezes import SqueezeOutcomes as SqueezeOutcomes

@@ -2,7 +2,7 @@
 
 A `Cost` is a function of a `Trajectory`. Costs add up and are multiplied by numbers:
 
-    cost = FinalPose(goal) + 0.1 * Travel() + 50.0 * Clearance(shape, fixtures, 0.01)
+    cost = Missed(goal, width=0.5) + 0.001 * FinalPose(goal)
 
 A plan of several pushes is a trajectory with a leading axis of pushes, and every cost takes it as it is. A cost is a
 pure function, and its derivatives are finite wherever those of the trajectory are.
@@ -21,16 +21,13 @@ from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, checked_array
 from pushjax._internal.xla import smallest
-from pushjax._math.vec import Vec2, norm
+from pushjax._math.vec import Vec2
 from pushjax.geometry import se2
-from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.shape import Shape
 from pushjax.planning.goal import Goal
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.trajectory import Trajectory
-
-OUTLINE_POINTS = 48  # points on an outline whose distances from fixtures are measured, besides its corners
 
 
 class Cost(eqx.Module):
@@ -107,81 +104,6 @@ class Missed(Cost):
         return jnp.where(smooth, transition, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))
 
 
-class WayPoints(Cost):
-    """Sum of the squared errors from several goals on the way, each at the pose where this error is least.
-
-    Attributes:
-        goals: The goals, in any order.
-    """
-
-    goals: tuple[Goal, ...]
-
-    def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        poses = _poses(push)
-        nearest = [smallest(goal.squared_error(poses)) for goal in self.goals]
-        return sum(nearest, jnp.zeros((), poses.dtype))
-
-
-class Travel(Cost):
-    """Length of the hand's path, m: of the first two numbers of its configuration. Transits are not counted."""
-
-    def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        return jnp.sum(norm(jnp.diff(push.configuration[..., :2], axis=-2)))
-
-
-class Work(Cost):
-    """Work of the hand against the friction of the table, J, for a limit surface whose load is known."""
-
-    def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        return jnp.sum(push.wrench * push.twist)
-
-
-class Clearance(Cost):
-    """Penalty for a slider that comes nearer to walls and fixtures than a distance that it should keep.
-
-    The penalty of a pose is the square of what is missing, as a fraction of the distance to keep. The cost is its mean
-    over the poses of the push. What the slider has is measured from points on each outline to the other body, so it is
-    exact for polygons that are apart.
-
-    Args:
-        shape: Outline of the slider.
-        fixtures: Walls and fixtures to stay away from.
-        distance: Distance to keep, m.
-
-    Raises:
-        ValueError: For a distance that is not positive, not finite or not a single number.
-    """
-
-    shape: Shape
-    fixtures: Fixtures
-    distance: Float[Array, ""]
-    points: Float[Array, "points 2"]
-
-    def __init__(self, shape: Shape, fixtures: Fixtures, distance: ArrayLike):
-        self.shape, self.fixtures = shape, tuple(fixtures)
-        self.distance = checked_array("distance", distance, (), positive=True)
-        self.points = _outline_points(shape)
-
-    def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        missing = jnp.maximum(self.distance - jax.vmap(self.nearest)(_poses(push)), 0) / self.distance
-        return jnp.mean(missing**2)
-
-    def nearest(self, pose: Float[Array, "3"]) -> Float[Array, ""]:
-        """Return the distance between the slider at a pose and the nearest wall or fixture, m, negative inside.
-
-        Args:
-            pose: Pose of the slider, (3,), world.
-        """
-        points, found = se2.transform(pose, self.points), [jnp.asarray(jnp.inf, pose.dtype)]
-        for each in self.fixtures:
-            found.append(_fixture_distance(each, points))
-            if isinstance(each, Wall):
-                continue
-            corners = se2.transform(each.pose, _outline_points(each.shape))
-            found.append(_shape_distance(self.shape, se2.transform(se2.inverse(pose), corners)))
-        return smallest(jnp.stack(found))
-
-
 class HandClearance(Cost):
     """Penalty for a hand of round fingers that comes nearer to walls and fixtures than a distance."""
 
@@ -212,11 +134,6 @@ def _fixture_distance(fixture: Wall | Fixture, points: Float[Array, "points 2"])
     return _shape_distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
 
 
-def _outline_points(shape: Shape) -> Float[Array, "points 2"]:
-    points = shape.boundary(OUTLINE_POINTS)
-    return jnp.concatenate([shape.vertices, points]) if isinstance(shape, Polygon) else points
-
-
 def _shape_distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest signed distance of points from a shape, both in its body frame, m."""
     outline = shape.outline()
@@ -241,13 +158,6 @@ class Mean(Risk):
 
     def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
         return jnp.mean(costs)
-
-
-class Worst(Risk):
-    """The largest of all samples."""
-
-    def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
-        return jnp.max(costs)
 
 
 class CVaR(Risk):

@@ -69,8 +69,8 @@ def worlds(made):
         noise = NOISE * rng.standard_normal((SEEN, 2, 3)) / np.array([1, 1, 0.04])
         for push in range(SEEN):
             belief = made.update(belief, noise[push, 0], paths[push], ends[0, push] + noise[push, 1])
-        _, kept = belief._replace(friction=jnp.asarray(rows)).drawn(jax.random.key(k), DRAWN)
-        draws = [np.swapaxes(ends[each, SEEN:], 0, 1) for each in (rows[-DRAWN:], np.asarray(kept))]
+        kept = rows[rng.choice(128, DRAWN, p=np.asarray(belief.weight) / np.sum(belief.weight))]
+        draws = [np.swapaxes(ends[each, SEEN:], 0, 1) for each in (rows[-DRAWN:], kept)]
         found.append((float(drawn.friction[0]), belief, ends[0, SEEN:], *draws))
     friction, beliefs, *rest = zip(*found, strict=True)
     return Worlds(np.array(friction), list(beliefs), *(np.stack(each) for each in rest))

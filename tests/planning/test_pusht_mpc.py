@@ -41,6 +41,11 @@ def made_controller(slider, contacts, angles, friction=0.0):
     return PushController(planner, PositionControl())
 
 
+def poses_reaching(library, goal):
+    """Return the pose from which each entry of a library reaches the goal."""
+    return compose(goal, inverse(library.relative))
+
+
 class Outcome(NamedTuple):
     covered: float
     steps: int
@@ -142,7 +147,7 @@ def test_risk_is_left_out_only_where_it_does_not_matter(adapting, monkeypatch):
     planner = adapting.planner.reweighted(np.arange(12) / 66)
     near = np.flatnonzero((planner.library.entries[:, 1] == 30) & planner.usable[planner.push])[::20]
     far = GOAL + np.random.default_rng(4).normal(size=(4, 3)) * np.array([0.04, 0.04, 0.5])
-    poses = np.concatenate([planner.library.poses_reaching(GOAL)[near], far])
+    poses = np.concatenate([poses_reaching(planner.library, GOAL)[near], far])
     finger = np.array([0.02, 0.02])
     monkeypatch.setattr(push_planner, "JUDGED", 4)
     few = [planner.choose(pose, finger) for pose in poses]
@@ -162,7 +167,7 @@ def test_one_push_where_one_is_enough(rectangle):
     """A start from which an entry of the library leads to the goal: that is what is chosen, and it arrives."""
     planner = rectangle.planner
     index = np.flatnonzero((planner.library.entries[:, 1] == 50) & planner.usable[planner.push])[40]
-    pose = planner.library.poses_reaching(GOAL)[index].astype(float)
+    pose = poses_reaching(planner.library, GOAL)[index].astype(float)
     finger = to_world(pose, planner.roadmap.goals[planner.push[index]])
     push = planner.choose(pose, finger)
     assert push.status == PlanStatus.ONE_PUSH

@@ -79,19 +79,6 @@ class FrictionBelief(NamedTuple):
         """Return the number of samples of equal weight that would be as good (Kish's effective sample size)."""
         return _effective(self.weight)
 
-    def drawn(self, key: PRNGKeyArray, count: int) -> tuple[LimitSurface, Float[Array, "count"]]:
-        """Draw samples by their weights.
-
-        Args:
-            key: PRNG key.
-            count: Number of draws.
-
-        Returns:
-            Limit surfaces with a leading axis of draws, and coefficients of friction, (count,).
-        """
-        rows = _systematic(key, self.weight, count)
-        return jax.tree.map(lambda leaf: leaf[rows], (self.surface, self.friction))
-
 
 class FrictionFilter(eqx.Module):
     """Settings of the filter.
@@ -223,10 +210,3 @@ def _distance_squared(a: Float[Array, "3"], b: Float[Array, "3"], length: Array)
     """Return the squared distance of two poses, m^2, with the angle between them wrapped to [-pi, pi]."""
     x, y, theta = a - b
     return x**2 + y**2 + (length * wrap_to_pi(theta)) ** 2
-
-
-def _systematic(key: PRNGKeyArray, weight: Float[Array, "samples"], count: int) -> Int[Array, "count"]:
-    """Return indices such that each appears within one of `count` times its weight."""
-    places = (jax.random.uniform(key, (), weight.dtype) + jnp.arange(count, dtype=weight.dtype)) / count
-    rows = jnp.searchsorted(jnp.cumsum(weight), places)
-    return jnp.minimum(rows, weight.shape[0] - 1)

@@ -26,7 +26,7 @@ import pushjax
 from pushjax._internal.checks import check_count, check_type
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
-from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.feedback.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.push_batch import simulate_pushes
@@ -256,35 +256,12 @@ class PushLibrary:
         mean = np.tensordot(self._weights(weight), self.outcomes, 1)
         return replace(self, outcomes=mean[None])
 
-    def final_spread(self, weight: np.ndarray | None = None) -> np.ndarray:
-        """Return how much the outcomes scatter over the samples: the root mean square distance, (pushes, lengths), m.
-
-        The distance of a sample from the mean is that of `pose_features`.
-
-        Args:
-            weight: Weights of the samples, as in `averaged`.
-        """
-        weights, mean, square = self._weights(weight), 0.0, 0.0
-        first = self.features(self.outcomes[0])
-        for each, outcome in zip(weights, self.outcomes, strict=True):
-            apart = self.features(outcome) - first
-            mean, square = mean + each * apart, square + each * apart**2
-        return np.sqrt(np.maximum(np.sum(square - mean**2, axis=-1), 0.0))
-
     def _weights(self, weight: np.ndarray | None) -> np.ndarray:
         count = len(self.outcomes)
         weights = np.full(count, 1 / count, np.float32) if weight is None else np.asarray(weight, np.float32)
         if weights.shape != (count,):
             raise ValueError(f"weight has shape {weights.shape}; expected ({count},), the samples of the library")
         return weights
-
-    def poses_reaching(self, goal: np.ndarray) -> np.ndarray:
-        """Return the pose from which each entry reaches a goal, (entries, 3), m and rad.
-
-        Args:
-            goal: The goal, (3,), world, m and rad.
-        """
-        return compose(np.asarray(goal), inverse(self.relative))
 
     def nearest(self, relative: np.ndarray, count: int, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries whose outcomes are nearest to relative poses.

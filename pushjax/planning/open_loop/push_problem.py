@@ -1,7 +1,6 @@
 """Simulation of pushes in a row under sampled friction: the problem that candidates of a search are evaluated on."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -109,12 +108,6 @@ class PushProblem(eqx.Module):
         total = self.risk(costs) + FAILURE * jnp.mean(failed.astype(costs.dtype))
         return jnp.where(jnp.isfinite(total), total, 2 * FAILURE)
 
-    def judge(self, parameters: Array) -> Float[Array, ""]:
-        """Return the cost of one candidate."""
-        paths, _ = self.lay_out(parameters)
-        found = jax.vmap(partial(self.sample, paths))(self.draws, self.start)
-        return self.total(found.cost, found.failed)
-
 
 # Candidates are evaluated by two programs, with one rollout each: compiling rollouts takes most of the time of a plan.
 # Both have one size, whatever the number of candidates and samples.
@@ -133,11 +126,6 @@ def _samples(paths: Array, draws: Draws, start: Array, problem: PushProblem) -> 
 @jit
 def _totals(costs: Array, failed: Array, problem: PushProblem) -> Array:
     return jax.vmap(problem.total)(costs, failed)
-
-
-@jit
-def _costs_and_gradients(parameters: Array, problem: PushProblem) -> tuple[Array, Array]:
-    return jax.lax.map(jax.value_and_grad(problem.judge), parameters)
 
 
 def lay_out(parameters: np.ndarray, problem: PushProblem) -> tuple[np.ndarray, np.ndarray]:
@@ -250,7 +238,6 @@ def push_problem(
 
 def objective(problem: PushProblem) -> Objective:
     """Return the cost of many candidates as a function on the host."""
-    dtype = problem.start.dtype
 
     def cost(parameters: np.ndarray) -> np.ndarray:
         found = samples_of(lay_out(parameters, problem)[0], problem)
@@ -258,8 +245,4 @@ def objective(problem: PushProblem) -> Objective:
         totals = [_totals(found.cost[each], found.failed[each], shared) for each in rows]
         return _joined(totals, len(parameters)).astype(np.float64)
 
-    def cost_and_gradient(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        costs, gradients = _costs_and_gradients(jnp.asarray(parameters, dtype), problem)
-        return np.asarray(costs, np.float64), np.asarray(gradients, np.float64)
-
-    return Objective(cost, cost_and_gradient, problem.pushes.scale)
+    return Objective(cost, problem.pushes.scale)
