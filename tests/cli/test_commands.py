@@ -392,7 +392,7 @@ def test_random_experiments_draw_and_write_a_page(random_record, name):
 
 def test_classes_of_grasps():
     """A rectangle flat between the pads is a stable grasp; on its diagonal, or with a corner in the way, it is not."""
-    from pushjax.experiments.grasps.outcomes import openings, spikes
+    from pushjax.experiments.grasps import openings, spikes
 
     block = pj.Polygon.rectangle(0.050, 0.035)
     diagonal = np.arctan2(0.050, 0.035)
@@ -400,7 +400,7 @@ def test_classes_of_grasps():
     np.testing.assert_allclose(
         openings(block, poses, 0.027), [0.035, 0.050, np.hypot(0.05, 0.035), 0.035, 0], atol=1e-5
     )
-    found = spikes(np.radians([0.1, -0.2, 180.3, 90, -90, 45.0]), np.pi)
+    found = spikes(np.radians([0.1, -0.2, 180.3, 90, -90, 45.0]))
     assert [spike["degrees"] for spike in found] == [0, 90, 45]
     assert [spike["share"] for spike in found] == pytest.approx([1 / 2, 1 / 3, 1 / 6])
 

@@ -7,7 +7,7 @@ import pytest
 
 import pushjax as pj
 from pushjax._math.vec import Vec2, Vec3
-from pushjax.experiments.grasps.sliders import butterfly
+from pushjax.experiments.grasps import butterfly
 from pushjax.simulation.candidate import FingerPose
 from pushjax.simulation.detection import pair_of
 from pushjax.simulation.finger_motion import BodyFrame, FingerMotion
