@@ -13,7 +13,7 @@ from pushjax.cli import main as cli
 from pushjax.experiments.plan import experiment
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning import Outcomes, PushPlan, PushPlanStatus
-from pushjax.planning.transits.between_pushes import transits_between
+from pushjax.planning.between_pushes import transits_between
 
 RADIUS, FRICTION = 0.005, 0.25
 BLOCK = 0.03 * np.array([(-1.5, -1), (1.5, -1), (1.5, 1), (-1.5, 1)])

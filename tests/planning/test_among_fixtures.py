@@ -16,8 +16,8 @@ import pytest
 import pushjax as pj
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning import Observation, Pace, PlanStatus, PositionControl, PushController, PushPlanner, Workspace
-from pushjax.planning.feedback.push_library import PushLibrary
-from pushjax.planning.transits.roadmap import TransitStatus
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.roadmap import TransitStatus
 
 shapely = pytest.importorskip("shapely")
 

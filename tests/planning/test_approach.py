@@ -5,7 +5,7 @@ import pytest
 
 from pushjax.geometry.polygon_numpy import inside, offset_curve, segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
-from pushjax.planning.transits.roadmap import Roadmap, TransitStatus, run_ups
+from pushjax.planning.roadmap import Roadmap, TransitStatus, run_ups
 from pushjax.planning.workspace import Workspace
 
 shapely = pytest.importorskip("shapely")

@@ -6,8 +6,8 @@ import pytest
 import pushjax as pj
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning import finger_motion
-from pushjax.planning.transits.between_pushes import transits_between
-from pushjax.planning.transits.roadmap import TransitStatus
+from pushjax.planning.between_pushes import transits_between
+from pushjax.planning.roadmap import TransitStatus
 
 shapely = pytest.importorskip("shapely")
 

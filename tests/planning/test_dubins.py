@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pushjax.planning.stable.dubins import WORDS, dubins
+from pushjax.planning.dubins import WORDS, dubins
 
 RADII = [(1.0, 1.0), (0.7, 1.6)]
 

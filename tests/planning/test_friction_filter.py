@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.planning.feedback.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
+from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 
 RADIUS, STEPS, NOISE = 0.01, 8, 2e-4
 SLIDER = pj.Slider(pj.Polygon.rectangle(0.1, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), 0.04))

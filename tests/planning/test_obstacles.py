@@ -7,7 +7,7 @@ import pushjax as pj
 from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning import Workspace
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.transits.roadmap import Roadmap, TransitStatus
+from pushjax.planning.roadmap import Roadmap, TransitStatus
 
 shapely = pytest.importorskip("shapely")
 

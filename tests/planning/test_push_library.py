@@ -10,13 +10,12 @@ import pytest
 import pushjax as pj
 from pushjax.experiments.pusht_mpc import player
 from pushjax.geometry import se2, se2_numpy
-from pushjax.planning.feedback.controller import PushController
-from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go
-from pushjax.planning.feedback.finger_control import PositionControl
-from pushjax.planning.feedback.friction_filter import FrictionFilter
-from pushjax.planning.feedback.push_library import PushLibrary, digest, fan, pose_features
-from pushjax.planning.feedback.push_planner import PushPlanner
-from pushjax.planning.pace import Pace
+from pushjax.planning.controller import PushController
+from pushjax.planning.cost_to_go import CostToGo, cost_to_go
+from pushjax.planning.finger_control import Pace, PositionControl
+from pushjax.planning.friction_filter import FrictionFilter
+from pushjax.planning.push_library import PushLibrary, digest, fan, pose_features
+from pushjax.planning.push_planner import PushPlanner
 from pushjax.planning.workspace import Extent, Workspace
 
 RADIUS, FRICTION = 0.01, 0.2

@@ -12,16 +12,15 @@ from pushjax.experiments import pusht_mpc
 from pushjax.experiments.pusht_mpc import experiment, player, setting
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning.feedback import push_planner
-from pushjax.planning.feedback.controller import Observation, PushController
-from pushjax.planning.feedback.coverage_table import CoverageTable
-from pushjax.planning.feedback.finger_control import FingerState, PositionControl
-from pushjax.planning.feedback.friction_filter import FrictionBelief, FrictionFilter
-from pushjax.planning.feedback.planned_push import PlanStatus
-from pushjax.planning.feedback.push_library import PushLibrary
-from pushjax.planning.feedback.push_planner import PushPlanner
-from pushjax.planning.pace import Pace
+from pushjax.planning import push_planner
+from pushjax.planning.controller import Observation, PushController
+from pushjax.planning.coverage_table import CoverageTable
+from pushjax.planning.finger_control import FingerState, Pace, PositionControl
+from pushjax.planning.friction_filter import FrictionBelief, FrictionFilter
+from pushjax.planning.planned_push import PlanStatus
 from pushjax.planning.push_batch import LEG, simulate_pushes
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.push_planner import PushPlanner
 from pushjax.planning.workspace import Workspace
 
 RADIUS, ENOUGH = 0.015, 0.95

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.planning import Squeezes, SqueezeStatus, plan_squeezes, squeeze_outcomes
-from pushjax.planning.squeezes import plan_squeezes as squeezes
-from pushjax.planning.squeezes.pose_spread import distances, entropy, most_likely
+from pushjax.planning import Squeezes, SqueezeStatus, plan_squeezes, squeeze_outcomes, squeezes
+from pushjax.planning.squeezes import distances, entropy, most_likely
 
 KEY = jax.random.key(0)
 WIDTH, HEIGHT, RADIUS = 0.05, 0.035, 0.02

@@ -10,7 +10,7 @@ import pushjax as pj
 from pushjax._internal.jit import quick_jit
 from pushjax.planning import StableStatus, shortest_push, stable_contacts, stable_push
 from pushjax.planning.friction_samples import draw_friction
-from pushjax.planning.stable.line_contact import LineContact, tightest_turn
+from pushjax.planning.line_contact import LineContact, tightest_turn
 
 WIDTH, HEIGHT, RADIUS, SPACING = 0.09, 0.06, 0.005, 0.04
 BLOCK, HAND = pj.Polygon.rectangle(WIDTH, HEIGHT), pj.Hand.two_fingers(RADIUS)

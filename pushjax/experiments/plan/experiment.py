@@ -24,8 +24,8 @@ from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
 from pushjax.identification.pushes_of_recordings import MAX_SLIDER_SIZE
 from pushjax.planning import FinalPose, Goal, PushPlan, PushPlanStatus, PushSequence, finger_motion, plan_pushes
-from pushjax.planning.transits.between_pushes import FingerMotion
-from pushjax.planning.transits.roadmap import TransitStatus
+from pushjax.planning.between_pushes import FingerMotion
+from pushjax.planning.roadmap import TransitStatus
 from pushjax.simulation.fixtures import Fixtures
 
 WAY_POINTS_FILE = "way_points.csv"

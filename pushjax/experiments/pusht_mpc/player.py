@@ -13,11 +13,11 @@ import platformdirs
 
 import pushjax as pj
 from pushjax.experiments.pusht_mpc import setting
-from pushjax.planning.feedback.controller import Observation, PushController
-from pushjax.planning.feedback.cost_to_go import CostToGo
-from pushjax.planning.feedback.coverage_table import CoverageTable
-from pushjax.planning.feedback.push_library import PushLibrary, digest, fan
-from pushjax.planning.feedback.push_planner import PushPlanner
+from pushjax.planning.controller import Observation, PushController
+from pushjax.planning.cost_to_go import CostToGo
+from pushjax.planning.coverage_table import CoverageTable
+from pushjax.planning.push_library import PushLibrary, digest, fan
+from pushjax.planning.push_planner import PushPlanner
 from pushjax.tasks.push_t import SIZE
 
 INSTALL = "gym-pusht is not installed; `pip install gym-pusht` gets it"

@@ -10,8 +10,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.geometry.se2_numpy import to_world
-from pushjax.planning.feedback.finger_control import SpringDamper
-from pushjax.planning.pace import Pace
+from pushjax.planning.finger_control import Pace, SpringDamper
 from pushjax.planning.workspace import Workspace
 from pushjax.tasks.push_t import (
     AGENT_RADIUS,

@@ -29,14 +29,14 @@ from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
 from pushjax.metrics import mean_pose
+from pushjax.planning.between_pushes import TIGHT, transits_between
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
 from pushjax.planning.goal import Goal
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE, Obstacles
-from pushjax.planning.open_loop.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
-from pushjax.planning.open_loop.push_sequence import PushSequence
+from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
+from pushjax.planning.push_sequence import PushSequence
+from pushjax.planning.roadmap import Transit, TransitStatus
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
-from pushjax.planning.transits.between_pushes import TIGHT, transits_between
-from pushjax.planning.transits.roadmap import Transit, TransitStatus
 from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
 from pushjax.simulation.fixtures import Fixtures
 from pushjax.simulation.hand import Hand

@@ -17,7 +17,7 @@ import numpy as np
 from pushjax._internal.checks import check_positive
 from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
-from pushjax.planning.transits.roadmap import Roadmap, Transit, TransitStatus, run_ups
+from pushjax.planning.roadmap import Roadmap, Transit, TransitStatus, run_ups
 from pushjax.planning.workspace import Workspace
 from pushjax.simulation.fixtures import Fixtures
 

@@ -17,13 +17,13 @@ from scipy.spatial import KDTree
 
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning.feedback.cost_to_go import CostToGo, cost_to_go, digest_of_costs
-from pushjax.planning.feedback.coverage_table import CoverageTable, Measure
-from pushjax.planning.feedback.free_space import GRID_STRIDE, FreeSpace
-from pushjax.planning.feedback.planned_push import PlannedPush, PlanStatus, PushChoice
-from pushjax.planning.feedback.push_library import PushLibrary
-from pushjax.planning.pace import Pace
-from pushjax.planning.transits.roadmap import Roadmap, ShortestTransits, Transit, run_ups
+from pushjax.planning.cost_to_go import CostToGo, cost_to_go, digest_of_costs
+from pushjax.planning.coverage_table import CoverageTable, Measure
+from pushjax.planning.finger_control import Pace
+from pushjax.planning.free_space import GRID_STRIDE, FreeSpace
+from pushjax.planning.planned_push import PlannedPush, PlanStatus, PushChoice
+from pushjax.planning.push_library import PushLibrary
+from pushjax.planning.roadmap import Roadmap, ShortestTransits, Transit, run_ups
 from pushjax.planning.workspace import Extent, Workspace
 from pushjax.simulation.pair import MAX_PENETRATION
 from pushjax.simulation.slider import Slider

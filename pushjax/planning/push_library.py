@@ -27,7 +27,7 @@ from pushjax._internal.checks import check_count, check_type
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
 from pushjax.geometry.se2_numpy import to_world
-from pushjax.planning.feedback.array_files import check_arrays, load_arrays, save_arrays
+from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.push_batch import simulate_pushes
 from pushjax.simulation.hand import Hand

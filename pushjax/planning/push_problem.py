@@ -16,7 +16,7 @@ from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, Risk
 from pushjax.planning.friction_samples import draw_friction, mean_friction
 from pushjax.planning.goal import Goal
-from pushjax.planning.open_loop.push_sequence import PushSequence
+from pushjax.planning.push_sequence import PushSequence
 from pushjax.planning.search import Objective
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.fixtures import Fixtures

@@ -9,6 +9,14 @@ All candidates for a squeeze are simulated from the same samples with the same f
 the poses that it leads to, and more if it leaves the slider outside of the jaw. The best few sequences are continued
 (beam search), because the squeeze that tells most is not always the one that the next can build on.
 
+The entropy compares every sample i with every sample j, by a Gaussian kernel of the width h:
+
+    entropy = -mean over i of log(mean over j of exp(-d_ij^2 / (4 h^2))).
+
+Here d_ij^2 is the squared distance of the positions plus the squared difference of the angles times a length. The
+entropy is zero if all samples are the same, log k for k poses far apart that are equally likely, and at most the
+logarithm of the number of samples. So its exponential is the number of poses that can be told apart.
+
 References: Goldberg, Orienting polygonal parts without sensors, 1993. Zhou, Paolini, Johnson, Bagnell & Mason, A
 probabilistic planning framework for planar grasping under uncertainty, 2017.
 """
@@ -28,7 +36,6 @@ from pushjax.contact.status import Status
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
-from pushjax.planning.squeezes.pose_spread import entropy, most_likely
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.random_rollout import Draws, rollout_under_draws
@@ -261,6 +268,40 @@ def squeeze_outcomes(
     none = np.zeros((len(poses), 0), bool)
     held, failed = (np.stack(each, axis=1) if each else none for each in (all_held, all_failed))
     return SqueezeOutcomes(np.stack(reached, axis=1), held, failed)
+
+
+def distances(
+    poses: np.ndarray,  # (..., samples, 3), m and rad
+    turns: np.ndarray,  # (turns,), after which the slider looks the same, rad
+    length: float,  # distance that counts as much as an angle of one radian, m
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances of positions, and of angles times `length`, between samples, (..., samples, samples), m."""
+    difference = poses[..., :, None, :] - poses[..., None, :, :]
+    position_distance = np.hypot(difference[..., 0], difference[..., 1])
+    angles = difference[..., 2, None] - turns
+    angles = np.abs(angles - 2 * np.pi * np.round(angles / (2 * np.pi))).min(axis=-1)
+    return position_distance, length * angles
+
+
+def entropy(
+    poses: np.ndarray,
+    turns: np.ndarray,
+    length: float,
+    width: float,  # of the kernel, m: poses that are nearer than about this are the same
+) -> np.ndarray:
+    """Return the entropy of samples of poses, (...,), in nats, with `poses`, `turns` and `length` as in `distances`."""
+    position_distance, angle_distance = distances(poses, turns, length)
+    kernel = np.exp(-(position_distance**2 + angle_distance**2) / (4 * width**2))
+    return -np.log(kernel.mean(axis=-1)).mean(axis=-1)
+
+
+def most_likely(poses: np.ndarray, turns: np.ndarray, max_distance: float, max_angle: float) -> tuple[int, np.ndarray]:
+    """Return the index of the sample with the most others near it, and whether each is near it, (samples,)."""
+    # Near are poses within `max_distance`, m, and `max_angle`, rad.
+    position_distance, angle_distance = distances(poses, turns, 1.0)  # with this length the second one is in rad
+    near = (position_distance <= max_distance) & (angle_distance <= max_angle)
+    best = int(np.argmax(near.sum(axis=1)))
+    return best, near[best]
 
 
 def _checked(key: PRNGKeyArray, slider: Slider, hand: Hand, belief: ArrayLike) -> np.ndarray:

@@ -14,10 +14,9 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
-from pushjax.planning.feedback.array_files import check_arrays, load_arrays, save_arrays
-from pushjax.planning.feedback.free_space import FreeSpace
-from pushjax.planning.feedback.pose_grid import POSITIONS, PoseGrid, grid_spacing
-from pushjax.planning.feedback.push_library import PushLibrary
+from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
+from pushjax.planning.free_space import POSITIONS, FreeSpace, PoseGrid, grid_spacing
+from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import Extent, Workspace
 
 FORMAT = 1  # of the file, and of what is computed here: raise it when either changes

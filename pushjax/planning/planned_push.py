@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.planning.transits.roadmap import Transit
+from pushjax.planning.roadmap import Transit
 
 
 class PlanStatus(IntEnum):

@@ -24,9 +24,9 @@ from pushjax._internal.checks import ArrayLike, as_float, check_count, check_fin
 from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2_numpy import compose, inverse
+from pushjax.planning.dubins import DubinsPath, dubins
 from pushjax.planning.friction_samples import draw_friction
-from pushjax.planning.stable.dubins import DubinsPath, dubins
-from pushjax.planning.stable.line_contact import LineContact, Turn, hand_front, line_contacts, tightest_turn
+from pushjax.planning.line_contact import LineContact, Turn, hand_front, line_contacts, tightest_turn
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 

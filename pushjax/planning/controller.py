@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from pushjax.geometry.se2_numpy import compose, inverse
-from pushjax.planning.feedback.finger_control import FingerControl, FingerState
-from pushjax.planning.feedback.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
-from pushjax.planning.feedback.planned_push import PlannedPush, PlanStatus
-from pushjax.planning.feedback.push_planner import PushPlanner
+from pushjax.planning.finger_control import FingerControl, FingerState
+from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
+from pushjax.planning.planned_push import PlannedPush, PlanStatus
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
-from pushjax.planning.transits.roadmap import Transit, TransitStatus
+from pushjax.planning.push_planner import PushPlanner
+from pushjax.planning.roadmap import Transit, TransitStatus
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 

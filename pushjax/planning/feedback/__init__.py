@@ -1,1 +1,0 @@
-"""The next push from where the slider is now, by a library of pushes."""

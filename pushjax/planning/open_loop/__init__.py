@@ -1,1 +1,0 @@
-"""Pushes in a row, planned before the first one starts."""

@@ -1,1 +1,0 @@
-"""Squeezes in a row that make an unknown pose known."""

@@ -1,1 +1,0 @@
-"""Pushes that carry a slider without slip."""

@@ -1,1 +1,0 @@
-"""Transits of a round finger from one push to the next."""
