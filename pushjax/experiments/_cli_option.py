@@ -1,4 +1,4 @@
-"""Options of the command line. Importing this module does not import JAX."""
+"""Options of the command line."""
 
 from typing import Any
 
@@ -6,6 +6,9 @@ import tyro
 
 
 def cli_option(metavar: str) -> Any:
-    """Return the tyro settings of an option with the placeholder `metavar`, whose help text states the default."""
-    # the empty hint keeps tyro from adding the default to the help text
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+    """Return the tyro settings of an option with the placeholder `metavar`; a default of None stays unsaid."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=_default)
+
+
+def _default(text: str) -> str:
+    return "" if text in ("", "None") else f"(default: {text})"

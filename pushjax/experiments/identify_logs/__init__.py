@@ -1,5 +1,5 @@
-"""Identification from a user's own logs: `experiment` builds on `options`, `setting`, `findings` and `picture`."""
+"""Identification from a user's own logs: `experiment` builds on `options`, `findings`, `picture` and `report`."""
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from pushjax.experiments.identify_logs.experiment import run as run
+from pushjax.experiments.identify_logs.options import Options as Options
+from pushjax.experiments.identify_logs.report import summary as summary

@@ -6,7 +6,6 @@ calibration of the setup.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,9 +19,8 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.experiments._record import result_record
 from pushjax.experiments._slider_options import expected_surface
-from pushjax.experiments.identify_logs import setting, words
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
-from pushjax.experiments.identify_logs.options import Options
+from pushjax.experiments.identify_logs.options import Options, hand_of, shape_of, support_of
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.pushes_of_recordings import has_wrenches, observed_often_enough, screen
@@ -74,13 +72,12 @@ def run(
         pictures = draw(findings, out)
         saved = out / "identified.json"
         found.save(saved)
-    chosen = {field.name: getattr(options, field.name) for field in fields(Options)}
-    own = {name: value for name, value in chosen.items() if value is not None}
+    chosen = {name: value for name, value in vars(options).items() if value is not None}
     noise = None if findings.noise is None else _noise(findings.noise)
     predicted = predictions(findings)
     return result_record(
         "identify",
-        {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | own,
+        {"seed": seed, "logs": [str(log) for log in logs], "level": LEVEL} | chosen,
         rows=parameters(findings, LEVEL),
         sigma_mm=1e3 * float(found.sigma),
         direction_sigma=float(found.direction_sigma),
@@ -109,11 +106,12 @@ def find(
     if not any(log.exists() for log in logs):
         missing = ", ".join(map(str, logs)) or "file"
         raise ValueError(f"LOG: give at least one file of recorded pushes; there is no {missing}")
-    options.check()
+    if options.forces and options.parts < 2:
+        raise ValueError(f"--forces needs --parts of at least 2, each of which gives a wrench; got {options.parts}")
     say(f"reading {len(logs)} {'log' if len(logs) == 1 else 'logs'}")
     recordings, unreadable = _for_each(logs, load_recordings)
-    shape = setting.shape_of(options.shape, recordings)
-    hand = setting.hand_of(options.hand, options.radius, recordings)
+    shape = shape_of(options.shape, recordings)
+    hand = hand_of(options.hand, options.radius, recordings)
     for one in recordings:
         columns = one.pushes[0].hand.shape[1]
         if columns != hand.dof:
@@ -187,7 +185,7 @@ def conditions(recordings: list[Recordings], shape, options: Options, seed: int)
     forces = options.forces and all(has_wrenches(one) for one in recordings)
     each = [Pushes.of(one, options.steps, parts=parts, shape=shape if forces else None) for one in recordings]
 
-    supports = [setting.support_of(options.support, shape, one) for one in recordings]
+    supports = [support_of(options.support, shape, one) for one in recordings]
 
     def expected(support: pj.Support) -> pj.LimitSurface:
         return expected_surface(support, degree, seed)
@@ -228,50 +226,3 @@ def _noise(noise: Noise) -> dict[str, Any]:
         "student_dof": float(noise.student_dof),
         "score_mm": 1e3 * float(noise.score),
     }
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints: one line per number found."""
-    problems, level = record["problems"], record["settings"]["level"]
-    counted = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
-    lines = [f"{record['pushes']} pushes used, {counted}."]
-    chosen = record["settings"]
-    if record["warning"] is not None:
-        lines.insert(0, f"WARNING: {record['warning']}")
-    if record["poses"] < chosen["parts"]:
-        lines.append(f"only final poses: not every push was seen {chosen['parts'] - 1} times on the way")
-    if chosen["forces"]:
-        lines.append(f"{record['wrenches']} measured wrenches.")
-    lines += [f"  {problem}" for problem in problems[:10]]
-    if len(problems) > 10:
-        lines.append(f"  and {len(problems) - 10} more (see the JSON)")
-    names = [row["label"] + (f" / {row['unit']}" if row["unit"] else "") for row in record["rows"]]
-    width = max(14, *(len(name) + 2 for name in names))
-    lines += ["", f"{'':{width}}{'estimate':>10}{f'{level:.0%} interval':>20}{'profile':>20}{'determined':>12}"]
-    for name, row in zip(names, record["rows"], strict=True):
-        normal, exact = (f"{row[name][0]:.3g} to {row[name][1]:.3g}" for name in ("interval", "profile"))
-        lines.append(f"{name:{width}}{row['estimate']:10.4g}{normal:>20}{exact:>20}{row['determined']:12.0%}")
-    lines += [
-        f"{name}: the posterior is far from normal; take the profile's interval, and not the estimate"
-        for name, row in zip(names, record["rows"], strict=True)
-        if words.is_not_normal(row)
-    ]
-    lines += [
-        f"limit surface: the pushes determine {record['surface_determined']:.1f} of the {record['surface_numbers']} "
-        "numbers that its prior varies",
-        "",
-        words.predicted(record),
-        f"sigma: {record['sigma_mm']:.3g} mm; " + ("converged" if record["converged"] else "NOT converged"),
-    ]
-    if record["noise"] is not None:
-        lines.append(f"noise: {words.noise(record['noise'])}")
-    lines.append(
-        "interval: for a normal posterior; profile: with all other numbers refitted; determined: part of the prior "
-        "variance that the pushes remove"
-    )
-    if record["failed_steps"]:
-        lines.append(f"{record['failed_steps']} steps of the predicted pushes failed (see the JSON)")
-    lines += [f"drew {path}" for path in record["pictures"]]
-    if record["identified"] is not None:
-        lines.append(f"wrote {record['identified']}, for pushjax.Identified.load")
-    return "\n".join(lines)

@@ -1,14 +1,17 @@
-"""Options of the identification from logs.
+"""What was pushed, by what and on what, and what is to be found: from options, or else from the logs."""
 
-This module does not import JAX, so that the command line answers at once.
-"""
-
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pushjax.experiments._cli_option import cli_option
+import numpy as np
 
+import pushjax as pj
+from pushjax.datasets.recordings import Recordings
+from pushjax.experiments._cli_option import cli_option
+from pushjax.experiments._slider_options import SHAPES, parse_numbers, parse_shape, parse_support
+
+HANDS = "finger, two_fingers, three_fingers, or parallel_jaw:0.05x0.01 (width and thickness of a pad)"
 Meters = Annotated[float | None, cli_option("M")]
 
 
@@ -48,7 +51,7 @@ class Options:
     contact_at_end: bool = False
     """The finger touches the object at the end of most pushes: use the gap that was measured there."""
     separate: bool = False
-    """Each log has its own friction and surface; all logs share the calibration. Default: they share everything."""
+    """Each log has its own friction and surface; all logs share the calibration."""
     steps: int = 40
     """Number of steps of each push."""
     parts: int = 1
@@ -59,23 +62,41 @@ class Options:
     noise: bool = False
     """Also estimate how much pushes scatter."""
 
-    def check(self) -> None:
-        """Raise ValueError for the first invalid option that can be found without a log."""
-        low, high = self.friction
-        if not 0 <= low < high < math.inf:
-            raise ValueError(f"--friction must be lowest and highest, at least 0 and different; got {low:g} {high:g}")
-        if self.radius is not None and not 0 <= self.radius < math.inf:
-            raise ValueError(f"--radius must be a length of at least 0 m; got {self.radius:g}")
-        for name in ("pressure_center", "inset", "overshoot", "lag_distance", "hand_offset", "frame_offset"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"--{name.replace('_', '-')} must be a positive length in m; got {value:g}")
-        if not 0 < self.surface_dof < math.inf:
-            raise ValueError(f"--surface-dof must be positive; got {self.surface_dof:g}")
-        if self.steps < 1:
-            raise ValueError(f"--steps must be at least 1; got {self.steps}")
-        if not 1 <= self.parts < max(self.steps, 2):
-            raise ValueError(f"--parts must be at least 1, and fewer than the {self.steps} steps; got {self.parts}")
-        if self.forces and self.parts < 2:
-            needs = "the parts of a push, each of which gives a wrench, to be 2 at least"
-            raise ValueError(f"--forces needs --parts, {needs}; got {self.parts}")
+
+def shape_of(text: str | None, recordings: list[Recordings]) -> pj.Polygon | pj.Disk | pj.Ellipse:
+    """Return the outline of the object, m, from the option or else from the logs."""
+    if text is not None:
+        return parse_shape(text)
+    known = [one.vertices for one in recordings if one.vertices is not None]
+    if len(known) < len(recordings):
+        raise ValueError(f"--shape: the logs do not tell the object's outline; give one of {SHAPES}")
+    if any(v.shape != known[0].shape or not np.allclose(v, known[0]) for v in known):
+        raise ValueError("the logs are of objects with different outlines: identify them one by one")
+    return pj.Polygon(known[0])
+
+
+def hand_of(text: str, radius: float | None, recordings: list[Recordings]) -> pj.Hand:
+    """Return the hand; fingers have the given radius, m, or else that of the logs."""
+    kind, _, rest = text.partition(":")
+    if kind == "parallel_jaw":
+        return pj.Hand.parallel_jaw(*parse_numbers("--hand", text, rest, "x", 2, HANDS))
+    constructors: dict[str, Callable[..., pj.Hand]] = {
+        "finger": pj.Hand.finger,
+        "two_fingers": pj.Hand.two_fingers,
+        "three_fingers": pj.Hand.three_fingers,
+    }
+    if kind not in constructors or rest:
+        raise ValueError(f"--hand: expected {HANDS}; got {text!r}")
+    if radius is None:
+        known = {one.tip_radius for one in recordings}
+        if len(known) > 1 or known == {None}:
+            raise ValueError("--radius: the logs do not tell the finger's radius; give it in m")
+        radius = known.pop()
+    return constructors[kind](radius)
+
+
+def support_of(text: str | None, shape: pj.Shape, recordings: Recordings) -> pj.Support:
+    """Return the support with unit load: the option's, or else the log's points, or else uniform pressure."""
+    if text is None and recordings.support_points is not None and len(recordings.support_points):
+        return pj.Support.tripod(recordings.support_points)
+    return parse_support("uniform" if text is None else text, shape)
