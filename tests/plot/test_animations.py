@@ -14,6 +14,7 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 from drawn import MM, RADIUS, SIDE, in_world, legend
+from pushes import trajectory
 
 import pushjax as pj
 from pushjax import plot
@@ -112,15 +113,13 @@ def test_a_recording_beside_its_simulation(push):
 
 def test_pads_and_words_of_several_contacts():
     """Pads are outlines; steps after the last motion are left out, except the one that says why it stopped."""
-    jaw, flat = pj.Hand.parallel_jaw(0.02, 0.01), jnp.zeros((35, 4, 2))
+    jaw = pj.Hand.parallel_jaw(0.02, 0.01)
     opening = np.concatenate([np.linspace(SIDE + 0.01, SIDE, 6), np.full(30, SIDE)])
-    configuration = jnp.column_stack([np.zeros((36, 3)), opening])
+    configuration = np.column_stack([np.zeros((36, 3)), opening])
     mode = np.zeros((35, 4), np.int8)
     mode[4] = pj.ContactMode.STICKING, pj.ContactMode.SLIDING_LEFT, pj.ContactMode.SLIDING_LEFT, 0
     status = np.where(np.arange(35) < 5, pj.Status.MOVING, pj.Status.GRASPED).astype(np.int8)
-    still, overlap = jnp.zeros((35, 3)), jnp.zeros(35)
-    words = {"mode": jnp.asarray(mode), "status": jnp.asarray(status), "overlap": overlap}
-    given = pj.Trajectory(jnp.zeros((36, 3)), configuration, still, still, flat, flat, flat, **words)
+    given = trajectory(np.zeros((36, 3)), configuration, 4, mode=mode, status=status)
     moving = plot.animate(BLOCK, jaw, given, forces=False, frames=7)
     (axes,) = moving.figure.axes
     moving.draw(5)

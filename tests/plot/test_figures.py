@@ -1,6 +1,5 @@
 """Each figure shows the given data, with units on every axis and a legend. The pixels are not tested."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -13,6 +12,7 @@ mpl.use("Agg")
 
 import matplotlib.pyplot as plt
 from drawn import MM, RADIUS, SIDE, ends_of, in_world, legend, legible
+from pushes import trajectory
 
 import pushjax as pj
 from pushjax import plot
@@ -26,24 +26,13 @@ SURFACE = pj.Ellipsoid(jnp.eye(3), LENGTH)
 
 
 def slid(steps: int = 6, turn: float = 0.4, dof: int = 2) -> pj.Trajectory:
-    """Return a push along x that rotates, with a hand that follows; its arrays are written directly."""
+    """Return a push along x that rotates, with a hand that follows."""
     t = np.linspace(0, 1, steps + 1)[:, None]
     pose = np.array([0.0, 0.001, 0.1]) + t * np.array([0.03, -0.005, turn])
     configuration = np.concatenate([pose[:, :2] - [SIDE / 2 + RADIUS, 0], np.zeros((steps + 1, dof - 2))], axis=1)
     if dof == 4:
         configuration[:, 3] = SIDE + 0.004
-    return pj.Trajectory(
-        pose=jnp.asarray(pose),
-        configuration=jnp.asarray(configuration),
-        twist=jnp.zeros((steps, 3)),
-        wrench=jnp.tile(jnp.array([1.0, 0, 0]), (steps, 1)),
-        force=jnp.tile(jnp.array([[1.0, 0.0]]), (steps, 1, 1)),
-        contact_point=jnp.tile(jnp.array([[-SIDE / 2, 0.0]]), (steps, 1, 1)),
-        contact_normal=jnp.tile(jnp.array([[1.0, 0.0]]), (steps, 1, 1)),
-        mode=jnp.full((steps, 1), pj.ContactMode.STICKING, jnp.int8),
-        status=jnp.zeros(steps, jnp.int8),
-        overlap=jnp.zeros(steps),
-    )
+    return trajectory(pose, configuration)
 
 
 def test_push_figure():
@@ -69,10 +58,9 @@ def test_push_figure():
 
 def test_a_grasp_is_drawn_until_it_stands_still():
     """Pads are drawn as outlines, round fingers as circles; the last moment is the last in which the slider moves."""
-    grasp = slid(dof=4)
-    rest = jnp.concatenate([grasp.pose, jnp.repeat(grasp.pose[-1:], 20, axis=0)])
-    held = jnp.concatenate([grasp.configuration, jnp.repeat(grasp.configuration[-1:], 20, axis=0)])
-    grasp = eqx.tree_at(lambda push: (push.pose, push.configuration), grasp, (rest, held))
+    moving = slid(dof=4)
+    held = (np.append(part, np.repeat(part[-1:], 20, axis=0), axis=0) for part in (moving.pose, moving.configuration))
+    grasp = trajectory(*held)
     jaw = pj.Hand.parallel_jaw(0.02, 0.01)
     axes = plot.push_figure(BLOCK, jaw, {"held: askew": grasp}, frames=2).axes[0]
     assert axes.get_title() == "held:\naskew"
@@ -93,7 +81,7 @@ def test_outline_of_a_smooth_shape():
     axes = plt.figure().add_subplot()
     plot.outline(axes, pj.Disk(0.01, (0.002, 0.0)), np.array([0.01, 0.02, np.pi / 2]), BLUE, 1.0, linestyle=":")
     (line,) = axes.lines
-    np.testing.assert_allclose(np.linalg.norm(line.get_xydata() - [10, 22], axis=1), 10, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(np.asarray(line.get_xydata()) - [10, 22], axis=1), 10, atol=1e-3)
     np.testing.assert_allclose(line.get_xydata()[0], line.get_xydata()[-1])
     assert line.get_linestyle() == ":"
 

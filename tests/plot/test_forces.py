@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from drawn import MM, legend, legible
+from pushes import trajectory
 
 import pushjax as pj
 from pushjax import plot
@@ -14,21 +15,8 @@ APART = np.array([[0.0, -0.012], [0.0, 0.012]])  # m, of two fingers on opposite
 
 def closed(opening, pose=(0.0, 0.0, 0.0), status=pj.Status.GRASPED, before=(0.0, 0.0, 0.0), at=(0.0, 0.0, 0.0)):
     """Return two steps of a hand that closes to an opening and stops; the slider rests at a pose."""
-    steps, contacts = 2, 2
-    flat = jnp.zeros((steps, contacts, 2))
-    configuration = jnp.array([[*before, opening + STEP], [*at, opening], [*at, opening]])
-    return pj.Trajectory(
-        pose=jnp.broadcast_to(jnp.array(pose), (steps + 1, 3)),
-        configuration=configuration,
-        twist=jnp.zeros((steps, 3)),
-        wrench=jnp.zeros((steps, 3)),
-        force=flat,
-        contact_point=flat,
-        contact_normal=flat,
-        mode=jnp.zeros((steps, contacts), jnp.int8),
-        status=jnp.array([pj.Status.MOVING, status], jnp.int8),
-        overlap=jnp.zeros(steps),
-    )
+    hand = [[*before, opening + STEP], [*at, opening], [*at, opening]]
+    return trajectory(np.tile(pose, (3, 1)), hand, 2, status=np.array([pj.Status.MOVING, status], np.int8))
 
 
 def torque(point, force):
