@@ -21,6 +21,7 @@ from pushjax.experiments._record import result_record
 from pushjax.experiments._slider_options import expected_surface
 from pushjax.experiments.identify_logs.findings import LENGTHS, Findings, parameters, predictions
 from pushjax.experiments.identify_logs.options import Options, hand_of, shape_of, support_of
+from pushjax.experiments.identify_logs.report import warning
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.pushes_of_recordings import has_wrenches, observed_often_enough, screen
@@ -28,9 +29,6 @@ from pushjax.identification.uncertainty import Profile, profile, scalar_position
 
 MIN_PUSHES = 3  # pushes; from fewer the size of their errors cannot be told
 LEVEL = 0.9
-# There is no warning if the mean deviation of the predicted final poses is less than POOR times the mean motion. There
-# is none either if it is less than the mean motion, and less than NO_BETTER times the mean deviation before the fit.
-POOR, NO_BETTER = 0.4, 0.9
 
 
 def run(
@@ -86,7 +84,7 @@ def run(
         poses=len(findings.pushes.observed_steps),
         wrenches=int(np.sum(np.asarray(findings.pushes.has_pair))),
         **predicted,
-        warning=_warning(predicted),
+        warning=warning(predicted),
         noise=noise,
         problems=[str(problem) for problem in findings.problems],
         identified=None if saved is None else str(saved),
@@ -202,17 +200,6 @@ def conditions(recordings: list[Recordings], shape, options: Options, seed: int)
             )
     whole = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *each)
     return whole, pj.Slider(shape, expected(supports[0]))
-
-
-def _warning(predicted: dict[str, Any]) -> str | None:
-    """Return a warning if the fit explains next to nothing, because its estimates then mean nothing; else None."""
-    mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
-    if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
-        return None
-    return (
-        f"what was found predicts final poses to {mean:.3g} mm in the mean, of {still:.3g} that the objects moved, and "
-        f"to {before:.3g} before: are units, frames, outline and radius right?"
-    )
 
 
 def _noise(noise: Noise) -> dict[str, Any]:

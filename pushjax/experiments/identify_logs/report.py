@@ -10,6 +10,9 @@ from pushjax.experiments._report import Table, table
 # normal posterior, and the other way round.
 NOT_NORMAL = 2.0
 MAX_PROBLEMS = 10  # that are listed
+# There is no warning if the mean deviation of the predicted final poses is less than POOR times the mean motion. There
+# is none either if it is less than the mean motion, and less than NO_BETTER times the mean deviation before the fit.
+POOR, NO_BETTER = 0.4, 0.9
 # What the unknowns are called in the report; the others keep the name that `pj.Unknowns` gives them.
 NAMES = {
     "friction": "friction at the contact",
@@ -24,6 +27,17 @@ NAMES = {
     "frame_offset.1": "offset of the object's frame, y in the body frame",
     "frame_offset.2": "rotation of the object's frame",
 }
+
+
+def warning(predicted: dict[str, Any]) -> str | None:
+    """Return a warning if the fit explains next to nothing, because its estimates then mean nothing; else None."""
+    mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
+    if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
+        return None
+    return (
+        f"what was found predicts final poses to {mean:.3g} mm in the mean, of {still:.3g} that the objects moved, and "
+        f"to {before:.3g} before: are units, frames, outline and radius right?"
+    )
 
 
 def summary(record: dict[str, Any]) -> list[str | Table]:
