@@ -25,6 +25,8 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
+from converted import converted  # noqa: E402, F401
+
 from pushjax.datasets import find_data  # noqa: E402
 
 # Tracing creates millions of objects that are soon deleted. A fifth of the time was spent in scans of the old ones.

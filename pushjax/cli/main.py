@@ -160,8 +160,8 @@ def _fetch(to: Annotated[Path | None, cli_option("FOLDER")] = None) -> None:
     Args:
         to: Where to. Default: pushjax's data folder of this user, where `reproduce table2` and `two-finger` look.
     """
-    from pushjax.datasets.data_folder import ENVIRONMENT_VARIABLE
     from pushjax.datasets.download import fetch_triangle, triangle_files
+    from pushjax.datasets.load import ENVIRONMENT_VARIABLE
 
     files = triangle_files()
     size = f"{sum(file.bytes for file in files) / 1e6:.0f} MB"
@@ -177,7 +177,7 @@ def data_folder(given: Path | None) -> Path:
     """Return the folder of the recorded pushes: the given one, else the one that `find_data` finds."""
     if given is not None and not given.is_dir():
         raise ValueError(f"--data: there is no folder {given}")
-    from pushjax.datasets.data_folder import find_data
+    from pushjax.datasets.load import find_data
 
     folder = given or find_data()
     if folder is None:

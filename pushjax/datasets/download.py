@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets.data_folder import default_folder
+from pushjax.datasets.load import default_folder
 
 SOURCE = "https://raw.githubusercontent.com/robinzhoucmu/MLab_EXP/4d86db9438203f51c4368e5b886def5c402955f3/"
 TIMEOUT = 30  # s without an answer

@@ -1,16 +1,44 @@
-"""Read recorded pushes from a file of any known kind."""
+"""Find recorded pushes on this machine, and read them from a file of any known kind.
 
+The package contains no recordings.
+"""
+
+import os
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
 
-from pushjax.datasets._archive import archive_names
-from pushjax.datasets.mit_logs import load_mit_hdf5, load_mit_json, load_mit_npz
-from pushjax.datasets.plain import LAYOUT, load_csv, load_plain_npz
-from pushjax.datasets.push_log import LogError
-from pushjax.datasets.recordings import Recordings
+import platformdirs
+
+from pushjax.datasets.mit_logs import load_mit_hdf5, load_mit_json
+from pushjax.datasets.plain import load_csv, load_npz
+from pushjax.datasets.recordings import LogError, Recordings
 from pushjax.datasets.triangle import load_triangle_log
-from pushjax.datasets.triangle_archive import load_push_npz
+
+ENVIRONMENT_VARIABLE = "PUSHJAX_DATA"
+
+
+def default_folder() -> Path:
+    """Return the folder that recorded pushes are fetched to (`fetch_triangle`); it need not exist."""
+    return platformdirs.user_data_path("pushjax", appauthor=False) / "data"
+
+
+def find_data(name: str | None = None) -> Path | None:
+    """Return the folder of recorded pushes, or an entry of it.
+
+    It is the folder that the environment variable PUSHJAX_DATA names. If the variable is not set, it is the folder that
+    recorded pushes are fetched to.
+
+    Args:
+        name: File or folder inside that folder; None for the folder itself.
+
+    Returns:
+        The path, or None if it does not exist.
+    """
+    given = os.environ.get(ENVIRONMENT_VARIABLE)
+    folder = Path(given).expanduser() if given else default_folder()
+    found = folder if name is None else folder / name
+    return found if found.exists() else None
 
 
 def load_recordings(path: str | PathLike[str]) -> Recordings:
@@ -23,9 +51,9 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
       `force_y`, in any order. The cells of the object are blank where it was not seen, those of the force where there
       was none.
     - `.npz` with `path` (n, k, dof), either `start` and `end` (n, 3) or `pose` (n, k, 3), and, if known, `force`
-      (n, k, 2) and `time` (n, k). `pose` is NaN where the object was not seen.
-    - `.npz` of the folders `three_point_push` and `mit_push_full`.
-    - `.txt`, `.txt.gz`: an original log of the aluminum triangle.
+      (n, k, 2), `time` (n, k) and what else `Recordings.save` writes. `pose` is NaN where the object was not seen. The
+      path of a push with fewer than k samples ends with rows of NaN.
+    - `.txt`, `.txt.gz`: an original log of the aluminum triangle, as by `load_triangle_log`.
     - `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install '.[hdf5]'` for the latter two).
 
     Lengths are in m, angles in rad, forces in N, times in s. All are in the world frame, and forces are those on the
@@ -44,39 +72,20 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
     return _select_loader(file)(file)
 
 
-def _load_triangle(path: Path) -> Recordings:
-    """Read an original triangle log."""
-    return Recordings.of_log(load_triangle_log(path))
-
-
-def _load_npz(path: Path) -> Recordings:
-    """Read an archive of the kind that its arrays indicate."""
-    names = archive_names(path, "pushes")
-    if "path" in names:
-        return load_plain_npz(path, names)
-    if "tip_offsets" in names:
-        return Recordings.of_log(load_push_npz(path))
-    if {"tip_t", "object_t"} <= names:
-        return load_mit_npz(path, names)
-    found_names = ", ".join(sorted(names)[:10]) or "none"
-    known = "or the arrays of the folders three_point_push or mit_push_full"
-    raise LogError(path, f"expected arrays of pushes: {LAYOUT}; {known}; found the arrays {found_names}")
-
-
 Loader = Callable[[Path], Recordings]
 _SIGNATURES: dict[bytes, Loader] = {
-    b"PK\x03\x04": _load_npz,
+    b"PK\x03\x04": load_npz,
     b"\x89HDF\r\n\x1a\n": load_mit_hdf5,
-    b"\x1f\x8b": _load_triangle,
+    b"\x1f\x8b": load_triangle_log,
 }
 _SUFFIXES: dict[str, Loader] = {
     ".csv": load_csv,
-    ".npz": _load_npz,
+    ".npz": load_npz,
     ".json": load_mit_json,
     ".h5": load_mit_hdf5,
     ".hdf5": load_mit_hdf5,
-    ".txt": _load_triangle,
-    ".gz": _load_triangle,
+    ".txt": load_triangle_log,
+    ".gz": load_triangle_log,
 }
 
 

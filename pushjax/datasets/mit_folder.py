@@ -1,56 +1,38 @@
-"""Read the straight pushes of one object on one surface from the MIT pushing data set as published, one file per push.
+"""Read the pushes of one object on one surface from the MIT pushing data set as published, one file per push.
 
-The result has the form of the curated archives (`mit_pushes`), with these differences:
+Pushes in which the tracker jumps or loses the object are left out. Nothing is smoothed.
 
-- The training pushes are drawn at random.
-- Pushes in which the tracker jumps are left out.
-- There is no rule that the object's angles at 10 and 90 % of the time lie between those at the ends. The toolbox of
-  Zhou, Bagnell, Mason, RSS 2017 needs such a rule, because its angles wrap.
-- Nothing is smoothed, and there are no predictions of another program.
+The time from 10 to 90 % of a push is divided into six equal parts. Each part gives one wrench, the mean over its
+samples, and one twist, the displacement of the object. The contact is the point of the outline nearest to the center of
+the finger. A part is left out if the object rests, if the force brakes the object or is weak, or if the force cannot be
+that of a finger pressing at the contact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets.mit_names import PREFIX, SUFFIXES, PushParameters, parse_push_name
-from pushjax.datasets.mit_push_file import MIDDLE_PART, MitPush, in_body, read_push, training_pairs
-from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, wrap_to_pi
+from pushjax.datasets.mit_logs import PREFIX, SUFFIXES, PushName, load_mit_log, parse_name
 from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
-from pushjax.datasets.push_log import Floats, LogError
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect, interpolated, rotation
 
-MIN_PUSHES = 10  # smallest number of pushes, of which a few are used for training
 SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
-# The rules of the curated archives for pushes whose tracker can be trusted:
-# - At the start, the tip is less than MAX_GAP (m) from the outline, outside or inside.
-# - At the end, it is less than MAX_OVERLAP (m) inside the outline.
-# - The object moves farther than the tip by at most MAX_AHEAD (m).
-# - The object turns by less than MAX_TURN (rad).
-# - The path of the tip is longer than MIN_PATH times the median path.
-MAX_GAP, MAX_OVERLAP, MAX_AHEAD, MAX_TURN, MIN_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
-
-
-def find_mit_pushes(folder: str | PathLike[str], surface: str, shape: str) -> list[tuple[PushParameters, Path]]:
-    """Find the files of one object's pushes in a folder and the folders below it.
-
-    Of several files with the same name, JSON is preferred to HDF5. Files with names of another form are ignored.
-
-    Args:
-        folder: The folder.
-        surface: Name of the surface, as in the file names.
-        shape: Name of the object, as in the file names.
-
-    Returns:
-        Name and path of each push, sorted by acceleration, speed, side, fraction, angle and repetition.
-
-    Raises:
-        LogError: If the folder is missing, or if it has no file of that object on that surface.
-    """
-    return _find_files(Path(folder).expanduser(), surface, shape)[0]
+# Fractions of the duration between which wrenches are taken. Before the first, the tip may not touch the object yet.
+# After the second, the tip may have stopped.
+MIDDLE_PART = (0.1, 0.9)
+NUM_PARTS = 6  # parts of that time, each of which gives one pair of wrench and twist
+# While the tip travels JUMP_WINDOW (m), a pushed object moves by much less than MAX_WINDOW_MOTION (m) and turns by much
+# less than MAX_WINDOW_TURN (rad). A tracker that reports more has jumped.
+JUMP_WINDOW, MAX_WINDOW_MOTION, MAX_WINDOW_TURN = 0.005, 0.020, np.deg2rad(30)
+# Parts of a push with less motion than MIN_MOTION (m) or less force than MIN_FORCE (N) carry no information about
+# friction. Neither do parts whose force is farther than MAX_FORCE_ANGLE (rad) from the contact normal. The force of a
+# sliding tip is some 15 deg from it. A larger angle may come from an offset of the force sensor: in a third of the logs
+# of rect1 on plywood at 100 mm/s, the offset is 1.6 N, with or without contact.
+MIN_MOTION, MIN_FORCE, MAX_FORCE_ANGLE = 0.0002, 0.1, np.deg2rad(30)
 
 
 def load_mit_folder(
@@ -58,201 +40,180 @@ def load_mit_folder(
     surface: str,
     shape: str,
     *,
-    speed: float = 0.010,
-    fast_speed: float = 0.020,
-    train_share: float = 0.3,
-    seed: int = 0,
+    speeds: Sequence[float] = (0.010, 0.020),
     progress: ProgressCallback = no_progress,
-) -> tuple[MitPushes, tuple[LogError, ...]]:
+) -> Recordings:
     """Read the pushes of constant speed of one object on one surface.
 
-    In the result, `index` is the position in `find_mit_pushes`. `repeats` pairs pushes of the same side, fraction and
-    angle, with the nearest repetition. `wrench` (N, N m) and `twist` (displacements in m, rad) are from valid training
-    pushes. `toolbox` is empty.
+    Each push begins and ends where tip, object and force are known. It has up to six pairs of wrench (N, N m) and twist
+    (displacements in m, rad). `Recordings.about` has "action", "speed", "side", "fraction", "angle" and "repetition".
 
     Args:
         folder: Folder of the unpacked `.json`, `.h5` or `.hdf5` files of the data set, which may be in folders of their
-            own.
+            own. Of several files with the same name, JSON is preferred.
         surface: Name of the surface, as in the file names.
-        shape: Name of the object, as in the file names; one of MIT_SHAPES.
-        speed: Speed of the pushes in `whole`, in m/s. Files with neither this speed nor `fast_speed` are not read.
-        fast_speed: Speed of the pushes in `fast`, in m/s.
-        train_share: Fraction of `whole` to use for training, drawn at random. The rest is `middle`.
-        seed: Seed of that draw.
+        shape: Name of the object, as in the file names: rect1 to rect3, tri1 to tri3, ellip1 to ellip3, hex or butter.
+        speeds: Speeds of the pushes in m/s. Files with other speeds are not read.
         progress: Called after each file with the number of files read and the number of files to read.
 
     Returns:
-        The pushes, and one error for each file that is misnamed or cannot be used.
+        The pushes, sorted by speed, side, fraction, angle and repetition, and one problem for each file that is
+        misnamed or cannot be used.
 
     Raises:
-        LogError: If the folder is missing, if it has no file of that object on that surface, or if fewer than ten
-            pushes at `speed` are usable.
-        ValueError: If the outline of the shape is unknown, if the speeds are equal, or if `train_share` is not between
-            0 and 1.
+        LogError: If the folder is missing, if it has no file of that object on that surface at one of the speeds, or if
+            no push is usable.
+        ValueError: If the outline of the shape is unknown.
     """
-    body = mit_shape(shape)
-    if not 0 < train_share < 1:
-        raise ValueError(f"train_share must be between 0 and 1; got {train_share}")
-    if abs(speed - fast_speed) < SAME_SPEED:
-        raise ValueError(f"speed and fast_speed must differ; got {speed} and {fast_speed}")
-    found, misnamed = _find_files(Path(folder).expanduser(), surface, shape)
-    constant_speed = [(index, *each) for index, each in enumerate(found) if each[0].acceleration == 0]
-    by_speed, unusable = _read_pushes(constant_speed, (speed, fast_speed), progress)
-    problems = [*misnamed, *unusable]
-    whole, fast = by_speed
-    if len(whole) < MIN_PUSHES:
-        raise _too_few_error(
-            Path(folder), f"{shape} on {surface} at {1e3 * speed:g} mm/s", len(whole), constant_speed, problems
-        )
-    is_training = np.zeros(len(whole), bool)
-    count = int(np.clip(round(train_share * len(whole)), 1, len(whole) - 1))
-    is_training[np.random.default_rng(seed).permutation(len(whole))[:count]] = True
-    test_rows = np.flatnonzero(~is_training)
-    pushes = _push_group(whole, (0.0, 1.0), body)
-    training_rows = np.flatnonzero(is_training & pushes.valid)
-    pairs = np.array([pair for row in training_rows for pair in training_pairs(whole[row], body)]).reshape(-1, 2, 3)
-    log = MitPushes(
-        whole=pushes,
-        middle=_push_group([whole[row] for row in test_rows], MIDDLE_PART, body),
-        fast=_push_group(fast, (0.0, 1.0), body),
-        is_training=is_training,
-        middle_of=test_rows.astype(np.int64),
-        repeats=_repeat_rows(fast, whole),
-        wrench=pairs[:, 0],
-        twist=pairs[:, 1],
-        vertices=body.vertices,
-        length=body.length,
-        tip_radius=body.tip_radius,
-        surface=surface,
-        shape=shape,
-        source=str(folder),
-    )
-    return log, tuple(problems)
+    body, path = mit_shape(shape), Path(folder).expanduser()
+    found, problems = find_files(path, surface, shape)
+    # the index of a push is its place among all files of the object and surface
+    wanted = [
+        (index, name, file)
+        for index, (name, file) in enumerate(found)
+        if name.acceleration == 0 and min(abs(name.speed - speed) for speed in speeds) < SAME_SPEED
+    ]
+    if not wanted:
+        asked, there = (", ".join(f"{1e3 * speed:g}" for speed in sorted(each)) for each in (speeds, _speeds(found)))
+        raise LogError(path, f"expected files of {shape} on {surface} at {asked} mm/s, found files at {there} mm/s")
+    results: list[Recording | LogError] = []
+    for done, (index, name, file) in enumerate(wanted):
+        try:
+            results.append(_read_push(index, name, file, body))
+        except LogError as error:
+            results.append(error)
+        progress(done + 1, len(wanted))
+    return collect(path, [*problems, *results], surface=surface, object=shape, **body._asdict())
 
 
-def _find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushParameters, Path]], list[LogError]]:
-    """Return what `find_mit_pushes` returns, and an error for each misnamed file of the same surface and object."""
+def find_files(folder: Path, surface: str, shape: str) -> tuple[list[tuple[PushName, Path]], list[LogError]]:
+    """Find the files of one object on one surface, sorted by their names' fields, with an error for a bad name."""
     if not folder.is_dir():
         raise LogError(folder, "expected a folder of the MIT pushing data set, found none")
-    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in (*SUFFIXES, ".zip"))
-    logs = [path for path in files if path.suffix.lower() in SUFFIXES and path.name.startswith(PREFIX)]
-    misnamed: list[LogError] = []
-    stems_found: dict[tuple[str, str], set[str]] = {}
-    found: dict[str, tuple[PushParameters, Path]] = {}
-    for path in sorted(logs, key=lambda path: SUFFIXES.index(path.suffix.lower())):
+    files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    found: dict[str, tuple[PushName, Path]] = {}
+    misnamed = []
+    others = set()
+    for path in sorted(files, key=lambda path: SUFFIXES.index(path.suffix.lower())):
+        if not path.name.startswith(PREFIX):
+            continue
         try:
-            name = parse_push_name(path)
+            name = parse_name(path)
         except LogError as error:
             if path.name.startswith(f"{PREFIX}{surface}_shape={shape}_"):
                 misnamed.append(error)
             continue
-        stems_found.setdefault((name.surface, name.shape), set()).add(path.stem)
         if (name.surface, name.shape) == (surface, shape):
             found.setdefault(path.stem, (name, path))
+        others.add(f"{name.shape} on {name.surface}")
     if not found:
+        zips = "only .zip files: unpack them first" if list(folder.rglob("*.zip")) else "none of the data set"
+        there = ", ".join(sorted(others)) or zips
+        wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
+        raise LogError(folder, f"{wanted}, found {there}")
+    return sorted(found.values(), key=lambda each: each[0][2:]), misnamed
+
+
+def _speeds(found: list[tuple[PushName, Path]]) -> set[float]:
+    """Return the speeds of the pushes of constant speed, m/s."""
+    return {name.speed for name, _ in found if name.acceleration == 0}
+
+
+def _read_push(index: int, name: PushName, path: Path, body: MitShape) -> Recording:
+    """Read the push of a file; LogError if the file is damaged or the tracker lost the object."""
+    (push,) = load_mit_log(path).pushes
+    push = _known_part(path, push)
+    _check_no_jump(path, push)
+    pairs = np.array(list(_wrench_twist_pairs(push, body))).reshape(-1, 2, 3)
+    about = {"action": name.action, **name._asdict()}
+    for known in ("surface", "shape", "acceleration"):  # equal for all pushes of a folder
+        del about[known]
+    return replace(push, index=index, wrench=pairs[:, 0], twist=pairs[:, 1], about=about)
+
+
+def _known_part(path: Path, push: Recording) -> Recording:
+    """Return a push from its first to its last sample with object and force; LogError if one between lacks them."""
+    assert push.force is not None  # these files always have force and time
+    assert push.time is not None
+    known = push.seen & np.isfinite(push.force[:, 0])
+    rows = np.flatnonzero(known)
+    if len(rows) < 2 or push.time[rows[-1]] == push.time[rows[0]]:
+        raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
+    # the force has no gaps, so an unknown sample is one at which the object was not seen
+    lost = push.time[rows[0] : rows[-1]][~known[rows[0] : rows[-1]]]
+    if len(lost):
+        span = f"{lost[0]:.2f} to {lost[-1]:.2f} s"
+        raise LogError(path, f"expected the object to be seen throughout, found it lost from {span}")
+    kept = slice(rows[0], rows[-1] + 1)
+    return Recording(0, push.hand[kept], push.pose[kept], push.force[kept], push.time[kept])
+
+
+def _check_no_jump(path: Path, push: Recording) -> None:
+    """Raise LogError if the tracker jumps."""
+    # All samples of a stretch of the path are compared, not only neighbors. The poses are interpolated at the time
+    # stamps of the tip, so where the tracker has fewer samples than the tip, a jump is spread over several samples.
+    assert push.time is not None
+    count, travel = len(push.hand), float(np.linalg.norm(push.hand[-1] - push.hand[0]))
+    window = count if travel <= JUMP_WINDOW else max(2, round(count * JUMP_WINDOW / travel))
+    extent = np.ptp(np.lib.stride_tricks.sliding_window_view(push.pose, window, axis=0), axis=2)
+    distance, turn = np.hypot(extent[:, 0], extent[:, 1]), extent[:, 2]
+    excess = np.maximum(distance / MAX_WINDOW_MOTION, turn / MAX_WINDOW_TURN)
+    row = int(np.argmax(excess))
+    if excess[row] > 1:
+        found = f"{1e3 * distance[row]:.0f} mm and {np.rad2deg(turn[row]):.0f} deg from {push.time[row]:.2f} s"
+        limits = f"{1e3 * MAX_WINDOW_MOTION:g} mm and {np.rad2deg(MAX_WINDOW_TURN):.0f} deg"
+        during = f"while the tip goes {1e3 * JUMP_WINDOW:g} mm"
         raise LogError(
-            folder,
-            _describe_missing(surface, shape, stems_found, [path for path in files if path.suffix.lower() == ".zip"]),
+            path, f"the tracker jumps: expected an object that moves by less than {limits} {during}, found {found}"
         )
-    return sorted(found.values(), key=_sort_key), misnamed
 
 
-def _read_pushes(
-    files: list[tuple[int, PushParameters, Path]], speeds: tuple[float, ...], progress: ProgressCallback
-) -> tuple[list[list[MitPush]], list[LogError]]:
-    """Read the pushes of each of the speeds, m/s, with one error for each file that cannot be used."""
-    pushes: list[list[MitPush]] = [[] for _ in speeds]
-    problems = []
-    wanted = [
-        (group, *each)
-        for each in files
-        for group, speed in zip(pushes, speeds, strict=True)
-        if abs(each[1].speed - speed) < SAME_SPEED
-    ]
-    for done, (group, index, name, path) in enumerate(wanted):
-        try:
-            group.append(read_push(index, name, path))
-        except LogError as error:
-            problems.append(error)
-        progress(done + 1, len(wanted))
-    return pushes, problems
+def times_at(push: Recording, fractions: Sequence[float] | Floats) -> Floats:
+    """Return the times (k,), in s, at these fractions (k,) of the duration of a push."""
+    assert push.time is not None
+    begin, end = push.time[0], push.time[-1]
+    return np.clip(begin + np.asarray(fractions) * (end - begin), begin, end)  # roundoff might exceed the end
 
 
-def _sort_key(named: tuple[PushParameters, Path]) -> tuple[float, ...]:
-    """Return the key by which pushes are sorted."""
-    _, _, *numbers, repetition = named[0]
-    return (*numbers, -1 if repetition is None else repetition)
+def states_at(push: Recording, fractions: Sequence[float] | Floats) -> tuple[Floats, Floats]:
+    """Return the poses (k, 3) and the hand's configurations (k, dof) at fractions (k,) of the duration of a push."""
+    assert push.time is not None
+    times = times_at(push, fractions)
+    return interpolated(times, push.time, push.pose), interpolated(times, push.time, push.hand)
 
 
-def _describe_missing(surface: str, shape: str, stems_found: dict[tuple[str, str], set[str]], zips: list[Path]) -> str:
-    """Describe what was found in place of the wanted files."""
-    wanted = f"expected files {PREFIX}{surface}_shape={shape}_... ({', '.join(SUFFIXES)})"
-    if stems_found:
-        counts = (f"{len(stems)} of {other} on {on}" for (on, other), stems in sorted(stems_found.items()))
-        return f"{wanted}, found {', '.join(counts)}"
-    if zips:
-        return f"{wanted}, found only .zip files ({zips[0].name}, say): unpack them first"
-    return f"{wanted}, found none of the data set"
+def in_body(pose: Floats, vectors: Floats) -> Floats:
+    """Rotate world vectors (k, 2) into the body frames of k poses (k, 3)."""
+    return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
 
 
-def _too_few_error(
-    folder: Path,
-    what: str,
-    count: int,
-    constant_speed: list[tuple[int, PushParameters, Path]],
-    problems: list[LogError],
-) -> LogError:
-    """Make the error for a folder with too few usable pushes."""
-    speeds = ", ".join(f"{1e3 * speed:g}" for speed in sorted({name.speed for _, name, _ in constant_speed})) or "none"
-    message = f"expected at least {MIN_PUSHES} usable pushes of {what}, found {count}; files there are at {speeds} mm/s"
-    if problems:
-        message += f"; {len(problems)} files cannot be used: {Path(problems[0].path).name}: {problems[0].message}"
-    return LogError(folder, message)
+def _wrench_twist_pairs(push: Recording, body: MitShape) -> Iterator[tuple[Floats, Floats]]:
+    """Iterate over the wrenches (3,), N and N m, and displacements (3,), m and rad, of the parts with pressing."""
+    assert push.time is not None
+    assert push.force is not None
+    tip, force = in_body(push.pose, push.hand - push.pose[:, :2]), in_body(push.pose, push.force)
+    distance, contact = nearest_on_outline(body.vertices, tip)
+    inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
+    torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
+    fractions = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
+    poses, _ = states_at(push, fractions)
+    row_at = np.searchsorted(push.time, times_at(push, fractions))
+    for part in range(0, 2 * NUM_PARTS, 2):
+        rows = slice(row_at[part], row_at[part + 2])
+        if rows.start == rows.stop:
+            continue
+        # wrench and displacement are about the body origin, in the body frame at the middle of the part
+        to_body = rotation(poses[part + 1, 2]).T
+        displacement = poses[part + 2] - poses[part]
+        wrench = np.append(to_body @ push.force[rows].mean(axis=0), torque[rows].mean())
+        twist = np.append(to_body @ displacement[:2], displacement[2])
+        motion = np.linalg.norm(twist[:2]) + body.length * abs(twist[2])
+        presses = np.abs(np.arctan2(across[rows].mean(), along[rows].mean())) < MAX_FORCE_ANGLE
+        strong = np.linalg.norm(wrench[:2]) >= MIN_FORCE
+        if presses and strong and motion >= MIN_MOTION and wrench @ twist > 0:
+            yield wrench, twist
 
 
-def _push_group(pushes: Sequence[MitPush], fractions: tuple[float, float], body: MitShape) -> StraightPushes:
-    """Return a group of pushes, each from its state at the first to that at the second fraction of its duration."""
-    ends = [push.states_at(fractions) for push in pushes]
-    pose = np.array([pose for pose, _ in ends]).reshape(-1, 2, 3)
-    tip = np.array([tip for _, tip in ends]).reshape(-1, 2, 2)
-    start, end = pose[:, 0], pose[:, 1]
-    end[:, 2] = start[:, 2] + wrap_to_pi(end[:, 2] - start[:, 2])
-    index = np.array([push.index for push in pushes], np.int64)
-    return StraightPushes(index, start, end, tip[:, 0], tip[:, 1], _is_trustworthy(pose, tip, body), toolbox={})
-
-
-def _is_trustworthy(pose: Floats, tip: Floats, body: MitShape) -> NDArray[np.bool_]:
-    """Return a mask (k,) of pushes whose poses (k, 2, 3) and tips (k, 2, 2) at the ends can be trusted."""
-    if not len(pose):
-        return np.zeros(0, bool)
-    before, after = (
-        nearest_on_outline(body.vertices, in_body(pose[:, end], tip[:, end] - pose[:, end, :2]))[0] - body.tip_radius
-        for end in (0, 1)
-    )
-    moved, path = (np.linalg.norm(each[:, 1, :2] - each[:, 0, :2], axis=1) for each in (pose, tip))
-    touching = (np.abs(before) < MAX_GAP) & (after > -MAX_OVERLAP)
-    pushed = (moved - path <= MAX_AHEAD) & (np.abs(pose[:, 1, 2] - pose[:, 0, 2]) < MAX_TURN)
-    return touching & pushed & (path > MIN_PATH * np.median(path))
-
-
-def _repeat_rows(fast: Sequence[MitPush], whole: Sequence[MitPush]) -> NDArray[np.int64]:
-    """Return the rows (r, 2) in `fast` and `whole` of the same nominal push with the nearest repetition."""
-    rows_by_nominal: dict[tuple[float, ...], list[int]] = {}
-    for row, push in enumerate(whole):
-        rows_by_nominal.setdefault(_nominal_push(push), []).append(row)
-    pairs = []
-    for row, push in enumerate(fast):
-        same = rows_by_nominal.get(_nominal_push(push), [])
-        if same:
-            pairs.append((row, min(same, key=lambda at: abs(_repetition(whole[at]) - _repetition(push)))))
-    return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-def _nominal_push(push: MitPush) -> tuple[float, ...]:
-    """Return side, fraction and angle, which are equal in repetitions of a push."""
-    return push.name.side, push.name.fraction, push.name.angle
-
-
-def _repetition(push: MitPush) -> int:
-    """Return the number of the repetition; 0 if the push has none."""
-    return push.name.repetition or 0
+def _cross(a: Floats, b: Floats) -> Floats:
+    """Return the cross products (n,) of vectors (n, 2) in the plane."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.datasets.push_log import Floats
+from pushjax.datasets.recordings import Floats
 
 TIP_RADIUS = 0.00475  # radius of the pusher's tip, m
 # Dimensions in m: half sides of rectangles, legs of triangles, distance of the origin from each leg.

@@ -1,21 +1,23 @@
-"""Read pushes from plain files: a `.csv` table, or an `.npz` archive of pushes with equally many samples.
+"""Read pushes from plain files: a `.csv` table, or an `.npz` archive as `Recordings.save` writes it.
 
 Units are SI, and the frame is the world frame. The constants at the top of this file list names and shapes.
 """
 
 import csv
 import math
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pushjax.datasets._archive import Arrays, floats, read_archive
-from pushjax.datasets.push_log import Floats, LogError
-from pushjax.datasets.recordings import FORCE, HAND, OBJECT, Recording, Recordings, checked_recording, collect
-from pushjax.datasets.records import ParseError, quoted
+from pushjax.datasets.checks import FORCE, HAND, OBJECT, checked_recording, collect_checked
+from pushjax.datasets.recordings import FACTS, Floats, LogError, Recording, Recordings, quoted
 
 # Columns of a table: all of _REQUIRED, and any groups of _OPTIONAL_GROUPS, each as a whole.
 _PUSH = "push"
@@ -25,11 +27,34 @@ COLUMNS = (_PUSH, *HAND, *OBJECT, "time", *FORCE)
 # A row may lack all numbers of the object's pose, if the object was not seen, or of the force, if none was measured.
 _MAY_BE_BLANK = (*OBJECT, *FORCE)
 
-# Arrays of an archive with n pushes of k samples: `path`, and either `start` and `end` or `pose`.
-_POSES_AT_ENDS, _POSES_ALL_ALONG = ("start", "end"), ("pose",)
-_OPTIONAL_ARRAYS = ("force", "time")
-ARRAYS = ("path", *_POSES_AT_ENDS, *_POSES_ALL_ALONG, *_OPTIONAL_ARRAYS)
-LAYOUT = "path (n, k, dof) with start and end (n, 3) or pose (n, k, 3), if known force (n, k, 2) and time (n, k)"
+# Arrays of an archive, with their shapes for n pushes of k samples. Arrays `about_...` have n rows of any shape. Only
+# `path` and the poses are required.
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "path": ("n", "k", "dof"),
+    "start": ("n", 3),
+    "end": ("n", 3),
+    "pose": ("n", "k", 3),
+    "force": ("n", "k", 2),
+    "time": ("n", "k"),
+    "wrench": ("n", "p", 3),
+    "twist": ("n", "p", 3),
+    "index": ("n",),
+    "vertices": ("v", 2),
+    "length": (),
+    "tip_radius": (),
+    "support_points": ("s", 2),
+    "support_force": ("s",),
+    "surface": (),
+    "object": (),
+    "problem": ("q",),
+    "problem_push": ("q",),
+}
+_TEXT = ("surface", "object", "problem")
+_ABOUT = "about_"
+LAYOUT = (
+    "path (n, k, dof) with start and end (n, 3) or pose (n, k, 3), if known force (n, k, 2), time (n, k) and others"
+)
+Arrays = dict[str, NDArray[Any]]
 
 
 class _Row(NamedTuple):
@@ -37,6 +62,14 @@ class _Row(NamedTuple):
 
     line: int  # line of the file on which the row ends, from 1
     cells: list[str]
+
+
+class _ParseError(Exception):
+    """A row that cannot be read."""
+
+    def __init__(self, message: str, line: int) -> None:
+        super().__init__(message)
+        self.line = line
 
 
 def load_csv(path: Path) -> Recordings:
@@ -50,7 +83,10 @@ def load_csv(path: Path) -> Recordings:
     # Rows that are too short to have a label form a push of their own, which becomes a problem.
     pushes = groupby(rows, key=lambda row: row.cells[label_column].strip() if label_column < len(row.cells) else "")
     # A push becomes a problem if a cell is bad, or if the object is not seen in its first or last row.
-    return collect(path, (_read_push(path, index, names, list(group)) for index, (_, group) in enumerate(pushes)))
+    return collect_checked(
+        path,
+        (_read_push(path, index, names, list(rows_of_push)) for index, (_, rows_of_push) in enumerate(pushes)),
+    )
 
 
 def _nonblank_rows(path: Path) -> Iterator[_Row]:
@@ -89,8 +125,8 @@ def _check_header(path: Path, header: _Row) -> list[str]:
 def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recording | LogError:
     """Read the rows of one push, or return the error that describes its first fault."""
     try:
-        numbers = [_read_row(names, row) for row in rows]
-    except ParseError as fault:
+        numbers = [_read_line(names, row) for row in rows]
+    except _ParseError as fault:
         return LogError(path, str(fault), push=index, line=fault.line)
 
     def columns(wanted: tuple[str, ...]) -> Floats:
@@ -107,87 +143,128 @@ def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Re
     )
 
 
-def _read_row(names: list[str], row: _Row) -> Mapping[str, float]:
-    """Read the numbers of a row, by column, or raise ParseError; NaN for a blank cell where it is allowed."""
+def _read_line(names: list[str], row: _Row) -> Mapping[str, float]:
+    """Read the numbers of a row, by column, or raise _ParseError; NaN for a blank cell where it is allowed."""
     if len(row.cells) != len(names):
-        raise ParseError(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
+        raise _ParseError(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
     cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
     if not cells.pop(_PUSH):
-        raise ParseError(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
+        raise _ParseError(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
     return {name: _read_cell(name, cell, row.line) for name, cell in cells.items()}
 
 
 def _read_cell(name: str, cell: str, line: int) -> float:
-    """Read the number in a cell, or raise ParseError; NaN for a blank cell where it is allowed."""
+    """Read the number in a cell, or raise _ParseError; NaN for a blank cell where it is allowed."""
     if not cell and name in _MAY_BE_BLANK:
         return math.nan
     try:
         value = float(cell)
     except ValueError:
         found = quoted(cell) if cell else "a blank"
-        raise ParseError(f"expected a number in column {name}, found {found}", line) from None
+        raise _ParseError(f"expected a number in column {name}, found {found}", line) from None
     if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_BE_BLANK):
-        raise ParseError(f"expected a finite number in column {name}, found {cell}", line)
+        raise _ParseError(f"expected a finite number in column {name}, found {cell}", line)
     return value
 
 
-def load_plain_npz(path: Path, names: frozenset[str]) -> Recordings:
-    """Read an `.npz` archive of pushes with equally many samples and with the arrays `names`."""
-    wanted = _arrays_to_read(path, names)
-    data = read_archive(path, wanted, "pushes")
+def load_npz(path: Path) -> Recordings:
+    """Read an `.npz` archive of pushes; rows of NaN at the end of a path stand for samples that the push lacks."""
+    data = _read_archive(path)
     _check_arrays(path, data)
-    numbers = {name: floats(array) for name, array in data.items()}
-    if "pose" in numbers:
-        pose = numbers["pose"]
-    else:
-        pose = np.full((*numbers["path"].shape[:2], 3), np.nan)
-        pose[:, 0], pose[:, -1] = numbers["start"], numbers["end"]
-
-    def optional_row(name: str, index: int) -> Floats | None:
-        return numbers[name][index] if name in numbers else None
-
+    numbers: dict[str, Floats] = {
+        name: np.array(array, np.float64)
+        for name, array in data.items()
+        if name not in _TEXT and not name.startswith(_ABOUT)
+    }
     # A push becomes a problem if it has numbers that are not finite, other than NaN for an unseen pose or no force.
-    return collect(
+    recordings = collect_checked(
         path,
-        (
-            checked_recording(
-                path, index, hand, pose[index], force=optional_row("force", index), time=optional_row("time", index)
-            )
-            for index, hand in enumerate(numbers["path"])
-        ),
+        (_read_row(path, row, numbers, data) for row in range(len(data["path"]))),
+        **{name: _fact(data[name]) for name in FACTS if name in data},
     )
+    stored = zip(data.get("problem", ()), numbers.get("problem_push", ()), strict=True)
+    problems = tuple(LogError(path, str(text), push=None if push < 0 else int(push)) for text, push in stored)
+    return replace(recordings, problems=(*problems, *recordings.problems))
 
 
-def _arrays_to_read(path: Path, names: frozenset[str]) -> list[str]:
-    """Return the names of the arrays to read, or raise LogError for unknown or conflicting arrays."""
-    unknown = sorted(names - set(ARRAYS))
-    if unknown:
-        raise LogError(path, f"expected {LAYOUT}; found unknown arrays {', '.join(unknown)}")
-    if set(_POSES_ALL_ALONG) & names and set(_POSES_AT_ENDS) & names:
+def _fact(array: NDArray[Any]) -> Any:
+    """Return the fact that an array holds: text, a number or an array of numbers."""
+    if array.dtype.kind == "U":
+        return str(array)
+    return np.array(array, np.float64) if array.ndim else float(array)
+
+
+def _read_row(path: Path, row: int, numbers: Mapping[str, Floats], data: Arrays) -> Recording | LogError:
+    """Read one push of an archive."""
+    hand = numbers["path"][row]
+    count = 1 + max(np.flatnonzero(~np.isnan(hand).all(axis=1)), default=-1)
+    if "pose" in numbers:
+        pose = numbers["pose"][row, :count]
+    else:
+        pose = np.full((count, 3), np.nan)
+        if count:
+            pose[0], pose[-1] = numbers["start"][row], numbers["end"][row]
+    samples = {name: numbers[name][row, :count] for name in ("force", "time") if name in numbers}
+    pairs = {name: numbers[name][row] for name in ("wrench", "twist") if name in numbers}
+    pairs = {name: values[~np.isnan(values).all(axis=1)] for name, values in pairs.items()}
+    about = {name.removeprefix(_ABOUT): array[row] for name, array in data.items() if name.startswith(_ABOUT)}
+    index = int(numbers["index"][row]) if "index" in numbers else row
+    return checked_recording(path, index, hand[:count], pose, **samples, **pairs, about=about)
+
+
+def _read_archive(path: Path) -> Arrays:
+    """Read the arrays of an `.npz` archive of pushes, or raise LogError."""
+    try:
+        # The file is opened here, because np.load does not close a file that is no archive.
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise LogError(path, "expected an .npz archive of pushes, found a single array")
+            _check_names(path, set(archive.files))
+            return {name: archive[name] for name in archive.files}
+    except LogError:
+        raise
+    except OSError as error:
+        raise LogError(
+            path, f"expected an .npz archive, but cannot read the file: {error.strerror or error}"
+        ) from error
+    # A damaged archive may request a compression method that does not exist, or more memory than there is.
+    except (ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
+        raise LogError(path, f"expected an .npz archive of pushes, found something else: {error}") from error
+
+
+def _check_names(path: Path, names: set[str]) -> None:
+    """Raise LogError for unknown, missing or conflicting arrays."""
+    unknown = sorted(name for name in names if name not in _SHAPES and not name.startswith(_ABOUT))
+    if "path" not in names or unknown:
+        found = f"unknown arrays {', '.join(unknown[:10])}" if unknown else "no path"
+        raise LogError(path, f"expected arrays of pushes: {LAYOUT}; found {found}")
+    if "pose" in names and names & {"start", "end"}:
         raise LogError(path, "expected either start and end or pose, found both")
-    poses = _POSES_ALL_ALONG if set(_POSES_ALL_ALONG) & names else _POSES_AT_ENDS
-    # Required arrays are listed even if they are absent, because `read_archive` reports them as missing.
-    return ["path", *poses, *(name for name in _OPTIONAL_ARRAYS if name in names)]
+    pairs = (("wrench", "twist"), ("problem", "problem_push"), *([] if "pose" in names else [("start", "end")]))
+    needed = {name for pair in pairs if names & set(pair) or pair[0] == "start" for name in pair}
+    if needed - names:
+        raise LogError(path, f"expected {LAYOUT}; found no {', '.join(sorted(needed - names))}")
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:
-    """Raise LogError unless the arrays have numbers and shapes that fit the shape of `path`."""
-    for name, array in data.items():
-        if array.dtype.kind not in "fiu":
-            raise LogError(path, f"expected numbers in {name}, found {array.dtype}")
-    path_shape = data["path"].shape
-    if len(path_shape) != 3 or path_shape[0] < 1 or path_shape[1] < 2 or path_shape[2] < 2:
+    """Raise LogError unless the arrays have the types and shapes of `_SHAPES`, which fit each other."""
+    given = data["path"].shape
+    if len(given) != 3 or given[0] < 1 or min(given[1:]) < 2:
         message = "expected path of shape (n, k, dof) for n pushes of k samples, dof and k at least 2"
-        raise LogError(path, f"{message}; found {path_shape}")
-    row_shapes = {
-        "start": (3,),
-        "end": (3,),
-        "pose": (path_shape[1], 3),
-        "force": (path_shape[1], 2),
-        "time": (path_shape[1],),
-    }
-    for name in data.keys() - {"path"}:
-        shape = (path_shape[0], *row_shapes[name])
-        if data[name].shape != shape:
-            expected = f"expected {name} of shape {shape} to go with path {path_shape}"
-            raise LogError(path, f"{expected}; found {data[name].shape}")
+        raise LogError(path, f"{message}; found {given}")
+    sizes: dict[str | int, int] = {}
+    for name in sorted(data, key=lambda name: name != "path"):
+        array = data[name]
+        shape = _SHAPES.get(name, ("n", *array.shape[1:]))
+        if not name.startswith(_ABOUT) and array.dtype.kind not in ("U" if name in _TEXT else "fiu"):
+            raise LogError(path, f"expected {'text' if name in _TEXT else 'numbers'} in {name}, found {array.dtype}")
+        fits = len(shape) == array.ndim
+        for size, length in zip(shape, array.shape, strict=False):
+            fits &= length == (size if isinstance(size, int) else sizes.setdefault(size, length))
+        if not fits:
+            wanted = ", ".join(f"{size}={sizes[size]}" if size in sizes else str(size) for size in shape)
+            raise LogError(path, f"expected {name} of shape ({wanted}), found {array.shape}")
+    for name in ("vertices", "length", "tip_radius", "support_points", "support_force", "index", "problem_push"):
+        if name in data and not np.isfinite(data[name]).all():
+            raise LogError(path, f"expected finite numbers in {name}, found NaN or infinity")

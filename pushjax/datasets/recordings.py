@@ -1,29 +1,69 @@
-"""Recorded pushes of any hand and object: one structure for all kinds of files.
+"""Recorded pushes of any hand and object: one structure for all files, and what the readers of files share.
 
-World frame, body frame and the sign of the force are those of `push_log`.
+Frames: *world* is the base frame of the robot. *body* is fixed to the object. A body point p lies at
+(x, y) + R(theta) p in the world. Forces and wrenches are those that the hand applies *to the object*.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike, fspath
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets.push_log import Floats, LogError, Push, PushLog, nothing_usable
-from pushjax.datasets.records import LARGEST_NUMBER
-
-# Names of the columns, in files and in error messages.
-HAND = ("hand_x", "hand_y", "hand_theta", "hand_distance")
-OBJECT = ("object_x", "object_y", "object_theta")
-FORCE = ("force_x", "force_y")
-# Largest object angle, in turns from zero; a larger one is taken to be in degrees. This is tested before unwrapping,
-# because unwrapped degrees look like any other angle.
-MAX_TURNS = 2
+Floats = NDArray[np.float64]
 
 
-class AnglesInDegrees(LogError):
-    """The error for a push whose angles are so large that they are probably in degrees."""
+class LogError(ValueError):
+    """A log, or one push of it, that cannot be used.
+
+    Attributes:
+        path: The file, as given by the caller.
+        message: What was expected, and what was found.
+        push: Index of the push in the file, from 0; None if unknown.
+        line: Line in the file, from 1; None if unknown.
+    """
+
+    def __init__(
+        self, path: str | PathLike[str], message: str, *, push: int | None = None, line: int | None = None
+    ) -> None:
+        super().__init__(message)
+        self.path = fspath(path)
+        self.message = message
+        self.push = push
+        self.line = line
+
+    def __str__(self) -> str:
+        place = [self.path]
+        if self.push is not None:
+            place.append(f"push {self.push}")
+        if self.line is not None:
+            place.append(f"line {self.line}")
+        return f"{', '.join(place)}: {self.message}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # By default, pickle rebuilds an exception from its message alone. That would fail between processes.
+        return _rebuild_error, (self.path, self.message, self.push, self.line)
+
+
+def _rebuild_error(path: str, message: str, push: int | None, line: int | None) -> LogError:
+    """Rebuild a pickled error."""
+    return LogError(path, message, push=push, line=line)
+
+
+def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> LogError:
+    """Return the error for a file without a usable push: the first problem, and how many more there are."""
+    if not problems:
+        return LogError(path, "expected at least one push, found none")
+    first = problems[0]
+    more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
+    return LogError(first.path, f"no usable push: {first.message}{more}", push=first.push, line=first.line)
+
+
+def _no_rows() -> Floats:
+    return np.empty((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,25 +74,35 @@ class Recording:
         index: Index of the push in its file, from 0.
         hand: (m, dof) configurations of the hand as `pushjax.Hand` takes them, in m and rad, world frame. With dof = 2
             they are the center (x, y) of a finger. With more, the third is the angle theta, which is continuous, and
-            the fourth is the distance d of the hand (the column `hand_distance` of a file).
+            the fourth is the distance d of the hand.
         pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one seen
-            sample to the next. NaN where the object was not seen.
-        seen: (m,) whether the object was seen. True for the first and the last sample.
+            sample to the next. NaN where the object was not seen; the first and the last sample are never NaN.
         force: (m, 2) forces on the object, in N, world frame, NaN where there is none; None if no force was recorded.
         time: (m,) times, in s, non-decreasing, from an arbitrary origin; None if no time was recorded.
+        wrench: (p, 3) wrenches on the object, of any scale, in the body frame about its origin, from the forces of the
+            push; (0, 3) if unknown.
+        twist: (p, 3) twists of the object under these wrenches, of any scale, in the body frame about its origin.
+        about: What else is known of the push, by name, as numbers, text or arrays; `Recordings.about` lists the names.
     """
 
     index: int
     hand: Floats
     pose: Floats
-    seen: NDArray[np.bool_]
-    force: Floats | None
-    time: Floats | None
+    force: Floats | None = None
+    time: Floats | None = None
+    wrench: Floats = field(default_factory=_no_rows)
+    twist: Floats = field(default_factory=_no_rows)
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(m,) whether the object was seen."""
+        return np.isfinite(self.pose[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """The usable pushes of one file, the problems of the others, and what the file says about the object.
+    """The usable pushes of one file, the problems of the others, and what is known of the object.
 
     Optional attributes are None if they are unknown.
 
@@ -60,11 +110,14 @@ class Recordings:
         pushes: The usable pushes, in the order of the file, all with the same dof.
         problems: One error for each unusable push, and one for each problem of the file as a whole (a truncated end,
             say).
-        source: The file that was read.
+        source: The file or folder that was read.
         vertices: (k, 2) vertices of the object, in m, body frame.
         length: Characteristic length, in m, which weighs rotation against translation.
         tip_radius: Radius of the finger, in m.
         support_points: (p, 2) support points, in m, body frame; (0, 2) if the whole face touches the surface.
+        support_force: (p,) normal force at each support point, in N.
+        surface: Name of the surface that the object slides on.
+        object: Name of the object; of the triangle, the name of its supports.
     """
 
     pushes: tuple[Recording, ...]
@@ -74,44 +127,95 @@ class Recordings:
     length: float | None = None
     tip_radius: float | None = None
     support_points: Floats | None = None
+    support_force: Floats | None = None
+    surface: str | None = None
+    object: str | None = None
 
-    @staticmethod
-    def of_log(log: PushLog) -> "Recordings":
-        """Convert a triangle log, in which the object is seen only at the first and the last sample of the finger.
+    def __len__(self) -> int:
+        return len(self.pushes)
 
-        The force is interpolated at the finger's samples. The finger's path is the logged one, which ends about a
-        millimeter before the object comes to rest (see `PushLog.commanded_tip_end`).
+    @property
+    def start(self) -> Floats:
+        """(n, 3) pose of the object at the first sample of each push, in m and rad, world frame."""
+        return np.array([push.pose[0] for push in self.pushes]).reshape(-1, 3)
+
+    @property
+    def end(self) -> Floats:
+        """(n, 3) pose of the object at the last sample of each push, in m and rad, world frame."""
+        return np.array([push.pose[-1] for push in self.pushes]).reshape(-1, 3)
+
+    def about(self, name: str) -> NDArray[Any]:
+        """Return what is known of each push under a name.
 
         Args:
-            log: The log, from `load_triangle_log` or `load_push_npz`.
+            name: From `load_two_finger_logs`: "action" (equal for repetitions of the same nominal push) and "began" (s
+                since 1970). From `load_mit_folder`: "action", "speed" (m/s), "side" (from 0), "fraction" (position
+                along the side, in [0, 1]), "angle" (from the normal of the side, rad) and "repetition" (from 0). From
+                an `.npz` file: the names of its arrays `about_…`.
 
         Returns:
-            The same pushes and problems.
+            (n, ...) values.
+
+        Raises:
+            KeyError: If nothing is known under that name.
         """
-        return Recordings(
-            pushes=tuple(_from_push(push) for push in log.pushes),
-            problems=log.problems,
-            source=log.source,
-            vertices=log.vertices,
-            length=log.length,
-            tip_radius=log.tip_radius,
-            support_points=log.support_points,
-        )
+        return np.array([push.about[name] for push in self.pushes])
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write everything to an `.npz` file, from which `load_recordings` reads the same numbers.
+
+        Args:
+            path: The file. The page "Data" of the documentation lists its arrays.
+
+        Raises:
+            ValueError: If there are no pushes.
+        """
+        if not self.pushes:
+            raise ValueError("pushes: expected at least one to save; got none")
+        columns: dict[str, list[Any]] = {
+            "path": [push.hand for push in self.pushes],
+            "pose": [push.pose for push in self.pushes],
+            "force": [push.force for push in self.pushes],
+            "time": [push.time for push in self.pushes],
+            "wrench": [push.wrench for push in self.pushes],
+            "twist": [push.twist for push in self.pushes],
+        }
+        arrays = {name: _padded(rows) for name, rows in columns.items() if all(row is not None for row in rows)}
+        arrays["index"] = np.array([push.index for push in self.pushes])
+        arrays |= {f"about_{name}": self.about(name) for name in self.pushes[0].about}
+        facts = (getattr(self, name) for name in FACTS)
+        arrays |= {name: np.asarray(fact) for name, fact in zip(FACTS, facts, strict=True) if fact is not None}
+        if self.problems:
+            arrays["problem"] = np.array([problem.message for problem in self.problems])
+            arrays["problem_push"] = np.array([-1 if each.push is None else each.push for each in self.problems])
+        with Path(path).expanduser().open("wb") as file:  # given a path, NumPy would append a suffix
+            np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def _from_push(push: Push) -> Recording:
-    """Convert a push of a triangle log."""
-    count = len(push.tip)
-    pose = np.full((count, 3), np.nan)
-    pose[0], pose[-1] = push.pose_start, push.pose_end
-    return Recording(
-        index=push.index,
-        hand=push.tip,
-        pose=pose,
-        seen=np.isfinite(pose[:, 0]),
-        force=interpolated(push.tip_time, push.force_time, push.force),
-        time=push.tip_time,
-    )
+FACTS = ("vertices", "length", "tip_radius", "support_points", "support_force", "surface", "object")
+
+
+def _padded(rows: Sequence[Floats]) -> Floats:
+    """Return arrays (m, ...) of several lengths m as one array, with NaN after the end of the shorter ones."""
+    padded = np.full((len(rows), max(map(len, rows)), *rows[0].shape[1:]), np.nan)
+    for target, row in zip(padded, rows, strict=True):
+        target[: len(row)] = row
+    return padded
+
+
+def collect(path: Path, results: Iterable[Recording | LogError], **facts: Any) -> Recordings:
+    """Collect the recordings and the errors of all pushes of a file; LogError if no push is usable."""
+    results = list(results)
+    problems = tuple(result for result in results if isinstance(result, LogError))
+    pushes = tuple(result for result in results if isinstance(result, Recording))
+    if not pushes:
+        raise nothing_usable(path, problems)
+    return Recordings(pushes, problems, str(path), **facts)
+
+
+def quoted(text: str) -> str:
+    """Quote text for a message, shortened to 40 characters."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
 def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
@@ -120,99 +224,12 @@ def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
     return np.stack(columns, axis=1)
 
 
-def collect(path: Path, results: Iterable[Recording | LogError]) -> Recordings:
-    """Collect the recordings and the errors of all pushes of a file; LogError if no push is usable."""
-    results = list(results)
-    if 4 * sum(isinstance(result, AnglesInDegrees) for result in results) > len(results):
-        # The others only seem to be in rad, because their angles in degrees are small.
-        message = "the angles of many other pushes of the file cannot be in rad: are all in degrees?"
-        results = [
-            AnglesInDegrees(path, message, push=result.index) if isinstance(result, Recording) else result
-            for result in results
-        ]
-    problems = tuple(result for result in results if isinstance(result, LogError))
-    pushes = tuple(result for result in results if isinstance(result, Recording))
-    if not pushes:
-        raise nothing_usable(path, problems)
-    return Recordings(pushes, problems, str(path))
+def rotation(theta: Floats | float) -> Floats:
+    """Return the rotation matrices (..., 2, 2) of angles (...) in rad."""
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
 
 
-def checked_recording(
-    path: Path,
-    index: int,
-    hand: Floats,
-    pose: Floats,  # NaN where the object was not seen, as `force` where there is none; angles may be wrapped
-    *,
-    force: Floats | None = None,
-    time: Floats | None = None,
-    lines: Sequence[int] | None = None,  # (m,), line of each sample in the file, from 1
-) -> Recording | LogError:
-    """Return the recording of one push, with unwrapped angles, or the error for its first fault."""
-
-    def error_at(message: str, row: int) -> LogError:
-        return LogError(
-            path, f"{message} in row {row} of the push", push=index, line=None if lines is None else lines[row]
-        )
-
-    if len(hand) < 2:
-        return LogError(
-            path, f"expected at least two rows, found {len(hand)}", push=index, line=lines[0] if lines else None
-        )
-    problem = _find_problem(hand, pose, force, time, error_at)
-    if problem is not None:
-        return problem
-    seen = np.isfinite(pose[:, 0])
-    largest = float(np.max(np.abs(pose[seen, 2])))
-    if largest > MAX_TURNS * 2 * np.pi:
-        message = f"object_theta is up to {largest:.4g} rad; expected at most two turns from zero: is it in degrees?"
-        return AnglesInDegrees(path, message, push=index, line=lines[0] if lines else None)
-    pose, hand = pose.copy(), hand.copy()
-    pose[seen, 2] = np.unwrap(pose[seen, 2])
-    if hand.shape[1] > 2:
-        hand[:, 2] = np.unwrap(hand[:, 2])
-    return Recording(index, hand, pose, seen, force, time)
-
-
-def _find_problem(
-    hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, error_at: Callable[[str, int], LogError]
-) -> LogError | None:
-    """Return the first fault in the arrays of `checked_recording`; `error_at` makes it of message and row."""
-    columns = [(hand_columns(hand.shape[1]), hand, False), (OBJECT, pose, True)]
-    if force is not None:
-        columns.append((FORCE, force, True))
-    if time is not None:
-        columns.append((("time",), time[:, None], False))
-    for names, values, may_be_missing in columns:
-        fault = find_bad_number(names, values, may_be_missing)
-        if fault is not None:
-            return error_at(*fault)
-    for row, where in ((0, "first"), (len(pose) - 1, "last")):
-        if np.isnan(pose[row, 0]):
-            return error_at(f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row)
-    back = np.flatnonzero(np.diff(time) < 0) if time is not None else []
-    if time is not None and len(back):
-        row = int(back[0]) + 1
-        step = time[row] - time[row - 1]
-        return error_at(f"expected time stamps that do not go back, found a step of {step:.3g} s", row)
-    return None
-
-
-def hand_columns(dof: int) -> tuple[str, ...]:
-    """Return the names (dof,) of the columns of a hand's configuration."""
-    return (*HAND[:dof], *(f"hand_{column}" for column in range(len(HAND), dof)))
-
-
-def find_bad_number(names: Sequence[str], values: Floats, may_be_missing: bool) -> tuple[str, int] | None:
-    """Return a message and the row of the first number (m, c) that is not finite or too large, or None."""
-    bad = ~(np.abs(values) < LARGEST_NUMBER)
-    if may_be_missing:  # then all numbers of a row may be NaN
-        bad[np.isnan(values).all(axis=1)] = False
-    rows = np.flatnonzero(bad.any(axis=1))
-    if not len(rows):
-        return None
-    row = int(rows[0])
-    column = int(np.argmax(bad[row]))
-    value = values[row, column]
-    limit, found = ("", "none") if np.isnan(value) else (f" below {LARGEST_NUMBER:g}", f"{value:g}")
-    alternative = f" (or none of {', '.join(names)})" if may_be_missing else ""
-    return f"expected a number{limit} for {names[column]}{alternative}, found {found}", row
+def wrap_angle(angle: Floats) -> Floats:
+    """Return the same angle in (-pi, pi], in rad."""
+    return np.pi - np.mod(np.pi - angle, 2 * np.pi)

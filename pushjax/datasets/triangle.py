@@ -1,35 +1,63 @@
 """Read original text logs of the aluminum triangle that one finger pushes.
 
-`_check_record` has the conditions under which a record counts as a push. `_convert_record` interprets its numbers. Both
-follow the published toolbox, with two exceptions: quaternions are normalized here, because they are logged with three
-to six digits, and angles never turn the long way.
+The conversion of the numbers follows the published toolbox, with two exceptions: quaternions are normalized here,
+because they are logged with three to six digits, and angles never turn the long way. The toolbox has lengths in
+millimeters, and points in the *corner frame*: the origin of this frame is at the right-angle corner, and its axes are
+along the two legs. Here points are in meters in the body frame, whose origin is at the center of mass.
 
-Reference: Zhou et al. 2017, Table 2.
+Reference: Zhou, Bagnell, Mason, "A fast stochastic contact model for planar pushing and grasping", RSS 2017, table 2,
+and its toolbox (github.com/robinzhoucmu/PlanarManipulationToolBox).
 """
 
+import re
 from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from pushjax.datasets import triangle_setup
-from pushjax.datasets.push_log import (
+from pushjax.datasets.recordings import (
     Floats,
     LogError,
-    Push,
-    PushLog,
-    contact_onset,
-    continuous_angle,
-    force_filter,
-    nothing_usable,
+    Recording,
+    Recordings,
+    collect,
+    interpolated,
     rotation,
     wrap_angle,
 )
-from pushjax.datasets.records import ParseError, Record, check_quaternions, read_records
+from pushjax.datasets.triangle_text import Record, check_quaternions, read_records
 
-# Broken trials have one to three samples per push. Complete ones have some 670 force and 220 robot samples.
-MIN_SAMPLES = 4
+# Calibration of the motion capture: the center of mass in the corner frame, in m (a third of each leg).
+CENTER_OF_MASS = np.array([0.05, 0.05, 0.0])
+# Outline about the center of mass, in m, with legs of 0.15 m.
+VERTICES = np.array([[0.0, 0.0], [0.0, 0.15], [0.15, 0.0]]) - CENTER_OF_MASS[:2]
+# The paper's characteristic length, in m: right-angle corner to center of mass (not the radius of gyration).
+LENGTH = float(np.hypot(CENTER_OF_MASS[0], CENTER_OF_MASS[1]))
+# Radius of the finger in the toolbox, in m. A finger of this radius would touch about 1.6 mm of travel before the
+# measured forces begin.
+TIP_RADIUS = 0.001
+# From comments in the toolbox: mass in kg, and the gravity that it computes with, in m/s^2.
+MASS, GRAVITY = 1.518, 9.8
+# The sensor's axes are turned by 45 degrees from the finger's and are seen from below, so R_TOOL is a reflection. The
+# sensor measures the reaction on the finger. The force on the object, in the finger's frame, is therefore
+# FORCE_SIGN * R_TOOL @ reading.
+R_TOOL = np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
+FORCE_SIGN = -1.0
+
+# Support points in the corner frame, in mm. Names of logs can contain these numbers: first the three x, then the three
+# y. "patch" has no points, because the whole face touches the surface.
+ARRANGEMENTS: dict[str, tuple[tuple[float, float], ...]] = {
+    "3pts1": ((30.0, 30.0), (63.33, 43.33), (43.33, 63.33)),
+    "3pts2": ((10.0, 10.0), (130.0, 10.0), (10.0, 130.0)),
+    "3pts3": ((30.0, 30.0), (90.0, 30.0), (30.0, 90.0)),
+    "3pts4": ((10.0, 10.0), (90.0, 30.0), (10.0, 130.0)),
+    "patch": (),
+}
+_SIX_NUMBERS = re.compile(r"(?<![\d.])\d+(?:\.\d+)?(?:_\d+(?:\.\d+)?){5}(?![\d.])")
+
+# The toolbox's filter drops the first 30 % of the samples: the finger approaches, and contact builds up.
+SKIPPED_FRACTION = 0.3
 # A finger that moves less than this (m) has no clear direction, because its path is logged with a resolution of 0.1 mm.
 MIN_TRAVEL = 0.001
 # The motion capture has jumped in two cases. (1) The object moved more than MAX_MOTION (m, as |dx| + length |dtheta|),
@@ -40,177 +68,194 @@ MAX_GAP = 0.003
 
 
 def load_triangle_log(
-    path: str | PathLike[str],
-    *,
-    surface: str | None = None,
-    arrangement: str | None = None,
-    support_points: ArrayLike | None = None,
-    strict: bool = False,
-) -> PushLog:
+    path: str | PathLike[str], *, surface: str | None = None, arrangement: str | None = None
+) -> Recordings:
     """Read an original log, plain or gzip-compressed, which is recognized by content and not by name.
 
-    Damaged pushes become entries of `problems`. The others stay usable, as far as the layout can be followed.
+    The object is seen at the first and the last sample of each push. The finger's path is the logged one, which ends
+    about a millimeter before the object comes to rest. The force is interpolated at the finger's samples. Each push has
+    one pair of wrench and twist, as in the paper: the mean wrench (N, N m) of the samples that are at least as strong
+    as the mean force, and the displacement (m, rad) in the body frame at the start.
 
     Args:
         path: The log.
         surface: Material that the triangle slides on; by default taken from the names of the file and its folder.
         arrangement: "3pts1" ... "3pts4" or "patch", which determines the support points; by default taken from the
             names.
-        support_points: (3, 2) or (0, 2) support points, in m, body frame; they override those of the arrangement.
-        strict: Whether to raise the first problem instead of collecting it.
 
     Returns:
         The usable pushes, and the problems of the others.
 
     Raises:
-        LogError: If no push is usable, or if the file is missing, empty or no such log. With `strict`, for the first
-            problem.
-        ValueError: If `arrangement` is unknown, or if the support points cannot carry the object.
+        LogError: If no push is usable, or if the file is missing, empty or no such log.
+        ValueError: If `arrangement` is unknown.
 
     Reference: Layout and processing are as in the toolbox of Zhou et al. 2017. The rule for jumps is our own.
     """
     file = Path(path).expanduser()
-    name, points = _select_support(file, arrangement, support_points)
-    normal_force = triangle_setup.support_force(points)
-    pushes: list[Push] = []
-    problems: list[LogError] = []
-    for record in read_records(file):
-        problem = record if isinstance(record, LogError) else None
-        if isinstance(record, Record):
-            try:
-                pushes.append(_usable_push(record))
-            except ParseError as fault:
-                problem = LogError(file, str(fault), push=record.index, line=fault.line)
-        if problem is not None:
-            if strict:
-                raise problem
-            problems.append(problem)
-    if not pushes:
-        raise nothing_usable(file, problems)
-    return PushLog(
-        pushes=tuple(pushes),
-        problems=tuple(problems),
-        vertices=triangle_setup.VERTICES.copy(),
-        length=triangle_setup.LENGTH,
-        tip_radius=triangle_setup.TIP_RADIUS,
-        support_points=points,
-        support_force=normal_force,
-        surface=surface if surface is not None else triangle_setup.surface_from_name(file),
-        arrangement=name,
-        source=str(file),
+    name, points = support_from_name(file)
+    if arrangement is not None:
+        name, points = arrangement, support_points(arrangement)
+    records, problems = read_records(file)
+    found = [_usable_push(file, record) for record in records]
+    return collect(file, [*found, *problems], **facts(surface or _surface_from_name(file), name, points))
+
+
+def facts(surface: str | None, arrangement: str | None, points: Floats | None) -> dict:
+    """Return what is known of the triangle on support points (p, 2), as fields of `Recordings`."""
+    return {
+        "vertices": VERTICES.copy(),
+        "length": LENGTH,
+        "tip_radius": TIP_RADIUS,
+        "support_points": points,
+        "support_force": None if points is None else support_force(points),
+        "surface": surface,
+        "object": arrangement,
+    }
+
+
+def support_points(arrangement: str) -> Floats:
+    """Return the support points (p, 2), m, body frame, of a key of ARRANGEMENTS; none for "patch"."""
+    if arrangement not in ARRANGEMENTS:
+        raise ValueError(f"arrangement must be one of {', '.join(ARRANGEMENTS)}; got {arrangement!r}")
+    return _body_from_corner(ARRANGEMENTS[arrangement])
+
+
+def support_force(points: ArrayLike) -> Floats:
+    """Return the normal forces (p,), N, of static equilibrium at three support points (p, 2), m, or at none."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    if len(points) == 0:
+        return np.empty(0)
+    # The forces add up to the weight and have no moment about the body origin. Points divided by LENGTH are
+    # dimensionless, so the condition number does not depend on the unit. It is large if the points lie on one line.
+    balance = np.vstack([np.ones(3), points.T / LENGTH])
+    on_a_line = np.linalg.cond(balance) > 1e8
+    force = np.full(3, -1.0) if on_a_line else np.linalg.solve(balance, np.array([MASS * GRAVITY, 0.0, 0.0]))
+    if np.any(force < 0):  # the object would tip over
+        raise ValueError(f"the center of mass must lie inside three support points; got {points.tolist()}")
+    return force
+
+
+def support_from_name(path: Path) -> tuple[str | None, Floats | None]:
+    """Determine arrangement and support points (p, 2), m, body frame, from the names of a file and its folder."""
+    for name in (path.name, path.parent.name):
+        numbers = _SIX_NUMBERS.search(name)
+        if numbers:  # such as 30_90_30_30_30_90: x of the three points and then y, mm, corner frame
+            points = np.array(numbers.group().split("_"), float).reshape(2, 3).T
+            known = [key for key, value in ARRANGEMENTS.items() if value and np.allclose(value, points)]
+            return (known[0] if known else None), _body_from_corner(points)
+        for arrangement in ARRANGEMENTS:
+            if arrangement in name:
+                return arrangement, support_points(arrangement)
+    return None, None
+
+
+def _surface_from_name(path: Path) -> str | None:
+    """Determine "plywood" or "hardboard" from the names of a file and its folder; None if they do not say."""
+    for name in (path.name, path.parent.name):
+        if "wood" in name:  # original logs name the folder so, and give only the arrangement for hardboard
+            return "plywood"
+        if "hardboard" in name:
+            return "hardboard"
+    return None if support_from_name(path)[1] is None else "hardboard"
+
+
+def _body_from_corner(points: ArrayLike) -> Floats:
+    """Convert points (p, 2) from the corner frame in mm to the body frame in m."""
+    return np.asarray(points, dtype=np.float64).reshape(-1, 2) / 1000 - CENTER_OF_MASS[:2]
+
+
+def _usable_push(path: Path, record: Record) -> Recording | LogError:
+    """Convert a record to a push, or return the error that says why it cannot be trusted."""
+    try:
+        record.check_samples()
+        start, end = object_poses(record)
+        # Unix times in s use most digits of a float64, so the clock of the push starts at its first force sample.
+        force_time = record.force[:, 0] - record.force[0, 0]
+        tip_time = record.robot[:, 0] - record.force[0, 0]
+        # The sensor measures in the finger's frame, which turns a little during the push.
+        yaw = np.unwrap(_yaw(record.robot[:, 4:]))
+        in_tool = FORCE_SIGN * record.force[:, 1:] @ R_TOOL.T
+        force = np.einsum("kij,kj->ki", rotation(np.interp(force_time, tip_time, yaw)), in_tool - in_tool[0])
+        tip = record.robot[:, 1:3] / 1000
+        _check_motion(start, end, tip)
+        return make_push(record.index, start, end, tip_time, tip, force_time, force)
+    except ValueError as fault:
+        return LogError(path, str(fault), push=record.index, line=record.line)
+
+
+def make_push(
+    index: int, start: Floats, end: Floats, tip_time: Floats, tip: Floats, force_time: Floats, force: Floats
+) -> Recording:
+    """Return the push of a finger, from poses (3,), tip (M, 2) and force (K, 2), world frame, on one clock."""
+    keep = _force_filter(force)
+    if not keep.any():
+        raise ValueError("expected the force to last after the first 30 % of the samples, found none there")
+    pose = np.full((len(tip), 3), np.nan)
+    pose[0], pose[-1] = start, end
+    # The object is seen only before and after the push. Its displacement is spread evenly over the kept samples, by
+    # sample number and not by time, because the paper's pairs were made in this way.
+    moved = end - start
+    moved[2] = wrap_angle(moved[2])
+    between = start + np.linspace(0.0, 1.0, int(keep.sum()))[:, None] * moved
+    body_from_world = rotation(between[:, 2]).swapaxes(1, 2)
+    at = np.stack([np.interp(force_time[keep], tip_time, column) for column in tip.T], axis=1)
+    body_force = np.einsum("kij,kj->ki", body_from_world, force[keep])
+    arm = np.einsum("kij,kj->ki", body_from_world, at - between[:, :2])
+    torque = arm[:, 0] * body_force[:, 1] - arm[:, 1] * body_force[:, 0]
+    return Recording(
+        index,
+        tip,
+        pose,
+        interpolated(tip_time, force_time, force),
+        tip_time,
+        wrench=np.append(body_force.mean(axis=0), torque.mean())[None],
+        twist=np.append(rotation(start[2]).T @ moved[:2], moved[2])[None],
     )
 
 
-def _select_support(path: Path, arrangement: str | None, points: ArrayLike | None) -> tuple[str, Floats]:
-    """Return the name of the arrangement and its support points (p, 2), from the arguments or else the names."""
-    name, known = triangle_setup.support_from_name(path) or (triangle_setup.UNKNOWN, np.empty((0, 2)))
-    if arrangement is not None:
-        name, known = arrangement, triangle_setup.support_points(arrangement)
-    if points is not None:
-        known = np.array(points, dtype=np.float64).reshape(-1, 2)
-        name = arrangement if arrangement is not None else triangle_setup.UNKNOWN
-    return name, known
+def _force_filter(force: Floats) -> NDArray[np.bool_]:
+    """Select the forces (K, 2) after the first 30 % that are at least as strong as the mean force, (K,)."""
+    # This is the rule of the toolbox, including its counting from 1. Nothing is smoothed.
+    count = len(force)
+    late = np.arange(1, count + 1) >= np.ceil(SKIPPED_FRACTION * count)
+    return late & (np.hypot(force[:, 0], force[:, 1]) >= np.hypot(*force.mean(axis=0)))
 
 
-def _usable_push(record: Record) -> Push:
-    """Convert a record to a push, or raise ParseError if the record cannot be trusted."""
-    _check_record(record)
-    push = _convert_record(record)
-    _check_motion(push, record.line + 1)
-    if not force_filter(push.force).any():
-        raise ParseError(
-            "expected the force to last after the first 30 % of the samples, found none there",
-            record.force_line,
-        )
-    return push
-
-
-def _check_record(record: Record) -> None:
-    """Check that a record has enough samples, unit quaternions, and clocks that rise and overlap in time."""
-    robot_count_line = record.robot_line - 1
-    for what, samples, line in (
-        ("force", record.force, record.line + 2),
-        ("robot", record.robot, robot_count_line),
-    ):
-        if len(samples) < MIN_SAMPLES:
-            raise ParseError(f"expected at least {MIN_SAMPLES} {what} samples, found {len(samples)}", line)
-    check_quaternions(record.poses[:, 3:], record.line, "object pose")
-    check_quaternions(record.robot[:, 4:], record.robot_line, "robot sample")
-    _check_clock(record.force[:, 0], record.force_line, "force")
-    _check_clock(record.robot[:, 0], record.robot_line, "robot")
-    if record.robot[0, 0] > record.force[-1, 0] or record.robot[-1, 0] < record.force[0, 0]:
-        raise ParseError("expected robot samples from the time of the force samples, found none", record.robot_line)
-
-
-def _check_clock(time: Floats, line: int, what: str) -> None:
-    """Raise ParseError if the times, the first of which is on `line`, decrease."""
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back):
-        step = time[back[0] + 1] - time[back[0]]
-        message = f"expected time stamps that do not decrease ({what} samples), found a step of {step:.3g} s"
-        raise ParseError(message, line + int(back[0]) + 1)
-
-
-def _check_motion(push: Push, line: int) -> None:
-    """Raise ParseError if the finger does not move or the motion capture jumps."""
-    # `line` has the pose after the push, which is where a jump shows
-    travel = float(np.hypot(*(push.tip[-1] - push.tip[0])))
+def _check_motion(start: Floats, end: Floats, tip: Floats) -> None:
+    """Raise ValueError if the finger, with path (M, 2), does not move or the motion capture jumps."""
+    travel = float(np.hypot(*(tip[-1] - tip[0])))
     if not travel >= MIN_TRAVEL:
-        raise ParseError(
-            f"expected the finger to move at least {MIN_TRAVEL * 1e3:g} mm, found {travel * 1e3:.2g} mm",
-            line,
-        )
-    moved = push.pose_end - push.pose_start
-    deviation = float(np.hypot(moved[0], moved[1]) + triangle_setup.LENGTH * abs(moved[2]))
-    gap = _end_gap(push)
+        raise ValueError(f"expected the finger to move at least {1e3 * MIN_TRAVEL:g} mm, found {1e3 * travel:.2g} mm")
+    moved = end - start
+    deviation = float(np.hypot(moved[0], moved[1]) + LENGTH * abs(moved[2]))
+    # distance of the last finger center from the line of the edge that faces the first one, > 0 outside
+    gap = float(_edge_distances(end, tip[-1])[np.argmax(_edge_distances(start, tip[0]))])
     # The condition is negated so that it also fails for NaN, which very large numbers can give.
     if not (deviation <= MAX_MOTION and abs(gap) <= MAX_GAP):
         expected = f"less than {MAX_MOTION * 1e3:g} mm and to end within {MAX_GAP * 1e3:g} mm of the finger"
         found = f"{deviation * 1e3:.4g} mm and {gap * 1e3:.4g} mm"
-        raise ParseError(f"the motion capture jumped: expected the object to move {expected}, found {found}", line)
-
-
-def _end_gap(push: Push) -> float:
-    """Return the distance of the last finger center from the line of the edge facing the first one (m, > 0 outside)."""
-    start = _edge_distances(push.pose_start, push.tip[0])
-    return float(_edge_distances(push.pose_end, push.tip[-1])[np.argmax(start)])
+        raise ValueError(f"the motion capture jumped: expected the object to move {expected}, found {found}")
 
 
 def _edge_distances(pose: Floats, point: Floats) -> Floats:
     """Return the signed distances (3,) of a world point from the lines of the edges, positive outside."""
-    edge = np.roll(triangle_setup.VERTICES, -1, axis=0) - triangle_setup.VERTICES
+    edge = np.roll(VERTICES, -1, axis=0) - VERTICES
     # The vertices are in clockwise order, so the outside is to the left of an edge.
     outward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
     in_body = rotation(pose[2]).T @ (point - pose[:2])
-    return np.sum((in_body - triangle_setup.VERTICES) * outward, axis=1)
+    return np.sum((in_body - VERTICES) * outward, axis=1)
 
 
-def _convert_record(record: Record) -> Push:
-    """Convert a checked record to a push, in SI units and the world frame."""
-    start, end = (body_pose(row) for row in record.poses)
+def object_poses(record: Record) -> tuple[Floats, Floats]:
+    """Return the poses (3,) of the body frame before and after a push: x, y (m), theta (rad), world frame."""
+    check_quaternions(record.poses[:, 3:], "object pose")
+    start, end = (_body_pose(row) for row in record.poses)
     end[2] = start[2] + wrap_angle(end[2] - start[2])
-    # Unix times in s use most digits of a float64, so the clock of the push starts at its first force sample.
-    force_time = record.force[:, 0] - record.force[0, 0]
-    tip_time = record.robot[:, 0] - record.force[0, 0]
-    tip = record.robot[:, 1:3] / 1000
-    yaw = continuous_angle(_yaw(record.robot[:, 4:]))
-    # The sensor measures in the finger's frame, which turns a little during the push.
-    in_tool = triangle_setup.FORCE_SIGN * record.force[:, 1:] @ triangle_setup.R_TOOL.T
-    force = np.einsum("kij,kj->ki", rotation(np.interp(force_time, tip_time, yaw)), in_tool - in_tool[0])
-    return Push(
-        index=record.index,
-        pose_start=start,
-        pose_end=end,
-        tip_time=tip_time,
-        tip=tip,
-        tip_yaw=yaw,
-        force_time=force_time,
-        force=force,
-        onset=contact_onset(force_time, force, tip_time, tip),
-    )
+    return start, end
 
 
-def body_pose(row: Floats) -> Floats:
+def _body_pose(row: Floats) -> Floats:
     """Convert a logged pose (7,) of the corner to the world pose (3,) of the body frame: x, y (m), theta (rad)."""
     w, x, y, z = row[3:] / np.linalg.norm(row[3:])
     # First two rows of the rotation matrix. The plate's small tilt shortens the distance to its center in the plane.
@@ -220,7 +265,7 @@ def body_pose(row: Floats) -> Floats:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         ]
     )
-    position = row[:2] / 1000 + matrix @ triangle_setup.CENTER_OF_MASS
+    position = row[:2] / 1000 + matrix @ CENTER_OF_MASS
     return np.append(position, wrap_angle(_yaw(row[None, 3:]))[0])
 
 

@@ -1,29 +1,27 @@
 """Read original logs of the aluminum triangle pushed with two fingers.
 
 Each session has two files, `exp_<time>_sensor<N>.txt` and `exp_<time>_pushaction<N>.txt`. The first is laid out as a
-log of one finger (`records`). The second has the number of pushes, and then for each the type of its motion and eleven
-numbers (`Action`). Push i follows action i; the shorter of the two files counts. World frame, body frame and hand frame
-are those of `two_finger`.
+log of one finger (`triangle_text`). The second has the number of pushes, and then for each the type of its motion and
+eleven numbers (`Action`). Push i follows action i; the shorter of the two files counts.
 
-Only the object's poses are taken from the sensor's file. The hand's path is the commanded one, from the measured start
-pose, because the robot's own stream ends after half of the rotation.
+The origin of the hand's frame is midway between the fingers, which are at (0, +-spacing / 2). Its x axis is the
+direction in which the hand first approaches. Only the object's poses are taken from the sensor's file. The hand's path
+is the commanded one, from the measured start pose, because the robot's own stream ends after half of the rotation.
 """
 
-from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.datasets import triangle_setup
+from pushjax.datasets import triangle
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.push_log import Floats, LogError, nothing_usable, rotation, wrap_angle
-from pushjax.datasets.records import ParseError, Record, check_quaternions, read_records
-from pushjax.datasets.triangle import body_pose
-from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect, rotation
+from pushjax.datasets.triangle_text import Record, read_records
 
-HALF_SPACING = 0.025  # m, from the middle of the hand to the center of each finger
+SPACING = 0.05  # m, between the centers of the fingers
+PATH_STEPS = 120  # of the commanded path; the arc of a turn is off the chords between them by at most 1 um
 # At the end one finger touches the outline, as far as the motion capture and an unknown outline tell: its center is
 # between these distances from the outline, m. If not, the motion capture jumped or the hand did not reach the object.
 MIN_END_GAP, MAX_END_GAP = -0.002, 0.004
@@ -41,76 +39,110 @@ class Action(NamedTuple):
     amount: float  # angle of the rotation, rad, or length of the straight motion, m
     closing: float  # distance from the point midway between the fingers to `contact` at the start, along `approach`, m
 
+    @property
+    def nominal(self) -> Floats:
+        """(9,) numbers that are equal for its repetitions."""
+        return np.concatenate([[self.turns, self.amount, self.closing], self.contact, self.target, self.approach])
 
-def load_two_finger_logs(folder: str | PathLike[str]) -> TwoFingerLog:
+
+def load_two_finger_logs(folder: str | PathLike[str]) -> Recordings:
     """Read all sessions in a folder of one arrangement of the supports.
 
-    A push becomes a problem if its records are damaged, if neither finger is at the outline at the end, or if the
-    object turns by more than 60 degrees.
+    The object is seen at the first and the last sample of each push. The hand's path is the commanded one, in 120 equal
+    steps. `Recordings.about` has "action" and "began".
+
+    A push becomes a problem if its record is damaged, if neither finger is at the outline at the end, or if the object
+    turns by more than 60 degrees. A session becomes a problem if one of its files cannot be read.
 
     Args:
-        folder: The folder, whose name tells the arrangement (`triangle_setup.support_from_name`).
+        folder: The folder, whose name tells the arrangement: it contains "3pts1", say, or the coordinates of the
+            support points in the authors' form.
 
     Returns:
         The usable pushes, in the order of time, and the problems of the others. The surface is unknown.
 
     Raises:
-        LogError: If there are no such files, if a file of actions is damaged, or if no push is usable.
+        LogError: If there are no such files, or if no push is usable.
     """
     path = Path(folder).expanduser()
     sensors = sorted(path.glob("exp_*_sensor*.txt"))
     if not sensors:
         raise LogError(path, "expected logs exp_…_sensor….txt, found none")
-    name, points = triangle_setup.support_from_name(path / "any") or (triangle_setup.UNKNOWN, np.empty((0, 2)))
-    rows: list[dict] = []
-    problems: list[LogError] = []
-    actions: list[Action] = []
+    found: list[_Push | LogError] = []
     for sensor in sensors:
-        planned = list(_read_actions(sensor.with_name(sensor.name.replace("_sensor", "_pushaction"))))
-        for record in read_records(sensor):
-            if isinstance(record, LogError):  # of a push, or of the whole file
-                if record.push is None or record.push < len(planned):
-                    problems.append(record)
-            elif record.index < len(planned):
-                action = planned[record.index]
-                found = _convert_push(sensor, record, action)
-                if isinstance(found, LogError):
-                    problems.append(found)
-                else:
-                    rows.append(found)
-                    actions.append(action)
-    if not rows:
-        raise nothing_usable(path, problems)
-    order = np.argsort([row["time"] for row in rows])
-    columns = {key: np.array([rows[k][key] for k in order]) for key in rows[0]}
-    group = np.unique([_nominal_numbers(actions[k]) for k in order], axis=0, return_inverse=True)[1].reshape(-1)
-    deviation = stick_deviation(
-        columns["hand_start"], columns["hand_end"], columns["pose_start"], columns["pose_end"], triangle_setup.LENGTH
-    )
-    return TwoFingerLog(
-        index=np.arange(len(rows)),
-        group=group.astype(np.int64),
-        **columns,
-        stick_deviation=deviation,
-        vertices=triangle_setup.VERTICES.copy(),
-        length=triangle_setup.LENGTH,
-        spacing=2 * HALF_SPACING,
-        support_points=points,
-        support_force=triangle_setup.support_force(points),
-        problems=tuple(problems),
-        surface=triangle_setup.UNKNOWN,
-        arrangement=name,
-        source=str(path),
-    )
+        try:
+            actions = _read_actions(sensor.with_name(sensor.name.replace("_sensor", "_pushaction")))
+            records, problems = read_records(sensor)
+        except LogError as error:  # of the whole session
+            found.append(error)
+            continue
+        found += [_convert_push(sensor, *each) for each in zip(records, actions, strict=False)]
+        found += [each for each in problems if each.push is None or each.push < len(actions)]
+    pushes = sorted((each for each in found if isinstance(each, _Push)), key=lambda each: each.began)
+    errors = [each for each in found if isinstance(each, LogError)]
+    known = triangle.facts(None, *triangle.support_from_name(path / "any"))
+    return collect(path, [*_recordings(pushes), *errors], **known | {"tip_radius": None})
 
 
-def _read_actions(path: Path) -> Iterator[Action]:
-    """Iterate over the actions of a file of planned pushes."""
+class _Push(NamedTuple):
+    """A push, with poses (3,) of object and hand in the world frame."""
+
+    action: Action
+    began: float  # s since 1970
+    start: Floats
+    end: Floats
+    hand_start: Floats
+    hand_end: Floats
+    turn: float  # rad, by which the hand turns
+    center: Floats  # (2,), about which the hand turns, m; NaN if it does not turn
+
+
+def _recordings(pushes: list[_Push]) -> list[Recording]:
+    """Return the recordings of the pushes, numbered in their order."""
+    if not pushes:
+        return []
+    nominal = [push.action.nominal for push in pushes]
+    group = np.unique(nominal, axis=0, return_inverse=True)[1].reshape(-1)
+    ends = [(push.start, push.end) for push in pushes]
+    hand = [np.array([getattr(push, name) for push in pushes]) for name in ("hand_start", "hand_end", "turn", "center")]
+    paths = commanded_paths(*hand)
+    return [
+        make_push(index, path, *ends[index], action=int(group[index]), began=pushes[index].began)
+        for index, path in enumerate(paths)
+    ]
+
+
+def make_push(index: int, path: Floats, start: Floats, end: Floats, **about: float) -> Recording:
+    """Return the push of a hand along a path (m, 4), with the poses (3,) of the object before and after."""
+    pose = np.full((len(path), 3), np.nan)
+    pose[0], pose[-1] = start, end
+    return Recording(index, path, pose, about=about)
+
+
+def commanded_paths(start: Floats, end: Floats, turn: Floats, center: Floats) -> Floats:
+    """Return the paths (n, PATH_STEPS + 1, 4) of hands that turn about centers (n, 2) or move straight, in m and rad.
+
+    Start and end poses are (n, 3). Hands with a `turn` (n,) of zero move straight, and their centers are not used.
+    """
+    fraction = np.linspace(0.0, 1.0, PATH_STEPS + 1)
+    angle = fraction * turn[:, None]
+    origin, travel = start[:, None, :2], (end - start)[:, None, :2]
+    turns = turn != 0
+    center = np.where(turns[:, None], center, 0.0)[:, None]
+    turned = center + np.einsum("nsij,nj->nsi", rotation(angle), (origin - center)[:, 0])
+    position = np.where(turns[:, None, None], turned, origin + fraction[:, None] * travel)
+    theta = start[:, 2, None] + angle
+    return np.concatenate([position, theta[..., None], np.full_like(theta, SPACING)[..., None]], axis=-1)
+
+
+def _read_actions(path: Path) -> list[Action]:
+    """Read the actions of a file of planned pushes."""
     try:
         lines = path.read_text("utf-8", errors="replace").splitlines()
     except OSError as error:
         raise LogError(path, f"expected planned pushes, but cannot read the file: {error.strerror or error}") from error
     size = 1 + len(NUMBERS_PER_LINE)
+    actions = []
     for index in range(1, len(lines) - size + 1, size):
         kind = lines[index].strip()
         try:
@@ -123,14 +155,15 @@ def _read_actions(path: Path) -> Iterator[Action]:
         if not kind or not valid:
             message = "expected the type of a push and 3, 3, 3 and 2 numbers on the lines after it"
             raise LogError(path, message, line=index + 1)
-        yield _parse_action(kind, values)
+        actions.append(_parse_action(kind, values))
+    return actions
 
 
 def _parse_action(kind: str, values: list[Floats]) -> Action:
     """Return the action of a type and its lines of numbers, which are in mm and degrees, in the corner frame."""
     turns = "Rotation" in kind
     contact, target, approach = (point[:2] for point in values[:3])
-    center = triangle_setup.CENTER_OF_MASS[:2]
+    center = triangle.CENTER_OF_MASS[:2]
     amount, closing = values[3]
     return Action(
         turns=turns,
@@ -142,47 +175,40 @@ def _parse_action(kind: str, values: list[Floats]) -> Action:
     )
 
 
-def _nominal_numbers(action: Action) -> Floats:
-    """Return the numbers (9,) of an action, which are equal for its repetitions."""
-    return np.concatenate([[action.turns, action.amount, action.closing], *action[1:4]])
+def _convert_push(path: Path, record: Record, action: Action) -> _Push | LogError:
+    """Return the push of a record, or the error that says why it is not usable."""
 
+    def error(message: str) -> LogError:
+        return LogError(path, message, push=record.index, line=record.line)
 
-def _convert_push(path: Path, record: Record, action: Action) -> dict | LogError:
-    """Return one row of the arrays of `TwoFingerLog`, by name, or the error that says why the push is not usable."""
     if not len(record.force):
-        return LogError(path, "expected force samples, found none", push=record.index)
+        return error("expected force samples, found none")
     try:
-        check_quaternions(record.poses[:, 3:], record.line, "object pose")
-    except ParseError as fault:
-        return LogError(path, str(fault), push=record.index, line=fault.line)
-    start, end = (body_pose(row) for row in record.poses)
-    object_turn = float(wrap_angle(end[2] - start[2]))
-    end[2] = start[2] + object_turn
+        start, end = triangle.object_poses(record)
+    except ValueError as fault:
+        return error(str(fault))
     world_from_body = rotation(start[2])
     position = start[:2] + world_from_body @ (action.contact - action.closing * action.approach)
     heading = np.arctan2(*(world_from_body @ action.approach)[::-1])
     if action.turns:
-        center, angle = start[:2] + world_from_body @ action.target, action.amount
-        end_position = center + rotation(angle) @ (position - center)
+        center, turn = start[:2] + world_from_body @ action.target, action.amount
+        end_position = center + rotation(turn) @ (position - center)
     else:
-        center, angle = np.full(2, np.nan), 0.0
+        center, turn = np.full(2, np.nan), 0.0
         end_position = position + world_from_body @ (action.closing * action.approach + action.amount * action.target)
-    hand_start, hand_end = np.append(position, heading), np.append(end_position, heading + angle)
-    gaps = [_finger_gaps(*poses) for poses in ((hand_start, start), (hand_end, end))]
-    nearest = float(np.min(gaps[1]))
-    if not MIN_END_GAP < nearest < MAX_END_GAP:
+    hand_start, hand_end = np.append(position, heading), np.append(end_position, heading + turn)
+    gap = _finger_gap(hand_end, end)
+    if not MIN_END_GAP < gap < MAX_END_GAP:
         expected = f"between {1e3 * MIN_END_GAP:g} and {1e3 * MAX_END_GAP:g} mm from the outline at the end"
-        return LogError(path, f"expected a finger {expected}, found {1e3 * nearest:.3g} mm", push=record.index)
-    if not abs(object_turn) < MAX_TURN:
-        found = f"found {np.degrees(object_turn):.3g}: the motion capture jumped"
-        return LogError(path, f"expected the object to turn by less than 60 degrees, {found}", push=record.index)
-    row = {"time": record.force[0, 0], "pose_start": start, "pose_end": end, "turn": angle, "center": center}
-    row |= {"hand_start": hand_start, "hand_end": hand_end, "gap_start": gaps[0], "gap_end": gaps[1]}
-    return row
+        return error(f"expected a finger {expected}, found {1e3 * gap:.3g} mm")
+    if not abs(end[2] - start[2]) < MAX_TURN:
+        found = f"found {np.degrees(end[2] - start[2]):.3g}: the motion capture jumped"
+        return error(f"expected the object to turn by less than 60 degrees, {found}")
+    return _Push(action, float(record.force[0, 0]), start, end, hand_start, hand_end, turn, center)
 
 
-def _finger_gaps(hand: Floats, pose: Floats) -> Floats:
-    """Return the signed distances (2,) of the fingers' centers from the outline, m, for poses of hand and object."""
-    offsets = np.array([[0.0, HALF_SPACING], [0.0, -HALF_SPACING]])
+def _finger_gap(hand: Floats, pose: Floats) -> float:
+    """Return the smallest signed distance of a finger's center from the outline, m, for poses of hand and object."""
+    offsets = np.array([[0.0, SPACING / 2], [0.0, -SPACING / 2]])
     fingers = hand[:2] + offsets @ rotation(hand[2]).T
-    return nearest_on_outline(triangle_setup.VERTICES, (fingers - pose[:2]) @ rotation(pose[2]))[0]
+    return float(np.min(nearest_on_outline(triangle.VERTICES, (fingers - pose[:2]) @ rotation(pose[2]))[0]))

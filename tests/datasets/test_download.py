@@ -9,8 +9,8 @@ import pytest
 
 from pushjax.cli import main as cli
 from pushjax.datasets import download, find_data
-from pushjax.datasets.data_folder import default_folder
 from pushjax.datasets.download import RemoteFile, fetch, triangle_files
+from pushjax.datasets.load import default_folder
 
 CONTENT = {"a log/exp 12:30.txt": b"50 pushes" * 1000, "b.txt": b"10 pushes"}
 

@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import os
 import shutil
 import sys
 from pathlib import Path
@@ -10,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pushjax.datasets import LogError, Recordings, load_push_npz, load_recordings, load_triangle_log
-from pushjax.datasets.recordings import Recording
-from pushjax.datasets.resampling import MAX_GAP
+from pushjax.datasets import LogError, Recording, Recordings, find_data, load_recordings, load_triangle_log
+from pushjax.datasets.streams import MAX_GAP
 
 MIT_JSONS = (
     "motion_surface=plywood_shape=hex_a=0_v=150_i=1.000_s=0.000_t=-0.349.json",
@@ -273,15 +273,19 @@ def test_a_bad_row_of_an_archive(tmp_path, change, words):
     [
         (lambda a: a.pop("end"), "found no end"),
         (lambda a: a.pop("path"), "expected arrays of pushes: path (n, k, dof)"),
+        (lambda a: a.update(wrench=np.ones((3, 5, 3))), "found no twist"),
         (lambda a: a.update(forces=np.ones((3, 5, 2))), "found unknown arrays forces"),
         (lambda a: a.update(pose=np.ones((3, 5, 3))), "expected either start and end or pose, found both"),
         (lambda a: a.update(path=np.ones((3, 5))), "expected path of shape (n, k, dof)"),
         (lambda a: a.update(path=np.ones((3, 1, 2))), "dof and k at least 2; found (3, 1, 2)"),
         (lambda a: a.update(path=np.ones((0, 5, 2))), "expected path of shape (n, k, dof)"),
-        (lambda a: a.update(start=np.ones((2, 3))), "expected start of shape (3, 3) to go with path (3, 5, 2)"),
-        (lambda a: a.update(time=np.ones(5)), "expected time of shape (3, 5)"),
+        (lambda a: a.update(start=np.ones((2, 3))), "expected start of shape (n=3, 3), found (2, 3)"),
+        (lambda a: a.update(time=np.ones(5)), "expected time of shape (n=3, k=5), found (5,)"),
+        (lambda a: a.update(about_side=np.ones(2)), "expected about_side of shape (n=3), found (2,)"),
+        (lambda a: a.update(surface=np.ones(())), "expected text in surface"),
+        (lambda a: a.update(length=np.array(np.nan)), "expected finite numbers in length"),
         (lambda a: a.update(end=np.full((3, 3), "x")), "expected numbers in end"),
-        (lambda a: a["path"].fill(np.nan), "no usable push: expected a number for hand_x, found none"),
+        (lambda a: a["path"].fill(np.nan), "no usable push: expected at least two rows, found 0"),
     ],
 )
 def test_archives_that_are_none(tmp_path, change, words):
@@ -290,39 +294,53 @@ def test_archives_that_are_none(tmp_path, change, words):
     fails(saved(tmp_path, given), words)
 
 
-# --- triangle logs ---
-
-
-def test_a_log_sees_both_ends_and_interpolates_the_force(data, tmp_path):
-    with np.load(data / "three_point_push" / "extra_hardboard_3pts3.npz") as archive:
-        content = dict(archive)
-    content["valid"][1] = False
-    file = saved(tmp_path, content)
-    log, found = load_push_npz(file), load_recordings(file)
-    assert only_problem(found).push == content["push_index"][1]
-    assert [str(problem) for problem in found.problems] == [str(problem) for problem in log.problems]
-    assert found.source == str(file)
-    assert found.vertices.shape == (3, 2)
-    assert found.support_points.shape == (3, 2)
-    assert (found.length, found.tip_radius) == (log.length, log.tip_radius)
-    for push, recorded in zip(log.pushes, found.pushes, strict=True):
-        assert recorded.index == push.index
-        np.testing.assert_array_equal(recorded.hand, push.tip)
-        np.testing.assert_array_equal(recorded.pose[[0, -1]], [push.pose_start, push.pose_end])
-        assert recorded.seen[[0, -1]].all()
-        assert recorded.seen.sum() == 2
-        force = known(recorded.force)
-        measured = np.isfinite(force[:, 0])
-        inside = (push.tip_time >= push.force_time[0]) & (push.tip_time <= push.force_time[-1])
-        np.testing.assert_array_equal(measured, inside)
-        assert np.abs(force[measured]).max() <= np.abs(push.force).max()
+def test_saved_recordings_are_read_back(tmp_path):
+    rng = np.random.default_rng(0)
+    pushes = tuple(
+        Recording(
+            10 * k,
+            rng.normal(size=(m, 4)),
+            np.vstack([rng.normal(size=(1, 3)), np.full((m - 2, 3), np.nan), rng.normal(size=(1, 3)) / 9]),
+            force=np.vstack([np.full((1, 2), np.nan), rng.normal(size=(m - 1, 2))]),
+            time=np.sort(rng.normal(size=m)),
+            wrench=rng.normal(size=(p, 3)),
+            twist=rng.normal(size=(p, 3)),
+            about={"action": f"push {k}", "speed": 0.1 * k, "end": rng.normal(size=3)},
+        )
+        for k, (m, p) in enumerate(((5, 1), (2, 0), (7, 3)))
+    )
+    facts = {"vertices": rng.normal(size=(4, 2)), "length": 0.1, "tip_radius": 0.0, "surface": "ice", "object": "duck"}
+    supports = {"support_points": np.empty((0, 2)), "support_force": np.empty(0)}
+    problems = (LogError("old", "damaged", push=7), LogError("old", "truncated"))
+    made = Recordings(pushes, problems, "old", **facts, **supports)
+    file = tmp_path / "log"  # without a suffix
+    made.save(file)
+    found = load_recordings(file)
+    assert (len(found), found.source) == (3, str(file))
+    assert [str(each) for each in found.problems] == [f"{file}, push 7: damaged", f"{file}: truncated"]
+    for ours, theirs in zip(found.pushes, pushes, strict=True):
+        assert ours.index == theirs.index
+        for name in ("hand", "pose", "force", "time", "wrench", "twist"):
+            # angles take the short way from one sample to the next
+            expected = getattr(theirs, name).copy()
+            if name in ("hand", "pose"):
+                seen = np.isfinite(expected[:, 2])
+                expected[seen, 2] = np.unwrap(expected[seen, 2])
+            np.testing.assert_array_equal(getattr(ours, name), expected, err_msg=name)
+    assert found.about("action").tolist() == ["push 0", "push 1", "push 2"]
+    np.testing.assert_array_equal(found.about("end"), [push.about["end"] for push in pushes])
+    np.testing.assert_array_equal(found.start, [push.pose[0] for push in found.pushes])
+    for name, value in {**facts, **supports}.items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+    with pytest.raises(ValueError, match="pushes: expected at least one to save"):
+        Recordings((), (), "none").save(file)
 
 
 def test_text_log(data):
     file = sorted((data / "raw" / "three_point_push").glob("plywood_3pts2__*.txt.gz"))[0]
     log, found = load_triangle_log(file), load_recordings(file)
-    assert [push.index for push in found.pushes] == [push.index for push in log.pushes]
-    same(found.pushes[3], Recordings.of_log(log).pushes[3], 0.0)
+    for ours, theirs in zip(found.pushes, log.pushes, strict=True):
+        same(ours, theirs, 0.0)
     np.testing.assert_array_equal(found.support_points, log.support_points)
 
 
@@ -366,13 +384,7 @@ def write_hdf5(path: Path, made: dict[str, np.ndarray]) -> Path:
     return path
 
 
-def write_npz(path: Path, made: dict[str, np.ndarray]) -> Path:
-    tip, body, wrench = (made[name] for name in ("tip_pose", "object_pose", "ft_wrench"))
-    content = {"tip_t": tip[:, 0], "tip_xy": tip[:, 1:3], "object_t": body[:, 0], "object_pose": body[:, 1:]}
-    return saved(path.parent, {**content, "ft_t": wrench[:, 0], "ft_wrench": wrench[:, 1:]}, path.name)
-
-
-WRITERS = {".json": write_json, ".h5": write_hdf5, ".hdf5": write_hdf5, ".npz": write_npz}
+WRITERS = {".json": write_json, ".h5": write_hdf5, ".hdf5": write_hdf5}
 KINDS = pytest.mark.parametrize("suffix", WRITERS)
 
 
@@ -400,7 +412,7 @@ def test_streams_are_brought_to_the_tips_stamps(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("name", MIT_JSONS)
-def test_raw_logs_agree_with_the_curated_arrays(data, tmp_path, name):
+def test_raw_logs_agree_with_the_curated_arrays(data, converted, tmp_path, name):
     raw = data / "raw" / "mit_push_full" / name
     for path in sorted((data / "mit_push_full").glob("*.npz")):
         with np.load(path) as archive:
@@ -409,11 +421,13 @@ def test_raw_logs_agree_with_the_curated_arrays(data, tmp_path, name):
             break
     else:
         pytest.skip(f"no curated archive of {name}")
-    ours, curated = load_recordings(raw), load_recordings(path)
+    ours, curated = load_recordings(raw), load_recordings(converted / "mit_push_full" / path.name)
     (push,) = ours.pushes
     same(push, curated.pushes[0], EXACT)
-    np.testing.assert_array_equal(curated.vertices, content["vertices_body"])
-    assert (curated.length, curated.tip_radius) == (content["rho"], content["tip_radius"])
+    # the name of the original tells the object
+    np.testing.assert_allclose(ours.vertices, content["vertices_body"], atol=2e-7)
+    assert ours.length == pytest.approx(float(content["rho"]), abs=2e-7)
+    assert (ours.tip_radius, ours.surface, ours.object) == (content["tip_radius"], curated.surface, curated.object)
     # the common window of tip and object, without losing a row
     time, seen = content["tip_t"], content["object_t"]
     inside = (time >= seen[0]) & (time <= seen[-1])
@@ -426,13 +440,13 @@ def test_raw_logs_agree_with_the_curated_arrays(data, tmp_path, name):
     same(load_recordings(copy).pushes[0], push, 0.0)
 
 
-def test_force_on_the_object_does_work_on_it(data):
+def test_force_on_the_object_does_work_on_it(converted):
     """The logged wrench is the reaction: with its sign the tip would brake the object.
 
     This does not hold in every log, because the sensor has an offset and the tip sometimes slides along the object.
     """
     power = []
-    for path in sorted((data / "mit_push_full").glob("*.npz")):
+    for path in sorted((converted / "mit_push_full").glob("*.npz")):
         (push,) = load_recordings(path).pushes
         velocity = np.gradient(push.hand, push.time, axis=0)
         power.append(np.nanmean(np.sum(velocity * push.force, axis=1)))
@@ -540,23 +554,6 @@ def test_json_that_is_no_log(tmp_path, text, words):
     fails(path, words)
 
 
-def test_archives_of_streams_that_are_none(tmp_path):
-    made = tables()
-    path = mit_log(tmp_path, made, ".npz")
-    with np.load(path) as archive:
-        content = dict(archive)
-    for change, words in (
-        ({"tip_xy": content["tip_xy"][1:]}, "expected tip_xy of shape (41, 2), found (40, 2)"),
-        ({"ft_t": content["ft_t"][None]}, "expected ft_t of shape (51,), found (1, 51)"),
-        ({"object_pose": content["object_pose"].astype(str)}, "expected numbers in object_pose"),
-        ({"vertices_body": np.ones(4)}, "expected vertices_body of shape"),
-        ({"rho": np.array(np.nan)}, "expected finite numbers in rho"),
-    ):
-        fails(saved(tmp_path, {**content, **change}), words)
-    del content["ft_t"]
-    fails(saved(tmp_path, content), "found no ft_t")
-
-
 def test_hdf5_without_its_reader(tmp_path, monkeypatch):
     path = mit_log(tmp_path, tables(), ".h5")
     monkeypatch.setitem(sys.modules, "h5py", None)
@@ -568,10 +565,10 @@ def test_hdf5_without_its_reader(tmp_path, monkeypatch):
 
 
 def test_the_kind_is_told_by_content_before_the_name(tmp_path):
-    for suffix in (".h5", ".npz"):
-        wrong = tmp_path / "named.csv"
-        shutil.copy(mit_log(tmp_path, tables(), suffix), wrong)
-        assert len(load_recordings(wrong).pushes) == 1
+    wrong = tmp_path / "named.csv"
+    for file, count in ((mit_log(tmp_path, tables(), ".h5"), 1), (saved(tmp_path, arrays()), 3)):
+        shutil.copy(file, wrong)
+        assert len(load_recordings(wrong)) == count
     zipped = tmp_path / "log.csv"
     zipped.write_bytes(gzip.compress(b"An unrelated text\n"))
     fails(zipped, "expected the number of pushes")
@@ -598,7 +595,7 @@ def test_files_of_no_kind(tmp_path):
         path.write_bytes(junk)
         fails(path, words)
     saved(tmp_path, {"poses": np.ones(3)}, "other.npz")
-    fails(tmp_path / "other.npz", "expected arrays of pushes", "found the arrays poses")
+    fails(tmp_path / "other.npz", "expected arrays of pushes", "found unknown arrays poses")
     np.save(tmp_path / "single.npy", np.ones(3))
     shutil.copy(tmp_path / "single.npy", tmp_path / "single.npz")
     fails(tmp_path / "single.npz", "found a single array")
@@ -606,7 +603,8 @@ def test_files_of_no_kind(tmp_path):
 
 @pytest.mark.parametrize("suffix", [".json", ".h5", ".npz"])
 def test_files_cut_short_or_damaged_never_fail_otherwise(tmp_path, suffix, rng):
-    whole = mit_log(tmp_path, tables(), suffix).read_bytes()
+    file = saved(tmp_path, arrays()) if suffix == ".npz" else mit_log(tmp_path, tables(), suffix)
+    whole = file.read_bytes()
     path = tmp_path / f"damaged{suffix}"
     for part in np.linspace(0.01, 0.99, 25):
         path.write_bytes(whole[: int(part * len(whole))])
@@ -618,3 +616,21 @@ def test_files_cut_short_or_damaged_never_fail_otherwise(tmp_path, suffix, rng):
         except LogError:
             continue
         assert np.isfinite(found.pushes[0].hand).all()
+
+
+# --- the folder of the data ---
+
+
+def test_find_data_follows_the_environment(tmp_path, monkeypatch):
+    (tmp_path / "some.npz").touch()
+    monkeypatch.setenv("PUSHJAX_DATA", str(tmp_path))
+    assert find_data() == tmp_path
+    assert find_data("some.npz") == tmp_path / "some.npz"
+    assert find_data("other.npz") is None
+    monkeypatch.setenv("PUSHJAX_DATA", os.fspath(tmp_path / "absent"))
+    assert find_data() is None
+
+
+def test_find_data_without_the_variable(monkeypatch):
+    monkeypatch.delenv("PUSHJAX_DATA", raising=False)
+    assert find_data() is None

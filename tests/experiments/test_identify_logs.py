@@ -244,7 +244,7 @@ def test_what_is_no_pushes_is_named(log, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     with pytest.raises(TypeError, match="pushes: expected a Pushes; got a Recordings"):
         pj.identify(load_recordings(log), slider, hand)
-    with pytest.raises(TypeError, match="log: expected a PushLog or Recordings; got a str"):
+    with pytest.raises(TypeError, match="log: expected a Recordings; got a str"):
         pj.Pushes.of("pushes.csv")
     with pytest.raises(TypeError, match="shape: expected a Shape; got a"):
         pj.Slider(surface, block)
@@ -338,7 +338,7 @@ def test_a_part_that_only_turns_tells_about_the_torque(block):
     pose = np.stack([0 * angle, 0 * angle, angle], axis=1)
     hand = 0.04 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     tangent = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    push = Recording(0, hand, pose, np.ones(STEPS + 1, bool), tangent, None)
+    push = Recording(0, hand, pose, tangent)
     pushes = pj.Pushes.of(Recordings((push,), (), "made"), STEPS, parts=3, shape=block)
     assert np.all(np.asarray(pushes.has_pair))
     np.testing.assert_allclose(pushes.twist[0], np.tile([0, 0, 0.1 / 3], (3, 1)), atol=1e-6)

@@ -1,6 +1,7 @@
 """Straight pushes of the MIT data set: loader, outlines, noise floor, and the experiment."""
 
 import json
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -8,104 +9,103 @@ import pytest
 
 import pushjax as pj
 from pushjax.cli import main as cli
-from pushjax.datasets import LogError, load_mit_pushes_npz
+from pushjax.datasets import LogError, Recording, Recordings
 from pushjax.experiments import table1
 from pushjax.experiments._cell_cache import CellCache
-from pushjax.experiments.table1 import conditions, experiment, methods
-from pushjax.experiments.table1.repeats import noise_floor_mm
+from pushjax.experiments._tables import Prediction, deviation_mm
+from pushjax.experiments.table1 import conditions, experiment, groups
+from pushjax.experiments.table1.groups import group, noise_floor_mm
 
 # Results of the published toolbox: mm, quartic, mean over all test pushes of ten objects, of which the archives contain
 # 70 %.
 TOOLBOX_MM = {"abs": 6.65, "plywood": 6.12}
 
 
-def archive(fast=True, **changes):
-    """Return the arrays of a small archive: five whole pushes, of which three are test pushes."""
-    rng = np.random.default_rng(3)
-    data = {"full_index": np.array([1, 4, 5, 8, 9]), "eval_index": np.array([0, 2, 3]), "v20_index": np.array([7, 6])}
-    for group, count in (("full", 5), ("eval", 3), ("v20", 2)):
-        start = rng.uniform(-1, 1, (count, 3))
-        data[f"{group}_object_pose_start"] = start
-        data[f"{group}_object_pose_end"] = start + np.array([0.01, 0.02, 0.3 + 2 * np.pi])
-        data[f"{group}_tip_start"], data[f"{group}_tip_end"] = rng.uniform(-1, 1, (2, count, 2))
-        data[f"{group}_valid"] = np.arange(count) != 1
-        for kind in ("poly4", "quadratic"):
-            data[f"{group}_sim_pose_end_{kind}"] = start - np.array([0.0, 0.0, 2 * np.pi])
-    data |= {"train_wrench": rng.normal(size=(6, 3)), "train_twist": rng.normal(size=(6, 3))}
-    data |= {
-        "train_valid": np.arange(6) > 0,
-        "eval_to_full": np.array([4, 9, 5]),
-        "v20_to_full_action": np.array([8, 3]),
-    }
-    data |= {"full_in_eval": np.isin(data["full_index"], (4, 9, 5)), "rho": np.float64(0.06)}
-    data |= {"vertices_body": np.array([[0, 0], [0.1, 0], [0, 0.1]]), "tip_radius": np.float64(0.005)}
-    data |= {"surface": np.str_("abs"), "shape": np.str_("tri9")}
-    if not fast:
-        data = {name: value for name, value in data.items() if not name.startswith("v20")}
-    return data | changes
+OUTLINE = 0.045 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+RADIUS = 0.005
 
 
-def written(folder, data):
-    path = folder / "pushes.npz"
-    np.savez(path, **{name: value for name, value in data.items() if value is not None})
-    return path
+def recorded(index, speed, about=None, shift=0.0, turn=0.3):
+    """Return a push of the right edge by 50 mm to the left, in eleven samples, from the gap `shift` on."""
+    time = np.linspace(0, 1, 11)
+    hand = np.column_stack([0.05 + shift - 0.05 * time, 0 * time])
+    pose = np.column_stack([-0.05 * time, 0 * time, turn * time * 0.1])
+    known = {"speed": speed, "action": f"action {index % 12}", "repetition": 0} | (about or {})
+    pairs = np.full((2, 3), float(index))
+    return Recording(index, hand, pose, 0 * hand, time, pairs, pairs, known)
 
 
-def test_loader_matches_rows(tmp_path):
-    log = load_mit_pushes_npz(written(tmp_path, archive()))
-    assert (len(log.whole), len(log.middle), len(log.fast)) == (5, 3, 2)
-    assert log.is_training.tolist() == [True, False, False, True, False]
-    assert log.middle_of.tolist() == [1, 4, 2]
-    assert log.repeats.tolist() == [[0, 3]]  # the other action is not in `whole`
-    assert log.whole.valid.tolist() == [True, False, True, True, True]
-    assert (log.wrench.shape, log.surface, log.shape, log.length) == ((5, 3), "abs", "tri9", 0.06)
-    np.testing.assert_allclose(log.middle.end - log.middle.start, [[0.01, 0.02, 0.3]] * 3)
-    np.testing.assert_allclose(log.middle.toolbox["quartic"], log.middle.start, atol=1e-12)
-    without = load_mit_pushes_npz(written(tmp_path, archive(fast=False)))
-    assert (len(without.fast), without.repeats.shape) == (0, (0, 2))
-    assert noise_floor_mm(without) is None
+def log_of(pushes):
+    return Recordings(tuple(pushes), (), "made", OUTLINE, 0.06, RADIUS, surface="abs", object="rect1")
 
 
-@pytest.mark.parametrize(
-    ("changes", "what"),
-    [
-        ({"eval_tip_end": None}, "found no eval_tip_end"),
-        ({"full_tip_start": np.zeros((4, 2))}, "full_tip_start"),
-        ({"eval_object_pose_end": np.full((3, 3), np.nan)}, "eval_object_pose_end"),
-        ({"train_twist": np.zeros((5, 3))}, "train_twist"),
-        ({"eval_to_full": np.array([4, 9, 77])}, "expected eval_to_full to name rows of full_index, found 77"),
-        ({"vertices_body": np.full((3, 2), np.inf)}, "vertices_body"),
-        ({"full_index": np.float64(2)}, "full_"),
-    ],
-)
-def test_damaged_archives_are_refused(tmp_path, changes, what):
-    with pytest.raises(LogError, match=what) as raised:
-        load_mit_pushes_npz(written(tmp_path, archive(**changes)))
-    assert raised.value.path.endswith("pushes.npz")
+def test_groups():
+    """Slow pushes are divided at random, and test pushes are cut."""
+    made = [recorded(k, 0.01) for k in range(12)] + [recorded(k, 0.02) for k in (12, 14, 16)]
+    first, again, other = (groups.grouped(log_of(made), seed) for seed in (0, 0, 1))
+    assert first.about("training").tolist() == again.about("training").tolist() != other.about("training").tolist()
+    whole, middle, fast = (groups.group(first, name) for name in ("whole", "middle", "fast"))
+    assert (len(whole), len(middle), len(fast), len(groups.training_pushes(first))) == (12, 10, 3, 2)
+    assert first.about("valid").all()
+    assert not set(middle.about("action")) & set(groups.training_pushes(first).about("action"))
+    np.testing.assert_allclose(whole.end - whole.start, [[-0.05, 0, 0.03]] * 12, atol=1e-12)
+    np.testing.assert_allclose(middle.end - middle.start, [[-0.04, 0, 0.024]] * 10, atol=1e-12)
+    np.testing.assert_allclose(groups.tips(middle)[:, :, 0], [[0.045, 0.005]] * 10, atol=1e-12)
+    assert groups._repeat_rows(fast, whole).tolist() == [[0, 0], [1, 2], [2, 4]]
+    assert noise_floor_mm(first) == pytest.approx(0, abs=1e-9)
+    assert noise_floor_mm(groups.grouped(log_of(made[:12]), 0)) is None
+    with pytest.raises(LogError, match="at least 10 usable pushes of rect1 on abs at 10 mm/s, found 3"):
+        groups.grouped(log_of(made[9:]), 0)
+
+
+def test_pushes_not_to_be_believed():
+    """Pushes too far from the outline, too short, or with too large a turn are kept and marked as not valid."""
+    made = [recorded(k, 0.01) for k in range(12)]
+    made[1], made[2], made[4] = (
+        recorded(1, 0.01, shift=0.01),
+        recorded(2, 0.01, shift=-0.01),
+        recorded(4, 0.01, turn=16),
+    )
+    made[3] = replace(made[3], **{name: getattr(made[3], name)[:6] for name in ("hand", "pose", "force", "time")})
+    whole = groups.group(groups.grouped(log_of(made), 0), "whole")
+    assert np.flatnonzero(~whole.about("valid")).tolist() == [1, 2, 3, 4]
+
+
+def test_repetitions():
+    """Each repetition of a fast push is matched with the nearest repetition of the slow one."""
+    made = [recorded(k, 0.01) for k in range(10)]
+    made += [recorded(0, 0.01, {"repetition": number}) for number in (1, 6)]
+    made += [recorded(0, 0.02, {"repetition": number}) for number in (0, 3, 4, 9)]
+    log = groups.grouped(log_of(made), 0)
+    rows = groups._repeat_rows(groups.group(log, "fast"), groups.group(log, "whole"))
+    assert rows.tolist() == [[0, 0], [1, 10], [2, 11], [3, 11]]
 
 
 @pytest.fixture(scope="module")
-def logs(data):
-    if not (data / "mit_push").is_dir():
-        pytest.skip(f"no {data / 'mit_push'}")
+def logs(converted):
+    if not (converted / "mit_push").is_dir():
+        pytest.skip("no mit_push")
     each = [(surface, name) for surface in conditions.SURFACES for name in conditions.OBJECTS]
-    return {key: conditions.load(data, *key) for key in each}
+    return {key: conditions.load(converted, *key) for key in each}
 
 
 def test_real_archives(logs):
     """All pushes of every object are loaded, with the errors of the original program as in its authors' data."""
-    assert sum(len(log.whole) for log in logs.values()) == 5726
-    assert sum(len(log.fast) for log in logs.values()) == 2214
+    assert sum(len(group(log, "whole")) for log in logs.values()) == 5726
+    assert sum(len(group(log, "fast")) for log in logs.values()) == 2214
     for log in logs.values():
-        travel = np.linalg.norm(log.middle.tip_end - log.middle.tip_start, axis=1)
+        whole, middle = group(log, "whole"), group(log, "middle")
+        travel = np.linalg.norm(np.diff(groups.tips(middle), axis=1), axis=2)
         assert np.all((travel > 0.04) & (travel < 0.047))
-        assert not log.is_training[log.middle_of].any()
-        assert np.all(np.abs(log.whole.end[:, 2] - log.whole.start[:, 2]) <= np.pi)
+        tested = np.isin(whole.about("action"), middle.about("action"))
+        assert not whole.about("training")[tested].any()
+        assert np.all(np.abs(whole.end[:, 2] - whole.start[:, 2]) <= np.pi)
     for surface, expected in TOOLBOX_MM.items():
+        tests = [group(logs[surface, name], "middle") for name in conditions.OBJECTS]
         means = [
-            experiment.deviation_mm(logs[surface, name], logs[surface, name].middle.toolbox["quartic"]).mean()
-            for name in conditions.OBJECTS
-            if name not in conditions.NOT_IN_PAPER
+            deviation_mm(test.about("toolbox_quartic"), test.end, test.length).mean()
+            for test in tests
+            if test.object not in conditions.NOT_IN_PAPER
         ]
         assert np.mean(means) == pytest.approx(expected, abs=0.3)
 
@@ -138,15 +138,15 @@ def test_sides(logs):
     """Pushes are about equally frequent on the sides of an object, or its quadrants; the tip is nearest to its side."""
     for name, many in (("rect1", 4), ("tri1", 3), ("hex", 6), ("ellip2", 4), ("butter", 4)):
         log = logs["abs", name]
-        side = conditions.pushed_sides(log, log.whole)
+        side = conditions.pushed_sides(group(log, "whole"))
         counts = np.bincount(side, minlength=many)
         assert len(counts) == many
         assert counts.min() > len(side) / many / 3
-    rect = logs["abs", "rect1"]
-    side = conditions.pushed_sides(rect, rect.whole)
-    start = rect.whole.start
+    rect = group(logs["abs", "rect1"], "whole")
+    side = conditions.pushed_sides(rect)
+    start = rect.start
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
-    away = rect.whole.tip_start - start[:, :2]
+    away = groups.tips(rect)[:, 0] - start[:, :2]
     local = np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
     middle = (rect.vertices + np.roll(rect.vertices, -1, axis=0)) / 2
     outward = middle / np.linalg.norm(middle, axis=1, keepdims=True)
@@ -168,23 +168,24 @@ def test_noise_floor(logs):
 
 def test_filled_up(logs):
     log = logs["abs", "tri1"]
-    rows = np.flatnonzero(log.is_training)
-    pushes = conditions.padded_pushes(log, log.whole, rows, 10, 128)
+    training, last = groups.training_pushes(log), group(log, "whole").pushes[-1].index
+    count, tips = len(training), groups.tips(training)
+    pushes = conditions.padded_pushes(training, last, 10, 128)
     assert pushes.path.shape == (128, 11, 2)
-    assert float(pushes.weight.sum()) == len(rows)
+    assert float(pushes.weight.sum()) == count
     assert 0 <= float(pushes.age.min()) < 0.2 < 0.8 < float(pushes.age.max()) <= 1
-    np.testing.assert_array_equal(pushes.side[: len(rows)], conditions.pushed_sides(log, log.whole)[rows])
-    with pytest.raises(ValueError, match=f"batch must be at least {len(rows)}; got 3"):
-        conditions.padded_pushes(log, log.whole, rows, 10, 3)
-    np.testing.assert_allclose(pushes.path[: len(rows), -1], log.whole.tip_end[rows])
-    np.testing.assert_allclose(pushes.path[3, 5], (log.whole.tip_start[rows[3]] + log.whole.tip_end[rows[3]]) / 2)
+    np.testing.assert_array_equal(pushes.side[:count], conditions.pushed_sides(training))
+    with pytest.raises(ValueError, match=f"batch must be at least {count}; got 3"):
+        conditions.padded_pushes(training, last, 10, 3)
+    np.testing.assert_allclose(pushes.path[:count, -1], tips[:, 1])
+    np.testing.assert_allclose(pushes.path[3, 5], tips[3].mean(axis=0))
 
 
 @pytest.mark.slow
-def test_experiment(logs, data, monkeypatch, tmp_path):
+def test_experiment(logs, converted, monkeypatch, tmp_path):
     """With ellipsoids for one object, results are as good as the paper's from forces, and no worse with calibration."""
     monkeypatch.setattr(experiment, "MODELS", {"ellipsoid": 2})
-    given = ["--surface", "abs", "--object", "rect1", "--steps", "30", "--data", str(data)]
+    given = ["--surface", "abs", "--object", "rect1", "--steps", "30", "--data", str(converted)]
     cli.main(["reproduce", "table1", *given, "--out", str(tmp_path), "--json", str(tmp_path / "t.json")])
     record = json.loads((tmp_path / "t.json").read_text())
     forces, found = record["cells"]
@@ -202,25 +203,25 @@ def test_experiment(logs, data, monkeypatch, tmp_path):
     assert not (tmp_path / "table1-cells.json").exists()
 
 
-def test_an_interrupted_run_goes_on(logs, data, monkeypatch, tmp_path):
+def test_an_interrupted_run_goes_on(logs, converted, monkeypatch, tmp_path):
     calls = []
 
     def guess(setting):
         calls.append(setting)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return methods.Prediction(np.zeros((196, 3)), 0.2, 0, None)
+        return Prediction(np.zeros(196), np.array(0.2), 0)
 
     monkeypatch.setattr(experiment, "METHODS", {"identified": guess})
     monkeypatch.setattr(experiment, "ConditionData", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
     monkeypatch.setattr(experiment, "_draw", lambda cells, out: [])
     choice = {"surface": ("abs",), "object": ("rect1",), "method": ("identified",), "out": tmp_path}
     with pytest.raises(KeyboardInterrupt):
-        table1.run(data, **choice)
+        table1.run(converted, **choice)
     assert len(json.loads((tmp_path / "table1-cells.json").read_text())["cells"]) == 1
     with pytest.raises(ValueError, match=r"table1-cells\.json is of a run with other settings"):
-        table1.run(data, steps=7, **choice)
-    record = table1.run(data, **choice)
+        table1.run(converted, steps=7, **choice)
+    record = table1.run(converted, **choice)
     assert len(calls) == 3
     assert [cell["model"] for cell in record["cells"]] == ["quartic", "ellipsoid"]
     assert [path.name for path in tmp_path.iterdir()] == ["table1-cells.json"]  # until the results are written
@@ -232,23 +233,24 @@ def test_an_interrupted_run_goes_on(logs, data, monkeypatch, tmp_path):
     ("arguments", "message"),
     [
         (["--object", "rect9"], "object must be one or more of rect1"),
-        (["--surface", "delrin"], "has no pushes on delrin; the published data set has"),
+        (["--surface", "delrin"], "expected files motion_surface=delrin_shape=rect1_"),
     ],
 )
-def test_bad_choices(data, arguments, message, capsys, tmp_path):
+def test_bad_choices(arguments, message, capsys, tmp_path):
     with pytest.raises(ValueError, match=r"method must be one or more of wrench_twist, identified; got \['ideal'\]"):
-        table1.run(data, method=("ideal",))
+        table1.run(tmp_path, method=("ideal",))
     with pytest.raises(SystemExit) as stop:
-        cli.main(["reproduce", "table1", "--data", str(data), "--out", str(tmp_path), *arguments])
+        cli.main(["reproduce", "table1", "--data", str(tmp_path), "--out", str(tmp_path), *arguments])
     assert stop.value.code == 1
     assert message in capsys.readouterr().err
 
 
 def test_files_left_out_are_named(tmp_path, monkeypatch):
     problem = LogError(tmp_path / "a.json", "the tracker jumps")
-    monkeypatch.setattr(conditions, "load_mit_folder", lambda *given, **options: ("log", (problem, problem)))
+    log = replace(log_of(recorded(k, 0.01) for k in range(12)), problems=(problem, problem))
+    monkeypatch.setattr(conditions, "load_mit_folder", lambda *given, **options: log)
     with pytest.warns(UserWarning, match=r"2 files of hex on delrin are left out, the first: .*a\.json.*tracker jumps"):
-        assert conditions.load(tmp_path, "delrin", "hex") == "log"
+        assert len(conditions.load(tmp_path, "delrin", "hex")) == 22
 
 
 def test_folder_without_the_pushes(tmp_path):

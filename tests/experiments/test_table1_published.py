@@ -12,7 +12,8 @@ import pytest
 
 from pushjax.cli import main as cli
 from pushjax.datasets import load_mit_folder
-from pushjax.experiments.table1 import experiment
+from pushjax.datasets.mit_folder import states_at
+from pushjax.experiments.table1 import experiment, groups
 
 SLOWER = 10
 RATES = {"tip_pose": 250.0, "object_pose": 180.0, "ft_wrench": 250.0}  # Hz
@@ -76,23 +77,21 @@ def published(pushes, tmp_path_factory):
 
 def test_the_motion_is_read_as_written(pushes, published):
     """Poses at the ends, and at 10 and 90 % of the time in which tip, object and force are known, are those logged."""
-    log, problems = load_mit_folder(published / "json", "plywood", "rect1")
-    assert problems == ()
-    assert len(log.whole) == len(pushes)
-    names = sorted(push.name for push in pushes)
+    log = load_mit_folder(published / "json", "plywood", "rect1")
+    assert (log.problems, len(log)) == ((), len(pushes))
     by_name = {push.name: push.streams for push in pushes}
-    order = sorted(names, key=lambda name: [float(part.split("=")[1]) for part in name.split("_")[-3:]])
-    travel = np.linalg.norm(log.whole.tip_end - log.whole.tip_start, axis=1)
+    order = sorted(by_name, key=lambda name: [float(part.split("=")[1]) for part in name.split("_")[-3:]])
+    whole = groups.group(groups.grouped(log, 0), "whole")
+    travel = np.linalg.norm(np.diff(groups.tips(whole), axis=1), axis=2)
     assert np.all((travel > 0.04) & (travel < 0.051))  # the object is not always seen to the end
-    for group, rows, shares in ((log.whole, range(len(order)), (0, 1)), (log.middle, log.middle_of, (0.1, 0.9))):
-        for each, row in enumerate(rows):
-            streams = by_name[order[row]]
-            begin, end = (max if side == 0 else min for side in (0, -1))
-            span = begin(table[0, 0] for table in streams.values()), end(table[-1, 0] for table in streams.values())
+    for name, push in zip(order, log.pushes, strict=True):
+        streams = by_name[name]
+        span = max(table[0, 0] for table in streams.values()), min(table[-1, 0] for table in streams.values())
+        motion = streams["object_pose"]
+        for shares in ((0, 1), (0.1, 0.9)):
             at = span[0] + np.array(shares) * (span[1] - span[0])
-            motion = streams["object_pose"]
             expected = np.column_stack([np.interp(at, motion[:, 0], column) for column in motion[:, 1:].T])
-            found = np.stack([group.start[each], group.end[each]])
+            found, _ = states_at(push, shares)
             np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=0, atol=CUT)
             np.testing.assert_allclose(np.diff(found[:, 2]), np.diff(expected[:, 2]), rtol=0, atol=TURN)
 

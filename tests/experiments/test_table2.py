@@ -7,8 +7,9 @@ import pytest
 from drawn import legend
 
 import pushjax as pj
-from pushjax.datasets import load_push_npz
+from pushjax.datasets import load_recordings
 from pushjax.experiments import table2
+from pushjax.experiments._tables import MODELS
 from pushjax.experiments.table2 import conditions, experiment
 
 # Pushes of two conditions; the folder has no other. Half of fourteen are as many pairs as an ellipsoid needs, and
@@ -18,20 +19,20 @@ SPLITS = 3
 
 
 @pytest.fixture(scope="module")
-def few(data, tmp_path_factory):
+def few(converted, tmp_path_factory):
     """Return the record of table 2 of a few pushes on hardboard, and its folder."""
 
     def load(folder, surface, name):
         if surface != "hardboard" or name not in PUSHES:
             return None
-        log = load_push_npz(folder / f"{surface}_{name}.npz")
+        log = load_recordings(folder / f"{surface}_{name}.npz")
         return replace(log, pushes=log.pushes[: PUSHES[name]])
 
     out = tmp_path_factory.mktemp("table2")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(conditions, "load", load)
         patch.setattr(conditions, "SPLITS", SPLITS)
-        return table2.run(data, out=out, steps=15, method=("ideal", "wrench_twist")), out
+        return table2.run(converted, out=out, steps=15, method=("ideal", "wrench_twist")), out
 
 
 @pytest.mark.slow
@@ -50,10 +51,10 @@ def test_cells_say_why_they_have_no_figure(few):
 
 
 @pytest.mark.slow
-def test_other_cells_and_means_are_of_the_few_pushes(few, data):
+def test_other_cells_and_means_are_of_the_few_pushes(few, converted):
     record, _ = few
-    log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")
-    moved = [push.pose_end - push.pose_start for push in log.pushes[:14]]
+    log = load_recordings(converted / "three_point_push" / "hardboard_3pts1.npz")
+    moved = (log.end - log.start)[:14]
     deviations = [1e3 * (np.hypot(*each[:2]) + log.length * abs(each[2])) for each in moved]
     figures = [cell for cell in record["cells"] if cell["mean_mm"] is not None]
     expected = {("ideal", "quartic"), ("ideal", "ellipsoid"), ("wrench_twist", "ellipsoid")}
@@ -104,11 +105,11 @@ def test_few_or_no_pushes():
         assert conditions.reason_missing(few, "wrench_twist", model) == f"{count - 1} pairs, needs {count}"
         assert conditions.reason_missing(few, "identified", model) is None
         with pytest.raises(ValueError, match=f"{count - 1} pairs; a surface .* needs at least {count}"):
-            pj.fit_limit_surface(np.ones((count - 1, 3)), np.ones((count - 1, 3)), 1.0, degree=conditions.MODELS[model])
+            pj.fit_limit_surface(np.ones((count - 1, 3)), np.ones((count - 1, 3)), 1.0, degree=MODELS[model])
 
 
-def test_every_split_learns_from_some_and_predicts_others(data):
-    log = load_push_npz(data / "three_point_push" / "hardboard_3pts1.npz")
+def test_every_split_learns_from_some_and_predicts_others(converted):
+    log = load_recordings(converted / "three_point_push" / "hardboard_3pts1.npz")
     for count in (2, 3, 7):
         for share in (0.4, 0.5):
             chosen = conditions.training(replace(log, pushes=log.pushes[:count]), share, np.random.default_rng(0))

@@ -8,25 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets.mit_folder import load_mit_folder
-from pushjax.datasets.mit_pushes import MitPushes, StraightPushes, load_mit_pushes_npz
+from pushjax.datasets import Recordings, load_mit_folder, load_recordings
+from pushjax.datasets.mit_folder import in_body
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.push_log import Floats, rotation
+from pushjax.datasets.recordings import Floats
+from pushjax.experiments.table1.groups import FAST, SLOW, grouped, tips
 
 ARCHIVES = "mit_push"
 SURFACES = ("abs", "plywood")
 OBJECTS = ("rect1", "rect2", "rect3", "tri1", "tri3", "ellip1", "ellip2", "ellip3", "hex", "butter", "tri2")
-ALL_SURFACES = ("delrin", *SURFACES)  # delrin is not in the curated archives, only in the published folders
+ALL_SURFACES = ("delrin", *SURFACES)
 NOT_IN_PAPER = ("tri2",)  # not in the paper, because the tracker lost it; excluded from every mean
-MODELS = {"quartic": 4, "ellipsoid": 2}
 # Polygons with fewer vertices get this many, by splitting edges, so that one compiled program serves all polygons.
 MIN_VERTICES = 6
 BUTTERFLY_VERTICES = (
     64  # vertices, at most 0.3 mm from its 636 original ones; a spline takes three times as long to compile
 )
 SIDES = 6  # at most; an outline with more vertices is divided into quadrants
-
-TRAIN_SHARE = 0.2  # training share of the paper, used for pushes that come without a split
 
 # Zhou et al. 2017, table 1: mean deviation in mm; mean deviation in mm if nothing moved; and the mean over conditions
 # of the ratio of the two in percent, delrin included.
@@ -46,27 +44,26 @@ PAPER_NO_MOTION_MM = {
 PAPER_PERCENT = {"quartic": 20.05, "ellipsoid": 21.39}
 
 
-def checked_surfaces(folder: Path, surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
-    """Check the names of surfaces and objects, and return the surfaces, by default the archives' ones."""
+def checked_surfaces(surface: Sequence[str] | None, object: Sequence[str]) -> tuple[str, ...]:
+    """Check the names of surfaces and objects, and return the surfaces, by default SURFACES."""
     surface = SURFACES if surface is None else surface
     for name, given, allowed in (("surface", surface, ALL_SURFACES), ("object", object, OBJECTS)):
         unknown = [one for one in given if one not in allowed]
         if unknown or not given:
             raise ValueError(f"{name} must be one or more of {', '.join(allowed)}; got {unknown or 'none'}")
-    if "delrin" in surface and (folder / ARCHIVES).is_dir():
-        raise ValueError(f"surface: {folder / ARCHIVES} has no pushes on delrin; the published data set has")
     return tuple(surface)
 
 
-def load(folder: Path, surface: str, name: str, seed: int = 0) -> MitPushes:
-    """Load the pushes of one object on one surface from its archive or else from the published files."""
-    if (folder / ARCHIVES).is_dir():
-        return load_mit_pushes_npz(folder / ARCHIVES / f"{surface}_{name}.npz")
-    log, problems = load_mit_folder(folder, surface, name, train_share=TRAIN_SHARE, seed=seed)
-    if problems:
-        what = f"{len(problems)} files of {name} on {surface} are left out"
-        warnings.warn(f"{what}, the first: {problems[0]}", stacklevel=2)
-    return log
+def load(folder: Path, surface: str, name: str, seed: int = 0) -> Recordings:
+    """Load the grouped pushes of one object on one surface, from their `.npz` file or else from published files."""
+    file = folder / ARCHIVES / f"{surface}_{name}.npz"
+    if file.is_file():
+        return load_recordings(file)
+    log = load_mit_folder(folder, surface, name, speeds=(SLOW, FAST))
+    if log.problems:
+        what = f"{len(log.problems)} files of {name} on {surface} are left out"
+        warnings.warn(f"{what}, the first: {log.problems[0]}", stacklevel=2)
+    return grouped(log, seed)
 
 
 def paper_mm(surface: str, name: str, model: str) -> float | None:
@@ -74,14 +71,15 @@ def paper_mm(surface: str, name: str, model: str) -> float | None:
     return None if name in NOT_IN_PAPER else PAPER_MM[surface, model][OBJECTS.index(name)]
 
 
-def outline(log: MitPushes) -> pj.Shape:
+def outline(log: Recordings) -> pj.Shape:
     """Return the object's outline: a fitted ellipse, or a polygon with a suitable number of vertices."""
-    if log.shape.startswith("ellip"):
-        inverse_squares = np.linalg.lstsq(log.vertices**2, np.ones(len(log.vertices)), rcond=None)[0]
+    vertices, name = np.asarray(log.vertices), str(log.object)
+    if name.startswith("ellip"):
+        inverse_squares = np.linalg.lstsq(vertices**2, np.ones(len(vertices)), rcond=None)[0]
         return pj.Ellipse(*(1 / np.sqrt(inverse_squares)))
-    if log.shape == "butter":
-        return pj.Polygon(log.vertices[np.arange(BUTTERFLY_VERTICES) * len(log.vertices) // BUTTERFLY_VERTICES])
-    return pj.Polygon(_with_split_edges(log.vertices))
+    if name == "butter":
+        return pj.Polygon(vertices[np.arange(BUTTERFLY_VERTICES) * len(vertices) // BUTTERFLY_VERTICES])
+    return pj.Polygon(_with_split_edges(vertices))
 
 
 def _with_split_edges(vertices: Floats) -> Floats:
@@ -93,10 +91,10 @@ def _with_split_edges(vertices: Floats) -> Floats:
     return vertices
 
 
-def pushed_sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
+def pushed_sides(pushes: Recordings) -> np.ndarray:
     """Return the edge (or quadrant) nearest to the tip at the start of each push, (pushes,)."""
-    tip = np.einsum("nji,nj->ni", rotation(pushes.start[:, 2]), pushes.tip_start - pushes.start[:, :2])
-    vertices = log.vertices
+    tip = in_body(pushes.start, tips(pushes)[:, 0] - pushes.start[:, :2])
+    vertices = np.asarray(pushes.vertices)
     if len(vertices) > SIDES:  # the quadrant of the body frame that the tip is in
         return (np.arctan2(tip[:, 1], tip[:, 0]) // (np.pi / 2)).astype(int) % 4
     edges = [
@@ -106,24 +104,22 @@ def pushed_sides(log: MitPushes, pushes: StraightPushes) -> np.ndarray:
     return np.argmin([np.abs(nearest_on_outline(edge, tip)[0]) for edge in edges], axis=0)
 
 
-def padded_pushes(log: MitPushes, pushes: StraightPushes, rows: np.ndarray, steps: int, batch: int) -> pj.Pushes:
-    """Convert the pushes `rows` to `Pushes` that are padded to the number `batch`."""
-    path = straight_paths(pushes, rows, steps)
-    # how late a push comes in the file
-    age = pushes.index / max(int(log.whole.index.max()), 1)
-    parts = pushes.start[rows], path, pushes.end[rows], age[rows], pushed_sides(log, pushes)[rows]
+def padded_pushes(pushes: Recordings, last: int, steps: int, batch: int) -> pj.Pushes:
+    """Convert straight pushes to `Pushes` that are padded to the number `batch`; `last` is the index of the latest."""
+    age = np.array([push.index for push in pushes.pushes]) / max(last, 1)  # how late a push comes in the file
+    parts = pushes.start, straight_paths(pushes, steps), pushes.end, age, pushed_sides(pushes)
     # The padding has no weight. With it, one compiled program serves all objects of a kind.
-    padding = batch - len(rows)
+    padding = batch - len(pushes)
     if padding < 0:
-        raise ValueError(f"batch must be at least {len(rows)}; got {batch}")
+        raise ValueError(f"batch must be at least {len(pushes)}; got {batch}")
     dtype = jnp.result_type(float)
     start, path, end, age, side = (
         jnp.asarray(np.concatenate([part, np.repeat(part[:1], padding, axis=0)]), dtype) for part in parts
     )
-    return pj.Pushes(start, path, end, (np.arange(batch) < len(rows)).astype(float), age=age, side=side)
+    return pj.Pushes(start, path, end, (np.arange(batch) < len(pushes)).astype(float), age=age, side=side)
 
 
-def straight_paths(pushes: StraightPushes, rows: np.ndarray, steps: int) -> Floats:
-    """Return the straight paths of the tip in the chosen pushes, (rows, steps + 1, 2), m, world."""
-    begin, stop = pushes.tip_start[rows], pushes.tip_end[rows]
+def straight_paths(pushes: Recordings, steps: int) -> Floats:
+    """Return the straight paths of the tip, (pushes, steps + 1, 2), m, world."""
+    begin, stop = tips(pushes).swapaxes(0, 1)
     return begin[:, None] + np.linspace(0, 1, steps + 1)[None, :, None] * (stop - begin)[:, None]

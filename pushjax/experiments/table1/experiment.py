@@ -2,10 +2,10 @@
 
 The limit surface and the friction of the finger are learned from about eighty whole pushes of each object. The other
 pushes are predicted, from 10 to 90 % of their time. The result is the mean deviation of the final poses (Zhou et al.
-2017, section VI.B, table 1). The curated archives also hold what the authors' toolbox predicts for the same pushes.
+2017, section VI.B, table 1).
 
 Deviations from the paper: there is one split, where the paper has ten. Pushes that the tracker lost are tested too, as
-in the paper. The curated archives have no pushes on delrin, the paper's third surface; the published folders do.
+in the paper. The paper's third surface, delrin, is left out unless it is asked for.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,12 +17,11 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets.mit_pushes import MitPushes
+from pushjax.datasets import Recordings
 from pushjax.experiments._cell_cache import CellCache
 from pushjax.experiments._record import result_record
-from pushjax.experiments._tables import bootstrapped_ci95
+from pushjax.experiments._tables import MODELS, Prediction, bootstrapped_ci95, deviation_mm
 from pushjax.experiments.table1.conditions import (
-    MODELS,
     NOT_IN_PAPER,
     OBJECTS,
     PAPER_PERCENT,
@@ -30,8 +29,8 @@ from pushjax.experiments.table1.conditions import (
     load,
     paper_mm,
 )
-from pushjax.experiments.table1.methods import METHODS, ConditionData, Prediction
-from pushjax.experiments.table1.repeats import noise_floor_mm
+from pushjax.experiments.table1.groups import group, noise_floor_mm, training_pushes
+from pushjax.experiments.table1.methods import METHODS, ConditionData
 
 
 def run(
@@ -49,12 +48,12 @@ def run(
     With `out`, every cell is saved there as soon as it is known. An interrupted run continues with the saved cells.
 
     Args:
-        folder: Folder of the data: the one that contains `mit_push/`, or that of the published data set.
+        folder: Folder of the published data set, or one with files `mit_push/SURFACE_OBJECT.npz` of grouped pushes.
         seed: Seed of the bootstrap, and of the choice of training pushes where the data do not have one.
         out: Folder for the pictures and the saved cells. None: neither.
         steps: Steps of each push.
         method: One or both of "wrench_twist" and "identified".
-        surface: Names of surfaces. None: those of the curated archives.
+        surface: Names of surfaces. None: abs and plywood.
         object: Names of objects.
         progress: Called with the number of cells done and their total.
 
@@ -65,7 +64,7 @@ def run(
         LogError: If data are missing or damaged.
         ValueError: If a method, surface or object is unknown.
     """
-    surface = checked_surfaces(folder, surface, object)
+    surface = checked_surfaces(surface, object)
     unknown = [one for one in method if one not in METHODS]
     if unknown or not method:
         raise ValueError(f"method must be one or more of {', '.join(METHODS)}; got {unknown or 'none'}")
@@ -76,7 +75,7 @@ def run(
         for model in MODELS:
             condition = cache(partial(ConditionData.of, log, model, steps))  # made only if a cell is missing
             for name in method:
-                labels = {"surface": log.surface, "object": log.shape, "model": model, "method": name}
+                labels = {"surface": log.surface, "object": log.object, "model": model, "method": name}
                 todo.append((labels, partial(_cell, log, model, METHODS[name], condition, seed)))
     cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
     means = {name: {model: _means_by_surface(cells, name, model) for model in MODELS} for name in method}
@@ -86,27 +85,27 @@ def run(
 
 
 def _cell(
-    log: MitPushes,
+    log: Recordings,
     model: str,
     method: Callable[[ConditionData], Prediction],
     condition: Callable[[], ConditionData],
     seed: int,
 ) -> dict[str, Any]:
     """Compute the figures of one cell, apart from its labels and run time."""
-    predicted = method(condition())
-    deviations = deviation_mm(log, predicted.final)
-    toolbox = log.middle.toolbox.get(model)
+    predicted, test = method(condition()), group(log, "middle")
+    deviations, by_toolbox = predicted.errors, f"toolbox_{model}"
+    toolbox = test.about(by_toolbox) if by_toolbox in test.pushes[0].about else None
     return {
         "mean_mm": float(deviations.mean()),
         "ci95_bootstrap_mm": bootstrapped_ci95(deviations, np.random.default_rng(seed)),
         "median_mm": float(np.median(deviations)),
         "worst_mm": float(deviations.max()),
-        "valid_mm": float(deviations[log.middle.valid].mean()),  # without the pushes that the tracker lost
-        "no_motion_mm": float(deviation_mm(log, log.middle.start).mean()),
-        "paper_mm": paper_mm(log.surface, log.shape, model),
-        "toolbox_mm": None if toolbox is None else float(deviation_mm(log, toolbox).mean()),
-        "friction": predicted.friction,
-        "learned": int(np.sum(log.is_training & log.whole.valid)),  # number of pushes, as "tested" is
+        "valid_mm": float(deviations[test.about("valid")].mean()),  # without the pushes that the tracker lost
+        "no_motion_mm": float(deviation_mm(test.start, test.end, log.length).mean()),
+        "paper_mm": paper_mm(str(log.surface), str(log.object), model),
+        "toolbox_mm": None if toolbox is None else float(deviation_mm(toolbox, test.end, log.length).mean()),
+        "friction": float(predicted.friction),
+        "learned": len(training_pushes(log)),  # number of pushes, as "tested" is
         "tested": len(deviations),
         "failed_steps": predicted.failed,
         **_calibration(predicted),
@@ -127,11 +126,6 @@ def _calibration(predicted: Prediction) -> dict[str, Any]:
         found |= {"frame_offset_deg": float(np.degrees(offset[2]))}
     sigma, gap_sigma = predicted.found.sigma, predicted.found.gap_sigma
     return found | {"sigma_mm": 1e3 * float(sigma), "gap_sigma_mm": 1e3 * float(gap_sigma)}
-
-
-def deviation_mm(log: MitPushes, final: np.ndarray) -> np.ndarray:
-    """Return the deviations (pushes,), mm, of the final poses (pushes, 3) predicted for `log.middle`."""
-    return 1e3 * np.asarray(pj.deviation(final, log.middle.end, log.length), np.float64)
 
 
 def _means_by_surface(cells: list[dict], method: str, model: str) -> dict[str, Any]:

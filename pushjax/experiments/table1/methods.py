@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets.mit_pushes import MitPushes
-from pushjax.experiments._tables import final_poses
-from pushjax.experiments.table1.conditions import MODELS, outline, padded_pushes
+from pushjax.datasets import Recordings
+from pushjax.experiments._tables import MODELS, Prediction, deviation_mm, final_poses
+from pushjax.experiments.table1.conditions import outline, padded_pushes
+from pushjax.experiments.table1.groups import group, training_pushes
 
 FRICTIONS = np.linspace(0.0, 0.6, 31)
 # Largest number of steps per push in the identification, which takes derivatives. More steps give the same answer.
@@ -35,15 +36,6 @@ UNKNOWNS: dict[str, Any] = {
 }
 
 
-class Prediction(NamedTuple):
-    """Predictions of the test pushes."""
-
-    final: np.ndarray  # (pushes, 3), final poses, world, m and rad
-    friction: float  # identified coefficient of friction
-    failed: int  # number of failed steps
-    found: pj.Identified | None  # None if the method identifies nothing else
-
-
 class ConditionData(NamedTuple):
     """One object on one surface as both methods take it, with pushes as padded arrays."""
 
@@ -56,18 +48,24 @@ class ConditionData(NamedTuple):
     length: float  # characteristic length of the deviations, m
 
     @staticmethod
-    def of(log: MitPushes, model: str, steps: int) -> "ConditionData":
+    def of(log: Recordings, model: str, steps: int) -> "ConditionData":
         """Prepare the data of one object for a model, with `steps` steps of each push."""
-        rows = np.flatnonzero(log.is_training & log.whole.valid)
+        assert log.length is not None  # known for every object of the data set
+        assert log.tip_radius is not None
+        training, test = training_pushes(log), group(log, "middle")
+        last = max(push.index for push in group(log, "whole").pushes)
         dtype = jnp.result_type(float)
-        pairs = jnp.asarray(log.wrench, dtype), jnp.asarray(log.twist, dtype)
+        wrench, twist = (
+            jnp.asarray(np.concatenate([getattr(push, name) for push in training.pushes]), dtype)
+            for name in ("wrench", "twist")
+        )
         return ConditionData(
-            padded_pushes(log, log.whole, rows, steps, TRAINING_SIZE),
-            padded_pushes(log, log.whole, rows, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
-            padded_pushes(log, log.middle, np.arange(len(log.middle)), steps, TEST_SIZE),
+            padded_pushes(training, last, steps, TRAINING_SIZE),
+            padded_pushes(training, last, min(steps, IDENTIFY_STEPS), TRAINING_SIZE),
+            padded_pushes(test, last, steps, TEST_SIZE),
             outline(log),
             pj.Hand.finger(log.tip_radius),
-            pj.fit_limit_surface(*pairs, log.length, degree=MODELS[model]),
+            pj.fit_limit_surface(wrench, twist, log.length, degree=MODELS[model]),
             log.length,
         )
 
@@ -80,20 +78,25 @@ class ConditionData(NamedTuple):
 def wrench_twist(condition: ConditionData) -> Prediction:
     """Predict with the fitted surface and the friction that is best for the training pushes, on a grid."""
     training, test = condition.training, condition.test
-    on_grid, _ = final_poses(condition.slider, condition.hand, training, jnp.asarray(FRICTIONS, training.path.dtype))
+    on_grid, *_ = final_poses(condition.slider, condition.hand, training, jnp.asarray(FRICTIONS, training.path.dtype))
     errors = pj.deviation(on_grid, training.end[None], condition.length)
     best = FRICTIONS[int(np.argmin(np.asarray(errors @ training.weight)))]
-    final, failed = final_poses(condition.slider, condition.hand, test, jnp.asarray([best], training.path.dtype))
-    final, failed = (without_padding(values[0], test) for values in (final, failed))
-    return Prediction(final, float(best), int(failed.sum()), None)
+    final, failed, _ = final_poses(condition.slider, condition.hand, test, jnp.asarray([best], training.path.dtype))
+    return _prediction(condition, final[0], best, failed[0], None)
 
 
 def identified(condition: ConditionData) -> Prediction:
     """Predict with everything that is identified from the final poses of the training pushes."""
     found = fitted(condition.coarse, condition, pj.Unknowns((0.0, 1.0), **UNKNOWNS))
     predicted = found.predict(condition.test, condition.slider, condition.hand)
-    final, failed = (without_padding(values, condition.test) for values in (predicted.pose[:, -1], predicted.failed))
-    return Prediction(final, float(found.friction), int(failed.sum()), found)
+    return _prediction(condition, predicted.pose[:, -1], found.friction, predicted.failed, found)
+
+
+def _prediction(condition: ConditionData, final, friction, failed, found: pj.Identified | None) -> Prediction:
+    """Return the prediction of the test pushes, from arrays that are padded to `TEST_SIZE`."""
+    final, failed, end = (without_padding(values, condition.test) for values in (final, failed, condition.test.end))
+    errors = deviation_mm(final, end, condition.length)
+    return Prediction(errors, np.asarray(friction, float), int(failed.sum()), found)
 
 
 def fitted(pushes: pj.Pushes, condition: ConditionData, unknowns: pj.Unknowns, overlap: float = 1.0) -> pj.Identified:

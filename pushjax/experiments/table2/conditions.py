@@ -8,11 +8,11 @@ import jax
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets import Push, PushLog, load_push_npz, load_triangle_log
+from pushjax.datasets import Recording, Recordings, load_recordings, load_triangle_log
+from pushjax.experiments._tables import MODELS
 
 SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4")
 CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
-MODELS = {"quartic": 4, "ellipsoid": 2}
 PAIRS, SPLITS = 400, 10
 COEFFICIENTS = {"quartic": 15, "ellipsoid": 6}  # a surface is fitted to at least as many pairs
 
@@ -26,6 +26,11 @@ PAPER_MM = {
 }
 PAPER_NO_MOTION_MM = {"hardboard": (16.63, 13.86, 14.83, 15.15), "plywood": (16.56, 13.81, 15.27, 14.20)}
 PAPER_PERCENT = {"quartic": 20.48, "ellipsoid": 24.97}
+
+
+# The robot was commanded to go 15 mm beyond an approach gap of 2.5 mm; in m. The log misses about the last millimeter
+# of this motion (the finger is still moving at the last logged sample), but the measured end pose includes it.
+COMMANDED_TRAVEL = 0.0175
 
 
 class Geometry(NamedTuple):
@@ -42,7 +47,7 @@ class Geometry(NamedTuple):
 GEOMETRIES = {"nominal": Geometry(0.001, 0.0, False), "measured": Geometry(0.0, 0.0007, True)}
 
 
-def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
+def load_all(folder: Path) -> dict[tuple[str, str], Recordings]:
     """Load the pushes of every condition that the folder has, by surface and object."""
     logs = {condition: load(folder, *condition) for condition in CONDITIONS}
     known = {condition: log for condition, log in logs.items() if log is not None}
@@ -55,12 +60,12 @@ def load_all(folder: Path) -> dict[tuple[str, str], PushLog]:
     return known
 
 
-def load(folder: Path, surface: str, name: str) -> PushLog | None:
-    """Load the pushes of a condition from its archive or else from the first original log, if there is one."""
-    archive = folder / f"{surface}_{name}.npz"
+def load(folder: Path, surface: str, name: str) -> Recordings | None:
+    """Load the pushes of a condition from its `.npz` file or else from the first original log, if there is one."""
+    file = folder / f"{surface}_{name}.npz"
     originals = sorted(folder.glob(f"{surface}_{name}*.txt*"))
-    if archive.exists():
-        return load_push_npz(archive)
+    if file.exists():
+        return load_recordings(file)
     return load_triangle_log(originals[0], surface=surface, arrangement=name) if originals else None
 
 
@@ -74,7 +79,7 @@ def reason_missing(train: np.ndarray | None, method: str, model: str) -> str | N
     return f"{pairs} pairs, needs {needed}" if method == "wrench_twist" and pairs < needed else None
 
 
-def ideal_surface(log: PushLog, model: str, key: jax.Array) -> pj.LimitSurface:
+def ideal_surface(log: Recordings, model: str, key: jax.Array) -> pj.LimitSurface:
     """Fit a limit surface to pairs of the known support points, under the loads that statics gives them.
 
     Args:
@@ -86,26 +91,29 @@ def ideal_surface(log: PushLog, model: str, key: jax.Array) -> pj.LimitSurface:
     return pj.fit_limit_surface(*support.wrench_twist_pairs(key, PAIRS), degree=MODELS[model])
 
 
-def outline(log: PushLog, geometry: Geometry) -> pj.Polygon:
+def outline(log: Recordings, geometry: Geometry) -> pj.Polygon:
     """Return the outline of the triangle, smaller by the inset of the geometry."""
     polygon = pj.Polygon(log.vertices)
     return polygon.inset(geometry.inset) if geometry.inset else polygon
 
 
-def recorded(log: PushLog, geometry: Geometry, steps: int) -> pj.Pushes:
+def recorded(log: Recordings, geometry: Geometry, steps: int) -> pj.Pushes:
     """Convert a log to `Pushes`, with paths that end where the geometry says."""
     if geometry.commanded_end:
-        log = replace(log, pushes=tuple(_with_commanded_end(log, push) for push in log.pushes))
+        log = replace(log, pushes=tuple(_with_commanded_end(push) for push in log.pushes))
     return pj.Pushes.of(log, steps)
 
 
-def _with_commanded_end(log: PushLog, push: Push) -> Push:
-    """Return the push with a path that ends where the robot was told to stop."""
-    tip = np.vstack([push.tip, log.commanded_tip_end(push)])
-    return replace(push, tip=tip, tip_time=np.append(push.tip_time, push.tip_time[-1]))
+def _with_commanded_end(push: Recording) -> Recording:
+    """Return the push with a path that ends where the robot was told to stop, which is inferred."""
+    travel = push.hand[-1] - push.hand[0]
+    end = push.hand[0] + COMMANDED_TRAVEL * travel / np.linalg.norm(travel)
+    pose = np.vstack([push.pose, push.pose[-1:]])
+    pose[-2] = np.nan
+    return replace(push, hand=np.vstack([push.hand, end]), pose=pose, force=None, time=None)
 
 
-def training(log: PushLog, share: float, rng: np.random.Generator) -> np.ndarray:
+def training(log: Recordings, share: float, rng: np.random.Generator) -> np.ndarray:
     """Return masks (splits, pushes) of the training pushes of random splits."""
     # with a share between one and three quarters, two or more pushes are never all on one side
     chosen = np.zeros((SPLITS, len(log.pushes)), bool)

@@ -22,14 +22,13 @@ import numpy as np
 
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets import PushLog
+from pushjax.datasets import Recordings
 from pushjax.experiments._record import result_record
-from pushjax.experiments._tables import bootstrapped_ci95
+from pushjax.experiments._tables import MODELS, Prediction, bootstrapped_ci95, deviation_mm
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
     CONDITIONS,
     GEOMETRIES,
-    MODELS,
     OBJECTS,
     PAIRS,
     PAPER_MM,
@@ -44,7 +43,7 @@ from pushjax.experiments.table2.conditions import (
     recorded,
     training,
 )
-from pushjax.experiments.table2.methods import FRICTIONS, ConditionData, Part, Prediction
+from pushjax.experiments.table2.methods import FRICTIONS, ConditionData, Part
 
 Condition = tuple[str, str]  # surface and object
 COLUMN = 20  # width of a column of the printed table
@@ -111,7 +110,7 @@ def run(
 def _cells(
     method: str,
     model: str,
-    logs: dict[Condition, PushLog],
+    logs: dict[Condition, Recordings],
     pushes: dict[Condition, pj.Pushes],
     geometry: Geometry,
     seed: int,
@@ -152,7 +151,7 @@ def _predict(method: str, model: str, data: list[ConditionData], geometry: Geome
         return methods.identified(data, geometry, lambda split: part(f"{words}, {split}")) if data else []
     predictions = []
     for each in data:
-        with part(f"{words}, {each.log.surface} {each.log.arrangement}"):
+        with part(f"{words}, {each.log.surface} {each.log.object}"):
             ideal = method == "ideal"
             predictions.append(methods.ideal(each, geometry) if ideal else methods.wrench_twist(each, model, geometry))
     return predictions
@@ -162,7 +161,7 @@ def _cell(
     pushes: pj.Pushes, length: float, found: Prediction, train: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Compute the figures of the pushes that were not learned from, over all splits."""
-    no_motion = 1e3 * np.asarray(pj.deviation(pushes.start, pushes.end, length), np.float64)
+    no_motion = deviation_mm(pushes.start, pushes.end, length)
     test = ~train
     means = [error[tested].mean() for error, tested in zip(found.errors, test, strict=True)]
     times_tested = test.sum(axis=0)

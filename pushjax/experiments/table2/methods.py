@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets import PushLog
-from pushjax.experiments._tables import final_poses
-from pushjax.experiments.table2.conditions import MODELS, Geometry, outline, recorded
+from pushjax.datasets import Recordings
+from pushjax.experiments._tables import MODELS, Prediction, deviation_mm, final_poses
+from pushjax.experiments.table2.conditions import Geometry, outline, recorded
 
 FRICTIONS = np.linspace(0.0, 0.8, 41)
 # Share of the pushes to learn from. A quartic has fifteen coefficients, and a push gives one pair.
@@ -32,18 +32,10 @@ SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
 class ConditionData(NamedTuple):
     """One condition as the methods take it."""
 
-    log: PushLog  # the pushes as logged, with their forces
+    log: Recordings  # the pushes as logged, with their forces
     pushes: pj.Pushes  # the same as arrays
     surface: pj.LimitSurface  # of the known support
     train: np.ndarray  # (splits, pushes), True for training pushes
-
-
-class Prediction(NamedTuple):
-    """Predictions of all pushes of one condition."""
-
-    errors: np.ndarray  # (splits, pushes), deviations, mm
-    friction: np.ndarray  # (splits,), identified coefficients of friction
-    failed: int  # number of failed steps
 
 
 def ideal(condition: ConditionData, geometry: Geometry) -> Prediction:
@@ -66,7 +58,11 @@ def wrench_twist(condition: ConditionData, model: str, geometry: Geometry) -> Pr
         geometry: Where the finger really was.
     """
     length = condition.surface.length
-    wrench, twist = (jnp.asarray(pairs, length.dtype) for pairs in condition.log.wrench_twist_pairs())
+    pushes = condition.log.pushes
+    wrench, twist = (
+        jnp.asarray(np.concatenate([getattr(push, name) for push in pushes]), length.dtype)
+        for name in ("wrench", "twist")
+    )
     errors, failed = [], 0
     for trains in condition.train:
         surface = pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model])
@@ -107,8 +103,7 @@ def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Pa
         with part(f"split {split + 1} of {len(first.train)}"):
             found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
             predicted = found.predict(fine, slider, hand)
-            off = pj.deviation(predicted.pose[..., -1, :], fine.end, length)
-            errors.append(1e3 * np.asarray(off, np.float64))
+            errors.append(deviation_mm(predicted.pose[..., -1, :], fine.end, length))
             failed += np.asarray(predicted.failed).sum(axis=(1, 2))
             friction.append(np.asarray(found.friction))
     return [
@@ -124,8 +119,8 @@ def _deviations_on_grid(
     log, pushes = condition.log, condition.pushes
     slider = pj.Slider(outline(log, geometry), surface)
     hand = pj.Hand.finger(geometry.radius)
-    final, failed = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
-    return 1e3 * np.asarray(pj.deviation(final, pushes.end[None], log.length), np.float64), np.asarray(failed)
+    final, failed, _ = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
+    return deviation_mm(final, pushes.end[None], log.length), np.asarray(failed)
 
 
 def _choose_friction(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Prediction:

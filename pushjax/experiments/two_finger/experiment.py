@@ -24,12 +24,11 @@ import jax
 import numpy as np
 
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax.datasets import LogError
-from pushjax.datasets.two_finger import TwoFingerLog, load_two_finger_npz
-from pushjax.datasets.two_finger_logs import load_two_finger_logs
+from pushjax.datasets import LogError, Recordings, load_recordings, load_two_finger_logs
 from pushjax.experiments._record import result_record
+from pushjax.experiments._tables import MODELS, deviation_mm
 from pushjax.experiments.two_finger import predictions
-from pushjax.experiments.two_finger.predictions import MODELS, PAIRS, SPLITS, TRAIN_SHARE, deviation_mm, predict, splits
+from pushjax.experiments.two_finger.predictions import PAIRS, SPLITS, TRAIN_SHARE, predict, splits
 from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, object_scores
 
 OBJECTS = ("3pts1", "3pts3", "patch")
@@ -46,7 +45,7 @@ def run(
     """Compute one cell for each object.
 
     Args:
-        folder: Folder of the data, which contains `two_finger_push/` with archives or with folders of published logs.
+        folder: Folder of the data, which contains `two_finger_push/` with folders of published logs, or `.npz` files.
         seed: Seed of the wrench-twist pairs, the splits and the bootstrap.
         out: Folder for the pictures. None: no pictures.
         steps: Steps of each push.
@@ -67,7 +66,7 @@ def run(
     cells, by_day, shown = [], [], []
     for index, (name, log) in enumerate(logs.items()):
         prediction = predict(log, model, jax.random.key(seed + index), steps, batch)
-        errors = deviation_mm(log, prediction.final)
+        errors = deviation_mm(prediction.final, log.end, log.length)
         tested = splits(log, errors, np.random.default_rng(seed + index))
         scores = object_scores(log, prediction, errors, tested, seed + index)
         cells.append({"object": name, "model": model} | scores)
@@ -89,11 +88,11 @@ def run(
     return result_record("two-finger", settings, cells=cells, days=by_day, pictures=pictures)
 
 
-def load(folder: Path, name: str) -> TwoFingerLog:
-    """Load the pushes of an arrangement from its archive, or else from its folder of original logs."""
-    archive, originals = folder / f"{name}.npz", folder / name
-    if archive.exists():
-        return load_two_finger_npz(archive)
+def load(folder: Path, name: str) -> Recordings:
+    """Load the pushes of an arrangement from its `.npz` file, or else from its folder of original logs."""
+    file, originals = folder / f"{name}.npz", folder / name
+    if file.exists():
+        return load_recordings(file)
     if originals.is_dir():
         return load_two_finger_logs(originals)
     fetched = "`pushjax data triangle` fetches them"

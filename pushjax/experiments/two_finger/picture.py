@@ -7,12 +7,13 @@ import numpy as np
 
 import pushjax as pj
 from pushjax import plot
-from pushjax.datasets.two_finger import TwoFingerLog
-from pushjax.experiments.two_finger.predictions import Tested, deviation_mm, per_push
+from pushjax.datasets import Recordings
+from pushjax.experiments._tables import deviation_mm
+from pushjax.experiments.two_finger.predictions import Tested, per_push
 from pushjax.plot.style import BLACK, BLUE, GRAY, ORANGE, STYLE, legend_below
 
 # name, log, predicted final poses (radii, frictions, n, 3), their deviations (radii, frictions, n), mm, and the splits
-Shown = tuple[str, TwoFingerLog, np.ndarray, np.ndarray, Tested]
+Shown = tuple[str, Recordings, np.ndarray, np.ndarray, Tested]
 
 
 def draw(shown: list[Shown], out: Path) -> str:
@@ -20,8 +21,8 @@ def draw(shown: list[Shown], out: Path) -> str:
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
         for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
-            each = per_push(errors, tested)
-            _distribution(row[0], name, each[np.isfinite(each)], deviation_mm(log, log.pose_start))
+            each, no_motion = per_push(errors, tested), deviation_mm(log.start, log.end, log.length or 0.0)
+            _distribution(row[0], name, each[np.isfinite(each)], no_motion)
             at, pushes = tested.chosen[0], tested.test[0]
             order = pushes[np.argsort(errors[at][pushes])]
             for panel, (word, share) in zip(
@@ -47,21 +48,21 @@ def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray)
     axes.legend(loc="upper left")
 
 
-def _one_push(axes, log: TwoFingerLog, push: int, final: np.ndarray) -> None:
+def _one_push(axes, log: Recordings, push: int, final: np.ndarray) -> None:
     """Draw the start, the measured end and the predicted end of one push, with the fingers."""
     shape = pj.Polygon(log.vertices)
     drawn = (
-        (log.pose_start[push], GRAY, "-", "start"),
-        (log.pose_end[push], BLACK, "-", "measured end"),
+        (log.start[push], GRAY, "-", "start"),
+        (log.end[push], BLACK, "-", "measured end"),
         (final, BLUE, "--", "predicted end"),
     )
     for pose, color, dash, label in drawn:
         plot.outline(axes, shape, pose, color, 1.5, linestyle=dash, label=label)
     for hand, color, label in (
-        (log.hand_start[push], GRAY, "fingers, start"),
-        (log.hand_end[push], ORANGE, "fingers, end"),
+        (log.pushes[push].hand[0], GRAY, "fingers, start"),
+        (log.pushes[push].hand[-1], ORANGE, "fingers, end"),
     ):
-        aside = log.spacing / 2 * np.array([-np.sin(hand[2]), np.cos(hand[2])])
+        aside = hand[3] / 2 * np.array([-np.sin(hand[2]), np.cos(hand[2])])
         fingers = 1e3 * np.stack([hand[:2] + aside, hand[:2] - aside])
         axes.plot(*fingers.T, "o", color=color, ms=5, label=label)
     axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")

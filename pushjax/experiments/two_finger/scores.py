@@ -9,29 +9,27 @@ from typing import Any
 import numpy as np
 
 import pushjax as pj
-from pushjax.datasets.two_finger import TwoFingerLog, stick_deviation
+from pushjax.datasets import Recordings
+from pushjax.datasets.recordings import Floats, rotation, wrap_angle
+from pushjax.experiments._tables import BOOTSTRAP_SAMPLES, deviation_mm, relative_motions
 from pushjax.experiments.two_finger import predictions
-from pushjax.experiments.two_finger.predictions import SPLITS, Prediction, Tested, deviation_mm, per_push
-from pushjax.geometry.se2 import compose, inverse
+from pushjax.experiments.two_finger.predictions import SPLITS, OnGrid, Tested, per_push
 
-BOOTSTRAP_SAMPLES = 2000
 MAX_STUCK_MOTION = 0.003  # m
 MIN_PUSHES_OF_A_DAY = 10
 DAY = 86400.0  # s
 
 
-def object_scores(
-    log: TwoFingerLog, prediction: Prediction, errors: np.ndarray, tested: Tested, seed: int
-) -> dict[str, Any]:
+def object_scores(log: Recordings, prediction: OnGrid, errors: np.ndarray, tested: Tested, seed: int) -> dict[str, Any]:
     """Return every score of one object, from the deviations (radii, frictions, n), mm, of its predictions."""
-    no_motion_errors = deviation_mm(log, log.pose_start)
+    no_motion_errors, action = deviation_mm(log.start, log.end, log.length), log.about("action")
     pairs = list(zip(tested.chosen, tested.test, strict=True))
     means = [errors[at][pushes].mean() for at, pushes in pairs]
     no_motion = float(np.mean([no_motion_errors[pushes].mean() for pushes in tested.test]))
     mean = float(np.mean(means))
     push_errors = per_push(errors, tested)
     was_tested = np.isfinite(push_errors)
-    interval = _interval(push_errors[was_tested], log.group[was_tested], np.random.default_rng(seed))
+    interval = _interval(push_errors[was_tested], action[was_tested], np.random.default_rng(seed))
     return {
         "mean_mm": mean,
         "no_motion_mm": no_motion,
@@ -40,12 +38,12 @@ def object_scores(
         "ci95_bootstrap_mm": interval,
         "median_mm": float(np.median(push_errors[was_tested])),
         "worst_mm": float(push_errors[was_tested].max()),
-        "worst_push": int(log.index[np.nanargmax(push_errors)]),
+        "worst_push": log.pushes[np.nanargmax(push_errors)].index,
         "friction": float(np.mean([predictions.FRICTIONS[friction] for _, friction in tested.chosen])),
         "radius_mm": float(1e3 * np.mean([predictions.RADII[radius] for radius, _ in tested.chosen])),
         "pushes": len(log),
         "unusable": len(log.problems),
-        "actions": len(np.unique(log.group)),
+        "actions": len(np.unique(action)),
         "splits": SPLITS,
         "failed_steps": int(prediction.failed.sum()),
         "jammed_pushes": float(np.mean([prediction.jammed[at].sum() for at in tested.chosen])),
@@ -63,14 +61,12 @@ def _interval(push_errors: np.ndarray, group: np.ndarray, rng: np.random.Generat
     return float(np.diff(np.quantile(means, [0.025, 0.975]))[0] / 2)
 
 
-def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> dict[str, Any]:
+def _stick_agreement(log: Recordings, final: np.ndarray, tested: Tested) -> dict[str, Any]:
     """Compare prediction and measurement on whether the object stuck to the hand."""
-    measured_stuck = log.stick_deviation < MAX_STUCK_MOTION
+    measured_stuck = stick_deviation(log, log.end) < MAX_STUCK_MOTION
     table = np.zeros((2, 2))
     for at, pushes in zip(tested.chosen, tested.test, strict=True):
-        predicted_stuck = (
-            stick_deviation(log.hand_start, log.hand_end, log.pose_start, final[at], log.length) < MAX_STUCK_MOTION
-        )
+        predicted_stuck = stick_deviation(log, final[at]) < MAX_STUCK_MOTION
         np.add.at(table, (measured_stuck[pushes].astype(int), predicted_stuck[pushes].astype(int)), 1.0)
     table /= table.sum()
     shares = {
@@ -87,12 +83,13 @@ def _stick_agreement(log: TwoFingerLog, final: np.ndarray, tested: Tested) -> di
     }
 
 
-def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
+def _repeats(log: Recordings, push_errors: np.ndarray) -> dict[str, Any]:
     """Compare the repeats of each action with each other, and with the model on the same pushes."""
-    moved, stuck = _object_motion(log), log.stick_deviation < MAX_STUCK_MOTION
+    moved, stuck = relative_motions(log.start, log.end), stick_deviation(log, log.end) < MAX_STUCK_MOTION
+    actions = log.about("action")
     floor, model, agree = [], [], []
-    for action in np.unique(log.group):
-        same_action = np.flatnonzero(log.group == action)
+    for action in np.unique(actions):
+        same_action = np.flatnonzero(actions == action)
         if len(same_action) < 2:
             continue
         for push in same_action:
@@ -116,14 +113,25 @@ def _repeats(log: TwoFingerLog, push_errors: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _object_motion(log: TwoFingerLog) -> np.ndarray:
-    """Return the end poses in the frames of the starts, (n, 3), in which repeats of an action are the same push."""
-    return np.asarray(compose(inverse(log.pose_start), log.pose_end), float)
+def stick_deviation(log: Recordings, end: np.ndarray) -> Floats:
+    """Return the motions (n,) of the object relative to the hand, m, if the object ends at the poses (n, 3)."""
+    assert log.length is not None
+    hands = np.array([push.hand[[0, -1], :3] for push in log.pushes]).swapaxes(0, 1)
+    before, after = (_in_hand_frame(*poses) for poses in zip(hands, (log.start, end), strict=True))
+    # zero if both moved as one body; closing an initial gap between hand and object counts as relative motion too
+    change = after - before
+    return np.hypot(change[:, 0], change[:, 1]) + log.length * np.abs(wrap_angle(change[:, 2]))
 
 
-def days(log: TwoFingerLog, errors: np.ndarray) -> list[dict[str, Any]]:
+def _in_hand_frame(hand: np.ndarray, pose: np.ndarray) -> Floats:
+    """Return the poses (n, 3) of the object in the frame of the hand."""
+    offset = np.einsum("nji,nj->ni", rotation(hand[:, 2]), pose[:, :2] - hand[:, :2])
+    return np.column_stack([offset, pose[:, 2] - hand[:, 2]])
+
+
+def days(log: Recordings, errors: np.ndarray) -> list[dict[str, Any]]:
     """Find each day's (UTC) best friction and radius on all its pushes, to see whether the setup stayed the same."""
-    rows, day = [], np.floor(log.time / DAY).astype(int)
+    rows, day = [], np.floor(log.about("began") / DAY).astype(int)
     for number in np.unique(day):
         of_day = day == number
         if np.count_nonzero(of_day) < MIN_PUSHES_OF_A_DAY:

@@ -1,13 +1,13 @@
 """Resample separately recorded streams of hand, object and force at the times of the hand's samples."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pushjax.datasets.push_log import Floats, LogError
-from pushjax.datasets.recordings import Recording, checked_recording, find_bad_number, interpolated
+from pushjax.datasets.checks import checked_recording, find_bad_number
+from pushjax.datasets.recordings import Floats, LogError, Recording, interpolated
 
 # If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
 MAX_GAP = 0.5
@@ -16,8 +16,7 @@ MAX_GAP = 0.5
 MAX_JITTER = 0.05
 
 
-@dataclass(frozen=True, eq=False)
-class Stream:
+class Stream(NamedTuple):
     """One recorded stream."""
 
     name: str  # in the file
@@ -27,7 +26,7 @@ class Stream:
 
     def rows(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> "Stream":
         """Return the stream of the selected rows, given as a mask or as indices."""
-        return Stream(self.name, self.columns, self.time[which], self.values[which])
+        return self._replace(time=self.time[which], values=self.values[which])
 
 
 def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Recording | LogError:
@@ -91,12 +90,7 @@ def _interpolate_poses(time: Floats, known_time: Floats, known: Floats) -> Float
     if len(known) == 0:
         return np.full((len(time), 3), np.nan)
     pose = interpolated(time, known_time, np.column_stack([known[:, :2], np.unwrap(known[:, 2])]))
-    pose[_within_gap(time, known_time)] = np.nan
+    before = np.clip(np.searchsorted(known_time, time, side="right") - 1, 0, None)
+    after = np.clip(np.searchsorted(known_time, time, side="left"), None, len(known_time) - 1)
+    pose[known_time[after] - known_time[before] > MAX_GAP] = np.nan
     return pose
-
-
-def _within_gap(time: Floats, known: Floats) -> NDArray[np.bool_]:
-    """Return a mask (m,) of the times between two `known` ones that are more than MAX_GAP apart."""
-    before = np.clip(np.searchsorted(known, time, side="right") - 1, 0, None)
-    after = np.clip(np.searchsorted(known, time, side="left"), None, len(known) - 1)
-    return known[after] - known[before] > MAX_GAP

@@ -1,0 +1,148 @@
+"""The groups of pushes of one condition of table 1, and how well a push predicts its own repetition.
+
+A condition is one `Recordings`, in which each push has two samples, a start and an end. What is known of a push has
+these names:
+
+- "group": "whole" are complete pushes at 10 mm/s. "middle" are the test pushes of these, from 10 to 90 % of their
+  duration. "fast" are complete pushes at 20 mm/s.
+- "training": whether a push of "whole" is a training push.
+- "valid": whether the tracker can be trusted.
+- "action": equal for repetitions of a nominal push; "repetition": their number, if they are numbered.
+- "toolbox_quartic" and "toolbox_ellipsoid": the end pose (3,) of a push of "middle" as predicted by the authors'
+  toolbox, if known.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+import pushjax as pj
+from pushjax.datasets import LogError, Recording, Recordings
+from pushjax.datasets.mit_folder import MIDDLE_PART, SAME_SPEED, in_body, states_at
+from pushjax.datasets.mit_shapes import nearest_on_outline
+from pushjax.datasets.recordings import Floats
+from pushjax.experiments._tables import relative_motions
+
+SLOW, FAST = 0.010, 0.020  # m/s
+TRAIN_SHARE = 0.2  # of the paper
+MIN_PUSHES = 10  # smallest number of slow pushes, of which a few are used for training
+# The rules for pushes whose tracker can be trusted:
+# - At the start, the tip is less than MAX_GAP (m) from the outline, outside or inside.
+# - At the end, it is less than MAX_OVERLAP (m) inside the outline.
+# - The object moves farther than the tip by at most MAX_AHEAD (m).
+# - The object turns by less than MAX_TURN (rad).
+# - The path of the tip is longer than MIN_PATH times the median path.
+MAX_GAP, MAX_OVERLAP, MAX_AHEAD, MAX_TURN, MIN_PATH = 0.008, 0.006, 0.005, np.deg2rad(75), 0.8
+
+
+def grouped(log: Recordings, seed: int) -> Recordings:
+    """Return the groups of pushes with all their samples; the training pushes are drawn at random."""
+    slow, fast = (
+        [push for push in log.pushes if abs(push.about["speed"] - speed) < SAME_SPEED] for speed in (SLOW, FAST)
+    )
+    if len(slow) < MIN_PUSHES:
+        what = f"{log.object} on {log.surface} at {1e3 * SLOW:g} mm/s"
+        raise LogError(log.source, f"expected at least {MIN_PUSHES} usable pushes of {what}, found {len(slow)}")
+    training = np.zeros(len(slow), bool)
+    count = int(np.clip(round(TRAIN_SHARE * len(slow)), 1, len(slow) - 1))
+    training[np.random.default_rng(seed).permutation(len(slow))[:count]] = True
+    tested = [push for push, trains in zip(slow, training, strict=True) if not trains]
+    groups = {
+        "whole": _group(log, slow, (0.0, 1.0), training),
+        "middle": _group(log, tested, MIDDLE_PART, np.zeros(len(tested), bool)),
+        "fast": _group(log, fast, (0.0, 1.0), np.zeros(len(fast), bool)),
+    }
+    pushes = (replace(push, about={**push.about, "group": name}) for name, each in groups.items() for push in each)
+    return replace(log, pushes=tuple(pushes))
+
+
+def _group(
+    log: Recordings, pushes: list[Recording], fractions: tuple[float, float], training: NDArray[np.bool_]
+) -> list[Recording]:
+    """Return pushes from the first to the second fraction of their duration."""
+    cut = [_between(push, fractions) for push in pushes]
+    valid = _is_trustworthy(replace(log, pushes=tuple(cut)))
+    return [
+        replace(push, about={**push.about, "training": bool(trains), "valid": bool(trusted)})
+        for push, trains, trusted in zip(cut, training, valid, strict=True)
+    ]
+
+
+def _between(push: Recording, fractions: tuple[float, float]) -> Recording:
+    """Return the states of a push at two fractions of its duration."""
+    pose, hand = states_at(push, fractions)
+    pose[1, 2] = pose[0, 2] + ((pose[1, 2] - pose[0, 2] + np.pi) % (2 * np.pi) - np.pi)
+    return replace(push, hand=hand, pose=pose, force=None, time=None)
+
+
+def _is_trustworthy(pushes: Recordings) -> NDArray[np.bool_]:
+    """Return a mask (k,) of pushes whose poses and tips at the ends can be trusted."""
+    if not len(pushes):
+        return np.zeros(0, bool)
+    tip, radius = tips(pushes), pushes.tip_radius or 0.0
+    before, after = (
+        nearest_on_outline(np.asarray(pushes.vertices), in_body(pose, tip[:, end] - pose[:, :2]))[0] - radius
+        for end, pose in enumerate((pushes.start, pushes.end))
+    )
+    moved = np.linalg.norm(pushes.end[:, :2] - pushes.start[:, :2], axis=1)
+    path = np.linalg.norm(tip[:, 1] - tip[:, 0], axis=1)
+    touching = (np.abs(before) < MAX_GAP) & (after > -MAX_OVERLAP)
+    pushed = (moved - path <= MAX_AHEAD) & (np.abs(pushes.end[:, 2] - pushes.start[:, 2]) < MAX_TURN)
+    return touching & pushed & (path > MIN_PATH * np.median(path))
+
+
+def group(log: Recordings, name: str) -> Recordings:
+    """Return the pushes of one group."""
+    return replace(log, pushes=tuple(push for push in log.pushes if push.about["group"] == name))
+
+
+def training_pushes(log: Recordings) -> Recordings:
+    """Return the training pushes that can be trusted."""
+    return replace(log, pushes=tuple(push for push in log.pushes if push.about["training"] and push.about["valid"]))
+
+
+def tips(pushes: Recordings) -> Floats:
+    """Return the centers of the tip at start and end, (pushes, 2, 2), m, world."""
+    return np.array([push.hand[[0, -1]] for push in pushes.pushes]).reshape(-1, 2, 2)
+
+
+def noise_floor_mm(log: Recordings) -> float | None:
+    """Estimate the mean deviation of a push from the mean of its repetitions; None without repetitions."""
+    whole, middle, fast = (group(log, name) for name in ("whole", "middle", "fast"))
+    rows = _repeat_rows(fast, whole)
+    if not len(rows):
+        return None
+    # Two pushes of a pair differ by sqrt(2) times the deviation. They start a millimeter or less apart, and one was
+    # twice as fast. Both are whole. The test pushes are shorter, so their floor is assumed to be lower in proportion to
+    # how far the object moves.
+    quick, slow = (
+        relative_motions(pushes.start, pushes.end)[each] for pushes, each in zip((fast, whole), rows.T, strict=True)
+    )
+    differences = np.asarray(pj.deviation(quick, slow, log.length), float)
+    ratio = _mean_motion(middle) / _mean_motion(whole)
+    return float(1e3 * differences.mean() / np.sqrt(2) * ratio)
+
+
+def _repeat_rows(fast: Recordings, whole: Recordings) -> NDArray[np.int64]:
+    """Return the rows (r, 2) in `fast` and `whole` of valid repetitions of one push, with the nearest numbers."""
+
+    def repetition(push: Recording) -> int:
+        return push.about.get("repetition", 0)
+
+    rows_by_action: dict[object, list[int]] = {}
+    for row, push in enumerate(whole.pushes):
+        rows_by_action.setdefault(push.about["action"], []).append(row)
+    pairs = []
+    for row, push in enumerate(fast.pushes):
+        same = rows_by_action.get(push.about["action"], [])
+        if same:
+            nearest = min(same, key=lambda at: abs(repetition(whole.pushes[at]) - repetition(push)))
+            if push.about["valid"] and whole.pushes[nearest].about["valid"]:
+                pairs.append((row, nearest))
+    return np.array(pairs, np.int64).reshape(-1, 2)
+
+
+def _mean_motion(pushes: Recordings) -> float:
+    """Return the mean deviation of the end poses from the start poses, m."""
+    return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, pushes.length), float)))
