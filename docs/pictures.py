@@ -168,10 +168,11 @@ def pusht() -> plot.Animation:
         for spine in axes.spines.values():
             spine.set(visible=True, color=GRAY, linewidth=3)
         axes.add_patch(Polygon(to_world(goal, corners), facecolor="#B9E4C9", edgecolor=GREEN, lw=1))
-        block = axes.add_patch(Polygon(corners, facecolor="#8FA3B8", edgecolor="#4A5B6C", lw=1.2))
+        block = Polygon(corners, facecolor="#8FA3B8", edgecolor="#4A5B6C", lw=1.2)
         arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=11, lw=1.6, color=ORANGE, zorder=3)
-        axes.add_patch(arrow)
-        finger = axes.add_patch(Circle((0, 0), setting.FINGER_RADIUS / setting.PIXEL, color=BLUE, zorder=4))
+        finger = Circle((0, 0), setting.FINGER_RADIUS / setting.PIXEL, color=BLUE, zorder=4)
+        for patch in (block, arrow, finger):
+            axes.add_patch(patch)
         title = axes.set_title(" ")
 
     def draw(k: int) -> None:

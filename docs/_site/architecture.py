@@ -37,13 +37,8 @@ POINT = 40  # room for an arrow that passes a row
 
 
 def modules() -> dict[str, set[str]]:
-    """Return, for each module of the package, the modules of the package that it imports, anywhere in its code.
-
-    A name from `pushjax` itself, also as `pj.NAME`, is assigned to the module that defines it.
-
-    Returns:
-        Names of the imported modules, by the name of the module.
-    """
+    """Return, for each module of the package, the modules of the package that it imports, anywhere in its code."""
+    # A name from `pushjax` itself, also as `pj.NAME`, is assigned to the module that defines it.
     public = {
         name.name: f"pushjax.{node.module}"
         for node in ast.parse((PACKAGE / "__init__.pyi").read_text()).body
@@ -85,11 +80,7 @@ def room(module: str) -> str:
 
 
 def rooms(found: dict[str, set[str]]) -> dict[str, set[str]]:
-    """Return, for each room, the other rooms that it imports.
-
-    Args:
-        found: Imports of the modules, from `modules`.
-    """
+    """Return, for each room, the other rooms that it imports, from the imports of `modules`."""
     built: dict[str, set[str]] = {room(module): set() for module in found}
     for module, others in found.items():
         built[room(module)] |= {room(other) for other in others} - {room(module)}
@@ -97,16 +88,7 @@ def rooms(found: dict[str, set[str]]) -> dict[str, set[str]]:
 
 
 def above(found: dict[str, set[str]], one: str, seen: tuple[str, ...] = ()) -> set[str]:
-    """Return everything that a room or module imports, directly or indirectly.
-
-    Args:
-        found: Imports of the rooms or modules.
-        one: Name of the room or module.
-        seen: Names on the way to it, for the recursion.
-
-    Raises:
-        ValueError: If the imports form a cycle.
-    """
+    """Return everything that a room or module imports, directly or not, or raise ValueError if there is a cycle."""
     if one in seen:
         raise ValueError(f"imports go round: {' → '.join((*seen[seen.index(one) :], one))}")
     return found[one].union(*(above(found, other, (*seen, one)) for other in found[one]))
@@ -139,10 +121,8 @@ def ways(found: dict[str, set[str]], row: dict[str, int]) -> list[list[str]]:
 
 
 def places(row: dict[str, int], paths: list[list[str]]) -> dict[str, tuple[float, float]]:
-    """Return the middle of each box and of each point that an arrow passes.
-
-    Within a row they are ordered by the mean place of what they are connected to in the rows above and below.
-    """
+    """Return the middle of each box and of each point that an arrow passes."""
+    # Within a row they are ordered by the mean place of what they are connected to in the rows above and below.
     at = dict(row) | {name: int(name.partition("@")[2]) for path in paths for name in path if "@" in name}
     levels: list[list[str]] = [[] for _ in range(1 + max(at.values()))]
     for name, k in at.items():
