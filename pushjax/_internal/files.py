@@ -26,7 +26,7 @@ def load_json(
     path: str | Path, content: str, format_name: str, version: int, build: Callable[[dict[str, Any], Any], T]
 ) -> T:
     """Return `build(record, dtype)` for a record of `save_json`; raise ValueError if the file holds no such record."""
-    # `content` is the expected content in words, for the error message
+    # `content` names the kind of file, for the error message
     try:
         record = json.loads(Path(path).expanduser().read_text())
         if record["format"] != format_name:
@@ -37,4 +37,4 @@ def load_json(
         return build(record, jax.dtypes.canonicalize_dtype(record["dtype"]))
     except (ValueError, KeyError, TypeError, IndexError) as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ValueError(f"{path} does not hold {content}: {reason}") from error
+        raise ValueError(f"{path} is not {content}: {reason}") from error

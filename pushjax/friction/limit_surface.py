@@ -247,7 +247,7 @@ class LimitSurface(eqx.Module):
             ValueError: If the file does not contain a surface of this class.
             OSError: If the file cannot be read.
         """
-        surface = load_json(path, "a limit surface saved by pushjax", FORMAT, VERSION, _surface_from_record)
+        surface = load_json(path, "a limit surface file", FORMAT, VERSION, _surface_from_record)
         if not isinstance(surface, cls):
             raise ValueError(f"{path} holds a {type(surface).__name__}, not a {cls.__name__}")
         return surface

@@ -1,6 +1,5 @@
 """The fit: residuals of pushes and prior as a sum of squares, and its minimization."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.jit import quick_jit
-from pushjax.identification.model import PerKind, Problem
+from pushjax.identification.model import Problem, ResidualKinds
 from pushjax.identification.pushes import Pushes
 
 MAX_STEPS = 60
@@ -22,7 +21,7 @@ GAP_SCALE = 3.0  # sigma: beyond this residual of a gap, the finger counts as ha
 
 
 # Numbers that a push counts as having measured. All its poses together weigh as much as one, and so do its directions.
-NUMBERS_PER_KIND = PerKind(poses=3, directions=2, gap=1)  # a direction is a unit vector
+NUMBERS_PER_KIND = ResidualKinds(poses=3, directions=2, gap=1)  # a direction is a unit vector
 
 
 class Fit(NamedTuple):
@@ -31,27 +30,11 @@ class Fit(NamedTuple):
     z: Float[Array, "size"]  # most probable unknowns
     sigma: Float[Array, "3"]  # standard deviations of poses (m), of directions of motion, and of gaps (m)
     precision: Float[Array, "size size"]  # inverse covariance of z
-    residual: PerKind  # (conditions, pushes, rows) of each kind, predicted less measured; see `Problem.residuals`
+    residual: ResidualKinds  # (conditions, pushes, rows) of each kind, predicted less measured; see `Problem.residuals`
     information: Float[Array, "conditions pushes size"]  # contribution of each push to the diagonal of the precision
     loss: Float[Array, ""]  # minimized sum of squares, prior included
     steps: Int[Array, ""]  # of the optimizer, over all rounds
     converged: Bool[Array, ""]  # whether the optimizer converged in the last round
-
-
-class FixedEntries(NamedTuple):
-    """Which entries of z are held fixed, and at which values."""
-
-    mask: Bool[Array, "size"]  # True for fixed entries
-    value: Float[Array, "size"]
-
-    @staticmethod
-    def none(start: Array) -> "FixedEntries":
-        """Return the value that fixes no entry of a vector like `start`."""
-        return FixedEntries(jnp.zeros(start.shape, bool), start)
-
-    def apply(self, z: Array) -> Array:
-        """Return z with the fixed entries at their values."""
-        return jnp.where(self.mask, self.value, z)
 
 
 def sum_of_squares(residuals: Any, axis: tuple[int, ...] | None = None) -> Array:
@@ -59,20 +42,22 @@ def sum_of_squares(residuals: Any, axis: tuple[int, ...] | None = None) -> Array
     return jax.tree.reduce(jnp.add, jax.tree.map(lambda each: jnp.sum(each**2, axis=axis), residuals))
 
 
-def push_weights(pushes: Pushes) -> PerKind:
+def push_weights(pushes: Pushes) -> ResidualKinds:
     """Return the weight (conditions, pushes) of each push for each kind of residual."""
     # pushes without a pair of wrench and motion have no directions
     directions = jnp.where(jnp.any(pushes.has_pair, axis=-1), pushes.weight, 0.0)
-    return PerKind(pushes.weight, directions, pushes.weight)
+    return ResidualKinds(pushes.weight, directions, pushes.weight)
 
 
-def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Float[Array, "3"], robust: float | None) -> PerKind:
+def weighted_residuals(
+    residual: ResidualKinds, pushes: Pushes, sigma: Float[Array, "3"], robust: float | None
+) -> ResidualKinds:
     """Return residuals whose squares add up to the data part of the loss."""
     # The poses of each push, and its directions, use the pseudo-Huber loss, which is linear beyond `robust` sigma
     # (None: least squares). Gaps use the bounded Geman-McClure loss, so a push whose finger lost the slider has almost
     # no influence.
     weighted = []
-    kinds = zip(PerKind._fields, residual, push_weights(pushes), sigma, strict=True)
+    kinds = zip(ResidualKinds._fields, residual, push_weights(pushes), sigma, strict=True)
     for kind, r, weight, std in kinds:
         r = r / std
         squared = jnp.sum(r**2, axis=-1, keepdims=True)
@@ -81,7 +66,7 @@ def weighted_residuals(residual: PerKind, pushes: Pushes, sigma: Float[Array, "3
         elif robust is not None:
             r = r * jnp.sqrt(2 / (1 + jnp.sqrt(1 + squared / robust**2)))
         weighted.append(r * jnp.sqrt(weight)[..., None])
-    return PerKind(*weighted)
+    return ResidualKinds(*weighted)
 
 
 def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, robust: float | None) -> Array:
@@ -93,38 +78,30 @@ def _robust_weights(kind: str, residual: Array, weight: Array, sigma: Array, rob
     return weight if robust is None else weight / jnp.sqrt(1 + squared / robust**2)
 
 
-class Schedule(NamedTuple):
+class Rounds(NamedTuple):
     """Number of rounds and tolerance of a fit."""
 
-    rounds: Int[Array, ""]  # alternations between z and sigma; one is enough if all of sigma is known
+    count: Int[Array, ""]  # alternations between z and sigma; one is enough if all of sigma is known
     tolerance: Float[Array, ""]  # of z in the last round
 
     @staticmethod
-    def of(dtype, rounds: int, tolerance: float | None = None) -> "Schedule":
-        """Return the schedule for a floating dtype; the default tolerance is 1e-6 in float64, 1e-4 in float32."""
+    def of(dtype, count: int, tolerance: float | None = None) -> "Rounds":
+        """Return the rounds for a floating dtype; the default tolerance is 1e-6 in float64, 1e-4 in float32."""
         default = 1e-6 if dtype == jnp.float64 else 1e-4
-        return Schedule(jnp.asarray(rounds), jnp.asarray(default if tolerance is None else tolerance, dtype))
-
-
-class _Evidence(NamedTuple):
-    """Estimates of the precision of z and of sigma from the residuals at the minimum."""
-
-    precision: Float[Array, "size size"]  # inverse covariance of z
-    information: Float[Array, "conditions pushes size"]  # contribution of each push to the diagonal of the precision
-    new_sigma: list[Array]  # standard deviation of each kind of residual; not used for a kind that was not measured
+        return Rounds(jnp.asarray(count), jnp.asarray(default if tolerance is None else tolerance, dtype))
 
 
 def _evidence(
-    residual: PerKind,  # at the minimizer, (conditions, pushes, rows) of each kind
-    jacobian: PerKind,  # its derivatives (conditions, pushes, rows, size) with respect to z
+    residual: ResidualKinds,  # at the minimizer, (conditions, pushes, rows) of each kind
+    jacobian: ResidualKinds,  # its derivatives (conditions, pushes, rows, size) with respect to z
     pushes: Pushes,
     before: Fit,  # result of the round before, with whose sigma the minimizer was found
     robust: float | None,
     has_normal_prior: Float[Array, "size"],  # 1 for entries of z that have a normal prior, else 0
-) -> _Evidence:
-    """Return the precision of z, and sigma as the evidence procedure estimates it."""
+) -> tuple[Array, Array, Array]:
+    """Return the precision of z, the information of each push, and sigma as the evidence procedure estimates it."""
     by_kind, information, counts_and_squares = [], jnp.zeros_like(before.information), []
-    kinds = zip(PerKind._fields, residual, jacobian, push_weights(pushes), before.sigma, strict=True)
+    kinds = zip(ResidualKinds._fields, residual, jacobian, push_weights(pushes), before.sigma, strict=True)
     for kind, r, derivatives, weight, std in kinds:
         robust_weight = _robust_weights(kind, r, weight, std, robust)
         scaled = derivatives * (jnp.sqrt(robust_weight) / std)[..., None, None]
@@ -142,77 +119,7 @@ def _evidence(
         jnp.sqrt(squares / jnp.maximum(numbers * count - jnp.trace(resolution), 3.0))
         for numbers, resolution, (count, squares) in zip(NUMBERS_PER_KIND, resolutions, counts_and_squares, strict=True)
     ]
-    return _Evidence(precision, information, new_sigma)
-
-
-def fit(
-    problem: Problem,
-    pushes: Pushes,  # with a leading axis of conditions
-    start: Float[Array, "size"],
-    sigma: Float[Array, "3"],  # initial or known standard deviations of poses (m), of directions, and of gaps (m)
-    robust: float | None,  # number of sigma from which a push has less influence; None: least squares
-    sigma_is_given: Bool[Array, "3"],
-    fixed: FixedEntries,
-    schedule: Schedule,  # may be traced
-) -> Fit:
-    """Find the most probable z and the standard deviations of the residuals, in alternation."""
-    has_normal_prior = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
-    rounds, last_tolerance = schedule
-
-    def one_round(index, before: Fit) -> Fit:
-        sigma = before.sigma
-
-        def residuals(z):
-            """Return the residuals of pushes and prior, whose squares add up to the loss, and their linearization."""
-            z = fixed.apply(z)
-            linearized = problem.linearize(z, pushes)
-            linear_residuals = problem.linear_residuals(z, linearized)
-            return (weighted_residuals(linear_residuals, pushes, sigma, robust), has_normal_prior * z), linearized
-
-        tolerance = jnp.where(index < rounds - 1, LOOSE_TOLERANCE, last_tolerance).astype(start.dtype)
-        found = least_squares(residuals, before.z, MAX_STEPS, tolerance)
-        z, residual = fixed.apply(found.z), found.auxiliary.value
-        evidence = _evidence(residual, problem.jacobian(z, found.auxiliary), pushes, before, robust, has_normal_prior)
-        weighted = weighted_residuals(residual, pushes, sigma, robust)
-        minimum = sum_of_squares((*weighted, has_normal_prior * z))
-        steps = before.steps + found.steps
-        new_sigma = jnp.where(sigma_is_given, sigma, jnp.maximum(jnp.stack(evidence.new_sigma), MIN_SIGMA))
-        # The last round keeps the sigma with which it fitted.
-        sigma = jnp.where(index < rounds - 1, new_sigma, sigma)
-        return Fit(z, sigma, evidence.precision, residual, evidence.information, minimum, steps, found.converged)
-
-    leading, size = pushes.weight.shape, len(start)
-    precision, information, minimum = (jnp.zeros(shape, start.dtype) for shape in ((size, size), (*leading, size), ()))
-    rows = PerKind(3 * len(pushes.observed_steps), 3 * pushes.wrench.shape[-2], int(problem.contact_at_end))
-    residual = PerKind(*(jnp.zeros((*leading, count), start.dtype) for count in rows))
-    no_steps, not_converged = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    first = Fit(fixed.apply(start), sigma, precision, residual, information, minimum, no_steps, not_converged)
-    return jax.lax.fori_loop(0, rounds, one_round, first)
-
-
-@quick_jit
-def compiled_fit(
-    problem: Problem,
-    pushes: Pushes,
-    start,
-    sigma,
-    sigma_is_given,
-    fixed: FixedEntries,
-    schedule: Schedule,
-    *,
-    robust: float | None,
-) -> Fit:
-    """Run `fit` as the one compiled program that all callers share."""
-    return fit(problem, pushes, start, sigma, robust, sigma_is_given, fixed, schedule)
-
-
-class Minimum(NamedTuple):
-    """Result of `least_squares`."""
-
-    z: Float[Array, "size"]
-    auxiliary: Any  # output of the residual function at z
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    return precision, information, jnp.stack(new_sigma)
 
 
 class _LevenbergMarquardt(optx.LevenbergMarquardt):
@@ -238,13 +145,49 @@ class _LevenbergMarquardt(optx.LevenbergMarquardt):
         return converged | (next_step_is_small & (state.num_steps_since_acceptance > 0)), result
 
 
-def least_squares(
-    residuals: Callable[[Array], tuple[Any, Any]],  # of z: a pytree of residual arrays, and an auxiliary output
+@quick_jit
+def fit(
+    problem: Problem,
+    pushes: Pushes,  # with a leading axis of conditions
     start: Float[Array, "size"],
-    max_steps: int,
-    tolerance: Any,  # relative and absolute
-) -> Minimum:
-    """Minimize a sum of squares by the Levenberg-Marquardt method."""
-    solver = _LevenbergMarquardt(tolerance)
-    found = optx.least_squares(lambda z, _: residuals(z), solver, start, has_aux=True, max_steps=max_steps, throw=False)
-    return Minimum(found.value, found.aux, found.stats["num_steps"], found.result == optx.RESULTS.successful)
+    sigma: Float[Array, "3"],  # initial or known standard deviations of poses (m), of directions, and of gaps (m)
+    sigma_is_given: Bool[Array, "3"],
+    frozen: Bool[Array, "size"],  # entries of z that stay as in `start`
+    rounds: Rounds,
+    *,
+    robust: float | None,  # number of sigma from which a push has less influence; None: least squares
+) -> Fit:
+    """Find the most probable z and the standard deviations of the residuals, in alternation."""
+    has_normal_prior = jnp.asarray(problem.prior.layout.has_normal_prior, start.dtype)
+
+    def one_round(index, before: Fit) -> Fit:
+        sigma = before.sigma
+
+        def residuals(z, _):
+            """Return the residuals of pushes and prior, whose squares add up to the loss, and their linearization."""
+            z = jnp.where(frozen, start, z)
+            linearized = problem.linearize(z, pushes)
+            linear_residuals = problem.linear_residuals(z, linearized)
+            return (weighted_residuals(linear_residuals, pushes, sigma, robust), has_normal_prior * z), linearized
+
+        tolerance = jnp.where(index < rounds.count - 1, LOOSE_TOLERANCE, rounds.tolerance).astype(start.dtype)
+        solver = _LevenbergMarquardt(tolerance)
+        found = optx.least_squares(residuals, solver, before.z, has_aux=True, max_steps=MAX_STEPS, throw=False)
+        z, residual = jnp.where(frozen, start, found.value), found.aux.value
+        jacobian = problem.jacobian(z, found.aux)
+        precision, information, new_sigma = _evidence(residual, jacobian, pushes, before, robust, has_normal_prior)
+        weighted = weighted_residuals(residual, pushes, sigma, robust)
+        minimum = sum_of_squares((*weighted, has_normal_prior * z))
+        steps, converged = before.steps + found.stats["num_steps"], found.result == optx.RESULTS.successful
+        new_sigma = jnp.where(sigma_is_given, sigma, jnp.maximum(new_sigma, MIN_SIGMA))
+        # The last round keeps the sigma with which it fitted.
+        sigma = jnp.where(index < rounds.count - 1, new_sigma, sigma)
+        return Fit(z, sigma, precision, residual, information, minimum, steps, converged)
+
+    leading, size = pushes.weight.shape, len(start)
+    precision, information, minimum = (jnp.zeros(shape, start.dtype) for shape in ((size, size), (*leading, size), ()))
+    rows = ResidualKinds(3 * len(pushes.observed_steps), 3 * pushes.wrench.shape[-2], int(problem.contact_at_end))
+    residual = ResidualKinds(*(jnp.zeros((*leading, count), start.dtype) for count in rows))
+    no_steps, not_converged = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    first = Fit(start, sigma, precision, residual, information, minimum, no_steps, not_converged)
+    return jax.lax.fori_loop(0, rounds.count, one_round, first)

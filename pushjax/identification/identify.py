@@ -1,7 +1,6 @@
 """The function `identify`: from recorded pushes to estimates with their uncertainty."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,19 +18,12 @@ from pushjax._internal.checks import (
 )
 from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.identification.fit import (
-    SIGMA_ROUNDS,
-    FixedEntries,
-    Schedule,
-    compiled_fit,
-    sum_of_squares,
-    weighted_residuals,
-)
-from pushjax.identification.model import Problem
+from pushjax.identification.fit import SIGMA_ROUNDS, Rounds, fit, sum_of_squares, weighted_residuals
+from pushjax.identification.model import Problem, Scene
 from pushjax.identification.prior import Prior
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified
-from pushjax.identification.unknowns import Unknowns, known_parameters
+from pushjax.identification.unknowns import Unknowns, known_parameters, per_condition
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
@@ -106,24 +98,23 @@ def identify(
     one_condition, pushes = pushes.weight.ndim == 1, pushes.as_conditions()
     conditions = pushes.weight.shape[0]
     surface = _surface_per_condition(slider.surface, conditions)
-    known_values = {"friction": _known_friction(friction, conditions, dtype)}
+    known_values = {"friction": per_condition("friction", friction, (), conditions, dtype)}
+    check_non_negative("friction", known_values["friction"])
     known_values |= known_parameters(known or {}, unknowns, conditions, dtype)
     metric_length = surface.length[0] if length is None else as_float(length, dtype, "length")
     pose_sigma = as_float(START_SIGMA if sigma is None else sigma, dtype)
     needs_round_finger = {"overlap": "overlap" in (*unknowns.names, *known_values), "contact_at_end": contact_at_end}
     _check_settings(pushes, hand, metric_length, pose_sigma, robust, needs_round_finger)
     prior = _prior(unknowns, surface, known_values, _mean_start(pushes))
-    problem = Problem(slider.shape, hand, surface, prior, metric_length, contact_at_end)
+    problem = Problem(Scene(slider.shape, hand, prior.origin), surface, prior, metric_length, contact_at_end)
     has_pairs = pushes.wrench.shape[-2] > 0
     # A kind of residual that was not measured has no sigma to estimate.
     sigma_is_given = jnp.array([sigma is not None, not has_pairs, not contact_at_end])
-    rounds = 1 if sigma is not None and not (has_pairs or contact_at_end) else SIGMA_ROUNDS
+    count = 1 if sigma is not None and not (has_pairs or contact_at_end) else SIGMA_ROUNDS
     start_sigma = jnp.stack([pose_sigma, *jnp.asarray([START_DIRECTION_SIGMA, START_GAP_SIGMA], dtype)])
     start = _best_start(problem, pushes, start_sigma, robust=robust)
-    schedule = Schedule.of(dtype, rounds)
-    fitted = compiled_fit(
-        problem, pushes, start, start_sigma, sigma_is_given, FixedEntries.none(start), schedule, robust=robust
-    )
+    frozen, rounds = jnp.zeros(start.shape, bool), Rounds.of(dtype, count)
+    fitted = fit(problem, pushes, start, start_sigma, sigma_is_given, frozen, rounds, robust=robust)
     # The residuals of poses are divided by the root of the number of poses.
     final_pose_residual = fitted.residual.poses[..., -3:] * len(pushes.observed_steps) ** 0.5
     per_push = (final_pose_residual, fitted.information)
@@ -184,17 +175,6 @@ def _surface_per_condition(surface: LimitSurface, conditions: int) -> LimitSurfa
         surface = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (conditions, *leaf.shape)), surface)
     check_shape("slider.surface.length", surface.length, (conditions,))
     return surface
-
-
-def _known_friction(friction: ArrayLike, conditions: int, dtype: Any) -> Array:
-    """Check the friction of all conditions, or of each, and return it as (conditions,)."""
-    value = as_float(friction, dtype, "friction")
-    if value.shape not in ((), (conditions,)):
-        expected = f"a scalar or ({conditions},), one per condition"
-        raise ValueError(f"friction has shape {value.shape}; expected {expected}")
-    check_finite("friction", value)
-    check_non_negative("friction", value)
-    return jnp.broadcast_to(value, (conditions,))
 
 
 @quick_jit

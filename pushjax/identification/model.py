@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from pushjax._internal.jit import quick_jit
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.friction.quartic import Quartic
@@ -17,7 +18,8 @@ from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2 import compose, inverse, transform
 from pushjax.geometry.shape import Shape
 from pushjax.identification.prior import Prior
-from pushjax.identification.pushes import Pushes, PushInput
+from pushjax.identification.pushes import Pushes
+from pushjax.identification.pushes_of_recordings import in_meters
 from pushjax.identification.unknowns import TABLE, Parameters
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.path import arc_length, interpolate_arc_length
@@ -29,7 +31,7 @@ from pushjax.simulation.trajectory import Trajectory
 DIRECTION_PARTS = 5
 
 
-class PerKind(NamedTuple):
+class ResidualKinds(NamedTuple):
     """One value for each kind of residual."""
 
     poses: Any
@@ -37,62 +39,80 @@ class PerKind(NamedTuple):
     gap: Any  # between finger and slider at the end
 
 
+class Scene(NamedTuple):
+    """The bodies in contact, and the reference point of the table."""
+
+    shape: Shape  # outline of the slider
+    hand: Hand
+    origin: Float[Array, "2"]  # world, m, the point about which `Table` describes the friction
+
+
 class Problem(eqx.Module):
     """Everything that stays constant during a fit."""
 
-    shape: Shape
-    hand: Hand
+    scene: Scene
     surface: LimitSurface  # of each condition, with a leading axis of conditions; the fit replaces its coefficients
     prior: Prior
     length: Float[Array, ""]  # of the metric, m
     contact_at_end: bool = eqx.field(static=True, default=False)  # whether the gap at the end of a push is a residual
 
-    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> PerKind:
+    def residuals(self, z: Float[Array, "size"], pushes: Pushes) -> ResidualKinds:
         """Return the residuals (conditions, pushes, rows) of each kind for all pushes, predicted less measured."""
         # Poses are x, y, length * theta, in m. They are divided by the root of their number, so that all poses of a
         # push together weigh as much as one. So are directions of motion. A gap, in m, separates the finger from the
         # slider's measured final pose. A kind that was not measured has no rows.
-        free, parameters = self._free_and_all(z)
-        blocks = self._residual_blocks(lambda f: f, free, parameters, pushes)
-        return PerKind(*(value for value, _ in blocks))
+        return self._residual_kinds(lambda residual: residual, *self._free_and_all(z), pushes)
 
     def linearize(self, z: Float[Array, "size"], pushes: Pushes) -> "Linearized":
         """Return residuals and their Jacobian with respect to the parameters of each push's own condition."""
         # A condition has some twenty parameters, however many entries z has. The result is constant in every
         # derivative: gradients do not flow through it. The Jacobian uses forward mode, also for the fifteen
         # coefficients of a quartic: it takes half the run time and half the compilation time of three reverse sweeps.
-        free, parameters = self._free_and_all(jax.lax.stop_gradient(z))
-        blocks = self._residual_blocks(lambda f: jax.jacfwd(f, has_aux=True), free, parameters, pushes)
-        jacobians, values = zip(*blocks, strict=True)
-        return Linearized(PerKind(*values), PerKind(*jacobians), free)
 
-    def _residual_blocks(
+        def with_jacobian(residual: Callable) -> Callable:
+            return jax.jacfwd(lambda free, *rest: (residual(free, *rest),) * 2, has_aux=True)
+
+        free, parameters = self._free_and_all(jax.lax.stop_gradient(z))
+        jacobians, values = zip(*self._residual_kinds(with_jacobian, free, parameters, pushes), strict=True)
+        return Linearized(ResidualKinds(*values), ResidualKinds(*jacobians), free)
+
+    def _residual_kinds(
         self,
-        transformation: Callable,  # of the function of each kind: the identity, or `jacfwd`
+        transformation: Callable,  # of the residual function of one push
         free: dict[str, Array],  # by name, with a leading axis of conditions; what to differentiate with respect to
         parameters: Parameters,  # `free` replaces some of them
         pushes: Pushes,
-    ) -> PerKind:
-        """Return, for each kind, the transformed residuals and the residuals of all conditions and pushes."""
-        # The functions return their residual twice, because `jacfwd` drops the value and keeps only an auxiliary output
-        # beside the Jacobian by name of parameter.
-        steps = tuple(pushes.observed_steps.tolist())
-        constants = (Scene(self.shape, self.hand, self.prior.origin), self.length)
-        data = _PushData(self.surface, pushes.inputs, pushes.poses)
+    ) -> ResidualKinds:
+        """Return the result of the transformed residual function of each kind, for all conditions and pushes."""
 
-        def pose_residual(free, parameters, data, constants):
-            return _pose_residual(free, parameters, data, constants, steps)
+        def over_all(residual: Callable) -> Any:
+            over_pushes = jax.vmap(transformation(residual), in_axes=(None, None, None, 0))
+            return jax.vmap(over_pushes)(free, parameters, self.surface, pushes)
 
-        poses = _over_conditions_and_pushes(transformation(pose_residual), free, parameters, data, constants)
+        poses = over_all(self._pose_residual)
         directions = gap = jax.tree.map(lambda leaf: leaf[:, :, :0], poses)  # no rows
         if pushes.wrench.shape[-2]:
-            pairs = _WrenchMotionPairs(self.surface, pushes.wrench, pushes.twist, pushes.has_pair)
-            directions = _over_conditions_and_pushes(transformation(_direction_residual), free, parameters, pairs, ())
+            directions = over_all(_direction_residual)
         if self.contact_at_end:
-            gap = _over_conditions_and_pushes(transformation(_gap_residual), free, parameters, data, constants)
-        return PerKind(poses, directions, gap)
+            gap = over_all(self._gap_residual)
+        return ResidualKinds(poses, directions, gap)
 
-    def linear_residuals(self, z: Float[Array, "size"], linearized: "Linearized") -> PerKind:
+    def _pose_residual(self, free: dict[str, Array], parameters: Parameters, surface: LimitSurface, push: Pushes):
+        """Return the pose residuals (3 * poses,) of one push, in m."""
+        predicted = predict_push(parameters._replace(**free), surface, self.scene, push)
+        steps = push.observed_steps
+        difference = predicted.pose[steps] - push.poses
+        return difference.at[:, 2].mul(self.length).reshape(-1) / float(np.sqrt(len(steps)))
+
+    def _gap_residual(self, free: dict[str, Array], parameters: Parameters, surface: LimitSurface, push: Pushes):
+        """Return the gap (1,) in m between finger and measured final pose."""
+        parameters = parameters._replace(**free)
+        shape, hand = apply_inset(self.scene.shape, self.scene.hand, parameters.inset)
+        end = push.end if parameters.frame_offset is None else compose(push.end, parameters.frame_offset)
+        distance, _, radius = finger_distance(shape, hand, end, _true_path(parameters, push)[-1])
+        return (distance - radius)[None]
+
+    def linear_residuals(self, z: Float[Array, "size"], linearized: "Linearized") -> ResidualKinds:
         """Return the residuals at z, to first order about the point of `linearized`."""
         # At that point the values and the derivatives with respect to z are exact, at the cost of matrix products only.
         free, _ = self._free_and_all(z)
@@ -106,9 +126,9 @@ class Problem(eqx.Module):
                 changes.append(jnp.einsum("cnri,ci->cnr", by_entry, difference))
             return value + jnp.sum(jnp.stack(changes), axis=0)
 
-        return PerKind(*map(extrapolate, linearized.value, linearized.jacobian))
+        return ResidualKinds(*map(extrapolate, linearized.value, linearized.jacobian))
 
-    def jacobian(self, z: Float[Array, "size"], linearized: "Linearized") -> PerKind:
+    def jacobian(self, z: Float[Array, "size"], linearized: "Linearized") -> ResidualKinds:
         """Return the Jacobian (conditions, pushes, rows, size) of each kind of residuals with respect to z."""
         return jax.jacfwd(lambda z: self.linear_residuals(z, linearized))(z)
 
@@ -123,107 +143,30 @@ class Problem(eqx.Module):
 class Linearized(NamedTuple):
     """Residuals and their Jacobian at one point z."""
 
-    value: PerKind  # (conditions, pushes, rows) of each kind
-    jacobian: PerKind  # for each kind, derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`
+    value: ResidualKinds  # (conditions, pushes, rows) of each kind
+    jacobian: (
+        ResidualKinds  # for each kind, derivatives (conditions, pushes, rows, ...) with respect to each entry of `free`
+    )
     free: dict[str, Array]  # estimated parameters (conditions, ...) by name, at that point
 
 
-class Scene(NamedTuple):
-    """The bodies in contact, and the reference point of the table."""
-
-    shape: Shape  # outline of the slider
-    hand: Hand
-    origin: Float[Array, "2"]  # world, m, the point about which `Table` describes the friction
-
-
-def predict_pushes(parameters: Parameters, surface: LimitSurface, scene: Scene, pushes: Pushes) -> Trajectory:
-    """Predict the pushes of all conditions, as trajectories with leading axes (conditions, pushes)."""
-    # `parameters` replaces the coefficients of the surfaces
-    over_pushes = jax.vmap(predict_push, in_axes=(None, None, None, 0))
-    over_all = jax.vmap(over_pushes, in_axes=(0, 0, None, 0))
-    return over_all(parameters, surface, scene, pushes.inputs)
-
-
-class _PushData(NamedTuple):
-    """Record of one push, with the surface of its condition."""
-
-    surface: LimitSurface
-    inputs: PushInput
-    poses: Array
-
-
-class _WrenchMotionPairs(NamedTuple):
-    """Wrenches and motions of one push and where they exist, with the surface of its condition."""
-
-    surface: LimitSurface
-    wrench: Array
-    twist: Array
-    valid: Array
-
-
-def _pose_residual(
-    free: dict[str, Array],
-    parameters: Parameters,
-    data: _PushData,
-    constants: tuple[Scene, Array],
-    steps: tuple[int, ...],
-):
-    """Return the pose residuals (3 * steps,) of one push, in m, as value and again as auxiliary output."""
-    scene, length = constants
-    predicted = predict_push(parameters._replace(**free), data.surface, scene, data.inputs)
-    difference = predicted.pose[np.array(steps)] - data.poses
-    residual = difference.at[:, 2].mul(length).reshape(-1) / float(np.sqrt(len(steps)))
-    return residual, residual
-
-
-def _gap_residual(
-    free: dict[str, Array], parameters: Parameters, data: _PushData, constants: tuple[Scene, Array]
-) -> tuple[Array, Array]:
-    """Return the gap (1,) in m between finger and measured final pose, as value and again as auxiliary output."""
-    parameters, scene = parameters._replace(**free), constants[0]
-    shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
-    offset, end = parameters.frame_offset, data.poses[-1]
-    end = end if offset is None else compose(end, offset)
-    path = correct_path(data.inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
-    distance, _, radius = finger_distance(shape, hand, end, path[-1])
-    residual = (distance - radius)[None]
-    return residual, residual
-
-
-def _direction_residual(
-    free: dict[str, Array], parameters: Parameters, pairs: _WrenchMotionPairs, constants: tuple[()]
-) -> tuple[Array, Array]:
-    """Return the direction residuals (3 * pairs,) of one push, as value and again as auxiliary output."""
+def _direction_residual(free: dict[str, Array], parameters: Parameters, surface: LimitSurface, push: Pushes) -> Array:
+    """Return the direction residuals (3 * pairs,) of one push."""
     # Directions are unit vectors along (vx, vy, length * omega), so wrenches and motions may have any scale.
-    # `constants` is empty, because the table's reference point and the hand do not matter here.
     parameters = parameters._replace(**free)
-    surface = with_coefficients(pairs.surface, parameters.surface)
+    surface = with_coefficients(surface, parameters.surface)
     metric = jnp.stack([jnp.ones_like(surface.length)] * 2 + [surface.length])
 
     def direction(v: Array) -> Array:
         squared = jnp.sum(v**2, axis=-1, keepdims=True)
         return jnp.where(squared > 0, v / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
 
-    valid = pairs.valid
-    wrench = jnp.where(valid[:, None], direction(pairs.wrench / metric[None]), 1.0)
+    valid = push.has_pair
+    wrench = jnp.where(valid[:, None], direction(push.wrench / metric[None]), 1.0)
     predicted = jax.vmap(surface.twist)(wrench * metric[None])
-    difference = direction(predicted * metric[None]) - direction(pairs.twist * metric[None])
+    difference = direction(predicted * metric[None]) - direction(push.twist * metric[None])
     residual = jnp.where(valid[:, None], difference, 0.0).reshape(-1)
-    residual = residual / jnp.sqrt(jnp.maximum(jnp.sum(valid), 1).astype(residual.dtype))
-    return residual, residual
-
-
-def _over_conditions_and_pushes(
-    function: Callable,
-    free: dict[str, Array],
-    parameters: Parameters,
-    data: "_PushData | _WrenchMotionPairs",
-    constants: tuple,
-):
-    """Map `function` over conditions and over the pushes that share a condition's parameters and surface."""
-    data_axes: Any = data._replace(**{name: None if name == "surface" else 0 for name in data._fields})
-    over_pushes = jax.vmap(function, in_axes=(None, None, data_axes, None))
-    return jax.vmap(over_pushes, in_axes=(0, 0, 0, None))(free, parameters, data, constants)
+    return residual / jnp.sqrt(jnp.maximum(jnp.sum(valid), 1).astype(residual.dtype))
 
 
 def coefficients_of(surface: LimitSurface) -> Array:
@@ -236,32 +179,43 @@ def with_coefficients(surface: LimitSurface, coefficients: Array) -> LimitSurfac
     return eqx.tree_at(coefficients_of, surface, coefficients)
 
 
+@quick_jit
+def predict_pushes(parameters: Parameters, surface: LimitSurface, scene: Scene, pushes: Pushes) -> Trajectory:
+    """Predict the pushes of all conditions, as trajectories with leading axes (conditions, pushes)."""
+    over_pushes = jax.vmap(predict_push, in_axes=(None, None, None, 0))
+    return jax.vmap(over_pushes, in_axes=(0, 0, None, 0))(parameters, surface, scene, pushes)
+
+
 def predict_push(
     parameters: Parameters,
     surface: LimitSurface,  # `parameters` replaces its coefficients
     scene: Scene,
-    inputs: PushInput,  # recorded start, path, age and side
+    push: Pushes,  # one push: its start, path, age and side
 ) -> Trajectory:
     """Predict one push, with the poses of the tracked frame, also if `frame_offset` is not zero."""
     shape, hand = apply_inset(scene.shape, scene.hand, parameters.inset)
     slider = Slider(shape, with_coefficients(surface, parameters.surface))
-    path = correct_path(inputs.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
-    offset = parameters.frame_offset
-    start = inputs.start if offset is None else compose(inputs.start, offset)
+    path, start, offset = _true_path(parameters, push), push.start, parameters.frame_offset
+    if offset is not None:
+        start = compose(start, offset)
     if parameters.overlap is not None:
         path = path.at[:, :2].add(parameters.overlap * overlap_vector(slider, hand, start, path[0])[None])
-    mu = parameters.friction
+    mu, by_side = parameters.friction, parameters.friction_by_side
     if parameters.friction_drift is not None:
-        mu = mu * jnp.exp(parameters.friction_drift * inputs.age)
-    by_side = parameters.friction_by_side
+        mu = mu * jnp.exp(parameters.friction_drift * push.age)
     if by_side is not None:
-        mu = mu * jnp.exp(by_side[jnp.clip(inputs.side.astype(int), 0, len(by_side) - 1)])
+        mu = mu * jnp.exp(by_side[jnp.clip(push.side.astype(int), 0, len(by_side) - 1)])
     table_parameters = {name: getattr(parameters, name) for name in TABLE if getattr(parameters, name) is not None}
     table = Table(**table_parameters, origin=scene.origin) if table_parameters else None
     trajectory = rollout(slider, hand, path, pose=start, friction=mu, table=table)
     if offset is None:
         return trajectory
     return eqx.tree_at(lambda p: p.pose, trajectory, compose(trajectory.pose, inverse(offset)[None]))
+
+
+def _true_path(parameters: Parameters, push: Pushes) -> Array:
+    """Return the true path (steps + 1, dof) of the hand in one push."""
+    return correct_path(push.path, parameters.overshoot, parameters.lag_distance, parameters.hand_offset)
 
 
 def overlap_vector(slider: Slider, hand: Hand, start: Array, configuration: Array) -> Float[Array, "2"]:
@@ -298,25 +252,25 @@ def correct_path(
     hand_offset: Array,  # (2,), world, m
 ) -> Array:
     """Return the true path (steps + 1, dof) of the hand, from the logged one."""
-    # The true path takes the configurations of the logged one at the arc lengths s (1 + overshoot / length) -
-    # lag_distance, shifted by `hand_offset`. Arc lengths count x and y only. Beyond an end of the logged path it goes
-    # straight on, in the direction of a fifth of the path: local directions of a recording are mostly roundoff.
-    arc = arc_length(path[:, :2])
-    length = arc[-1]
-    true_arc = arc * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
-    # the change is added, because a hand that only closes or turns has no arc length to interpolate at
-    at_logged, at_true = (interpolate_arc_length(path, arc, s) for s in (arc, jnp.clip(true_arc, 0, length)))
+    # The true path takes the configurations of the logged one at the travels s (1 + overshoot / length) - lag_distance,
+    # shifted by `hand_offset`. Beyond an end of the logged path it goes straight on, in the direction of a fifth of the
+    # path: local directions of a recording are mostly roundoff.
+    travel = arc_length(in_meters(path))
+    length = travel[-1]
+    true_travel = travel * (1 + overshoot / jnp.where(length > 0, length, 1.0)) - lag_distance
+    # the change is added, so that a path without a correction keeps its bits
+    at_logged, at_true = (interpolate_arc_length(path, travel, s) for s in (travel, jnp.clip(true_travel, 0, length)))
     corrected = path + (at_true - at_logged)
     rows = max(len(path) // DIRECTION_PARTS, 1)
-    beyond, before = jnp.maximum(true_arc - length, 0), jnp.minimum(true_arc, 0)
-    corrected = corrected + beyond[:, None] * _change_per_length(path, arc, -1 - rows, -1)[None]
-    corrected = corrected + before[:, None] * _change_per_length(path, arc, 0, rows)[None]
+    beyond, before = jnp.maximum(true_travel - length, 0), jnp.minimum(true_travel, 0)
+    corrected = corrected + beyond[:, None] * _change_per_length(path, travel, -1 - rows, -1)[None]
+    corrected = corrected + before[:, None] * _change_per_length(path, travel, 0, rows)[None]
     return corrected.at[:, :2].add(hand_offset[None])
 
 
-def _change_per_length(path: Array, arc: Array, first: int, last: int) -> Float[Array, "dof"]:
-    """Return the change of configuration per arc length between two rows; zero if their arc lengths are equal."""
-    length = arc[last] - arc[first]
+def _change_per_length(path: Array, travel: Array, first: int, last: int) -> Float[Array, "dof"]:
+    """Return the change of configuration per travel between two rows; zero if the hand rests."""
+    length = travel[last] - travel[first]
     return jnp.where(length > 0, (path[last] - path[first]) / jnp.where(length > 0, length, 1.0), 0.0)
 
 

@@ -21,8 +21,9 @@ sampler of the gamma distribution). Derivatives are correct in expectation. Ther
 key, but by Adam with a new key for every step.
 """
 
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -35,15 +36,7 @@ from pushjax._internal.files import load_json, save_json, to_list
 from pushjax._internal.jit import jit
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.friction.friction_model import FrictionModel, Sampler
-from pushjax.identification.predictive import (
-    ConditionSampler,
-    NoiseParameters,
-    PoseJacobian,
-    PredictiveModel,
-    RandomInputs,
-    log_density,
-    predict,
-)
+from pushjax.identification.predictive import NoiseParameters, PredictiveModel, log_density, predict
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.result import Identified, from_record, to_record
 from pushjax.metrics import energy_score
@@ -52,7 +45,7 @@ from pushjax.simulation.slider import Slider
 
 Score = Literal["energy", "density"]
 FORMAT, VERSION = "pushjax noise", 1
-ARRAYS = ("surface_dof", "friction", "hand_offset", "sigma", "relative_error", "student_dof", "score", "history")
+ARRAYS = (*(field.name for field in fields(NoiseParameters)), "score", "history")
 SAMPLES = 32  # samples of each push in each step of the search
 STEPS = 80
 CHUNK = 10  # steps between two calls of `progress`
@@ -69,11 +62,10 @@ START = {
 LOWER_BOUNDS = {"surface_dof": 9.0, "student_dof": 1.0}
 
 
-class Noise(eqx.Module):
+class Noise(NoiseParameters):
     """Distribution of pushes about their prediction.
 
     Attributes:
-        identified: What `identify` returned.
         surface_dof: Degrees of freedom of the limit surface.
         friction: (..., 2) range on which mu is uniform, for each condition.
         hand_offset: Scale in m of the hand's displacement against the slider, in x and in y, which differs from push to
@@ -82,18 +74,13 @@ class Noise(eqx.Module):
         relative_error: (2,) scale of the additional error per distance that the slider moved, and per length * angle
             that it turned.
         student_dof: Degrees of freedom of Student's distribution of all of these errors.
+        identified: What `identify` returned.
         score: Mean score of the final poses at the end of the search; in m if it is the energy score.
         history: (steps,) mean score during the search.
         sampler: Sampler of the limit surfaces; see `FrictionModel`.
     """
 
     identified: Identified
-    surface_dof: Float[Array, ""]
-    friction: Float[Array, "*conditions 2"]
-    hand_offset: Float[Array, ""]
-    sigma: Float[Array, ""]
-    relative_error: Float[Array, "2"]
-    student_dof: Float[Array, ""]
     score: Float[Array, ""]
     history: Float[Array, "steps"]
     sampler: Sampler = eqx.field(static=True)
@@ -122,7 +109,7 @@ class Noise(eqx.Module):
         Raises:
             ValueError: If the file holds something else.
         """
-        return load_json(path, "noise that pushjax identified", FORMAT, VERSION, _noise_from_record)
+        return load_json(path, "a noise file", FORMAT, VERSION, _noise_from_record)
 
     def predict(
         self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
@@ -140,8 +127,7 @@ class Noise(eqx.Module):
             (..., pushes, n, 3) final poses, world, m and rad.
         """
         predictive = PredictiveModel.of(self.identified, pushes, slider, hand, self.sampler)
-        drawn = predict(key, predictive, self._parameters, n)
-        return drawn[0] if self.identified.one_condition else drawn
+        return self.identified._drop_condition_axis(predict(key, predictive, self, n))
 
     def log_density(
         self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int
@@ -162,8 +148,7 @@ class Noise(eqx.Module):
             (..., pushes) log density per cubic meter of (x, y, length * theta).
         """
         predictive = PredictiveModel.of(self.identified, pushes, slider, hand, self.sampler)
-        density = log_density(key, predictive, self._parameters, n)
-        return density[0] if self.identified.one_condition else density
+        return self.identified._drop_condition_axis(log_density(key, predictive, self, n))
 
     def transferred_to(self, identified: Identified) -> "Noise":
         """Return the same noise about an estimate from other pushes.
@@ -174,16 +159,9 @@ class Noise(eqx.Module):
         Returns:
             The noise. If the range of friction differs between conditions, it has the widest range.
         """
-        center, half_width = identified.friction, jnp.max(self.friction[..., 1] - self.identified.friction)
-        friction = jnp.stack([jnp.maximum(center - half_width, 0), center + half_width], axis=-1)
+        half_width = jnp.max(self.friction[..., 1] - self.identified.friction)
+        friction = _friction_range(identified.friction, half_width)
         return eqx.tree_at(lambda noise: (noise.identified, noise.friction), self, (identified, friction))
-
-    @property
-    def _parameters(self) -> NoiseParameters:
-        friction = self.friction[None] if self.identified.one_condition else self.friction
-        return NoiseParameters(
-            self.surface_dof, friction, self.hand_offset, self.sigma, self.relative_error, self.student_dof
-        )
 
 
 def identify_noise(
@@ -232,25 +210,20 @@ def identify_noise(
         raise ValueError(f"samples must be at least 2; got {samples}")
     check_positive("steps", steps)
     predictive = PredictiveModel.of(found, pushes, slider, hand, sampler)
-    log_noise = _initial_log_noise(found)
-    state, scores, iterates_of_chunks = _optimizer(steps).init(log_noise), [], []
-    keys = jax.random.split(key, steps)
+    start = {name: jnp.asarray(value, found.z.dtype) - LOWER_BOUNDS.get(name, 0.0) for name, value in START.items()}
+    logs = jax.tree.map(jnp.log, start | {"sigma": found.sigma / 2})
+    state, chunks, keys = _optimizer(steps).init(logs), [], jax.random.split(key, steps)
     for first in range(0, steps, CHUNK):
-        chunk_keys = keys[first : first + CHUNK]
-        log_noise, state, chunk_scores, iterates = _descend(
-            log_noise, state, chunk_keys, predictive, samples, steps, score
-        )
-        scores.append(chunk_scores)
-        iterates_of_chunks.append(iterates)
-        progress(first + len(chunk_keys), steps)
-    history = jnp.concatenate(scores)
-    iterates = jax.tree.map(lambda *parts: jnp.concatenate(parts), *iterates_of_chunks)
+        chunk = keys[first : first + CHUNK]
+        logs, state, *scores_and_iterates = _descend(logs, state, chunk, predictive, samples, steps, score)
+        chunks.append(scores_and_iterates)
+        progress(first + len(chunk), steps)
+    history, iterates = jax.tree.map(lambda *parts: jnp.concatenate(parts), *chunks)
     last = min(AVERAGED, steps)
     mean = jax.tree.map(lambda leaf: jnp.mean(leaf[-last:], axis=0), iterates)
-    best = mean.parameters(predictive.parameters.friction)
-    if found.one_condition:
-        best = best._replace(friction=best.friction[0])
-    return Noise(found, score=jnp.mean(history[-last:]), history=history, sampler=sampler, **best._asdict())
+    parameters = vars(_parameters(mean, predictive.parameters.friction))
+    parameters["friction"] = found._drop_condition_axis(parameters["friction"])
+    return Noise(**parameters, identified=found, score=jnp.mean(history[-last:]), history=history, sampler=sampler)
 
 
 def _optimizer(steps: int) -> optax.GradientTransformation:
@@ -258,87 +231,71 @@ def _optimizer(steps: int) -> optax.GradientTransformation:
     return optax.adam(optax.cosine_decay_schedule(LEARNING_RATE, steps, FINAL_RATE_FRACTION))
 
 
-class _LogNoise(NamedTuple):
-    """The parameters that are optimized, as unbounded numbers (logarithms of the distance to the lower bound)."""
-
-    surface_dof: Float[Array, ""]
-    friction_half_width: Float[Array, ""]
-    hand_offset: Float[Array, ""]
-    sigma: Float[Array, ""]
-    relative_error: Float[Array, "2"]
-    student_dof: Float[Array, ""]
-
-    def parameters(self, center: Float[Array, "conditions"]) -> NoiseParameters:
-        """Return the parameters of the noise; `center` is the identified friction of each condition."""
-        half_width = jnp.exp(self.friction_half_width)
-        values = {
-            name: LOWER_BOUNDS[name] + jnp.exp(value) if name in LOWER_BOUNDS else jnp.exp(value)
-            for name, value in self._asdict().items()
-            if name != "friction_half_width"
-        }
-        return NoiseParameters(
-            friction=jnp.stack([jnp.maximum(center - half_width, 0), center + half_width], axis=-1), **values
-        )
+def _friction_range(center: Float[Array, "*conditions"], half_width: Array) -> Float[Array, "*conditions 2"]:
+    """Return the lowest and highest friction."""
+    return jnp.stack([jnp.maximum(center - half_width, 0), center + half_width], axis=-1)
 
 
-def _initial_log_noise(found: Identified) -> _LogNoise:
-    """Return the parameters at which the search starts."""
-    initial = {name: jnp.asarray(value, found.z.dtype) - LOWER_BOUNDS.get(name, 0.0) for name, value in START.items()}
-    return _LogNoise(**jax.tree.map(jnp.log, initial | {"sigma": found.sigma / 2}))
+# What is optimized are unbounded numbers by name: logarithms of the distance to the lower bound.
+_Logs = dict[str, Array]
+
+
+def _parameters(logs: _Logs, center: Float[Array, "conditions"]) -> NoiseParameters:
+    """Return the parameters of the noise; `center` is the identified friction of each condition."""
+    values = {name: LOWER_BOUNDS.get(name, 0.0) + jnp.exp(value) for name, value in logs.items()}
+    return NoiseParameters(friction=_friction_range(center, values.pop("friction_half_width")), **values)
 
 
 @jit
-def _descend(log_noise, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
-    """Take one optimizer step per key; return parameters and state, and the scores before and parameters after each."""
+def _descend(logs: _Logs, state, keys, predictive: PredictiveModel, samples: int, steps: int, score: Score):
+    """Take one optimizer step per key; return logs and state, and the scores before and logs after each."""
     optimizer = _optimizer(steps)
 
     def step(carry, key):
-        log_noise, state = carry
-        value, gradient = _score(log_noise, key, predictive, samples, score)
+        logs, state = carry
+        value, gradient = _score(logs, key, predictive, samples, score)
         updates, state = optimizer.update(gradient, state)
-        log_noise = optax.apply_updates(log_noise, updates)
-        return (log_noise, state), (value, log_noise)
+        logs = optax.apply_updates(logs, updates)
+        return (logs, state), (value, logs)
 
-    (log_noise, state), (scores, iterates) = jax.lax.scan(step, (log_noise, state), keys)
-    return log_noise, state, scores, iterates
+    (logs, state), (scores, iterates) = jax.lax.scan(step, (logs, state), keys)
+    return logs, state, scores, iterates
 
 
 def _score(
-    log_noise: _LogNoise, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
-) -> tuple[Array, _LogNoise]:
+    logs: _Logs, key: PRNGKeyArray, predictive: PredictiveModel, samples: int, score: Score
+) -> tuple[Array, _Logs]:
     """Return the mean score and its gradient."""
     # A pose depends on dof, on its own mu and on the position of its hand. Its derivatives with respect to these use
     # forward mode. The rest is cheap, and uses reverse mode through the linearized poses.
 
-    def linearize(
-        condition: ConditionSampler, key: PRNGKeyArray, parameters: NoiseParameters
-    ) -> tuple[RandomInputs, tuple[Array, PoseJacobian]]:
-        inputs = condition.draw_inputs(key, samples)
-        return inputs, condition.linearize(inputs, parameters)
+    def linearize(condition: PredictiveModel, key: PRNGKeyArray, noise: NoiseParameters):
+        inputs = condition.sample_inputs(key, samples)
+        return inputs, condition.linearize(inputs, noise)
 
     center, pushes = predictive.parameters.friction, predictive.pushes
-    start = log_noise.parameters(center)
+    start = _parameters(logs, center)
     inputs, (poses, jacobian) = predictive.over_conditions(linearize, key, start)
-    linearized_at = jax.lax.stop_gradient(start.dof_and_friction(inputs))
+    linearized_at = jax.lax.stop_gradient(inputs.dof_and_friction(start))
 
-    def mean_score(log_noise: _LogNoise) -> Array:
-        parameters = log_noise.parameters(center)
-        changes = zip(parameters.dof_and_friction(inputs), linearized_at, strict=True)
+    def mean_score(logs: _Logs) -> Array:
+        noise = _parameters(logs, center)
+        changes = zip(inputs.dof_and_friction(noise), linearized_at, strict=True)
         dof, mu = ((now - then)[..., None] for now, then in changes)
-        unit_errors = inputs.unit_errors(parameters.student_dof)
+        unit_errors = inputs.unit_errors(noise.student_dof)
         unshifted = poses + jacobian.dof * dof + jacobian.mu * mu
-        shift = parameters.hand_offset * jnp.einsum("...ij,...j->...i", jacobian.hand_shift, unit_errors[..., :2])
+        shift = noise.hand_offset * jnp.einsum("...ij,...j->...i", jacobian.hand_shift, unit_errors[..., :2])
         if score == "density":
-            scores = -predictive.log_density(unshifted + shift, pushes, parameters)
+            scores = -predictive.log_density(unshifted + shift, noise)
         else:
             # `unshifted` does not include the hand's displacement: a relative error of that would be a product of two
             # heavy-tailed variables, whose mean may be infinite
-            error_scale = predictive.error_scale(unshifted, pushes, parameters)
+            error_scale = predictive.error_scale(unshifted, noise)
             difference = predictive.with_errors(unshifted + shift, error_scale, unit_errors) - pushes.end[..., None, :]
             scores = jax.vmap(jax.vmap(lambda x: energy_score(x, jnp.zeros(3, x.dtype), predictive.length)))(difference)
         return jnp.sum(pushes.weight * scores) / jnp.sum(pushes.weight)
 
-    return jax.value_and_grad(mean_score)(log_noise)
+    return jax.value_and_grad(mean_score)(logs)
 
 
 def _noise_from_record(record: dict[str, Any], dtype: Any) -> Noise:

@@ -14,8 +14,6 @@ pressure_center  center of pressure c, about which the torque of the surface is 
 the rest         see `Unknowns`: entries of z times their standard deviation.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -141,78 +139,52 @@ class Prior(eqx.Module):
 
     def parameters(self, z: Float[Array, "size"]) -> Parameters:
         """Return the physical parameters of every condition."""
-        of_conditions = jax.vmap(
-            lambda numbers, *rest: _condition_parameters(_entries_by_name(numbers, self.layout), self.unknowns, *rest)
-        )
-        return of_conditions(z[self.layout.positions], self.known, self.mean_surface)
+
+        def of_condition(*condition) -> Parameters:
+            values, factors = self._values_and_factors(*condition)
+            gram = factors @ jnp.swapaxes(factors, 1, 2)
+            surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
+            zeros = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), gram.dtype) for name in ALWAYS_PRESENT}
+            return Parameters(surface=surface, **(zeros | values))
+
+        return jax.vmap(of_condition)(z[self.layout.positions], self.known, self.mean_surface)
 
     def factors(self, z: Float[Array, "size"]) -> Float[Array, "conditions terms 3 3"]:
         """Return the lower triangular factors L_k of every condition's surface."""
-
-        def of_condition(numbers: Array, known: dict[str, Array], mean: PriorSurface) -> Array:
-            entries = _entries_by_name(numbers, self.layout)
-            return _surface_factors(entries, _values(entries, self.unknowns, known, mean.length), mean)
-
-        full = jax.vmap(of_condition)(z[self.layout.positions], self.known, self.mean_surface)
+        conditions = z[self.layout.positions], self.known, self.mean_surface
+        full = jax.vmap(lambda *condition: self._values_and_factors(*condition)[1])(*conditions)
         # an unknown center of pressure makes them full; the QR decomposition makes them triangular again
         return jnp.swapaxes(jnp.linalg.qr(jnp.swapaxes(full, -1, -2), mode="r"), -1, -2)
+
+    def _values_and_factors(
+        self, z: Array, known: dict[str, Array], mean: PriorSurface
+    ) -> tuple[dict[str, Array], Float[Array, "terms 3 3"]]:
+        """Return the parameters of one condition by name, and its surface as factors L_k that may be full."""
+        values, factors = dict(known), mean.factors
+        for name, where in self.layout.slices.items():
+            entries = z[where]
+            if name == "surface":
+                factors = factors + mean.relative_std * factors @ _unit_perturbation(entries.reshape(-1, 6))
+                continue
+            prior = getattr(self.unknowns, name).astype(z.dtype)
+            if name == "friction":
+                values[name] = prior[0] + (prior[1] - prior[0]) * jax.nn.sigmoid(entries[0])
+                continue
+            value = prior * entries
+            if name == "frame_offset":
+                value = value.at[2].divide(mean.length)
+            values[name] = value[0] if SIZES[name] == 1 else value
+        if "pressure_center" in values:
+            cx, cy = values["pressure_center"] / mean.length
+            row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
+            shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
+            factors = shift.T[None] @ factors
+        return values, factors
 
     @property
     def mean(self) -> Float[Array, "size"]:
         """The prior mean of z, which is zero."""
         return jnp.zeros(self.layout.size, self.origin.dtype)
-
-
-def _entries_by_name(z: Array, layout: Layout) -> dict[str, Any]:
-    """Split the entries of one condition by the name of the unknown."""
-    return {name: z[where] for name, where in layout.slices.items()}
-
-
-def _surface_factors(
-    entries: dict[str, Any], values: dict[str, Array], mean: PriorSurface
-) -> Float[Array, "terms 3 3"]:
-    """Return factors L_k of the surface, which are not triangular if there is a center of pressure."""
-    factors = mean.factors
-    if "surface" in entries:
-        factors = factors + mean.relative_std * factors @ _unit_perturbation(entries["surface"].reshape(-1, 6))
-    if "pressure_center" in values:
-        cx, cy = values["pressure_center"] / mean.length
-        row = jnp.stack([cy, -cx, jnp.ones_like(cx)])
-        shift = jnp.eye(3, dtype=factors.dtype).at[2].set(row)  # maps F to F with tau about the center of pressure
-        factors = shift.T[None] @ factors
-    return factors
-
-
-def _condition_parameters(
-    entries: dict[str, Any],  # of z, by the name of the unknown
-    unknowns: Unknowns,
-    known: dict[str, Array],  # by name
-    mean: PriorSurface,  # of the condition
-) -> Parameters:
-    """Return the physical parameters of one condition."""
-    values = _values(entries, unknowns, known, mean.length)
-    factors = _surface_factors(entries, values, mean)
-    gram = factors @ jnp.swapaxes(factors, 1, 2)
-    surface = squared_quadratics(gram) if factors.shape[0] > 1 else gram[0]
-    zeros = {name: jnp.zeros((SIZES[name],) if SIZES[name] > 1 else (), gram.dtype) for name in ALWAYS_PRESENT}
-    return Parameters(surface=surface, **(zeros | values))
-
-
-def _values(entries: dict[str, Any], unknowns: Unknowns, known: dict[str, Array], length: Array) -> dict[str, Array]:
-    """Return the parameters of one condition that are known or estimated, by name, but for the surface."""
-    values = dict(known)
-    for name, numbers in entries.items():
-        if name == "surface":
-            continue
-        prior = getattr(unknowns, name).astype(numbers.dtype)
-        if name == "friction":
-            values[name] = prior[0] + (prior[1] - prior[0]) * jax.nn.sigmoid(numbers[0])
-        else:
-            value = prior * numbers
-            if name == "frame_offset":
-                value = value.at[2].divide(length)
-            values[name] = value[0] if SIZES[name] == 1 else value
-    return values
 
 
 def _unit_perturbation(entries: Float[Array, "terms 6"]) -> Float[Array, "terms 3 3"]:

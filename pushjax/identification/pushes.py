@@ -1,7 +1,6 @@
 """Recorded pushes as arrays, the data of identification."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,20 +17,12 @@ from pushjax._internal.checks import (
     check_type,
     common_dtype,
 )
+from pushjax.datasets.push_log import PushLog
 from pushjax.datasets.recordings import Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.identification.pushes_of_recordings import push_arrays
 
 STEPS = 50  # default number of steps of each path
-
-
-class PushInput(NamedTuple):
-    """What is known of a push before it happens; see `Pushes` for the fields."""
-
-    start: Float[Array, "*pushes 3"]
-    path: Float[Array, "*pushes steps+1 dof"]
-    age: Float[Array, "*pushes"]
-    side: Float[Array, "*pushes"]
 
 
 class Pushes(eqx.Module):
@@ -88,19 +79,19 @@ class Pushes(eqx.Module):
         if self.start.ndim not in (2, 3):
             raise ValueError(f"start has shape {self.start.shape}; expected (pushes, 3), or with conditions in front")
         leading = self.start.shape[:-1]
-        no_rows = jnp.zeros((*leading, 0, 3), dtype)
-        self.weight = jnp.ones(leading, dtype) if weight is None else as_float(weight, dtype, "weight")
-        self.poses_between, self.wrench, self.twist = (
-            no_rows if value is None else as_float(value, dtype) for value in (poses_between, wrench, twist)
-        )
-        self.age, self.side = (
-            jnp.zeros(leading, dtype) if value is None else as_float(value, dtype) for value in (age, side)
-        )
+        zeros, no_rows = jnp.zeros(leading, dtype), jnp.zeros((*leading, 0, 3), dtype)
+
+        def given(value: ArrayLike | None, default: Array, name: str) -> Array:
+            return default if value is None else as_float(value, dtype, name)
+
+        self.weight = given(weight, jnp.ones(leading, dtype), "weight")
+        self.age, self.side = given(age, zeros, "age"), given(side, zeros, "side")
+        self.poses_between = given(poses_between, no_rows, "poses_between")
+        self.wrench, self.twist = given(wrench, no_rows, "wrench"), given(twist, no_rows, "twist")
         check_shape("end", self.end, (*leading, 3))
         check_shape("path", self.path, (*leading, "steps + 1", "dof"))
-        check_shape("weight", self.weight, leading)
-        check_shape("age", self.age, leading)
-        check_shape("side", self.side, leading)
+        for name in ("weight", "age", "side"):
+            check_shape(name, getattr(self, name), leading)
         check_shape("poses_between", self.poses_between, (*leading, "k", 3))
         check_shape("wrench", self.wrench, (*leading, "p", 3))
         check_shape("twist", self.twist, self.wrench.shape)
@@ -128,11 +119,6 @@ class Pushes(eqx.Module):
         return jnp.concatenate([self.poses_between, self.end[..., None, :]], axis=-2)
 
     @property
-    def inputs(self) -> "PushInput":
-        """What is known of every push before it happens."""
-        return PushInput(self.start, self.path, self.age, self.side)
-
-    @property
     def has_pair(self) -> Bool[Array, "*conditions pushes pairs"]:
         """(pushes, p) whether neither the wrench nor the motion of a pair is zero."""
         return jnp.any(self.wrench != 0, axis=-1) & jnp.any(self.twist != 0, axis=-1)
@@ -142,11 +128,11 @@ class Pushes(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[None], self) if self.weight.ndim == 1 else self
 
     @staticmethod
-    def of(log: Recordings, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
+    def of(log: PushLog | Recordings, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
         """Make pushes from the usable pushes of a log.
 
         Args:
-            log: The recordings of a log.
+            log: A log of one finger, or the recordings that `load_recordings` returns.
             steps: Number of steps of each path.
             parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked
                 during all pushes. Otherwise only the final pose is used.
@@ -160,8 +146,9 @@ class Pushes(eqx.Module):
             ValueError: If `steps` or `parts` is less than one, or if several `parts` are not fewer than `steps`.
             TypeError: If `log` is of another type.
         """
-        check_type("log", log, Recordings)
-        return Pushes(**push_arrays(log, steps, parts, shape))
+        check_type("log", log, PushLog, Recordings)
+        recordings = log if isinstance(log, Recordings) else Recordings.of_log(log)
+        return Pushes(**push_arrays(recordings, steps, parts, shape))
 
     @staticmethod
     def conditions(several: Sequence["Pushes"]) -> "Pushes":

@@ -5,13 +5,15 @@ uses NumPy, because each recording has its own number of samples and JAX would c
 """
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pushjax._internal.jit import quick_jit
-from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, nothing_usable, rotation
+from pushjax.datasets.push_log import Floats, LogError, nothing_usable, rotation
+from pushjax.datasets.recordings import Recording, Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.hand import Hand, RoundFinger
 
@@ -30,7 +32,7 @@ MAX_DISTANCE = 30.0
 MAX_TURN = 2 * np.pi  # rad, largest rotation of a slider in a push
 TRAVEL_MARGIN = 0.01  # m, margin for a slider that moves farther than its hand, and for errors of the tracker
 
-TURN_LENGTH = 0.05  # m/rad, what a turn of the hand counts as a distance
+TURN_LENGTH = 0.05  # m/rad, travel of a hand that turns
 
 
 def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> Recordings:
@@ -65,7 +67,7 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> 
     sparse = [push for push in kept if not _is_observed_often_enough(push, parts)]
     if 2 * len(sparse) <= len(kept):
         for push in sparse:
-            reason = f"the object was seen {push.seen[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
+            reason = f"the object was tracked {push.seen[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
             problems.append(LogError(recordings.source, reason, push=push.index))
         kept = [push for push in kept if _is_observed_often_enough(push, parts)]
     if not kept:
@@ -77,9 +79,8 @@ def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> s
     """Return why a push is physically impossible, or None."""
     # the comparisons are written so that NaN fails them
     start, end = push.pose[0], push.pose[-1]
-    step_lengths = np.linalg.norm(np.diff(push.hand[:, :2], axis=0), axis=1)
-    travel, distance = float(step_lengths.sum()), float(np.linalg.norm(push.hand[:, :2] - start[:2], axis=1).min())
-    hand_turns = push.hand.shape[1] > 2 and float(np.abs(np.diff(push.hand[:, 2:], axis=0)).sum()) > 1e-3
+    travel = float(_hand_travel(push)[-1])
+    distance = float(np.linalg.norm(push.hand[:, :2] - start[:2], axis=1).min())
     moved, turn = float(np.linalg.norm(end[:2] - start[:2])), float(abs(end[2] - start[2]))
     if not (turn <= MAX_TURN and abs(start[2]) <= 2 * MAX_TURN):
         found = f"turns by {turn:.4g}" if not turn <= MAX_TURN else f"starts at {start[2]:.4g}"
@@ -89,7 +90,7 @@ def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> s
             ("the hand moves", travel) if travel > MAX_DISTANCE * size else ("the hand stays away by", distance)
         )
         return f"{what} {found:.4g} m, of an object {size:.3g} m across: are its coordinates in millimeters?"
-    if not (travel >= MIN_TRAVEL or hand_turns):
+    if not travel >= MIN_TRAVEL:
         return f"the hand moves {travel:.2g} m; expected at least {MIN_TRAVEL:g} m"
     if not (moved <= travel + size + TRAVEL_MARGIN):
         return f"the object moves {moved:.4g} m, the hand {travel:.4g} m: the tracker jumped"
@@ -168,10 +169,15 @@ def has_wrenches(recordings: Recordings) -> bool:
     return all(push.force is not None and push.hand.shape[1] == 2 for push in recordings.pushes)
 
 
+def in_meters(configurations: Any) -> Any:
+    """Return configurations (m, dof) of a hand with the angle as a length: their distances are its travel."""
+    lengths = np.where(np.arange(configurations.shape[1]) == 2, TURN_LENGTH, 1.0)  # the third coordinate is an angle
+    return configurations * lengths.astype(configurations.dtype)[None]
+
+
 def _hand_travel(push: Recording) -> Floats:
-    """Return the distance (m,) that the hand has moved at each sample, with turns as distances, m."""
-    lengths = np.where(np.arange(push.hand.shape[1]) == 2, TURN_LENGTH, 1.0)  # the third coordinate is an angle
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(push.hand, axis=0) * lengths, axis=1))])
+    """Return the distance (m,) that the hand has traveled at each sample, m."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(in_meters(push.hand), axis=0), axis=1))])
 
 
 def _interpolated_columns(values: Floats, arc: Floats, query: Floats) -> Floats:

@@ -12,7 +12,6 @@ from scipy.special import ndtri
 
 from pushjax._internal.checks import ArrayLike
 from pushjax._internal.files import load_json, save_json, to_list
-from pushjax._internal.jit import quick_jit
 from pushjax.friction.limit_surface import LimitSurface
 from pushjax.identification import uncertainty
 from pushjax.identification.model import Scene, apply_inset, correct_path, limit_surfaces, predict_pushes
@@ -151,7 +150,7 @@ class Identified(eqx.Module):
         Raises:
             ValueError: If the file holds something else.
         """
-        return load_json(path, "what pushjax identified", FORMAT, VERSION, from_record)
+        return load_json(path, "an identification file", FORMAT, VERSION, from_record)
 
     def sample(self, key: PRNGKeyArray, n: int) -> Parameters:
         """Sample `n` values from the posterior distribution.
@@ -163,13 +162,10 @@ class Identified(eqx.Module):
         Returns:
             Independent samples; fields as in `parameters`, with a leading axis (n,).
         """
-        return jax.vmap(lambda z: self._drop_condition_axis(self.prior.parameters(z)))(self._sample_z(key, n))
-
-    def _sample_z(self, key: PRNGKeyArray, n: int) -> Float[Array, "n size"]:
-        """Sample `n` vectors z from the posterior distribution."""
-        upper = jnp.linalg.cholesky(self.precision).T
         normal = jax.random.normal(key, (len(self.z), n), self.z.dtype)
-        return self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
+        upper = jnp.linalg.cholesky(self.precision).T
+        z = self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
+        return jax.vmap(lambda one: self._drop_condition_axis(self.prior.parameters(one)))(z)
 
     def interval(self, level: float = 0.9) -> dict[str, tuple[Array, Array]]:
         """Return an interval for each unknown except the surface.
@@ -192,20 +188,50 @@ class Identified(eqx.Module):
         names = [name for name in self.prior.layout.names if name != "surface"]
         return {name: (getattr(low, name), getattr(high, name)) for name in names}
 
-    def profile(self, pushes: Pushes, slider: Slider, hand: Hand, label: str, **options: Any) -> uncertainty.Profile:
-        """Compute how much worse all pushes are explained if one number is held at other values.
+    def profile(
+        self,
+        pushes: Pushes,
+        slider: Slider,
+        hand: Hand,
+        label: str,
+        *,
+        points: int = uncertainty.POINTS,
+        reach: float = uncertainty.REACH,
+    ) -> uncertainty.Profile:
+        """Compute how much worse all pushes are explained if one number of z is held at other values.
 
-        See `pushjax.identification.uncertainty.profile` for the arguments and options. `label` is one of `labels`.
+        Args:
+            pushes: Pushes, as given to `identify`.
+            slider: Slider, as given to `identify`.
+            hand: Hand, as given to `identify`.
+            label: One of `labels`, except those of the surface.
+            points: Number of values on either side of the estimate.
+            reach: Distance from the estimate to the outermost values, in standard deviations.
+
+        Returns:
+            The profile, with 2 * points + 1 values, and more where it is flat or steep. A side on which a friction is
+                at an end of its range has none.
+
+        Raises:
+            ValueError: If `label` is another label.
         """
-        return uncertainty.profile(self, pushes, slider, hand, label, **options)
+        return uncertainty.profile(self, pushes, slider, hand, label, points=points, reach=reach)
 
     def bootstrap(self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int) -> Parameters:
-        """Identify from `n` sets of pushes that are drawn from the given ones with replacement.
+        """Identify from `n` bootstrap samples of the pushes of each condition, each from this estimate.
 
-        See `pushjax.identification.uncertainty.bootstrap`.
+        Args:
+            key: PRNG key.
+            pushes: Pushes, as given to `identify`.
+            slider: Slider, as given to `identify`.
+            hand: Hand, as given to `identify`.
+            n: Number of samples.
 
         Returns:
             The estimates, with a leading axis (n,).
+
+        Raises:
+            ValueError: If all pushes of a condition have weight zero.
         """
         return uncertainty.bootstrap(key, self, pushes, slider, hand, n)[0]
 
@@ -249,18 +275,12 @@ class Identified(eqx.Module):
             Trajectories; every array has leading axes (..., pushes).
         """
         parameters = self.prior.parameters(self.z)
-        scene = Scene(slider.shape, hand, self.prior.origin)
-        trajectories = _predict_pushes(
-            parameters, limit_surfaces(self.prior, parameters), scene, pushes.as_conditions()
-        )
-        return self._drop_condition_axis(trajectories)
+        surfaces, scene = limit_surfaces(self.prior, parameters), Scene(slider.shape, hand, self.prior.origin)
+        return self._drop_condition_axis(predict_pushes(parameters, surfaces, scene, pushes.as_conditions()))
 
     def _drop_condition_axis(self, tree: Any) -> Any:
         """Drop the axis of conditions if the pushes had none."""
         return jax.tree.map(lambda leaf: leaf[0], tree) if self.one_condition else tree
-
-
-_predict_pushes = quick_jit(predict_pushes)
 
 
 def to_record(found: Identified) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from scipy.special import ndtri
 
 from pushjax._internal.jit import jit
-from pushjax.identification.fit import FixedEntries, Schedule, compiled_fit, fit
-from pushjax.identification.model import Problem, limit_surfaces
+from pushjax.identification.fit import Rounds, fit
+from pushjax.identification.model import Problem, Scene, limit_surfaces
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
@@ -24,10 +24,9 @@ POINTS, REACH = 3, 2.7  # points of a profile on each side of the estimate, and 
 # A profile ends where a friction is within 0.25 % of its range from an end of it: pushes that do not determine a
 # friction leave its z with a standard deviation of hundreds.
 MAX_FRICTION_Z = 6.0
-# The rise at which an interval of 90 % ends. A side of a profile that does not reach it goes on, up to so many times to
-# twice the distance. A side whose first point above it is above so many times that rise is refined, by up to so many
-# points.
-RISE_OF_90 = ndtri(0.95) ** 2 / 2
+DROP_AT_90 = ndtri(0.95) ** 2 / 2  # of the log posterior density, at the ends of an interval of 90 %
+# Each side of a profile is extended (at most EXTENSIONS times, doubling the distance) until the drop is reached, and
+# refined (at most REFINEMENTS points) where the first point overshoots by more than STEEP.
 EXTENSIONS, STEEP, REFINEMENTS = 8, 3.0, 6
 TOLERANCE = 1e-3  # tolerance of z, whose numbers have a prior standard deviation of one
 
@@ -38,14 +37,14 @@ class Profile(NamedTuple):
     Attributes:
         label: Label of that number of z.
         value: (points,) values at which it is held, in the unit that `Parameters` gives.
-        rise: (points,) increase of half the loss, which is the negative log posterior density. All other unknowns are
-            optimized. A 90 % interval is where it is below 1.35.
-        normal: (points,) the same increase if the posterior were normal in z.
+        log_posterior_drop: (points,) decrease of the log posterior density (half the loss, negative) from its maximum.
+            All other unknowns are optimized. A 90 % interval is where it is below 1.35.
+        normal: (points,) the same decrease if the posterior were normal in z.
     """
 
     label: str
     value: np.ndarray
-    rise: np.ndarray
+    log_posterior_drop: np.ndarray
     normal: np.ndarray
 
 
@@ -59,24 +58,7 @@ def profile(
     points: int = POINTS,
     reach: float = REACH,
 ) -> Profile:
-    """Compute the profile of one number of z that is not part of the surface.
-
-    Args:
-        found: What `identify` returned.
-        pushes: Pushes, as given to `identify`.
-        slider: Slider, as given to `identify`.
-        hand: Hand, as given to `identify`.
-        label: One of `found.labels`, except those of the surface.
-        points: Number of values on either side of the estimate.
-        reach: Distance from the estimate to the outermost values, in standard deviations.
-
-    Returns:
-        The profile, with 2 * points + 1 values, and more where it is flat or steep. A side on which a friction is at an
-            end of its range has none.
-
-    Raises:
-        ValueError: If `label` is another label.
-    """
+    """Compute the profile of one number of z; `Identified.profile` describes it."""
     positions = scalar_positions(found)
     if label not in positions:
         raise ValueError(f"label must be one of {', '.join(positions)}; got {label!r}")
@@ -86,13 +68,12 @@ def profile(
     std = float(np.sqrt(np.asarray(covariance)[position, position]))
     # The direction in which all other entries would move if the posterior were normal.
     direction = covariance[position] / covariance[position, position] * std
-    fixed, schedule = jnp.arange(len(found.z)) == position, Schedule.of(found.z.dtype, 1, TOLERANCE)
-    sigma, given = _sigma_by_kind(found), jnp.array([True, True, True])
+    frozen, rounds = jnp.arange(len(found.z)) == position, Rounds.of(found.z.dtype, 1, TOLERANCE)
+    sigma, given = _sigma_by_kind(found), jnp.ones(3, bool)
 
     def refit(near: _ProfilePoint, distance: float) -> _ProfilePoint:
         z = near.z + (distance - near.distance) * direction
-        entries = FixedEntries(fixed, z)
-        fitted = compiled_fit(problem, pushes, z, sigma, given, entries, schedule, robust=found.robust)
+        fitted = fit(problem, pushes, z, sigma, given, frozen, rounds, robust=found.robust)
         return _ProfilePoint(distance, fitted.z, float(fitted.loss))
 
     estimate = refit(_ProfilePoint(0.0, found.z, 0.0), 0.0)
@@ -128,7 +109,7 @@ def _profile_side(
 ) -> list[_ProfilePoint]:
     """Return the points of a profile on one side of the estimate."""
 
-    def rise(point: _ProfilePoint) -> float:
+    def drop(point: _ProfilePoint) -> float:
         return (point.loss - estimate.loss) / 2
 
     side = [estimate]
@@ -136,12 +117,12 @@ def _profile_side(
         side.append(refit(side[-1], distance))
     for _ in range(EXTENSIONS):
         last = side[-1]
-        if rise(last) > RISE_OF_90 or abs(last.distance) >= limit:
+        if drop(last) > DROP_AT_90 or abs(last.distance) >= limit:
             break
         side.append(refit(last, float(np.sign(last.distance)) * min(2 * abs(last.distance), limit)))
     for _ in range(REFINEMENTS):
-        above = next((k for k, point in enumerate(side) if rise(point) > RISE_OF_90), None)
-        if above is None or rise(side[above]) <= STEEP * RISE_OF_90:
+        above = next((k for k, point in enumerate(side) if drop(point) > DROP_AT_90), None)
+        if above is None or drop(side[above]) <= STEEP * DROP_AT_90:
             break
         side.insert(above, refit(side[above - 1], (side[above - 1].distance + side[above].distance) / 2))
     return side[1:]
@@ -158,7 +139,7 @@ def bootstrap(
     has_weight = weights > 0
     empty = np.flatnonzero(~has_weight.any(axis=1))
     if empty.size:
-        raise ValueError(f"pushes: condition {empty[0]} has no push with a weight, so none can be drawn from it")
+        raise ValueError(f"pushes: condition {empty[0]} has no push with a weight to sample")
     counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in has_weight] for _ in range(n)])
     z = _refitted(
         problem, pushes, found.z, _sigma_by_kind(found), jnp.asarray(counts * weights, found.z.dtype), found.robust
@@ -169,14 +150,10 @@ def bootstrap(
 @jit
 def _refitted(problem: Problem, pushes: Pushes, start, sigma, weights, robust: float | None):
     """Fit z to each row of `weights`, with sigma fixed."""
-    fixed, given, schedule = (
-        FixedEntries.none(start),
-        jnp.array([True, True, True]),
-        Schedule.of(start.dtype, 1, TOLERANCE),
-    )
+    given, frozen, rounds = jnp.ones(3, bool), jnp.zeros(start.shape, bool), Rounds.of(start.dtype, 1, TOLERANCE)
 
     def fit_weighted(weight):
-        return fit(problem, pushes.weighted(weight), start, sigma, robust, given, fixed, schedule).z
+        return fit(problem, pushes.weighted(weight), start, sigma, given, frozen, rounds, robust=robust).z
 
     return jax.vmap(fit_weighted)(weights)
 
@@ -206,19 +183,14 @@ def profile_interval(profile: Profile, level: float = 0.9) -> tuple[float, float
         level: Probability that the interval contains.
 
     Returns:
-        The values between which the rise stays below that of the interval of a normal distribution. If the profile does
-            not rise so far on one side, its outermost value on that side.
+        The values between which the log posterior density drops less than at the ends of the interval of a normal
+            distribution. If the profile does not drop so far on one side, its outermost value on that side.
     """
-    minimum = int(np.argmin(profile.rise))
-    limit = ndtri(0.5 + level / 2) ** 2 / 2
-    ends = []
-    for values, rise in (
-        (profile.value[minimum::-1], profile.rise[minimum::-1]),
-        (profile.value[minimum:], profile.rise[minimum:]),
-    ):
-        rising = np.maximum.accumulate(rise)
-        ends.append(float(np.interp(limit, rising, values)))
-    return ends[0], ends[1]
+    drop, limit = profile.log_posterior_drop, ndtri(0.5 + level / 2) ** 2 / 2
+    top = int(np.argmin(drop))
+    sides = (slice(top, None, -1), slice(top, None))
+    low, high = (float(np.interp(limit, np.maximum.accumulate(drop[side]), profile.value[side])) for side in sides)
+    return low, high
 
 
 def _pushes_and_problem(found: "Identified", pushes: Pushes, slider: Slider, hand: Hand) -> tuple[Pushes, Problem]:
@@ -226,7 +198,8 @@ def _pushes_and_problem(found: "Identified", pushes: Pushes, slider: Slider, han
     dtype = found.z.dtype
     pushes, slider, hand = jax.tree.map(lambda leaf: leaf.astype(dtype), (pushes, slider, hand))
     surface = limit_surfaces(found.prior, found.prior.parameters(found.z))
-    return pushes.as_conditions(), Problem(slider.shape, hand, surface, found.prior, found.length, found.contact_at_end)
+    scene = Scene(slider.shape, hand, found.prior.origin)
+    return pushes.as_conditions(), Problem(scene, surface, found.prior, found.length, found.contact_at_end)
 
 
 def _sigma_by_kind(found: "Identified") -> Array:

@@ -68,7 +68,7 @@ class Unknowns(eqx.Module):
 
     `friction` is a range and `surface_dof` a number of degrees of freedom. From `pressure_center` to
     `friction_by_side`, each field is the standard deviation, in the unit named, of a normal prior about zero. Their
-    default is None.
+    default is None. Distances along the path of a hand include its opening, and its turns at 0.05 m/rad.
 
     Attributes:
         friction: (2,) lowest and highest value of mu. Default: (0, 1).
@@ -161,14 +161,20 @@ def known_parameters(
             raise ValueError(f"known: {name!r} is not one of {', '.join(NORMAL_PRIORS)}{instead.get(name, '')}")
         if name in unknowns.names:
             raise ValueError(f"known: {name!r} is also estimated; leave it out, or pass unknowns with {name}=None")
-        array, size = as_float(value, dtype, f"known[{name!r}]"), SIZES[name] or unknowns.sides
+        size = SIZES[name] or unknowns.sides
         shape = (size,) if name == "friction_by_side" or size > 1 else ()
-        if array.shape not in (shape, (conditions, *shape)):
-            expected = f"{shape}, or {(conditions, *shape)} with an axis of conditions"
-            raise ValueError(f"known: {name!r} has shape {array.shape}; expected {expected}")
-        check_finite(f"known[{name!r}]", array)
-        values[name] = jnp.broadcast_to(array, (conditions, *shape))
+        values[name] = per_condition(f"known[{name!r}]", value, shape, conditions, dtype)
     return values
+
+
+def per_condition(name: str, value: ArrayLike, shape: tuple[int, ...], conditions: int, dtype: Any) -> Array:
+    """Check a value of this shape for all conditions, or for each, and return it with a leading axis of conditions."""
+    array = as_float(value, dtype, name)
+    if array.shape not in (shape, (conditions, *shape)):
+        expected = f"{shape}, or {(conditions, *shape)} with an axis of conditions"
+        raise ValueError(f"{name} has shape {array.shape}; expected {expected}")
+    check_finite(name, array)
+    return jnp.broadcast_to(array, (conditions, *shape))
 
 
 class Parameters(NamedTuple):

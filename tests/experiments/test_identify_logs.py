@@ -20,7 +20,7 @@ from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.datasets.recordings import Recording
 from pushjax.experiments.identify_logs import Options, findings
 from pushjax.experiments.identify_logs.experiment import _warning, conditions
-from pushjax.identification.noise import _LogNoise, _score
+from pushjax.identification.noise import _score
 from pushjax.identification.predictive import PredictiveModel
 from pushjax.identification.pushes_of_recordings import screen
 from pushjax.identification.uncertainty import Profile, _profile_side, _ProfilePoint, bootstrap, profile_interval
@@ -326,7 +326,7 @@ def test_a_push_that_was_seen_too_rarely_is_left_out(log, block):
     rare = replace(whole.pushes[3], seen=np.isin(np.arange(STEPS + 1), (0, 5, STEPS)))
     recordings = replace(whole, pushes=(*whole.pushes[:3], rare, *whole.pushes[4:]))
     screened = screen(recordings, block, pj.Hand.finger(RADIUS), parts=3)
-    assert "the object was seen 1 times on the way; 3 parts need 2" in [p.message for p in screened.problems]
+    assert "the object was tracked 1 times on the way; 3 parts need 2" in [p.message for p in screened.problems]
     assert pj.Pushes.of(screened, STEPS, parts=3, shape=block).wrench.shape == (15, 2 + 1, 3)
     unseen = replace(recordings, pushes=tuple(replace(p, seen=rare.seen) for p in whole.pushes))
     assert len(screen(unseen, block, pj.Hand.finger(RADIUS), parts=3).pushes) == 16  # their final poses are used
@@ -400,9 +400,9 @@ def test_profile_side_finds_a_wall(wall):
 
     estimate = _ProfilePoint(0.0, jnp.zeros(1), 0.0)
     side = [estimate, *_profile_side(refit, estimate, [-1 / 3, -2 / 3, -1.0], limit=20.0)]
-    distances, rises = np.array([[point.distance, point.loss / 2] for point in side]).T
+    distances, drops = np.array([[point.distance, point.loss / 2] for point in side]).T
     assert np.all(np.diff(distances) < 0)
-    profile = Profile("friction", distances[::-1], rises[::-1], distances[::-1] ** 2 / 2)
+    profile = Profile("friction", distances[::-1], drops[::-1], distances[::-1] ** 2 / 2)
     assert profile_interval(profile)[0] == pytest.approx(-wall - 0.0135, abs=0.02 * max(wall, 1))
 
 
@@ -423,19 +423,19 @@ def test_profile_of_a_friction_that_is_only_bounded():
     low, high = profile_interval(friction)
     assert 0.02 < low < 0.06  # with 0.05 the finger slides, with 0.1 it never does
     assert high == pytest.approx(1, abs=0.01)
-    assert friction.rise[0] > 10
+    assert friction.log_posterior_drop[0] > 10
 
 
 @pytest.mark.slow
 def test_profile_is_the_loss_with_one_number_held(few, found, block, surface):
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
     friction = found.profile(few, slider, hand, "friction", points=3)
-    assert friction.rise.min() == 0
+    assert friction.log_posterior_drop.min() == 0
     at = np.argmin(np.abs(friction.normal))
-    assert friction.rise[at] < 1e-3
+    assert friction.log_posterior_drop[at] < 1e-3
     assert friction.value[at] == pytest.approx(float(found.friction), abs=1e-9)
     # with little noise the result is nearly normal
-    np.testing.assert_allclose(friction.rise, friction.normal, rtol=0.3, atol=0.05)
+    np.testing.assert_allclose(friction.log_posterior_drop, friction.normal, rtol=0.3, atol=0.05)
     low, high = profile_interval(friction, 0.9)
     expected = [float(end) for end in found.interval(0.9)["friction"]]
     np.testing.assert_allclose([low, high], expected, atol=0.3 * (expected[1] - expected[0]))
@@ -463,7 +463,7 @@ def test_noise(few, found, block, surface, tmp_path):
     values = (15.0, 3e-4, 4e-4, [0.01, 0.02], 4.0)
     dof, offset, sigma, relative, tails = (jnp.array(value) for value in values)
     score = jnp.array(0.0), jnp.zeros(1)
-    known = pj.Noise(found, dof, friction[0], offset, sigma, relative, tails, *score, "sum_of_squares")
+    known = pj.Noise(dof, friction[0], offset, sigma, relative, tails, found, *score, "sum_of_squares")
     many = jax.tree.map(lambda leaf: jnp.concatenate([leaf] * 5), few)
     drawn = known.predict(jax.random.key(1), many, slider, hand, 2)
     assert drawn.shape == (80, 2, 3)
@@ -483,7 +483,7 @@ def test_noise(few, found, block, surface, tmp_path):
     for one, other in zip(jax.tree.leaves(noise), jax.tree.leaves(loaded), strict=True):
         np.testing.assert_array_equal(one, other)
     found.save(tmp_path / "found.json")
-    with pytest.raises(ValueError, match="does not hold noise that pushjax identified: its format is another"):
+    with pytest.raises(ValueError, match="is not a noise file: its format is another"):
         pj.Noise.load(tmp_path / "found.json")
     likelihood: Any = "likelihood"
     with pytest.raises(ValueError, match="score must be one of energy, density; got 'likelihood'"):
@@ -511,9 +511,8 @@ def test_energy_score_has_a_mean_for_the_longest_tails(few, found, block, surfac
 
     @jax.jit
     def scored(key, relative):
-        numbers = {name: jnp.log(value) for name, value in values.items()}
-        log_noise = _LogNoise(**numbers, relative_error=jnp.log(jnp.full(2, relative)))
-        return _score(log_noise, key, predictive, 8, "energy")[0]
+        logs = {name: jnp.log(value) for name, value in values.items()}
+        return _score(logs | {"relative_error": jnp.log(jnp.full(2, relative))}, key, predictive, 8, "energy")[0]
 
     keys = jax.random.split(jax.random.key(0), 20)
     changes = [float(scored(key, 0.05) - scored(key, 1e-6)) for key in keys]
@@ -531,7 +530,7 @@ def test_density(few, found, block, surface):
     sure = jnp.stack([found.friction, found.friction])
     numbers = (jnp.array(value) for value in (1e9, 1e-9, sigma, [0.0, 0.0], tails))
     dof, offset, spread, none, nu = numbers
-    known = pj.Noise(found, dof, sure, offset, spread, none, nu, jnp.array(0.0), jnp.zeros(1), "sum_of_squares")
+    known = pj.Noise(dof, sure, offset, spread, none, nu, found, jnp.array(0.0), jnp.zeros(1), "sum_of_squares")
     ends = found.predict(few, slider, hand).pose[:, -1]
     off = 1e-3 * np.random.default_rng(0).normal(size=ends.shape) / [1, 1, float(found.length)]
     off[:, 2] += 2 * np.pi * np.arange(len(off))  # full turns do not count

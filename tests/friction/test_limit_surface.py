@@ -360,7 +360,7 @@ def test_wrong_files(tmp_path):
     }
     for content in damaged.values():
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        with pytest.raises(ValueError, match=r"surface\.json does not hold a limit surface"):
+        with pytest.raises(ValueError, match=r"surface\.json is not a limit surface file"):
             LimitSurface.load(path)
     with pytest.raises(FileNotFoundError):
         LimitSurface.load(tmp_path / "none.json")

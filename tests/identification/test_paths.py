@@ -7,6 +7,7 @@ import pytest
 
 import pushjax as pj
 from pushjax.identification.model import correct_path
+from pushjax.identification.pushes_of_recordings import in_meters
 
 
 @pytest.mark.parametrize("column", [2, 3])
@@ -19,12 +20,15 @@ def test_a_hand_that_only_closes_or_turns_keeps_its_path(column):
     # the end of a closing that goes over into a translation is kept, too
     moves = path.at[:, 0].set(jnp.array([0, 0, 0, 0, 0.001, 0.002]))
     np.testing.assert_allclose(correct_path(moves, none, none, jnp.zeros(2)), moves, atol=1e-15)
+    # the hand goes on straight: it translates, and closes or turns, which counts as travel too
     longer = correct_path(moves, jnp.asarray(0.001), none, jnp.zeros(2))
-    np.testing.assert_allclose(longer[-1, 0], 0.003, atol=1e-12)
+    beyond = (longer - moves)[-1] / (moves[-1] - moves[-2])
+    np.testing.assert_allclose(beyond[0], beyond[column], rtol=1e-9)
+    np.testing.assert_allclose(jnp.linalg.norm(in_meters(longer - moves)[-1]), 0.001, rtol=1e-9)
 
 
 def test_friction_from_a_jaw_that_closes():
-    """Pushes by a jaw that only closes on an askew block tell the friction of its pads."""
+    """Pushes by a jaw that only closes on an askew block determine the friction of its pads."""
     slider = pj.Slider(pj.Polygon.rectangle(0.06, 0.04), pj.Ellipsoid(np.eye(3), length=0.025))
     jaw, rng = pj.Hand.parallel_jaw(width=0.03, thickness=0.01), np.random.default_rng(0)
     path = np.asarray(pj.line((0, 0, 0, 0.075), (0, 0, 0, 0.056), 12))

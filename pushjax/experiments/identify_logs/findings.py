@@ -69,7 +69,7 @@ def parameters(findings: Findings, level: float) -> list[dict[str, Any]]:
                 "z": float(found.z[index]),
                 "z_deviation": float(deviation[index]),
                 "profile_value": scale * each.value,
-                "profile_rise": each.rise,
+                "profile_drop": each.log_posterior_drop,
             }
         )
     return rows

@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 
 from pushjax import plot
 from pushjax.experiments.identify_logs.findings import Findings, unit
-from pushjax.identification.uncertainty import RISE_OF_90
+from pushjax.identification.uncertainty import DROP_AT_90
 
 SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
 
@@ -89,12 +89,12 @@ def _profiles(findings: Findings, out: Path) -> Path:
         # Signed distances of the values from the estimate, in standard deviations of z.
         distance = np.sign(np.arange(len(each.normal)) - np.argmin(each.normal)) * np.sqrt(2 * each.normal)
         dense = np.linspace(distance[0], distance[-1], 200)
-        value, rise = (PchipInterpolator(distance, y)(dense) for y in (scale * each.value, each.rise))
-        panel.plot(value, rise, "-", color=plot.BLUE, label="all else at its best")
-        panel.plot(scale * each.value, each.rise, "o", color=plot.BLUE, ms=3)
+        value, drop = (PchipInterpolator(distance, y)(dense) for y in (scale * each.value, each.log_posterior_drop))
+        panel.plot(value, drop, "-", color=plot.BLUE, label="all else at its best")
+        panel.plot(scale * each.value, each.log_posterior_drop, "o", color=plot.BLUE, ms=3)
         panel.plot(value, dense**2 / 2, "--", color=plot.ORANGE, label="normal")
-        panel.axhline(RISE_OF_90, color=plot.GRAY, lw=0.8, label="where a 90 % interval ends")
+        panel.axhline(DROP_AT_90, color=plot.GRAY, lw=0.8, label="where a 90 % interval ends")
         panel.set(xlabel=each.label + (f" / {name}" if name else ""), ylim=(0, 5))
-    axes[0, 0].set_ylabel("rise of the negative log posterior")
+    axes[0, 0].set_ylabel("drop of the log posterior density")
     plot.legend_below(figure, axes[0, 0], columns=3)
     return plot.save(figure, out / "identify_profiles.png")
