@@ -275,12 +275,11 @@ def test_time_limit_is_that_of_make(push_t):
 
 @pytest.mark.parametrize("steps", [2, 400])
 def test_time_limit_may_be_that_of_the_parameters(steps):
-    params = PushT(**QUICK).params(max_steps_in_episode=steps)
-    single = gymnasium.make("pushjax/PushT-v0", params=params, **QUICK)
+    made = {"task": Walk(), "params": Walk().default_params.replace(max_steps_in_episode=steps)}
+    single = gymnasium.make("pushjax/PushT-v0", **made)
     single.reset(seed=0)
-    single.unwrapped._state = single.unwrapped._state.replace(time=np.int32(steps - 2))
-    assert [single.step(np.array([20.0, 20.0]))[3] for _ in range(2)] == [False, True]
-    many = gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, params=params, **QUICK)
+    assert [single.step(np.full(2, 5.0))[3] for _ in range(steps)] == [False] * (steps - 1) + [True]
+    many = gymnasium.make_vec("pushjax/PushT-v0", num_envs=2, **made)
     assert many.params.max_steps_in_episode == steps
 
 
