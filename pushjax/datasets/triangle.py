@@ -133,7 +133,7 @@ def support_force(points: ArrayLike) -> Floats:
     force = np.full(3, -1.0) if on_a_line else np.linalg.solve(balance, np.array([MASS * GRAVITY, 0.0, 0.0]))
     if np.any(force < 0):  # the object would tip over
         raise ValueError(f"the center of mass must lie inside three support points; got {points.tolist()}")
-    return force
+    return np.asarray(force, np.float64)
 
 
 def support_from_name(path: Path) -> tuple[str | None, Floats | None]:

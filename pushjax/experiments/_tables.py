@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
+from pushjax.datasets import Recordings
 from pushjax.geometry.se2 import compose, inverse
 
 MODELS = {"quartic": 4, "ellipsoid": 2}  # limit surfaces and their degrees
+SUPPORT_POINTS = 150  # that stand for uniform pressure
 BOOTSTRAP_SAMPLES = 2000
 
 
@@ -20,6 +22,20 @@ class Prediction(NamedTuple):
     friction: np.ndarray  # (...,), coefficient of friction that was learned
     failed: int  # number of failed steps
     found: pj.Identified | None = None  # None if the method identifies nothing else
+
+
+def polygon(log: Recordings) -> pj.Polygon:
+    """Return the outline of the object."""
+    assert log.vertices is not None  # known for the objects of all tables
+    return pj.Polygon(log.vertices)
+
+
+def support(log: Recordings) -> pj.Support:
+    """Return the support of the object, with unit load: its points, or uniform pressure if it has none."""
+    points, force = log.support_points, log.support_force
+    if points is None or force is None or len(points) == 0:
+        return pj.Support.uniform(polygon(log), SUPPORT_POINTS)
+    return pj.Support.points(points, force / np.sum(force))
 
 
 @jax.jit

@@ -109,6 +109,7 @@ def tips(pushes: Recordings) -> Floats:
 
 def noise_floor_mm(log: Recordings) -> float | None:
     """Estimate the mean deviation of a push from the mean of its repetitions; None without repetitions."""
+    assert log.length is not None  # known for every object of the data set
     whole, middle, fast = (group(log, name) for name in ("whole", "middle", "fast"))
     rows = _repeat_rows(fast, whole)
     if not len(rows):
@@ -120,7 +121,7 @@ def noise_floor_mm(log: Recordings) -> float | None:
         relative_motions(pushes.start, pushes.end)[each] for pushes, each in zip((fast, whole), rows.T, strict=True)
     )
     differences = np.asarray(pj.deviation(quick, slow, log.length), float)
-    ratio = _mean_motion(middle) / _mean_motion(whole)
+    ratio = _mean_motion(middle, log.length) / _mean_motion(whole, log.length)
     return float(1e3 * differences.mean() / np.sqrt(2) * ratio)
 
 
@@ -143,6 +144,6 @@ def _repeat_rows(fast: Recordings, whole: Recordings) -> NDArray[np.int64]:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-def _mean_motion(pushes: Recordings) -> float:
+def _mean_motion(pushes: Recordings, length: float) -> float:
     """Return the mean deviation of the end poses from the start poses, m."""
-    return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, pushes.length), float)))
+    return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, length), float)))

@@ -9,7 +9,7 @@ import numpy as np
 
 import pushjax as pj
 from pushjax.datasets import Recording, Recordings, load_recordings, load_triangle_log
-from pushjax.experiments._tables import MODELS
+from pushjax.experiments._tables import MODELS, polygon, support
 
 SURFACES, OBJECTS = ("hardboard", "plywood"), ("3pts1", "3pts2", "3pts3", "3pts4")
 CONDITIONS = [(surface, name) for surface in SURFACES for name in OBJECTS]
@@ -87,14 +87,12 @@ def ideal_surface(log: Recordings, model: str, key: jax.Array) -> pj.LimitSurfac
         model: "quartic" or "ellipsoid".
         key: PRNG key of the wrench-twist pairs.
     """
-    support = pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
-    return pj.fit_limit_surface(*support.wrench_twist_pairs(key, PAIRS), degree=MODELS[model])
+    return pj.fit_limit_surface(*support(log).wrench_twist_pairs(key, PAIRS), degree=MODELS[model])
 
 
 def outline(log: Recordings, geometry: Geometry) -> pj.Polygon:
     """Return the outline of the triangle, smaller by the inset of the geometry."""
-    polygon = pj.Polygon(log.vertices)
-    return polygon.inset(geometry.inset) if geometry.inset else polygon
+    return polygon(log).inset(geometry.inset) if geometry.inset else polygon(log)
 
 
 def recorded(log: Recordings, geometry: Geometry, steps: int) -> pj.Pushes:

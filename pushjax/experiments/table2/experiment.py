@@ -158,7 +158,7 @@ def _predict(method: str, model: str, data: list[ConditionData], geometry: Geome
 
 
 def _cell(
-    pushes: pj.Pushes, length: float, found: Prediction, train: np.ndarray, rng: np.random.Generator
+    pushes: pj.Pushes, length: float | None, found: Prediction, train: np.ndarray, rng: np.random.Generator
 ) -> dict[str, Any]:
     """Compute the figures of the pushes that were not learned from, over all splits."""
     no_motion = deviation_mm(pushes.start, pushes.end, length)

@@ -5,10 +5,9 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 
-import pushjax as pj
 from pushjax import plot
 from pushjax.datasets import Recordings
-from pushjax.experiments._tables import deviation_mm
+from pushjax.experiments._tables import deviation_mm, polygon
 from pushjax.experiments.two_finger.predictions import Tested, per_push
 from pushjax.plot.style import BLACK, BLUE, GRAY, ORANGE, STYLE, legend_below
 
@@ -50,7 +49,7 @@ def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray)
 
 def _one_push(axes, log: Recordings, push: int, final: np.ndarray) -> None:
     """Draw the start, the measured end and the predicted end of one push, with the fingers."""
-    shape = pj.Polygon(log.vertices)
+    shape = polygon(log)
     drawn = (
         (log.start[push], GRAY, "-", "start"),
         (log.end[push], BLACK, "-", "measured end"),

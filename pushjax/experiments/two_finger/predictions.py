@@ -9,9 +9,9 @@ import numpy as np
 import pushjax as pj
 from pushjax.datasets import Recordings
 from pushjax.datasets.recordings import Floats, interpolated
-from pushjax.experiments._tables import MODELS, final_poses
+from pushjax.experiments._tables import MODELS, final_poses, polygon, support
 
-PAIRS, SUPPORT_POINTS = 400, 150
+PAIRS = 400
 SPLITS, TRAIN_SHARE = 10, 0.4
 FRICTIONS = np.linspace(0.0, 0.8, 17)
 RADII = (0.0, 0.0005, 0.001, 0.0015)
@@ -32,25 +32,21 @@ class Tested(NamedTuple):
     test: list[np.ndarray]  # indices of the test pushes of each split
 
 
-def support(log: Recordings) -> pj.Support:
-    """Return the support of the object, with unit load: its points, or uniform pressure if it has none."""
-    if log.support_points is None or log.support_force is None or len(log.support_points) == 0:
-        return pj.Support.uniform(pj.Polygon(log.vertices), SUPPORT_POINTS)
-    return pj.Support.points(log.support_points, log.support_force / np.sum(log.support_force))
-
-
 def hand_paths(log: Recordings, steps: int) -> Floats:
     """Return the commanded configurations of the hand in equal steps, (n, steps + 1, 4), world, m and rad."""
     if steps < 1:
         raise ValueError(f"steps must be at least 1; got {steps}")
-    rows = [(np.linspace(0, len(push.hand) - 1, steps + 1), np.arange(len(push.hand))) for push in log.pushes]
-    return np.array([interpolated(*each, push.hand) for each, push in zip(rows, log.pushes, strict=True)])
+    paths = []
+    for push in log.pushes:
+        rows = np.arange(len(push.hand), dtype=float)
+        paths.append(interpolated(np.linspace(0, rows[-1], steps + 1), rows, push.hand))
+    return np.array(paths)
 
 
 def predict(log: Recordings, model: str, key: jax.Array, steps: int, batch: int | None = None) -> OnGrid:
     """Simulate every push with every radius and friction, with pushes padded to the number `batch`."""
     pairs = support(log).wrench_twist_pairs(key, PAIRS)
-    slider = pj.Slider(pj.Polygon(log.vertices), pj.fit_limit_surface(*pairs, degree=MODELS[model]))
+    slider = pj.Slider(polygon(log), pj.fit_limit_surface(*pairs, degree=MODELS[model]))
     # logs that are padded to the same number share one compiled program
     rows = np.arange(max(len(log), batch or 0)) % len(log)
     pushes = pj.Pushes(log.start[rows], hand_paths(log, steps)[rows], log.end[rows])

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-import pushjax as pj
 from pushjax.datasets import Recordings
 from pushjax.datasets.recordings import Floats, rotation, wrap_angle
 from pushjax.experiments._tables import BOOTSTRAP_SAMPLES, deviation_mm, relative_motions
@@ -94,10 +93,10 @@ def _repeats(log: Recordings, push_errors: np.ndarray) -> dict[str, Any]:
             continue
         for push in same_action:
             others = same_action[same_action != push]
-            distance = np.asarray(pj.deviation(moved[push], moved[others].mean(axis=0), log.length))
+            distance = float(deviation_mm(moved[push], moved[others].mean(axis=0), log.length))
             # The mean of all repeats is estimated from the other k - 1, which makes the deviation too large by
             # sqrt(k / (k - 1)).
-            floor.append(1e3 * float(distance) * np.sqrt(len(others) / len(same_action)))
+            floor.append(distance * np.sqrt(len(others) / len(same_action)))
             model.append(push_errors[push])
             agree += list(stuck[others] == stuck[push])
     if not floor:
