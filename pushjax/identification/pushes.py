@@ -17,7 +17,6 @@ from pushjax._internal.checks import (
     check_type,
     common_dtype,
 )
-from pushjax.datasets.push_log import PushLog
 from pushjax.datasets.recordings import Recordings
 from pushjax.geometry.shape import Shape
 from pushjax.identification.pushes_of_recordings import push_arrays
@@ -128,11 +127,11 @@ class Pushes(eqx.Module):
         return jax.tree.map(lambda leaf: leaf[None], self) if self.weight.ndim == 1 else self
 
     @staticmethod
-    def of(log: PushLog | Recordings, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
+    def of(log: Recordings, steps: int = STEPS, *, parts: int = 1, shape: Shape | None = None) -> "Pushes":
         """Make pushes from the usable pushes of a log.
 
         Args:
-            log: A log of one finger, or the recordings that `load_recordings` returns.
+            log: The recordings of a log.
             steps: Number of steps of each path.
             parts: Number of equal parts of each push. The slider's pose after each part is used, if it was tracked
                 during all pushes. Otherwise only the final pose is used.
@@ -146,9 +145,8 @@ class Pushes(eqx.Module):
             ValueError: If `steps` or `parts` is less than one, or if several `parts` are not fewer than `steps`.
             TypeError: If `log` is of another type.
         """
-        check_type("log", log, PushLog, Recordings)
-        recordings = log if isinstance(log, Recordings) else Recordings.of_log(log)
-        return Pushes(**push_arrays(recordings, steps, parts, shape))
+        check_type("log", log, Recordings)
+        return Pushes(**push_arrays(log, steps, parts, shape))
 
     @staticmethod
     def conditions(several: Sequence["Pushes"]) -> "Pushes":

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pushjax._internal.jit import quick_jit
-from pushjax.datasets.push_log import Floats, LogError, nothing_usable, rotation
-from pushjax.datasets.recordings import Recording, Recordings
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, nothing_usable, rotation
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.hand import Hand, RoundFinger
 
