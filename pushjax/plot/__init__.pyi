@@ -14,7 +14,6 @@ from .forces import contact_forces as contact_forces
 from .forces import squeeze_forces as squeeze_forces
 from .parts import hand_at as hand_at
 from .parts import outline as outline
-from .push_panel import RecordedPush as RecordedPush
 from .single_pushes import push_figure as push_figure
 from .single_pushes import real_figure as real_figure
 from .surfaces import limit_surfaces as limit_surfaces

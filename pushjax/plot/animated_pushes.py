@@ -14,11 +14,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from pushjax.datasets.recordings import Recording
 from pushjax.geometry.shape import Shape
 from pushjax.plot.animation import Animation
 from pushjax.plot.forces import SQUEEZE_LABEL
 from pushjax.plot.parts import centroids, draw_fixtures, placed_outline, vertices
-from pushjax.plot.push_panel import PushPanel, RecordedPush, fingers_along
+from pushjax.plot.push_panel import PushPanel, fingers_along
 from pushjax.plot.style import BLACK, BLUE, GREEN, ORANGE, PURPLE, RED, STYLE, legend_below, panel_row
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
@@ -32,7 +33,7 @@ MARGIN = 0.04  # width of the empty margin, in units of what is shown
 def animate(
     shape: Shape,
     hand: Hand,
-    pushes: Trajectory | RecordedPush | Mapping[str, Trajectory | RecordedPush],
+    pushes: Trajectory | Recording | Mapping[str, Trajectory | Recording],
     *,
     measured: Mapping[str, np.ndarray] | None = None,
     forces: bool = True,
@@ -52,7 +53,7 @@ def animate(
         shape: Outline of the slider.
         hand: The hand.
         pushes: One push, or several by name, all of that shape and hand: trajectories of `rollout`, or recordings
-            (`RecordedPush`), which are shown without forces.
+            (`pushjax.datasets.Recording`), which are shown without forces.
         measured: Poses (points, 3) by the name of a push, world, m and rad. They are drawn dashed over that push.
         forces: Whether contacts and forces are shown. The arrows of all panels have one scale, and the legend gives
             the largest force.

@@ -1,11 +1,12 @@
 """One panel of an animation of pushes: its data at each point of the push, and what it shows at one of them."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from pushjax.contact.status import ContactMode, Status
+from pushjax.datasets.recordings import Recording
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import contact_forces, squeeze_forces
@@ -30,18 +31,6 @@ ARROWS: dict[str, Any] = {
 }
 
 
-class RecordedPush(NamedTuple):
-    """A push that was measured; world, m and rad.
-
-    Attributes:
-        pose: (points, 3), poses of the slider.
-        configuration: (points, dof), configurations of the hand.
-    """
-
-    pose: np.ndarray
-    configuration: np.ndarray
-
-
 class PushPanel:
     """The outlines, contacts, forces and words of a push, in mm and N, and the artists that show one point of it."""
 
@@ -49,14 +38,14 @@ class PushPanel:
         self,
         shape: Shape,
         hand: Hand,
-        push: Trajectory | RecordedPush,
+        push: Trajectory | Recording,
         measured: np.ndarray | None,  # (points, 3), poses to draw over it, world, m and rad
         forces: bool,  # whether to draw contacts and forces
         friction: float | None,  # at the contacts, to draw the squeeze that holds the slider
     ):
         pose, points = np.asarray(push.pose, float), vertices(shape)
         self.outline, self.center = placed_outline(points, pose), centroids(shape, pose)  # of the slider, by point
-        self.fingers = fingers_along(hand, push.configuration)
+        self.fingers = fingers_along(hand, push.hand if isinstance(push, Recording) else push.configuration)
         if len(self.fingers[0]) != len(pose):
             raise ValueError(f"push has {len(pose)} poses, but {len(self.fingers[0])} configurations")
         self.measured = None if measured is None else placed_outline(points, np.asarray(measured, float))
@@ -65,7 +54,7 @@ class PushPanel:
         self.words = [""] * len(pose)
         self.failed = self.stopped = -1  # the first failed step, and the step at which the hand stops
         self.squeeze = None
-        if not isinstance(push, Trajectory):
+        if isinstance(push, Recording):
             return
         self.failed, self.stopped, self.words = int(push.first_failure), int(push.stopped), _words(push)
         if forces:

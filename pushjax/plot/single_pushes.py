@@ -9,6 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from pushjax.contact.status import Status
+from pushjax.datasets.recordings import Recording
 from pushjax.geometry.shape import Shape
 from pushjax.plot.forces import SQUEEZE_LABEL, Forces, squeeze_forces
 from pushjax.plot.parts import (
@@ -21,7 +22,6 @@ from pushjax.plot.parts import (
     placed_outline,
     vertices,
 )
-from pushjax.plot.push_panel import RecordedPush
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, RED, STYLE, legend_below, panel_row
 from pushjax.simulation.fixtures import Fixture, Wall
 from pushjax.simulation.hand import Hand
@@ -98,9 +98,7 @@ def _title_with_failure(name: str, push: Trajectory) -> str:
     return name if failed_step < 0 else f"{name}\n{Status(int(push.status[failed_step])).name} from step {failed_step}"
 
 
-def real_figure(
-    shape: Shape, pushes: Mapping[str, tuple[RecordedPush, np.ndarray]], hand: Hand | None = None
-) -> Figure:
+def real_figure(shape: Shape, pushes: Mapping[str, tuple[Recording, np.ndarray]], hand: Hand | None = None) -> Figure:
     """Draw real pushes side by side.
 
     The measured start is gray, the measured end is black. The predicted end is blue and dashed; several predicted ends
@@ -108,8 +106,8 @@ def real_figure(
 
     Args:
         shape: Outline of the slider.
-        pushes: By name, a push that was measured, and its predicted pose at the end (3,) or samples of it (draws, 3),
-            world, m and rad. The poses between the first and the last are not drawn and may be missing.
+        pushes: By name, a recording, and its predicted pose at the end (3,) or samples of it (draws, 3), world, m and
+            rad.
         hand: The hand. None: it is not drawn.
     """
     with plt.rc_context(STYLE):
@@ -119,7 +117,7 @@ def real_figure(
             outline(axes, shape, push.pose[-1], BLACK, 1.5, label="measured end")
             _draw_predicted(axes, shape, np.asarray(predicted))
             if hand is not None:
-                fingers = finger_poses(hand, push.configuration)
+                fingers = finger_poses(hand, push.hand)
                 for k in range(fingers.shape[1]):
                     label = "fingers' paths" if k == 0 else None
                     axes.plot(*(MM * fingers[:, k, :2]).T, "-.", color=ORANGE, lw=1.2, label=label)

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from pushes import trajectory
 
 import pushjax as pj
 from pushjax import plot
+from pushjax.datasets import Recording
 from pushjax.plot.style import GREEN
 
 BLOCK, FINGER = pj.Polygon.rectangle(SIDE, SIDE), pj.Hand.finger(RADIUS)
@@ -31,9 +33,9 @@ def push():
     return pj.rollout(slider, FINGER, path, pose=jnp.array([0.0, 0.0, 0.1]), friction=0.15)
 
 
-def recorded(points: int = 8) -> plot.RecordedPush:
+def recorded(points: int = 8) -> Recording:
     pose = np.linspace(0, 1, points)[:, None] * np.array([0.03, -0.01, 0.4])
-    return plot.RecordedPush(pose, pose[:, :2] - [0.035, 0])
+    return Recording(0, pose[:, :2] - [0.035, 0], pose)
 
 
 def lines(axes) -> dict[str, np.ndarray]:
@@ -159,7 +161,7 @@ def test_refuses(tmp_path):
     with pytest.raises(ValueError, match="frames must be at least 2; got 1"):
         plot.animate(BLOCK, FINGER, recorded(), frames=1)
     with pytest.raises(ValueError, match="push has 8 poses, but 7 configurations"):
-        plot.animate(BLOCK, FINGER, recorded()._replace(configuration=recorded().configuration[1:]))
+        plot.animate(BLOCK, FINGER, replace(recorded(), hand=recorded().hand[1:]))
     moving = plot.animate(BLOCK, FINGER, recorded(), frames=2)
     with pytest.raises(ValueError, match=r"a.avi: motion is written as .gif, .html, .mp4; got .avi"):
         plot.save(moving, tmp_path / "a.avi")

@@ -17,6 +17,7 @@ from pushes import trajectory
 import pushjax as pj
 from pushjax import plot
 from pushjax.contact.problem import Motion
+from pushjax.datasets import Recording
 from pushjax.friction.support import WrenchTwistPairs
 from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, ORANGE, PURPLE, RED
 
@@ -90,7 +91,7 @@ def test_real_figure():
     measured, predicted = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.3]]), np.array([0.021, 0.001, 0.25])
     path = np.array([[-0.035, 0.0], [-0.02, 0.0], [-0.015, 0.0]])
     draws = predicted + 1e-3 * np.random.default_rng(0).normal(size=(30, 3))
-    push = plot.RecordedPush(measured, path)
+    push = Recording(0, path, np.insert(measured, 1, np.nan, axis=0))
     figure = plot.real_figure(BLOCK, {"median: 1.2 mm": (push, predicted), "cloud": (push, draws)}, FINGER)
     legible(figure)
     left, right = figure.axes
