@@ -235,6 +235,9 @@ def test_scripts_in_commands_exist():
     named = {name for path in PAGES for name in re.findall(r"python (docs/[\w/]+\.py)", path.read_text())}
     assert named
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+    pictures = {name for path in PAGES for name in re.findall(r"python docs/pictures\.py (\w+)", path.read_text())}
+    script = (DOCS / "pictures.py").read_text()
+    assert [name for name in sorted(pictures) if f"\ndef {name}() -> " not in script] == []
 
 
 def test_benchmarks_in_commands_exist():
