@@ -38,34 +38,15 @@ _SHIFT = 8.03e-5
 
 
 class MitShape(NamedTuple):
-    """The outline of an object, and the tip that pushes it.
+    """The outline of an object, and the tip that pushes it; ellipses have 99 vertices, the butterfly has 636."""
 
-    Attributes:
-        vertices: (v, 2) vertices in m, body frame, counterclockwise.
-        length: Characteristic length, in m, which weighs rotation against translation: the mean distance of the
-            vertices from their mean.
-        tip_radius: Radius of the tip, in m.
-    """
-
-    vertices: Floats
-    length: float
-    tip_radius: float
+    vertices: Floats  # (v, 2), m, body frame, counterclockwise
+    length: float  # mean distance of the vertices from their mean, m, which weighs rotation against translation
+    tip_radius: float  # m
 
 
 def mit_shape(name: str) -> MitShape:
-    """Return one of the shapes in MIT_SHAPES.
-
-    Ellipses have 99 vertices, the butterfly has 636.
-
-    Args:
-        name: Name of the shape in the data set.
-
-    Returns:
-        The outline, its characteristic length and the tip's radius.
-
-    Raises:
-        ValueError: If the name is not in MIT_SHAPES.
-    """
+    """Return one of the shapes in MIT_SHAPES."""
     if name not in MIT_SHAPES:
         raise ValueError(f"shape must be one of {', '.join(MIT_SHAPES)}; got {name!r}")
     vertices = _vertices(name)
@@ -80,16 +61,12 @@ def nearest_on_outline(vertices: Floats, points: Floats) -> tuple[Floats, Floats
     distance = np.linalg.norm(offset - fraction[..., None] * edge, axis=2)
     rows, edge_index = np.arange(len(points)), np.argmin(distance, axis=1)
     nearest_point = vertices[edge_index] + fraction[rows, edge_index][:, None] * edge[edge_index]
-    # Winding number of the outline about each point. It counts the edges that cross the ray from the point along +x.
-    # Rising edges add one, falling edges subtract one. It is not zero for a point inside.
-    vertex_above = offset[..., 1] < 0
+    # A point is inside if the ray from it along +x crosses an odd number of edges.
+    above = offset[..., 1] < 0  # whether the first vertex of each edge is above the point
+    next_above = np.roll(above, -1, axis=1)
     left = edge[:, 0] * offset[..., 1] > edge[:, 1] * offset[..., 0]
-    rising, falling = (
-        ~vertex_above & np.roll(vertex_above, -1, axis=1),
-        vertex_above & ~np.roll(vertex_above, -1, axis=1),
-    )
-    winding = np.sum(rising & left, axis=1) - np.sum(falling & ~left, axis=1)
-    return np.where(winding == 0, 1, -1) * distance[rows, edge_index], nearest_point
+    inside = np.sum((above != next_above) & (left == next_above), axis=1) % 2 == 1
+    return np.where(inside, -1, 1) * distance[rows, edge_index], nearest_point
 
 
 def _vertices(name: str) -> Floats:

@@ -91,18 +91,15 @@ def load_csv(path: Path) -> Recordings:
 
 def _nonblank_rows(path: Path) -> Iterator[_Row]:
     """Iterate over the rows that are not blank."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file)
-            try:
-                for cells in reader:
-                    if any(cell.strip() for cell in cells):
-                        yield _Row(reader.line_num, cells)
-            except (csv.Error, UnicodeDecodeError) as error:
-                message = f"expected a table in UTF-8 text, found something else: {error}"
-                raise LogError(path, message, line=reader.line_num + 1) from error
-    except OSError as error:
-        raise LogError(path, f"expected a table, but cannot read the file: {error.strerror or error}") from error
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        reader = csv.reader(file)
+        try:
+            for cells in reader:
+                if any(cell.strip() for cell in cells):
+                    yield _Row(reader.line_num, cells)
+        except (csv.Error, UnicodeDecodeError) as error:
+            message = f"expected a table in UTF-8 text, found something else: {error}"
+            raise LogError(path, message, line=reader.line_num + 1) from error
 
 
 def _check_header(path: Path, header: _Row) -> list[str]:
@@ -206,7 +203,8 @@ def _read_row(path: Path, row: int, numbers: Mapping[str, Floats], data: Arrays)
             pose[0], pose[-1] = numbers["start"][row], numbers["end"][row]
     samples = {name: numbers[name][row, :count] for name in ("force", "time") if name in numbers}
     pairs = {name: numbers[name][row] for name in ("wrench", "twist") if name in numbers}
-    pairs = {name: values[~np.isnan(values).all(axis=1)] for name, values in pairs.items()}
+    known = np.isfinite(sum(pairs.values(), np.zeros(3))).all(axis=-1)
+    pairs = {name: values[known] for name, values in pairs.items()}
     about = {name.removeprefix(_ABOUT): array[row] for name, array in data.items() if name.startswith(_ABOUT)}
     index = int(numbers["index"][row]) if "index" in numbers else row
     return checked_recording(path, index, hand[:count], pose, **samples, **pairs, about=about)
@@ -224,27 +222,22 @@ def _read_archive(path: Path) -> Arrays:
             return {name: archive[name] for name in archive.files}
     except LogError:
         raise
-    except OSError as error:
-        raise LogError(
-            path, f"expected an .npz archive, but cannot read the file: {error.strerror or error}"
-        ) from error
     # A damaged archive may request a compression method that does not exist, or more memory than there is.
-    except (ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, RuntimeError, MemoryError, zlib.error, zipfile.BadZipFile) as error:
         raise LogError(path, f"expected an .npz archive of pushes, found something else: {error}") from error
 
 
 def _check_names(path: Path, names: set[str]) -> None:
     """Raise LogError for unknown, missing or conflicting arrays."""
-    unknown = sorted(name for name in names if name not in _SHAPES and not name.startswith(_ABOUT))
-    if "path" not in names or unknown:
-        found = f"unknown arrays {', '.join(unknown[:10])}" if unknown else "no path"
-        raise LogError(path, f"expected arrays of pushes: {LAYOUT}; found {found}")
     if "pose" in names and names & {"start", "end"}:
         raise LogError(path, "expected either start and end or pose, found both")
-    pairs = (("wrench", "twist"), ("problem", "problem_push"), *([] if "pose" in names else [("start", "end")]))
-    needed = {name for pair in pairs if names & set(pair) or pair[0] == "start" for name in pair}
-    if needed - names:
-        raise LogError(path, f"expected {LAYOUT}; found no {', '.join(sorted(needed - names))}")
+    needed = {"path", *(("pose",) if "pose" in names else ("start", "end"))}
+    needed = needed.union(*(pair for pair in (("wrench", "twist"), ("problem", "problem_push")) if names & set(pair)))
+    unknown = sorted(name for name in names if name not in _SHAPES and not name.startswith(_ABOUT))
+    kinds = (("unknown arrays", unknown[:10]), ("no", sorted(needed - names)))
+    faults = [f"{what} {', '.join(found)}" for what, found in kinds if found]
+    if faults:
+        raise LogError(path, f"expected arrays of pushes: {LAYOUT}; found {'; '.join(faults)}")
 
 
 def _check_arrays(path: Path, data: Arrays) -> None:

@@ -27,9 +27,9 @@ class LogError(ValueError):
     """
 
     def __init__(
-        self, path: str | PathLike[str], message: str, *, push: int | None = None, line: int | None = None
+        self, path: str | PathLike[str], message: str, push: int | None = None, line: int | None = None
     ) -> None:
-        super().__init__(message)
+        super().__init__(path, message, push, line)  # all arguments, from which pickle makes the error again
         self.path = fspath(path)
         self.message = message
         self.push = push
@@ -42,15 +42,6 @@ class LogError(ValueError):
         if self.line is not None:
             place.append(f"line {self.line}")
         return f"{', '.join(place)}: {self.message}"
-
-    def __reduce__(self) -> tuple[object, ...]:
-        # By default, pickle rebuilds an exception from its message alone. That would fail between processes.
-        return _rebuild_error, (self.path, self.message, self.push, self.line)
-
-
-def _rebuild_error(path: str, message: str, push: int | None, line: int | None) -> LogError:
-    """Rebuild a pickled error."""
-    return LogError(path, message, push=push, line=line)
 
 
 def nothing_usable(path: str | PathLike[str], problems: Sequence[LogError]) -> LogError:

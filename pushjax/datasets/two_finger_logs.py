@@ -9,9 +9,10 @@ direction in which the hand first approaches. Only the object's poses are taken 
 is the commanded one, from the measured start pose, because the robot's own stream ends after half of the rotation.
 """
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def load_two_finger_logs(folder: str | PathLike[str]) -> Recordings:
     sensors = sorted(path.glob("exp_*_sensor*.txt"))
     if not sensors:
         raise LogError(path, "expected logs exp_…_sensor….txt, found none")
-    found: list[_Push | LogError] = []
+    found: list[Recording | LogError] = []
     for sensor in sensors:
         try:
             actions = _read_actions(sensor.with_name(sensor.name.replace("_sensor", "_pushaction")))
@@ -78,61 +79,36 @@ def load_two_finger_logs(folder: str | PathLike[str]) -> Recordings:
             continue
         found += [_convert_push(sensor, *each) for each in zip(records, actions, strict=False)]
         found += [each for each in problems if each.push is None or each.push < len(actions)]
-    pushes = sorted((each for each in found if isinstance(each, _Push)), key=lambda each: each.began)
-    errors = [each for each in found if isinstance(each, LogError)]
     known = triangle.facts(None, *triangle.support_from_name(path / "any"))
-    return collect(path, [*_recordings(pushes), *errors], **known | {"tip_radius": None})
+    log = collect(path, found, **known | {"tip_radius": None})
+    pushes = sorted(log.pushes, key=lambda push: push.about["began"])
+    action = np.unique([push.about["action"] for push in pushes], axis=0, return_inverse=True)[1].reshape(-1)
+    numbered = (
+        replace(push, index=index, about={**push.about, "action": int(action[index])})
+        for index, push in enumerate(pushes)
+    )
+    return replace(log, pushes=tuple(numbered))
 
 
-class _Push(NamedTuple):
-    """A push, with poses (3,) of object and hand in the world frame."""
-
-    action: Action
-    began: float  # s since 1970
-    start: Floats
-    end: Floats
-    hand_start: Floats
-    hand_end: Floats
-    turn: float  # rad, by which the hand turns
-    center: Floats  # (2,), about which the hand turns, m; NaN if it does not turn
-
-
-def _recordings(pushes: list[_Push]) -> list[Recording]:
-    """Return the recordings of the pushes, numbered in their order."""
-    if not pushes:
-        return []
-    nominal = [push.action.nominal for push in pushes]
-    group = np.unique(nominal, axis=0, return_inverse=True)[1].reshape(-1)
-    ends = [(push.start, push.end) for push in pushes]
-    hand = [np.array([getattr(push, name) for push in pushes]) for name in ("hand_start", "hand_end", "turn", "center")]
-    paths = commanded_paths(*hand)
-    return [
-        make_push(index, path, *ends[index], action=int(group[index]), began=pushes[index].began)
-        for index, path in enumerate(paths)
-    ]
-
-
-def make_push(index: int, path: Floats, start: Floats, end: Floats, **about: float) -> Recording:
-    """Return the push of a hand along a path (m, 4), with the poses (3,) of the object before and after."""
-    pose = np.full((len(path), 3), np.nan)
-    pose[0], pose[-1] = start, end
-    return Recording(index, path, pose, about=about)
-
-
-def commanded_paths(start: Floats, end: Floats, turn: Floats, center: Floats) -> Floats:
-    """Return the paths (n, PATH_STEPS + 1, 4) of hands that turn about centers (n, 2) or move straight, in m and rad.
-
-    Start and end poses are (n, 3). Hands with a `turn` (n,) of zero move straight, and their centers are not used.
-    """
+def make_push(
+    index: int,
+    ends: tuple[Floats, Floats],  # poses (3,) of the object
+    hands: tuple[Floats, Floats],  # poses (3,) of the hand, commanded
+    turn: float,  # of the hand, rad; if it is zero, the hand moves straight
+    center: Floats,  # (2,), about which the hand turns, m
+    **about: Any,
+) -> Recording:
+    """Return the push of a hand along its commanded path, with the poses of the object before and after."""
     fraction = np.linspace(0.0, 1.0, PATH_STEPS + 1)
-    angle = fraction * turn[:, None]
-    origin, travel = start[:, None, :2], (end - start)[:, None, :2]
-    turns = turn != 0
-    center = np.where(turns[:, None], center, 0.0)[:, None]
-    turned = center + np.einsum("nsij,nj->nsi", rotation(angle), (origin - center)[:, 0])
-    position = np.where(turns[:, None, None], turned, origin + fraction[:, None] * travel)
-    theta = start[:, 2, None] + angle
-    return np.concatenate([position, theta[..., None], np.full_like(theta, SPACING)[..., None]], axis=-1)
+    start, end = hands
+    if turn:
+        position = center + np.einsum("sij,j->si", rotation(fraction * turn), start[:2] - center)
+    else:
+        position = start[:2] + fraction[:, None] * (end - start)[:2]
+    path = np.column_stack([position, start[2] + fraction * turn, np.full(len(fraction), SPACING)])
+    pose = np.full((len(path), 3), np.nan)
+    pose[0], pose[-1] = ends
+    return Recording(index, path, pose, about=about)
 
 
 def _read_actions(path: Path) -> list[Action]:
@@ -175,7 +151,7 @@ def _parse_action(kind: str, values: list[Floats]) -> Action:
     )
 
 
-def _convert_push(path: Path, record: Record, action: Action) -> _Push | LogError:
+def _convert_push(path: Path, record: Record, action: Action) -> Recording | LogError:
     """Return the push of a record, or the error that says why it is not usable."""
 
     def error(message: str) -> LogError:
@@ -204,7 +180,8 @@ def _convert_push(path: Path, record: Record, action: Action) -> _Push | LogErro
     if not abs(end[2] - start[2]) < MAX_TURN:
         found = f"found {np.degrees(end[2] - start[2]):.3g}: the motion capture jumped"
         return error(f"expected the object to turn by less than 60 degrees, {found}")
-    return _Push(action, float(record.force[0, 0]), start, end, hand_start, hand_end, turn, center)
+    about = {"action": action.nominal, "began": float(record.force[0, 0])}
+    return make_push(record.index, (start, end), (hand_start, hand_end), turn, center, **about)
 
 
 def _finger_gap(hand: Floats, pose: Floats) -> float:

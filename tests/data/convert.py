@@ -19,7 +19,6 @@ from pushjax.datasets import LogError, Recording, Recordings
 from pushjax.datasets.recordings import wrap_angle
 from pushjax.datasets.streams import Stream, align_streams
 from pushjax.datasets.triangle import make_push
-from pushjax.datasets.two_finger_logs import commanded_paths
 from pushjax.datasets.two_finger_logs import make_push as make_two_finger_push
 
 Arrays = dict[str, Any]
@@ -78,12 +77,13 @@ def two_fingers(path: Path, data: Arrays) -> Recordings:
     """Convert pushes of the triangle by two fingers."""
     start = np.array(data["object_pose_start"], float)
     end = nearest_end(start, data["object_pose_end"])
-    hand = (data[name] for name in ("pusher_pose_start", "pusher_pose_end", "rotation_angle", "cor_world"))
-    paths = commanded_paths(*(np.array(array, float) for array in hand))
+    names = ("pusher_pose_start", "pusher_pose_end", "rotation_angle", "cor_world")
+    hand_start, hand_end, turn, center = (np.array(data[name], float) for name in names)
 
     def push(row: int) -> Recording:
         about = {"action": int(data["action_group"][row]), "began": float(data["t0_unix"][row])}
-        return make_two_finger_push(int(data["push_index"][row]), paths[row], start[row], end[row], **about)
+        ends, hands = (start[row], end[row]), (hand_start[row], hand_end[row])
+        return make_two_finger_push(int(data["push_index"][row]), ends, hands, turn[row], center[row], **about)
 
     return recordings(path, data, valid_pushes(path, data, push))
 

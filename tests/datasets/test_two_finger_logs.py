@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pushjax.datasets import LogError, load_recordings, load_two_finger_logs
-from pushjax.datasets.two_finger_logs import commanded_paths
+from pushjax.datasets.two_finger_logs import make_push
 
 
 @pytest.fixture
@@ -42,20 +42,18 @@ def test_a_push_is_that_of_the_curated_arrays(converted, session):
     assert log.length == pytest.approx(curated.length)
 
 
-def test_paths_turn_rigidly_or_go_straight_to_the_commanded_end():
-    rng = np.random.default_rng(5)
-    start, turn, center = rng.normal(size=(4, 3)), np.array([0.0, 0.1, -0.2, 0.3]), rng.normal(size=(4, 2))
-    center[0] = np.nan
-    end = start + rng.normal(size=(4, 3))
-    paths = commanded_paths(start, end, turn, center)
-    assert np.isfinite(paths).all()
-    np.testing.assert_allclose(paths[:, 0, :3], start, atol=1e-12)
-    np.testing.assert_allclose(paths[0, -1, :2], end[0, :2], atol=1e-12)
-    np.testing.assert_allclose(paths[:, -1, 2], start[:, 2] + turn, atol=1e-12)
-    np.testing.assert_allclose(paths[..., 3], 0.05)
-    np.testing.assert_allclose(np.diff(paths[0, :, :2], n=2, axis=0), 0, atol=1e-12)
-    away = np.linalg.norm(paths[1:, :, :2] - center[1:, None], axis=-1)
-    np.testing.assert_allclose(away, np.broadcast_to(away[:, :1], away.shape), atol=1e-12)
+def test_paths_turn_rigidly_or_go_straight_to_the_commanded_end(rng):
+    for turn in (0.0, 0.1, -0.2):
+        start, end, pose = rng.normal(size=(3, 3))
+        center = rng.normal(size=2)
+        path = make_push(0, (pose, pose), (start, end), turn, center).hand
+        np.testing.assert_allclose(path[0], [*start, 0.05], atol=1e-12)
+        np.testing.assert_allclose(path[-1, 2], start[2] + turn, atol=1e-12)
+        if turn:
+            np.testing.assert_allclose(np.ptp(np.linalg.norm(path[:, :2] - center, axis=1)), 0, atol=1e-12)
+        else:
+            np.testing.assert_allclose(path[-1, :2], end[:2], atol=1e-12)
+            np.testing.assert_allclose(np.diff(path[:, :2], n=2, axis=0), 0, atol=1e-12)
 
 
 def test_a_straight_push_follows_its_action(session):
