@@ -12,14 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from pushjax._internal.checks import (
-    ArrayLike,
-    as_float,
-    check_finite,
-    check_positive,
-    check_shape,
-    common_dtype,
-)
+from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, check_shape, common_dtype
 from pushjax._internal.jit import quick_jit
 
 # The smallest bandwidth of a density estimate, in m. No tracker resolves less, and grasps end in distributions that
@@ -115,10 +108,7 @@ def _energy_score(x: Array, y: Array, scale: Array) -> Array:
 
 
 def _score_distance(a: Array, b: Array, length: Array) -> Array:
-    """Return the distance d of `energy_score` between poses, m.
-
-    Its derivative at distance zero, where it has a corner, is zero.
-    """
+    """Return the distance d of `energy_score` between poses, m; its derivative at its corner, zero, is zero."""
     a, b = jnp.broadcast_arrays(a, b)
     difference = a - b
     chord = 2 * length * jnp.sin(difference[..., 2] / 2)
@@ -227,13 +217,7 @@ def mean_pose(poses: Float[Array, "n 3"]) -> Float[Array, "3"]:
 
 
 class _Kernel:
-    """Gaussian kernels centered at the samples, each repeated one full turn away on either side.
-
-    Args:
-        points: Samples as points (n, 3), as from `_flat_points`, m.
-        min_bandwidth: Standard deviation that is added in every direction, m.
-        length: Length that weighs the angle, m.
-    """
+    """Gaussian kernels centered at the points of `_flat_points`, each repeated one full turn away on either side."""
 
     def __init__(self, points: Array, min_bandwidth: Array, length: Array):
         n = points.shape[0]
@@ -256,11 +240,8 @@ class _Kernel:
 
 
 def _flat_points(samples: Array, observed: Array, length: Array) -> tuple[Array, Array]:
-    """Return samples and observations as points (x, y, length * theta), m, relative to the mean of the samples.
-
-    Angles are unwrapped to within half a turn of the samples' mean direction. Positions are relative to their mean,
-    because float32 has no digits to lose.
-    """
+    """Return samples and observations as points (x, y, length * theta), m, relative to the mean of the samples."""
+    # Positions are relative because float32 has no digits to lose, and angles are within half a turn of their mean.
     center = mean_pose(samples)
 
     def relative_points(poses: Array) -> Array:
