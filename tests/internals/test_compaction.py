@@ -17,6 +17,9 @@ def chosen(needed, x, shared):
     return where_needed_without_derivatives(needed, work, otherwise, x, shared)
 
 
+each_chosen = jax.jit(jax.vmap(chosen, in_axes=(0, 0, None)))
+
+
 def expected(needed, x, shared):
     return {"square": np.where(needed, x * x + shared, x), "sign": np.where(needed, np.sign(x), 0)}
 
@@ -31,12 +34,21 @@ def same(found, wanted):
 def test_only_those_in_need_are_changed(size, share):
     rng = np.random.default_rng(size)
     x, needed = rng.integers(-9, 10, size).astype(np.float32), rng.random(size) < share
-    found = jax.jit(jax.vmap(chosen, in_axes=(0, 0, None)))(needed, x, np.float32(2))
-    same(found, expected(needed, x, 2))
+    same(each_chosen(needed, x, np.float32(2)), expected(needed, x, 2))
 
 
-@pytest.mark.parametrize("axes", [(None, 0, 0), (0, None, 0), (0, 0, None), (0, None, None), (None, None, 0)])
-@pytest.mark.parametrize("inner", [(0, 0, None), (0, 0, 0), (None, 0, None), (0, None, None)])
+# of `needed`, `x` and `shared`; over the rows, each of them has neither, either and both axes
+@pytest.mark.parametrize(
+    ("axes", "inner"),
+    [
+        ((None, 0, 0), (0, 0, None)),
+        ((0, None, 0), (0, 0, 0)),
+        ((0, 0, None), (None, 0, None)),
+        ((0, None, None), (0, None, None)),
+        ((None, None, 0), (None, 0, None)),
+        ((None, 0, None), (0, None, 0)),
+    ],
+)
 def test_a_batch_of_batches(axes, inner):
     """With two batch axes, every argument may or may not have either axis."""
     rng = np.random.default_rng(0)
@@ -46,7 +58,7 @@ def test_a_batch_of_batches(axes, inner):
         return rng.random(sizes) < 0.4 if kind == 0 else rng.integers(-9, 10, sizes).astype(np.float32)
 
     args = [draw(kind) for kind in range(3)]
-    found = jax.vmap(jax.vmap(chosen, in_axes=inner), in_axes=axes)(*args)
+    found = jax.jit(jax.vmap(jax.vmap(chosen, in_axes=inner), in_axes=axes))(*args)
     wide = []
     for kind, value in enumerate(args):
         shape = [n if axis == 0 else 1 for n, axis in ((4, axes[kind]), (50, inner[kind]))]
@@ -81,12 +93,15 @@ def rounds_of(needed, start, limit):
     return where_needed_without_derivatives(needed, collatz, otherwise, start, limit)
 
 
+each_of_rounds = jax.jit(jax.vmap(rounds_of, in_axes=(0, 0, None)))
+
+
 @pytest.mark.parametrize("size", [1, 3, PLACES, PLACES + 1, 3 * PLACES + 7])
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
 def test_rounds_of_different_numbers(size, share):
     rng = np.random.default_rng(size)
     start, needed = rng.integers(2, 1000, size).astype(np.int32), rng.random(size) < share
-    found = jax.jit(jax.vmap(rounds_of, in_axes=(0, 0, None)))(needed, start, np.int32(90))
+    found = each_of_rounds(needed, start, np.int32(90))
     wanted = [collatz_of(int(x), 90) if n else (0, x) for x, n in zip(start, needed, strict=True)]
     same(found, {"rounds": [w[0] for w in wanted], "last": [w[1] for w in wanted]})
 
@@ -94,7 +109,7 @@ def test_rounds_of_different_numbers(size, share):
 def test_rounds_in_batches_of_batches_and_alone():
     rng = np.random.default_rng(1)
     start, needed, limit = rng.integers(2, 1000, (5, 70)), rng.random((5, 70)) < 0.5, np.array([3, 9, 20, 40, 90])
-    found = jax.vmap(jax.vmap(rounds_of, in_axes=(0, 0, None)))(needed, start, limit)
+    found = jax.jit(jax.vmap(jax.vmap(rounds_of, in_axes=(0, 0, None))))(needed, start, limit)
     for k in (0, 4):
         one = rounds_of(needed[k, 7], jnp.asarray(start[k, 7]), limit[k])
         same(one, {name: found[name][k, 7] for name in one})
