@@ -168,18 +168,12 @@ def _check_no_jump(path: Path, push: Recording) -> None:
         )
 
 
-def times_at(push: Recording, fractions: Sequence[float] | Floats) -> Floats:
-    """Return the times (k,), in s, at these fractions (k,) of the duration of a push."""
+def states_at(push: Recording, fractions: Sequence[float] | Floats) -> tuple[Floats, Floats, Floats]:
+    """Return times (k,), poses (k, 3) and the hand's configurations (k, dof) at fractions (k,) of the duration."""
     assert push.time is not None
     begin, end = push.time[0], push.time[-1]
-    return np.clip(begin + np.asarray(fractions) * (end - begin), begin, end)  # roundoff might exceed the end
-
-
-def states_at(push: Recording, fractions: Sequence[float] | Floats) -> tuple[Floats, Floats]:
-    """Return the poses (k, 3) and the hand's configurations (k, dof) at fractions (k,) of the duration of a push."""
-    assert push.time is not None
-    times = times_at(push, fractions)
-    return interpolated(times, push.time, push.pose), interpolated(times, push.time, push.hand)
+    times = np.clip(begin + np.asarray(fractions) * (end - begin), begin, end)  # roundoff might exceed the end
+    return times, interpolated(times, push.time, push.pose), interpolated(times, push.time, push.hand)
 
 
 def in_body(pose: Floats, vectors: Floats) -> Floats:
@@ -195,9 +189,8 @@ def _wrench_twist_pairs(push: Recording, body: MitShape) -> Iterator[tuple[Float
     distance, contact = nearest_on_outline(body.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
     torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
-    fractions = np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1)
-    poses, _ = states_at(push, fractions)
-    row_at = np.searchsorted(push.time, times_at(push, fractions))
+    times, poses, _ = states_at(push, np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1))
+    row_at = np.searchsorted(push.time, times)
     for part in range(0, 2 * NUM_PARTS, 2):
         rows = slice(row_at[part], row_at[part + 2])
         if rows.start == rows.stop:

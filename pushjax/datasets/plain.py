@@ -64,14 +64,6 @@ class _Row(NamedTuple):
     cells: list[str]
 
 
-class _ParseError(Exception):
-    """A row that cannot be read."""
-
-    def __init__(self, message: str, line: int) -> None:
-        super().__init__(message)
-        self.line = line
-
-
 def load_csv(path: Path) -> Recordings:
     """Read a table in UTF-8 text, with a header, columns in any order, and consecutive rows for each push."""
     rows = _nonblank_rows(path)
@@ -121,10 +113,12 @@ def _check_header(path: Path, header: _Row) -> list[str]:
 
 def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Recording | LogError:
     """Read the rows of one push, or return the error that describes its first fault."""
-    try:
-        numbers = [_read_line(names, row) for row in rows]
-    except _ParseError as fault:
-        return LogError(path, str(fault), push=index, line=fault.line)
+    numbers = []
+    for row in rows:
+        try:
+            numbers.append(_read_cells(names, row.cells))
+        except ValueError as fault:
+            return LogError(path, str(fault), push=index, line=row.line)
 
     def columns(wanted: tuple[str, ...]) -> Floats:
         return np.array([[row[name] for name in wanted] for row in numbers], dtype=np.float64)
@@ -140,28 +134,25 @@ def _read_push(path: Path, index: int, names: list[str], rows: list[_Row]) -> Re
     )
 
 
-def _read_line(names: list[str], row: _Row) -> Mapping[str, float]:
-    """Read the numbers of a row, by column, or raise _ParseError; NaN for a blank cell where it is allowed."""
-    if len(row.cells) != len(names):
-        raise _ParseError(f"expected {len(names)} cells, as in the header, found {len(row.cells)}", row.line)
-    cells = dict(zip(names, (cell.strip() for cell in row.cells), strict=True))
-    if not cells.pop(_PUSH):
-        raise _ParseError(f"expected the number of the push in column {_PUSH}, found a blank", row.line)
-    return {name: _read_cell(name, cell, row.line) for name, cell in cells.items()}
-
-
-def _read_cell(name: str, cell: str, line: int) -> float:
-    """Read the number in a cell, or raise _ParseError; NaN for a blank cell where it is allowed."""
-    if not cell and name in _MAY_BE_BLANK:
-        return math.nan
-    try:
-        value = float(cell)
-    except ValueError:
-        found = quoted(cell) if cell else "a blank"
-        raise _ParseError(f"expected a number in column {name}, found {found}", line) from None
-    if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_BE_BLANK):
-        raise _ParseError(f"expected a finite number in column {name}, found {cell}", line)
-    return value
+def _read_cells(names: list[str], cells: list[str]) -> Mapping[str, float]:
+    """Return the numbers of a row, by column, or raise ValueError; NaN for a blank cell where it is allowed."""
+    if len(cells) != len(names):
+        raise ValueError(f"expected {len(names)} cells, as in the header, found {len(cells)}")
+    numbers = {}
+    for name, cell in zip(names, map(str.strip, cells), strict=True):
+        if name == _PUSH:
+            if not cell:
+                raise ValueError(f"expected the number of the push in column {_PUSH}, found a blank")
+            continue
+        try:
+            value = float(cell) if cell or name not in _MAY_BE_BLANK else math.nan
+        except ValueError:
+            found = quoted(cell) if cell else "a blank"
+            raise ValueError(f"expected a number in column {name}, found {found}") from None
+        if not math.isfinite(value) and not (math.isnan(value) and name in _MAY_BE_BLANK):
+            raise ValueError(f"expected a finite number in column {name}, found {cell}")
+        numbers[name] = value
+    return numbers
 
 
 def load_npz(path: Path) -> Recordings:

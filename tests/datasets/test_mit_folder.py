@@ -250,7 +250,7 @@ def check(found, rows):
         lasts = duration(row) + LAST - FIRST
         for shares in ((0, 1), (0.1, 0.9)):
             at = pose(row, FIRST + np.array(shares) * lasts)
-            poses, tips = states_at(push, shares)
+            _, poses, tips = states_at(push, shares)
             np.testing.assert_allclose(poses, at, rtol=0, atol=LINEAR)
             # the tip rotates a little: its path is not linear between its samples, 10 ms apart
             np.testing.assert_allclose(tips, tip(row, at), rtol=0, atol=LINEAR)

@@ -91,7 +91,7 @@ def test_the_motion_is_read_as_written(pushes, published):
         for shares in ((0, 1), (0.1, 0.9)):
             at = span[0] + np.array(shares) * (span[1] - span[0])
             expected = np.column_stack([np.interp(at, motion[:, 0], column) for column in motion[:, 1:].T])
-            found, _ = states_at(push, shares)
+            _, found, _ = states_at(push, shares)
             np.testing.assert_allclose(found[:, :2], expected[:, :2], rtol=0, atol=CUT)
             np.testing.assert_allclose(np.diff(found[:, 2]), np.diff(expected[:, 2]), rtol=0, atol=TURN)
 

@@ -71,7 +71,7 @@ def _group(
 
 def _between(push: Recording, fractions: tuple[float, float]) -> Recording:
     """Return the states of a push at two fractions of its duration."""
-    pose, hand = states_at(push, fractions)
+    _, pose, hand = states_at(push, fractions)
     pose[1, 2] = pose[0, 2] + ((pose[1, 2] - pose[0, 2] + np.pi) % (2 * np.pi) - np.pi)
     return replace(push, hand=hand, pose=pose, force=None, time=None)
 
