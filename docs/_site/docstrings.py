@@ -63,28 +63,16 @@ def _columns_kept(text: str) -> str:
 
 
 def _signed(found: griffe.Class) -> None:
-    """Give a class without its own `__init__` a signature made of its fields."""
+    """Let griffe take a class whose arguments are its fields for a dataclass: then it has a signature."""
     bases = [str(base).rpartition(".")[2] for base in found.bases]
     found.bases = [base for base, name in zip(found.bases, bases, strict=True) if name not in ("Module", "NamedTuple")]
-    if "__init__" in found.members:
-        return
-    if not any(base in BASES for base in bases) and "dataclass" not in found.labels:
-        return
-    parameters = [griffe.Parameter("self", kind=griffe.ParameterKind.positional_or_keyword)]
-    for name, member in found.members.items():
-        annotation = str(getattr(member, "annotation", None) or "")
-        if not isinstance(member, griffe.Attribute) or not annotation or re.search("Abstract|ClassVar", annotation):
-            continue
-        if "property" in member.labels:
-            continue
-        value = None if member.value is None else str(member.value)
-        default = re.search(r"default=([^,)]+)", value) if value and "field(" in value else None
-        shown = default[1] if default else None if value and "field(" in value else value
-        parameters.append(
-            griffe.Parameter(
-                name, annotation=member.annotation, kind=griffe.ParameterKind.positional_or_keyword, default=shown
-            )
-        )
-    if len(parameters) > 1:
-        init = griffe.Function("__init__", parameters=griffe.Parameters(*parameters), lineno=found.lineno)
-        found.set_member("__init__", init)
+    fields = [member for member in found.members.values() if isinstance(member, griffe.Attribute) and member.annotation]
+    for field in fields:
+        if "Abstract" in str(field.annotation):
+            field.labels.add("property")  # no argument
+        if "field(" in str(field.value):
+            default = re.search(r"default=([^,)]+)", str(field.value))
+            field.value = default[1] if default else None
+    if any(base in BASES for base in bases) and any("property" not in field.labels for field in fields):
+        name = griffe.ExprName("dataclass", parent="dataclasses")  # pyright: ignore[reportArgumentType]
+        found.decorators.append(griffe.Decorator(name, lineno=None, endlineno=None))
