@@ -41,7 +41,8 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
         if len(paths) > MOST_LINES:
             _draw_counts(figure, axes, paths)
         else:
-            traces(axes, paths / MM, alpha=_opacity(len(paths)))
+            # Where paths are dense, many on top of each other still show.
+            traces(axes, paths / MM, alpha=float(np.clip(30 / len(paths), 0.06, 0.6)))
             axes.plot([], [], color=BLUE, lw=0.8, label="paths of the centroid")
         outline(axes, shape, trajectories[0, 0], BLACK, 1.4, label="start")
         order = np.argsort(trajectories[:, -1, 2])
@@ -53,8 +54,7 @@ def cloud_figure(shape: Shape, hand: Hand, path: np.ndarray, trajectories: np.nd
         hand_at(axes, hand, fingers[0], BLACK, 1.0)
         hand_at(axes, hand, fingers[-1], RED, 1.0)
         axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=title)
-        handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))  # each label once
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
+        legend_below(figure, axes, columns=2)
         return figure
 
 
@@ -124,8 +124,3 @@ def _draw_counts(figure: Figure, axes: Axes, paths: np.ndarray) -> None:
     edges = [CELL * (first[k] + np.arange(counts.shape[k] + 1)) for k in (0, 1)]
     drawn = axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, norm=LogNorm(1, len(paths)), cmap="Blues")
     figure.colorbar(drawn, ax=axes, label="paths of the centroid / (1/mm²)", shrink=0.6)
-
-
-def _opacity(lines: int) -> float:
-    """Return the opacity at which this many lines on top of each other still show where they are dense."""
-    return float(np.clip(30 / max(lines, 1), 0.06, 0.6))

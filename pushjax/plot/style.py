@@ -74,6 +74,6 @@ def bars(color: str, hatched: bool = False) -> dict[str, Any]:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:
-    """Draw one legend for all panels below them, with the labels of `axes` in `columns` columns."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns)
+    """Draw one legend for all panels below them, with each label of `axes` once, in `columns` columns."""
+    handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)
