@@ -3,15 +3,14 @@
 import gzip
 import json
 import math
-import os
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mit_files import write_streams
 
-from pushjax.datasets import LogError, Recording, Recordings, find_data, load_recordings, load_triangle_log
+from pushjax.datasets import LogError, Recording, Recordings, load_recordings, load_triangle_log
 from pushjax.datasets.streams import MAX_GAP
 
 MIT_JSONS = (
@@ -371,25 +370,11 @@ def tables(
     return made
 
 
-def write_json(path: Path, made: dict[str, np.ndarray]) -> Path:
-    path.write_text(json.dumps({name: rows.tolist() for name, rows in made.items()}))
-    return path
-
-
-def write_hdf5(path: Path, made: dict[str, np.ndarray]) -> Path:
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(path, "w") as file:
-        for name, rows in made.items():
-            file[name] = rows
-    return path
-
-
-WRITERS = {".json": write_json, ".h5": write_hdf5, ".hdf5": write_hdf5}
-KINDS = pytest.mark.parametrize("suffix", WRITERS)
+KINDS = pytest.mark.parametrize("suffix", [".json", ".h5", ".hdf5"])
 
 
 def mit_log(folder: Path, made: dict[str, np.ndarray], suffix: str = ".json") -> Path:
-    return WRITERS[suffix](folder / f"log{suffix}", made)
+    return write_streams(folder / f"log{suffix}", made)
 
 
 @KINDS
@@ -436,7 +421,9 @@ def test_raw_logs_agree_with_the_curated_arrays(data, converted, tmp_path, name)
     for column in range(3):
         expected = np.interp(time[inside], seen, content["object_pose"][:, column])
         np.testing.assert_allclose(push.pose[:, column], expected, atol=EXACT)
-    copy = write_hdf5(tmp_path / "log.h5", {key: np.array(rows) for key, rows in json.loads(raw.read_text()).items()})
+    copy = write_streams(
+        tmp_path / "log.h5", {key: np.array(rows) for key, rows in json.loads(raw.read_text()).items()}
+    )
     same(load_recordings(copy).pushes[0], push, 0.0)
 
 
@@ -554,13 +541,6 @@ def test_json_that_is_no_log(tmp_path, text, words):
     fails(path, words)
 
 
-def test_hdf5_without_its_reader(tmp_path, monkeypatch):
-    path = mit_log(tmp_path, tables(), ".h5")
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    fails(path, "h5py", "pip install '.[hdf5]'")
-    assert "h5py" not in vars(sys.modules["pushjax.datasets.mit_logs"])
-
-
 # --- detection of the kind of file ---
 
 
@@ -616,21 +596,3 @@ def test_files_cut_short_or_damaged_never_fail_otherwise(tmp_path, suffix, rng):
         except LogError:
             continue
         assert np.isfinite(found.pushes[0].hand).all()
-
-
-# --- the folder of the data ---
-
-
-def test_find_data_follows_the_environment(tmp_path, monkeypatch):
-    (tmp_path / "some.npz").touch()
-    monkeypatch.setenv("PUSHJAX_DATA", str(tmp_path))
-    assert find_data() == tmp_path
-    assert find_data("some.npz") == tmp_path / "some.npz"
-    assert find_data("other.npz") is None
-    monkeypatch.setenv("PUSHJAX_DATA", os.fspath(tmp_path / "absent"))
-    assert find_data() is None
-
-
-def test_find_data_without_the_variable(monkeypatch):
-    monkeypatch.delenv("PUSHJAX_DATA", raising=False)
-    assert find_data() is None
