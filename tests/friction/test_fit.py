@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from benchmarks.peers import fits
 
 # A convex quartic need not be a sum of squared quadratics. This is the loss it may cost compared with the semidefinite
 # program over all sos-convex quartics. The largest on all 22 real sets is 0.4 %.
@@ -58,30 +59,14 @@ def stated_loss(surface: pj.LimitSurface, wrench, twist, length) -> float:
 
 
 def semidefinite_loss(wrench, twist, length) -> float:
-    """Return the minimum over all sos-convex quartics: z' hess H(F) z = y' Q y with y = z (x) F and Q positive."""
+    """Return the minimum of the loss over all sos-convex quartics, with the scales of the twists as variables."""
     cp = pytest.importorskip("cvxpy")
-    from pushjax.friction.quartic import _curvature_tensor
-
     f, v = normalized(wrench, twist, length)
-    n = len(f)
-    a, s, q = cp.Variable(15), cp.Variable(n, nonneg=True), cp.Variable((9, 9), PSD=True)
-    tensor = np.stack([_curvature_tensor(unit) for unit in np.eye(15)], axis=-1)
-    matching = []
-    for i, j, k, m in np.ndindex(3, 3, 3, 3):
-        if i <= j and k <= m:
-            places = {(i, j, k, m), (j, i, k, m), (i, j, m, k), (j, i, m, k)}
-            gram = sum(q[3 * p[0] + p[2], 3 * p[1] + p[3]] for p in places)
-            matching.append(gram == sum(tensor[p] for p in places) @ a)
-    from pushjax.friction.quartic import MONOMIALS
-
-    values = np.prod(f[:, None] ** MONOMIALS, axis=2)
-    gradients = []
-    for k in range(3):
-        lowered = np.maximum(MONOMIALS - np.eye(3, dtype=int)[k], 0)
-        gradients.append(MONOMIALS[:, k] * np.prod(f[:, None] ** lowered, axis=2))
+    a, s = cp.Variable(15), cp.Variable(len(f), nonneg=True)
+    values, gradients = fits.values_and_gradients(f, 4)
     misfit = sum(cp.sum_squares(g @ a - cp.multiply(s, v[:, k])) for k, g in enumerate(gradients))
-    loss = misfit / n + 2 * cp.sum_squares(values @ a - 1) / n + 1e-3 * cp.sum_squares(a)
-    return float(cp.Problem(cp.Minimize(loss), matching).solve(solver=cp.CLARABEL))
+    loss = (misfit + 2 * cp.sum_squares(values @ a - 1)) / len(f) + 1e-3 * cp.sum_squares(a)
+    return float(cp.Problem(cp.Minimize(loss), fits.convexity(a, 4)).solve(solver=cp.CLARABEL))
 
 
 @pytest.mark.parametrize("name", ["uniform", "rim", "tripod"])
