@@ -1,6 +1,6 @@
 """Checks of the numbers of one push, which come before everything else is computed from them."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +48,14 @@ def checked_recording(
     **others: Any,  # fields of `Recording` that need no check
 ) -> Recording | LogError:
     """Return the recording of one push, with unwrapped angles, or the error for its first fault."""
-
-    def error_at(message: str, row: int) -> LogError:
-        return LogError(
-            path, f"{message} in row {row} of the push", push=index, line=None if lines is None else lines[row]
-        )
-
     first_line = lines[0] if lines else None
     if len(hand) < 2:
         return LogError(path, f"expected at least two rows, found {len(hand)}", push=index, line=first_line)
-    problem = _find_problem(hand, pose, force, time, error_at)
-    if problem is not None:
-        return problem
+    fault = _find_fault(hand, pose, force, time)
+    if fault is not None:
+        message, row = fault
+        line = lines[row] if lines else None
+        return LogError(path, f"{message} in row {row} of the push", push=index, line=line)
     seen = np.isfinite(pose[:, 0])
     largest = float(np.max(np.abs(pose[seen, 2])))
     if largest > MAX_TURNS * 2 * np.pi:
@@ -72,10 +68,8 @@ def checked_recording(
     return Recording(index, hand, pose, force, time, **others)
 
 
-def _find_problem(
-    hand: Floats, pose: Floats, force: Floats | None, time: Floats | None, error_at: Callable[[str, int], LogError]
-) -> LogError | None:
-    """Return the first fault in the arrays of `checked_recording`; `error_at` makes it of message and row."""
+def _find_fault(hand: Floats, pose: Floats, force: Floats | None, time: Floats | None) -> tuple[str, int] | None:
+    """Return a message and the row of the first fault in the arrays of `checked_recording`, or None."""
     columns = [(hand_columns(hand.shape[1]), hand, False), (OBJECT, pose, True)]
     if force is not None:
         columns.append((FORCE, force, True))
@@ -84,15 +78,15 @@ def _find_problem(
     for names, values, may_be_missing in columns:
         fault = find_bad_number(names, values, may_be_missing)
         if fault is not None:
-            return error_at(*fault)
+            return fault
     for row, where in ((0, "first"), (len(pose) - 1, "last")):
         if np.isnan(pose[row, 0]):
-            return error_at(f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row)
+            return f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row
     back = np.flatnonzero(np.diff(time) < 0) if time is not None else []
     if time is not None and len(back):
         row = int(back[0]) + 1
         step = time[row] - time[row - 1]
-        return error_at(f"expected time stamps that do not go back, found a step of {step:.3g} s", row)
+        return f"expected time stamps that do not go back, found a step of {step:.3g} s", row
     return None
 
 

@@ -117,38 +117,34 @@ def _read_actions(path: Path) -> list[Action]:
         lines = path.read_text("utf-8", errors="replace").splitlines()
     except OSError as error:
         raise LogError(path, f"expected planned pushes, but cannot read the file: {error.strerror or error}") from error
-    size = 1 + len(NUMBERS_PER_LINE)
+    size, center = 1 + len(NUMBERS_PER_LINE), triangle.CENTER_OF_MASS[:2]
     actions = []
     for index in range(1, len(lines) - size + 1, size):
         kind = lines[index].strip()
+        turns = "Rotation" in kind
         try:
             values = [np.array(line.split(), float) for line in lines[index + 1 : index + size]]
             valid = all(len(v) == n and np.isfinite(v).all() for v, n in zip(values, NUMBERS_PER_LINE, strict=True))
             # the approach and, unless the push turns, the target are directions
-            valid &= values[2][:2].any() and ("Rotation" in kind or values[1][:2].any())
+            valid &= values[2][:2].any() and (turns or values[1][:2].any())
         except ValueError:
             valid = False
         if not kind or not valid:
             message = "expected the type of a push and 3, 3, 3 and 2 numbers on the lines after it"
             raise LogError(path, message, line=index + 1)
-        actions.append(_parse_action(kind, values))
+        # the numbers are in mm and degrees, and the points in the corner frame
+        (contact, target, approach), (amount, closing) = (point[:2] for point in values[:3]), values[3]
+        actions.append(
+            Action(
+                turns=turns,
+                contact=contact / 1000 - center,
+                target=target / 1000 - center if turns else target / np.linalg.norm(target),
+                approach=approach / np.linalg.norm(approach),
+                amount=float(np.radians(amount) if turns else amount / 1000),
+                closing=float(closing / 1000),
+            )
+        )
     return actions
-
-
-def _parse_action(kind: str, values: list[Floats]) -> Action:
-    """Return the action of a type and its lines of numbers, which are in mm and degrees, in the corner frame."""
-    turns = "Rotation" in kind
-    contact, target, approach = (point[:2] for point in values[:3])
-    center = triangle.CENTER_OF_MASS[:2]
-    amount, closing = values[3]
-    return Action(
-        turns=turns,
-        contact=contact / 1000 - center,
-        target=target / 1000 - center if turns else target / np.linalg.norm(target),
-        approach=approach / np.linalg.norm(approach),
-        amount=float(np.radians(amount) if turns else amount / 1000),
-        closing=float(closing / 1000),
-    )
 
 
 def _convert_push(path: Path, record: Record, action: Action) -> Recording | LogError:
