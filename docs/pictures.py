@@ -31,13 +31,15 @@ import pushjax as pj
 from pushjax import planning, plot
 from pushjax.datasets import find_data
 from pushjax.experiments import demo, squeeze, stochastic_push
-from pushjax.experiments.pusht_mpc import player, setting
+from pushjax.experiments.pusht_mpc import make_plant
 from pushjax.experiments.table2 import conditions
-from pushjax.geometry.polygon_numpy import outline_vertices
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
+from pushjax.planning.pusht import PIXEL, pusht_pose
 from pushjax.plot.parts import draw_fixtures, placed_outline
 from pushjax.plot.style import BLACK, BLUE, GRAY, GREEN, MM, ORANGE, RED, STYLE, legend_below, panel_row
 from pushjax.tasks import PushAlongWall, PushBox, PushTwoFingers, Squeeze, TableTask
+from pushjax.tasks.push_t import AGENT_RADIUS, T_CENTER, T_VERTICES
+from pushjax.tasks.push_t import GOAL as GOAL_IN_GYM
 
 PUSHES = 200
 FRICTIONS = {"friction 0.1: it slides": 0.1, "friction 0.6: it sticks": 0.6}
@@ -139,18 +141,18 @@ class Moment(NamedTuple):
 
 def pusht_moments(seed: int) -> list[Moment]:
     """Play one episode, and return its control steps."""
-    plant, (made, _) = player.make_plant(), player.controller()
+    plant, made = make_plant(), planning.pusht_controller()
     seen, _ = plant.reset(seed=seed)
-    memory, key, moments, over, coverage = made.initial_memory(), jax.random.key(seed), [], False, 0.0
+    state, key, moments, over, coverage = made.initial_state(), jax.random.key(seed), [], False, 0.0
     while True:
-        pose = setting.from_gym(seen[2:4], seen[4])
-        pushed = None if memory.push is None else np.stack([memory.push.start, memory.end]) / setting.PIXEL
-        at = np.array([*(pose[:2] / setting.PIXEL), pose[2]])
-        moments.append(Moment(np.array(seen[:2]), at, pushed, memory.pushes, coverage))
+        now = planning.pusht_observation(seen)
+        pushed = None if state.push is None else np.stack([state.push.start, state.end]) / PIXEL
+        at = now.pose / [PIXEL, PIXEL, 1.0]
+        moments.append(Moment(np.array(seen[:2]), at, pushed, state.pushes, coverage))
         if over:
             return moments
-        action, memory = made(key, planning.Observation(setting.PIXEL * seen[:2], pose), memory)
-        seen, _, terminated, truncated, info = plant.step(np.clip(action / setting.PIXEL, 0, SCREEN))
+        action, state = made(key, now, state)
+        seen, _, terminated, truncated, info = plant.step(np.clip(action / PIXEL, 0, SCREEN))
         coverage, over = float(info["coverage"]), terminated or truncated
 
 
@@ -160,8 +162,8 @@ def pusht() -> plot.Animation:
     The T, its goal, the finger, and the push that is going on.
     """
     moments = pusht_moments(SEED)
-    corners = outline_vertices(setting.slider().shape) / setting.PIXEL
-    goal = setting.goal() / [setting.PIXEL, setting.PIXEL, 1.0]
+    corners = np.array(T_VERTICES, float) - T_CENTER
+    goal = pusht_pose(GOAL_IN_GYM) / [PIXEL, PIXEL, 1.0]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(figsize=(4.0, 4.25), layout="constrained")
         axes.set(xlim=(0, SCREEN), ylim=(SCREEN, 0), aspect="equal", xticks=[], yticks=[])
@@ -170,7 +172,7 @@ def pusht() -> plot.Animation:
         axes.add_patch(Polygon(to_world(goal, corners), facecolor="#B9E4C9", edgecolor=GREEN, lw=1))
         block = Polygon(corners, facecolor="#8FA3B8", edgecolor="#4A5B6C", lw=1.2)
         arrow = FancyArrowPatch((0, 0), (1, 1), arrowstyle="-|>", mutation_scale=11, lw=1.6, color=ORANGE, zorder=3)
-        finger = Circle((0, 0), setting.FINGER_RADIUS / setting.PIXEL, color=BLUE, zorder=4)
+        finger = Circle((0, 0), AGENT_RADIUS, color=BLUE, zorder=4)
         for patch in (block, arrow, finger):
             axes.add_patch(patch)
         title = axes.set_title(" ")
@@ -184,7 +186,7 @@ def pusht() -> plot.Animation:
         arrow.set_visible(after.push is not None)
         if after.push is not None:
             arrow.set_positions(*map(tuple, after.push))
-        solved = ", solved" if now.coverage > setting.ENOUGH else ""
+        solved = ", solved" if now.coverage > 0.95 else ""
         title.set_text(f"push {max(1, after.pushes)}, {0.1 * (step + share):.1f} s, {now.coverage:.0%}{solved}")
 
     frames = FRAMES_BETWEEN * (len(moments) - 1) + HOLD
@@ -212,22 +214,22 @@ class Episode(NamedTuple):
     pushing: list[bool]
 
 
-def episode_among_fixtures(slider: pj.Slider, pushes: planning.PushLibrary, known: tuple) -> Episode:
+def episode_among_fixtures(scene: planning.PushScene, pushes: planning.PushLibrary) -> Episode:
     """Play one episode among the fixtures, with a planner that knows some of them."""
-    table = planning.Workspace.rectangle((0.0, 0.0), (SIDE, SIDE), known)
-    planner = planning.PushPlanner(slider, RADIUS, pushes, GOAL, table, planning.Pace(0.05, 0.02, 0.02))
+    table = planning.Workspace.rectangle((0.0, 0.0), (SIDE, SIDE))
+    planner = planning.PushPlanner(scene, pushes, GOAL, table, planning.SpeedLimits(0.05, 0.02, 0.02))
     made = planning.PushController(planner, planning.PositionControl())
-    memory, hand, pose, finger = made.initial_memory(), pj.Hand.finger(RADIUS), START, FINGER
+    state, pose, finger = made.initial_state(), START, FINGER
     found = Episode([START], [], [])
     while len(found.paths) < MOST_STEPS and planner.measure(compose(inverse(GOAL), pose)) < planner.measure.enough:
-        target, memory = made(jax.random.key(0), planning.Observation(finger, pose), memory)
+        target, state = made(jax.random.key(0), planning.Observation(finger, pose), state)
         path = pj.line(finger, target, LEG)
-        done = pj.rollout(slider, hand, path, pose=pose, friction=FRICTION, fixtures=FIXTURES)
+        done = pj.rollout(scene.slider, scene.hand, path, pose=pose, friction=FRICTION, fixtures=FIXTURES)
         paths = np.asarray(done.configuration, float)  # the finger stops at a jam
         pose, finger = np.asarray(done.pose[-1], float), paths[-1]
         found.poses.append(pose)
         found.paths.append(paths)
-        found.pushing.append(memory.pushing)
+        found.pushing.append(state.pushing)
     return found
 
 
@@ -237,11 +239,14 @@ def among_fixtures() -> Figure:
     Drawn are the box after each push, and the paths of the finger.
     """
     slider = pj.Slider(pj.Polygon.rectangle(0.10, 0.06), pj.Ellipsoid(np.eye(3), 0.05))
-    pushes = planning.PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=120, angles=7)
+    scenes = {
+        name: planning.PushScene(slider, pj.Hand.finger(RADIUS), FRICTION, known) for name, known in KNOWN.items()
+    }
+    pushes = planning.PushLibrary.build(next(iter(scenes.values())), contacts=120, angles=7)
     with plt.rc_context(STYLE):
         figure, all_axes = panel_row(len(KNOWN), 4.0, 4.2, shared=True)
-        for axes, (name, known) in zip(all_axes, KNOWN.items(), strict=True):
-            found = episode_among_fixtures(slider, pushes, known)
+        for axes, (name, scene) in zip(all_axes, scenes.items(), strict=True):
+            found = episode_among_fixtures(scene, pushes)
             _draw_among_fixtures(axes, slider.shape, found)
             axes.set_title(f"{name}: {len(found.paths)} control steps")
         all_axes[0].set_ylabel("y / mm")

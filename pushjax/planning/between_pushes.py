@@ -17,8 +17,8 @@ import numpy as np
 from pushjax._internal.checks import check_positive
 from pushjax.geometry.polygon_numpy import segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
+from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.roadmap import Roadmap, Transit, TransitStatus, run_ups
-from pushjax.planning.workspace import Workspace
 from pushjax.simulation.fixtures import Fixtures
 
 # Quantiles of the samples' displacement that the finger keeps in addition to its clearance, in the order of attempts.
@@ -72,16 +72,16 @@ def transits_between(
     paths, predicted, samples = (np.asarray(each, float) for each in (paths, predicted, samples))
     if start is None and not len(paths):
         return Transits((), np.zeros(len(samples), bool))
-    scene = _Scene(vertices, radius, clearance, Workspace.unlimited(fixtures))
+    around = _Surroundings(vertices, radius, clearance, Obstacles.of(fixtures))
     transits, touched = [], np.zeros(len(samples), bool)
     origins = [None if start is None else np.asarray(start, float), *paths[:, -1]]
     for k, (pose, origin) in enumerate(zip(predicted, origins, strict=True)):
         scatter = _displacement(vertices, pose, samples[:, k])
         margins = [*(clearance + np.quantile(scatter, q) for q in QUANTILES), clearance, TIGHT * clearance]
-        tried = (_transit(scene, margin, paths[k : k + 1], pose, origin) for margin in margins)
+        tried = (_transit(around, margin, paths[k : k + 1], pose, origin) for margin in margins)
         transit = next((each for each in tried if each.status == TransitStatus.FOUND), None)
         if transit is None:  # the last attempt is the least demanding, and tells why
-            transit = _transit(scene, margins[-1], paths[k : k + 1], pose, origin)
+            transit = _transit(around, margins[-1], paths[k : k + 1], pose, origin)
         else:
             touched |= _touches(vertices, radius, transit.points, samples[:, k])
         transits.append(transit)
@@ -118,61 +118,64 @@ def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: flo
     return FingerMotion(np.concatenate([[0.0], np.cumsum(duration)]), points, pushes)
 
 
-class _Scene(NamedTuple):
+class _Surroundings(NamedTuple):
     """What transits are planned in."""
 
     vertices: np.ndarray  # (vertices, 2), of the slider, body frame, m
     radius: float  # of the finger, m
     clearance: float  # of the finger, m
-    workspace: Workspace  # with the fixtures
+    obstacles: Obstacles
 
     def roadmap(self, margin: float, goals: np.ndarray) -> Roadmap:
         """Return the roadmap for a distance from the slider, m; from fixtures no more than the clearance is kept."""
-        return Roadmap(self.vertices, self.radius, margin, goals, min(margin, self.clearance))
+        return Roadmap(self.vertices, self.radius, margin, goals, self.obstacles, min(margin, self.clearance))
 
 
-def _transit(scene: _Scene, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+def _transit(
+    around: _Surroundings, margin: float, paths: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
+) -> Transit:
     """Return the transit to the start of the first of `paths`, or the retreat if there are none."""
     if len(paths):
-        return _approach(scene, margin, paths[0], pose, origin)
+        return _approach(around, margin, paths[0], pose, origin)
     if origin is None:
         raise ValueError("a retreat begins where a push ends")
-    return scene.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose, scene.workspace)
+    return around.roadmap(margin, np.zeros((0, 2))).retreat(origin, pose)
 
 
-def _approach(scene: _Scene, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None) -> Transit:
+def _approach(
+    around: _Surroundings, margin: float, path: np.ndarray, pose: np.ndarray, origin: np.ndarray | None
+) -> Transit:
     """Return the transit to the start of a push, with a run-up from where the finger has its full distance."""
     first, second = to_body(pose, path[:2])
     ahead = (second - first) / np.linalg.norm(second - first)
     blocked = Transit(
         path[:1] if origin is None else np.asarray(origin, float)[None], np.inf, TransitStatus.GOAL_BLOCKED
     )
-    if signed_distances(scene.vertices, first) < (1 - TOUCH) * scene.radius:
+    if signed_distances(around.vertices, first) < (1 - TOUCH) * around.radius:
         return blocked
     for part in RUN_UPS:
-        longest = part * (scene.radius + margin)
-        run_up = float(run_ups(scene.vertices, scene.radius, margin, first[None], ahead[None], longest)[0])
+        longest = part * (around.radius + margin)
+        run_up = float(run_ups(around.vertices, around.radius, margin, first[None], ahead[None], longest)[0])
         begin = (first - run_up * ahead)[None]
-        if np.isfinite(run_up) and _keeps_out(scene, margin, to_world(pose, begin[0]), path[0]):
+        if np.isfinite(run_up) and _keeps_out(around, margin, to_world(pose, begin[0]), path[0]):
             break
     else:
         return blocked
     if origin is None:
         transit = Transit(to_world(pose, begin), 0.0, TransitStatus.FOUND)
     else:
-        roadmap = scene.roadmap(margin, begin)
-        transit = roadmap.transit(roadmap.transits(origin, pose, scene.workspace), 0, pose)
+        roadmap = around.roadmap(margin, begin)
+        transit = roadmap.transit(roadmap.transits(origin, pose), 0, pose)
     if transit.status != TransitStatus.FOUND or run_up == 0:
         return transit
     return Transit(np.concatenate([transit.points, path[:1]]), transit.length + run_up, TransitStatus.FOUND)
 
 
-def _keeps_out(scene: _Scene, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
+def _keeps_out(around: _Surroundings, margin: float, begin: np.ndarray, start: np.ndarray) -> bool:
     """Return whether a run-up begins with the clearance from fixtures, and touches none."""
-    obstacles = scene.workspace.obstacles
-    if obstacles.point_clearance(begin) < scene.radius + min(margin, scene.clearance):
+    if around.obstacles.point_clearance(begin) < around.radius + min(margin, around.clearance):
         return False
-    return bool(obstacles.segment_clearance(begin, start) >= scene.radius)
+    return bool(around.obstacles.segment_clearance(begin, start) >= around.radius)
 
 
 def _displacement(vertices: np.ndarray, pose: np.ndarray, samples: np.ndarray) -> np.ndarray:

@@ -20,11 +20,10 @@ from jaxtyping import PRNGKeyArray
 from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.planning.finger_control import FingerControl, FingerState
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
-from pushjax.planning.planned_push import PlannedPush, PlanStatus
+from pushjax.planning.planned_push import PlannedPush, PushStatus
 from pushjax.planning.push_batch import GROUP, LEG, simulate_pushes
 from pushjax.planning.push_planner import PushPlanner
 from pushjax.planning.roadmap import Transit, TransitStatus
-from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length
@@ -44,7 +43,7 @@ LATE = 1.5  # a push is over after this times its planned number of control step
 # that is missing, and of the distance of the final pose from the target.
 SHIFT_WEIGHT, SCORE_WEIGHT, DISTANCE_WEIGHT = 0.02, 7.3, 0.1
 LEARNING_STEPS = 5  # steps of the simulation of a control step that updates the belief about friction
-SHAKE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
+RANDOMIZE_AFTER = 5  # pushes after which costs are made random, more with each push, to leave a cycle
 
 
 class Observation(NamedTuple):
@@ -59,7 +58,7 @@ class Observation(NamedTuple):
     pose: np.ndarray
 
 
-class Memory(NamedTuple):
+class ControllerState(NamedTuple):
     """What the controller remembers between control steps."""
 
     push: PlannedPush | None  # the current push
@@ -72,7 +71,7 @@ class Memory(NamedTuple):
     taken: int  # control steps of the current push
     pushes: int  # pushes so far
     waited: int  # control steps in which there was no push to make
-    status: PlanStatus  # of the last plan
+    status: PushStatus  # of the last plan
     belief: FrictionBelief | None = None  # about friction
     last: Observation | None = None  # one control step ago, if the finger was pushing then
     path: np.ndarray | None = None  # (points, 2), of the finger since then by its own model, world, m
@@ -86,14 +85,13 @@ class PushController:
         control: Model of the finger.
         feedback: Whether the end of a push is corrected while it runs.
         noise: Standard deviation of the positions that are seen, m.
-        friction_filter: How a belief about friction is updated by what is seen. None: friction is that of the planner's
-            library.
-        prior: Belief before anything is seen. If the planner's library has as many samples, they must be the same: both
-            come from `draw_friction` with one key.
+        friction_filter: How a belief about friction is updated by what is seen. None: friction is the scene's mean.
+        prior: Belief before anything is seen, from `friction_filter.init`. If the library has as many samples, they
+            must be the same: build it with the same key.
 
     Raises:
         ValueError: If one of `friction_filter` and `prior` is given without the other, or if the filter is for another
-            slider or finger than the planner's library.
+            scene than the planner's library.
     """
 
     def __init__(
@@ -110,11 +108,10 @@ class PushController:
             raise ValueError("friction_filter and prior must be given together")
         self.friction_filter, self.prior = friction_filter, prior
         if friction_filter is not None:
-            planner.sampled.check_made_for(friction_filter.slider, float(friction_filter.hand.radius[0]))
+            planner.library_samples.check_made_for(friction_filter.scene)
         self.planner, self.control, self.feedback = planner, control, feedback
-        self.friction = planner.sampled.friction
-        self.hand = Hand.finger(planner.radius)
-        self.length = planner.library.length
+        self.scene = planner.scene
+        self.length = planner.mean_library.length
         grid = np.stack(np.meshgrid(ALONG, ACROSS, indexing="ij"), axis=-1).reshape(-1, 2)
         self.offsets = self.length * grid
         self.moved = MOVED * self.length + 4 * noise
@@ -122,164 +119,170 @@ class PushController:
         if len(grid) > GROUP:
             raise ValueError(f"there are {len(grid)} ends to try; at most {GROUP} are simulated together")
 
-    def initial_memory(self) -> Memory:
-        """Return the memory of the first control step; the finger is at rest."""
+    def initial_state(self) -> ControllerState:
+        """Return the state of the first control step; the finger is at rest."""
         zero = np.zeros(2)
-        return Memory(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PlanStatus.NO_PUSH, self.prior)
+        return ControllerState(None, False, np.zeros(3), zero, 0.0, 0.0, zero, 0, 0, 0, PushStatus.NO_PUSH, self.prior)
 
     def prepare(self) -> None:
         """Compile the programs of control steps, which are else compiled when they are first needed."""
-        self._shake(jax.random.key(0), 1)
+        self._cost_noise(jax.random.key(0), 1)
         if self.friction_filter is not None and self.prior is not None:
             self.friction_filter.update(self.prior, np.zeros(3), np.zeros((LEARNING_STEPS + 1, 2)), np.zeros(3))
         if self.feedback:
             far = self.planner.goal[:2] + 10 * self.length
             aim = np.zeros(2)
             push = PlannedPush(
-                PlanStatus.ONE_PUSH, Transit(aim[None], 0.0, TransitStatus.FOUND), aim, aim, self.planner.goal, 0.0
+                PushStatus.ONE_PUSH, Transit(aim[None], 0.0, TransitStatus.FOUND), aim, aim, self.planner.goal, 0.0
             )
             self._corrected(far, self.planner.goal, far + 0.1 * self.length, push, self.prior)
 
-    def __call__(self, key: PRNGKeyArray, observation: Observation, memory: Memory) -> tuple[np.ndarray, Memory]:
-        """Return the next action and the memory after it.
+    def __call__(
+        self, key: PRNGKeyArray, observation: Observation, state: ControllerState
+    ) -> tuple[np.ndarray, ControllerState]:
+        """Return the next action and the state after it.
 
         Args:
             key: Key of the random costs that end a cycle of pushes.
             observation: What is seen now.
-            memory: Result of the control step before, or `initial_memory`.
+            state: Result of the control step before, or `initial_state`.
 
         Returns:
-            The action of `control`, (2,), and the memory for the next control step.
+            The action of `control`, (2,), and the state for the next control step.
         """
-        state = FingerState(np.asarray(observation.finger, float), memory.velocity)
+        finger = FingerState(np.asarray(observation.finger, float), state.velocity)
         pose = np.asarray(observation.pose, float)
-        memory = self._learned(pose, memory)
+        state = self._learned(pose, state)
         fresh = False
         for _ in range(3):  # a push may be over at once
-            if memory.push is None:
-                memory, fresh = self._plan(key, state, pose, memory), True
-                if memory.push is None:
-                    return self._finish(state, pose, state.position, memory._replace(waited=memory.waited + 1))
-            if not memory.pushing:
-                target, memory = self._go(state, pose, memory)
+            if state.push is None:
+                state, fresh = self._plan(key, finger, pose, state), True
+                if state.push is None:
+                    return self._finish(finger, pose, finger.position, state._replace(waited=state.waited + 1))
+            if not state.pushing:
+                target, state = self._go(finger, pose, state)
             else:
                 # the end of a push that has just been planned needs no correction
-                target, memory = self._push(state, pose, memory, correct=self.feedback and not fresh)
+                target, state = self._push(finger, pose, state, correct=self.feedback and not fresh)
             if target is not None:
-                return self._finish(state, pose, target, memory)
-        return self._finish(state, pose, state.position, memory)
+                return self._finish(finger, pose, target, state)
+        return self._finish(finger, pose, finger.position, state)
 
     def _finish(
-        self, state: FingerState, pose: np.ndarray, target: np.ndarray, memory: Memory
-    ) -> tuple[np.ndarray, Memory]:
-        """Return the action that brings the finger to `target`, (2,), and the memory with what follows from it."""
-        action = self.control.action(state, target)
-        memory = memory._replace(velocity=self.control.after(state, action).velocity, last=None)
-        if self.friction_filter is not None and memory.pushing:
-            path = np.concatenate([state.position[None], self.control.motion(state, action)])
-            memory = memory._replace(last=Observation(state.position, pose), path=path)
-        return action, memory
+        self, finger: FingerState, pose: np.ndarray, target: np.ndarray, state: ControllerState
+    ) -> tuple[np.ndarray, ControllerState]:
+        """Return the action that brings the finger to `target`, (2,), and the state with what follows from it."""
+        action = self.control.action(finger, target)
+        state = state._replace(velocity=self.control.after(finger, action).velocity, last=None)
+        if self.friction_filter is not None and state.pushing:
+            path = np.concatenate([finger.position[None], self.control.motion(finger, action)])
+            state = state._replace(last=Observation(finger.position, pose), path=path)
+        return action, state
 
-    def _learned(self, pose: np.ndarray, memory: Memory) -> Memory:
+    def _learned(self, pose: np.ndarray, state: ControllerState) -> ControllerState:
         """Update the belief by the motion since the last control step, if the finger was pushing."""
-        if self.friction_filter is None or memory.last is None or memory.path is None:
-            return memory
-        assert memory.belief is not None
-        points = np.round(np.linspace(0, len(memory.path) - 1, LEARNING_STEPS + 1)).astype(int)
-        belief = self.friction_filter.update(memory.belief, memory.last.pose, memory.path[points], pose)
-        return memory._replace(belief=belief)
+        if self.friction_filter is None or state.last is None or state.path is None:
+            return state
+        assert state.belief is not None
+        points = np.round(np.linspace(0, len(state.path) - 1, LEARNING_STEPS + 1)).astype(int)
+        belief = self.friction_filter.update(state.belief, state.last.pose, state.path[points], pose)
+        return state._replace(belief=belief)
 
-    def _plan(self, key: PRNGKeyArray, state: FingerState, pose: np.ndarray, memory: Memory) -> Memory:
+    def _plan(
+        self, key: PRNGKeyArray, finger: FingerState, pose: np.ndarray, state: ControllerState
+    ) -> ControllerState:
         """Plan a push. If there is none, `push` stays None."""
-        shake = self._shake(key, memory.pushes) if memory.pushes > SHAKE_AFTER else None
-        push = self._planner(memory.belief).choose(pose, state.position, shake)
-        planned = memory._replace(status=push.status, pushing=False, pose=pose, along=0.0, taken=0)
+        cost_noise = self._cost_noise(key, state.pushes) if state.pushes > RANDOMIZE_AFTER else None
+        push = self._planner(state.belief).choose(pose, finger.position, cost_noise)
+        planned = state._replace(status=push.status, pushing=False, pose=pose, along=0.0, taken=0)
         if push.status.failed:
             return planned._replace(push=None)
-        return planned._replace(push=push, end=push.end, pushes=memory.pushes + 1)
+        return planned._replace(push=push, end=push.end, pushes=state.pushes + 1)
 
-    def _shake(self, key: PRNGKeyArray, pushes: int) -> np.ndarray:
+    def _cost_noise(self, key: PRNGKeyArray, pushes: int) -> np.ndarray:
         """Return random costs of all pushes, which grow with the number of pushes so far, control steps."""
         seed = np.asarray(jax.random.key_data(jax.random.fold_in(key, pushes))).ravel().tolist()
-        return np.abs(np.random.default_rng(seed).normal(0, pushes, len(self.planner.library.starts)))
+        return np.abs(np.random.default_rng(seed).normal(0, pushes, len(self.planner.mean_library.starts)))
 
     def _planner(self, belief: FrictionBelief | None) -> PushPlanner:
         """Return the planner, with the weights of the belief if it has as many samples as the library."""
-        if belief is None or len(belief.weight) != len(self.planner.sampled.outcomes):
+        if belief is None or len(belief.weight) != len(self.planner.library_samples.outcomes):
             return self.planner
         if belief.status == BeliefStatus.PRIOR:
             return self.planner
         return self.planner.reweighted(np.asarray(belief.weight))
 
-    def _go(self, state: FingerState, pose: np.ndarray, memory: Memory) -> tuple[np.ndarray | None, Memory]:
+    def _go(
+        self, finger: FingerState, pose: np.ndarray, state: ControllerState
+    ) -> tuple[np.ndarray | None, ControllerState]:
         """Return the next target on the way to a push, or None if the push begins or must be planned anew."""
-        features = self.planner.library.features
-        if np.linalg.norm(features(pose) - features(memory.pose)) > self.moved:
-            return None, memory._replace(push=None)
-        push = memory.push
+        features = self.planner.mean_library.features
+        if np.linalg.norm(features(pose) - features(state.pose)) > self.moved:
+            return None, state._replace(push=None)
+        push = state.push
         assert push is not None
         points = np.concatenate([push.transit.points, push.start[None]])
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         total, run_up = lengths[-1], lengths[-1] - lengths[-2]
-        pace, remaining = self.planner.pace, total - memory.along
-        if remaining <= run_up + self.arrived and remaining <= pace.push:
-            return None, memory._replace(pushing=True)
+        speeds, remaining = self.planner.speeds, total - state.along
+        if remaining <= run_up + self.arrived and remaining <= speeds.push:
+            return None, state._replace(pushing=True)
         # slow enough at the start of the push
-        braking = np.sqrt(pace.push**2 + 2 * pace.acceleration * max(remaining, 0.0))
-        speed = pace.next_speed(memory.speed, remaining + pace.push, min(pace.free, braking))
-        ahead = np.minimum(memory.along + speed * SLOWER, total)
+        braking = np.sqrt(speeds.push**2 + 2 * speeds.acceleration * max(remaining, 0.0))
+        speed = speeds.next_speed(state.speed, remaining + speeds.push, min(speeds.free, braking))
+        ahead = np.minimum(state.along + speed * SLOWER, total)
         targets = np.stack([np.interp(ahead, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
-        motions = self.control.motion(state, self.control.action(state, targets))
+        motions = self.control.motion(finger, self.control.action(finger, targets))
         apart = self.planner.finger_clearance(pose, motions).min(-1)
-        now = float(self.planner.finger_clearance(pose, state.position))
+        now = float(self.planner.finger_clearance(pose, finger.position))
         needed = min(CLOSE * self.length, now + 1e-3 * self.length)
         good = np.flatnonzero(apart >= needed)
         best = int(good[0]) if len(good) else int(np.argmax(apart))
-        return targets[best], memory._replace(along=float(ahead[best]), speed=float(ahead[best] - memory.along))
+        return targets[best], state._replace(along=float(ahead[best]), speed=float(ahead[best] - state.along))
 
     def _push(
-        self, state: FingerState, pose: np.ndarray, memory: Memory, correct: bool
-    ) -> tuple[np.ndarray | None, Memory]:
+        self, finger: FingerState, pose: np.ndarray, state: ControllerState, correct: bool
+    ) -> tuple[np.ndarray | None, ControllerState]:
         """Return the next target in a push, or None if the push is over."""
-        push, pace = memory.push, self.planner.pace
+        push, speeds = state.push, self.planner.speeds
         assert push is not None
-        end = memory.end
-        remaining = float(np.linalg.norm(end - state.position))
+        end = state.end
+        remaining = float(np.linalg.norm(end - finger.position))
         # a finger that does not go where it should would try forever
-        late = memory.taken > LATE * pace.push_time(np.linalg.norm(push.end - push.start)) + 3
+        late = state.taken > LATE * speeds.push_time(np.linalg.norm(push.end - push.start)) + 3
         # no correction at the end: it would go on and on for less than the next push gains in the same time
         if remaining < self.arrived or late:
-            return None, memory._replace(push=None, pushing=False, speed=0.0)
+            return None, state._replace(push=None, pushing=False, speed=0.0)
         if correct and remaining < CORRECTED * self.length:
-            end = self._corrected(state.position, pose, end, push, memory.belief)
-        ahead = end - state.position
+            end = self._corrected(finger.position, pose, end, push, state.belief)
+        ahead = end - finger.position
         remaining = float(np.linalg.norm(ahead))
-        speed = pace.next_speed(memory.speed, remaining, pace.push)
-        target = state.position + ahead * min(speed / max(remaining, 1e-9), 1.0)
-        return target, memory._replace(end=end, speed=speed, taken=memory.taken + 1)
+        speed = speeds.next_speed(state.speed, remaining, speeds.push)
+        target = finger.position + ahead * min(speed / max(remaining, 1e-9), 1.0)
+        return target, state._replace(end=end, speed=speed, taken=state.taken + 1)
 
     def _corrected(
-        self, finger: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
+        self, position: np.ndarray, pose: np.ndarray, end: np.ndarray, push: PlannedPush, belief: FrictionBelief | None
     ) -> np.ndarray:
         """Return the best of the ends around `end`, (2,), world, m."""
-        ahead = end - finger
+        ahead = end - position
         remaining = float(np.linalg.norm(ahead))
         along = ahead / remaining if remaining > 1e-9 else np.array([1.0, 0.0])
         across = np.array([-along[1], along[0]])
         scale = min(1.0, FINE + remaining / (FULL * self.length) * (1 - FINE))
         ends = end + scale * (self.offsets[:, :1] * along + self.offsets[:, 1:] * across)
-        paths = finger + (ends - finger)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
-        slider, friction = self.planner.slider, self.friction
+        paths = position + (ends - position)[:, None] * np.linspace(0, 1, LEG + 1)[:, None]
+        slider, friction = self.scene.slider, self.scene.mean_friction
         if belief is not None:
             surface, mu = _mean(belief)
             slider, friction = Slider(slider.shape, surface), float(mu)
-        poses, _ = simulate_pushes(slider, self.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
+        poses, _ = simulate_pushes(slider, self.scene.hand, paths, np.broadcast_to(pose, (len(ends), 3)), friction)
         final = poses[:, -1].astype(float)
-        features = self.planner.library.features
+        features = self.planner.mean_library.features
         # least distance from the push's target, or, if the push is to reach the goal, largest score
         missed = np.linalg.norm(features(final) - features(push.target), axis=1)
         cost = (missed + SHIFT_WEIGHT * np.linalg.norm(ends - end, axis=1)) / self.length
-        if push.status == PlanStatus.ONE_PUSH:
+        if push.status == PushStatus.ONE_PUSH:
             score = self.planner.measure(compose(inverse(self.planner.goal), final))
             cost = SCORE_WEIGHT * (1 - score) + DISTANCE_WEIGHT * cost
         return ends[np.argmin(cost)]

@@ -6,6 +6,7 @@ stands for all pushes into that cell, and one sweep of the iteration takes minim
 """
 
 import hashlib
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.free_space import POSITIONS, FreeSpace, PoseGrid, grid_spacing
 from pushjax.planning.push_library import PushLibrary
-from pushjax.planning.workspace import Extent, Workspace
+from pushjax.planning.workspace import BoundingBoxTable, Workspace
 
 FORMAT = 1  # of the file, and of what is computed here: raise it when either changes
 NEVER = 1e3  # control steps; cost of poses from which the goal is not reached
@@ -63,7 +64,7 @@ def cost_to_go(
     axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
     theta = np.arange(ANGLES) * (2 * np.pi / ANGLES)
     cells = np.stack(np.meshgrid(*axes, theta, indexing="ij"), axis=-1).astype(np.float32)
-    blocked = Extent(vertices).outside(cells, workspace) > 0
+    blocked = BoundingBoxTable(vertices).outside(cells, workspace) > 0
     values = _last_push(library, goal, cells, push_time, usable, tolerance, between, space)
     moves = [_moves(library, angle, spacing, push_time + between, usable) for angle in theta]
     allowed = [_starts_allowed(library, workspace, cells[:, :, k], move) for k, move in enumerate(moves)]
@@ -90,14 +91,25 @@ def cost_to_go(
     return CostToGo(np.asarray(low, np.float32), spacing, values)
 
 
-def digest_of_costs(
-    library: PushLibrary, goal: np.ndarray, workspace: Workspace, *, space: FreeSpace | None = None, **given: Any
-) -> str:
+def cached_cost_to_go(cache: Path | None, *given: Any, **settings: Any) -> CostToGo:
+    """Read the cost to go from a folder, or compute it as `cost_to_go` does and keep it there."""
+    if cache is None:
+        return cost_to_go(*given, **settings)
+    path = cache / f"cost-{digest_of_costs(*given, **settings)[:16]}.npz"
+    with suppress(FileNotFoundError, ValueError):  # there is none, or it is damaged
+        return CostToGo.load(path)
+    value = cost_to_go(*given, **settings)
+    cache.mkdir(parents=True, exist_ok=True)
+    value.save(path)
+    return value
+
+
+def digest_of_costs(library: PushLibrary, *given: Any, space: FreeSpace | None = None, **more: Any) -> str:
     """Return the hash of what `cost_to_go` depends on; the arguments are the same."""
     settings = FORMAT, POSITIONS, ANGLES, SWEEPS, CHANGE, LAST_PUSHES, NEAR_CENTER
-    kept = None if space is None else (space.clearance, space.slider_clearance)
-    content = hashlib.sha256(f"{library.digest} {settings} {kept} {sorted(given)}".encode())
-    for leaf in jax.tree.leaves((goal, workspace, given)):
+    kept = None if space is None else (space.clearance, space.slider_clearance, *space.obstacles)
+    content = hashlib.sha256(f"{library.digest} {settings} {sorted(more)}".encode())
+    for leaf in jax.tree.leaves((given, kept, more)):
         content.update(f"{np.shape(leaf)}".encode() + np.asarray(leaf, np.float64).tobytes())
     return content.hexdigest()
 
@@ -153,7 +165,7 @@ def _codes(shift: np.ndarray) -> np.ndarray:
 
 def _starts_allowed(library: PushLibrary, workspace: Workspace, cells: np.ndarray, moves: _Moves) -> np.ndarray:
     """Return whether the finger can be where each move starts, (moves, positions, positions)."""
-    starts = library.starts[library.entries[moves.entry, 0], :2].astype(np.float32)
+    starts = library.starts[library.entries[moves.entry, 0]].astype(np.float32)
     return workspace.allows_finger(to_world(cells[None], starts[:, None, None]))
 
 

@@ -93,7 +93,7 @@ class SpringDamper:
         return FingerState(position, velocity_row[0] * away + velocity_row[1] * state.velocity)
 
 
-class Pace(NamedTuple):
+class SpeedLimits(NamedTuple):
     """Speeds of a finger. Times are in control steps.
 
     Attributes:

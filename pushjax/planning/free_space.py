@@ -77,8 +77,8 @@ class FreeSpace:
 
     def __init__(
         self,
-        workspace: Workspace,  # obstacles, and limits of the finger
-        roadmap: Roadmap,  # vertices, radius, and as goals the points where the library's pushes begin with run-ups
+        workspace: Workspace,  # limits of the finger
+        roadmap: Roadmap,  # its goals are the points where the library's pushes begin with run-ups
         library: PushLibrary,  # the methods take other outcomes too, of the same starts, directions and lengths
         clearance: float,  # that slider and finger keep from obstacles, m
         goal: np.ndarray,  # (3,), world; if it is nearer to an obstacle, the slider keeps only its distance there
@@ -86,10 +86,10 @@ class FreeSpace:
         high: np.ndarray,  # (2,), highest
     ):
         self.workspace, self.roadmap, self.length = workspace, roadmap, library.length
-        self.obstacles, self.vertices, self.radius = workspace.obstacles, roadmap.vertices, roadmap.radius
+        self.obstacles, self.vertices, self.radius = roadmap.obstacles, roadmap.vertices, roadmap.radius
         self.low, self.spacing = low, grid_spacing(low, high) / SUBDIVISIONS
         self.positions = SUBDIVISIONS * (POSITIONS - 1) + 1
-        reach = np.linalg.norm(library.starts[:, :2], axis=1).max() + library.travel[-1]
+        reach = np.linalg.norm(library.starts, axis=1).max() + library.travel[-1]
         self.padding = int(np.ceil(reach / self.spacing)) + 1  # cells beyond the grid that a push may lead to
         self.clearance = clearance  # of the finger, m
         at_goal = float(self.slider_distance(goal))
@@ -151,7 +151,7 @@ class FreeSpace:
         # poses outside of the grid count as free of obstacles for the slider
         last = self.low + self.spacing * (self.positions - 1)
         in_grid = np.all((poses[..., :2] >= self.low) & (poses[..., :2] <= last), axis=-1)
-        ends = library.starts[pushes, None, :2] + library.travel[::GRID_STRIDE, None] * library.directions[pushes, None]
+        ends = library.starts[pushes, None] + library.travel[::GRID_STRIDE, None] * library.directions[pushes, None]
         finger = self.obstacles.point_clearance(to_world(pose, ends)) >= self.radius + self.clearance
         # A slider that is nearer already may stay so. Its distance on the grid can be off by about the spacing.
         required = min(self.slider_clearance, float(self.slider_distance(pose)) - self.spacing)
@@ -162,7 +162,7 @@ class FreeSpace:
         """Return whether pushes `entries` from poses (entries, 3), world, are free by exact distances, (entries,)."""
         push, index = library.entries[entries].T
         steps = np.minimum(np.arange(0, index.max(initial=0) + EXACT_STRIDE, EXACT_STRIDE), index[:, None])
-        ends = library.starts[push, :2] + library.travel[index, None] * library.directions[push]
+        ends = library.starts[push] + library.travel[index, None] * library.directions[push]
         reached = compose(poses[:, None], library.outcomes[0][push[:, None], steps])
         starts = to_world(poses, self.roadmap.goals[push])
         return self._run_up_may_start(starts) & self._keeps_distance(reached, starts, to_world(poses, ends))
@@ -192,7 +192,7 @@ class FreeSpace:
         steps = np.minimum(np.arange(0, len(library.travel) + GRID_STRIDE, GRID_STRIDE), index[:, None])
         here = np.array([0.0, 0.0, angle])
         poses = compose(here, library.outcomes[0][push[:, None], steps].astype(float))
-        ends = library.starts[push, None, :2] + library.travel[steps, None] * library.directions[push, None]
+        ends = library.starts[push, None] + library.travel[steps, None] * library.directions[push, None]
         turns = np.rint(poses[..., 2] * (ANGLES / (2 * np.pi))).astype(int) % ANGLES
         slider_cells, finger_cells, run_up_cells = (
             np.rint(each / self.spacing).astype(int) + self.padding

@@ -28,10 +28,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_shape, check_type, checked_array, concrete
 from pushjax._internal.jit import quick_jit
 from pushjax._math.vec import wrap_to_pi
-from pushjax.friction.friction_model import FrictionModel
 from pushjax.friction.limit_surface import LimitSurface
-from pushjax.planning.friction_samples import draw_friction
-from pushjax.simulation.hand import Hand
+from pushjax.planning.scene import PushScene, draw_friction
 from pushjax.simulation.rollout import rollout
 from pushjax.simulation.slider import Slider
 
@@ -41,35 +39,21 @@ LOST = 10.0  # scales of the error beyond which a motion is not explained by a s
 
 
 class BeliefStatus(IntEnum):
-    """What the last motion did to a belief.
+    """What the last motion did to a belief."""
 
-    Attributes:
-        PRIOR: Nothing was seen yet.
-        UPDATED: The weights were updated.
-        UNEXPLAINED: No sample explains the motion, or a number was not finite. The belief is as it was.
-    """
-
-    PRIOR = 0
+    PRIOR = 0  # nothing was seen yet
     UPDATED = 1
-    UNEXPLAINED = 2
+    UNEXPLAINED = 2  # no sample explains the motion, or a number was not finite; the belief is as it was
 
 
 class FrictionBelief(NamedTuple):
-    """Weighted samples of friction.
+    """Weighted samples of friction."""
 
-    Attributes:
-        surface: Limit surfaces, with a leading axis of samples.
-        friction: Coefficients of contact friction, (samples,).
-        evidence: Log likelihood of the motions that were seen so far, (samples,).
-        weight: Weights, (samples,), which add up to one.
-        status: `BeliefStatus` of the last motion.
-    """
-
-    surface: LimitSurface
-    friction: Float[Array, "samples"]
-    evidence: Float[Array, "samples"]
-    weight: Float[Array, "samples"]
-    status: Int[Array, ""]
+    surface: LimitSurface  # with a leading axis of samples
+    friction: Float[Array, "samples"]  # coefficients of contact friction
+    evidence: Float[Array, "samples"]  # log likelihood of the motions that were seen so far
+    weight: Float[Array, "samples"]  # add up to one
+    status: Int[Array, ""]  # `BeliefStatus` of the last motion
 
     def mean(self) -> tuple[LimitSurface, Float[Array, ""]]:
         """Return the weighted means of the limit surfaces and of the coefficients of friction."""
@@ -83,12 +67,13 @@ class FrictionBelief(NamedTuple):
 class FrictionFilter(eqx.Module):
     """Settings of the filter.
 
-    `init` and `update` are pure functions, compiled, and may be part of other programs and of batches.
+    `init` and `update` are pure functions, compiled, and may be part of other programs and of batches. A belief is a
+    NamedTuple of the samples' limit surfaces, `surface`, coefficients of contact friction, `friction`, and weights,
+    `weight`, which add up to one. Its `status` says whether the last motion was UPDATED, or UNEXPLAINED by all samples.
+    `mean()` returns the weighted means of surface and friction, and `effective()` the number of effective samples.
 
     Args:
-        slider: The slider; its surface is the mean of the sampled surfaces.
-        hand: The hand.
-        model: Distribution of friction; its `resample_every` must be None.
+        scene: Slider, hand, and the distribution of friction. Fixtures are not considered: push away from them.
         samples: Number of samples.
         effective: Least number of effective samples that tempering leaves.
         error: Standard deviation of the error of a motion that is seen, in x, y and length * theta, m. It includes the
@@ -100,9 +85,7 @@ class FrictionFilter(eqx.Module):
         TypeError: If an argument is of another type.
     """
 
-    slider: Slider
-    hand: Hand
-    model: FrictionModel
+    scene: PushScene
     effective: Float[Array, ""]
     error: Float[Array, ""]
     relative_error: Float[Array, ""]
@@ -110,31 +93,27 @@ class FrictionFilter(eqx.Module):
 
     def __init__(
         self,
-        slider: Slider,
-        hand: Hand,
-        model: FrictionModel,
+        scene: PushScene,
         *,
         samples: int = 128,
         effective: ArrayLike = 6.0,
         error: ArrayLike = 5e-4,
         relative_error: ArrayLike = 0.05,
     ):
-        check_type("slider", slider, Slider)
-        check_type("hand", hand, Hand)
-        check_type("model", model, FrictionModel)
+        check_type("scene", scene, PushScene)
         check_count("samples", samples)
-        self.slider, self.hand, self.model, self.samples = slider, hand, model, samples
+        self.scene, self.samples = scene, samples
         numbers = {"effective": effective, "error": error, "relative_error": relative_error}
         for name, value in numbers.items():
             sign = {"non_negative" if name == "relative_error" else "positive": True}
-            setattr(self, name, checked_array(name, value, (), slider.surface.length.dtype, **sign))
+            setattr(self, name, checked_array(name, value, (), scene.slider.surface.length.dtype, **sign))
         known = concrete(self.effective)
         if known is not None and not 1 <= known <= samples:
             raise ValueError(f"effective must be from 1 to the number of samples, {samples}; got {effective!r}")
 
     def init(self, key: PRNGKeyArray) -> FrictionBelief:
-        """Draw the samples of `draw_friction` with this key, with equal weights."""
-        draws = draw_friction(key, self.slider.surface, self.model, self.samples)
+        """Draw samples, with equal weights, which are those of `PushLibrary.build` with this key."""
+        draws = draw_friction(key, self.scene.slider.surface, self.scene.friction, self.samples)
         surface, friction = jax.tree.map(lambda leaf: leaf[:, 0], (draws.surface, draws.friction))
         weight = jnp.full((self.samples,), 1 / self.samples, self.error.dtype)
         status = jnp.asarray(BeliefStatus.PRIOR, jnp.int32)
@@ -160,7 +139,7 @@ class FrictionFilter(eqx.Module):
         check_shape("before", start, (3,))
         check_shape("after", end, (3,))
         hand_path = as_float(path, dtype, "path")
-        check_shape("path", hand_path, ("steps + 1", self.hand.dof))
+        check_shape("path", hand_path, ("steps + 1", self.scene.hand.dof))
         return _update(self, belief, start, hand_path, end)
 
 
@@ -195,11 +174,11 @@ def _squared_errors(
     settings: FrictionFilter, belief: FrictionBelief, before: Array, path: Array, after: Array
 ) -> Float[Array, "samples"]:
     """Return the squared pose error of the simulation under each sample, in scales of the error."""
-    length = settings.slider.surface.length
+    slider, length = settings.scene.slider, settings.scene.slider.surface.length
     scale = settings.error**2 + settings.relative_error**2 * _distance_squared(before, after, length)
 
     def squared_error(surface: LimitSurface, mu: Array) -> Float[Array, ""]:
-        push = rollout(Slider(settings.slider.shape, surface), settings.hand, path, pose=before, friction=mu)
+        push = rollout(Slider(slider.shape, surface), settings.scene.hand, path, pose=before, friction=mu)
         # a sample whose simulation failed explains nothing
         return jnp.where(jnp.any(push.failed), jnp.inf, _distance_squared(push.pose[-1], after, length) / scale)
 

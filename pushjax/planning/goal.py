@@ -1,5 +1,6 @@
-"""The pose that a plan shall reach, and how far from it another pose is."""
+"""The pose that a plan shall reach, how far from it another pose is, and whether a plan reaches it."""
 
+from enum import IntEnum
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,30 @@ from pushjax._internal.checks import ArrayLike, as_float, check_count, checked_a
 from pushjax._math.vec import norm, wrap_to_pi
 
 ANGLE_TOLERANCE = float(np.radians(5))  # rad
+
+
+class PlanStatus(IntEnum):
+    """Whether a plan does what was asked for, or why not.
+
+    Attributes:
+        FOUND: It does so, at least as surely as was asked for.
+        UNLIKELY: The best plan that was found does so less surely.
+        NO_TRANSIT: No plan of pushes that was found can be carried out. In the best one, the finger does not get from
+            push to push without touching slider or fixtures.
+        HAND_IN_FIXTURE: No plan of pushes that was found can be carried out. In the best one, the hand runs into a
+            fixture in a push.
+        NOT_STABLE: There is no stable push: on no edge does the contact stick for every sampled friction, not even when
+            it pushes straight ahead.
+        OUT_OF_REACH: There is no stable push, not even to a pose straight ahead, because no contact can turn to either
+            side without slip.
+    """
+
+    FOUND = 0
+    UNLIKELY = 1
+    NO_TRANSIT = 2
+    HAND_IN_FIXTURE = 3
+    NOT_STABLE = 4
+    OUT_OF_REACH = 5
 
 
 class Goal(eqx.Module):

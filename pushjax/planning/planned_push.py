@@ -8,7 +8,7 @@ import numpy as np
 from pushjax.planning.roadmap import Transit
 
 
-class PlanStatus(IntEnum):
+class PushStatus(IntEnum):
     """What the next push is for, or why there is none.
 
     Attributes:
@@ -31,13 +31,13 @@ class PlanStatus(IntEnum):
     @property
     def failed(self) -> bool:
         """Whether there is no push."""
-        return self >= PlanStatus.NO_TRANSIT
+        return self >= PushStatus.NO_TRANSIT
 
 
 class PlannedPush(NamedTuple):
     """The next push."""
 
-    status: PlanStatus  # what the push is for, or why there is none
+    status: PushStatus  # what the push is for, or why there is none
     transit: Transit  # of the finger to where the run-up begins, world; without a push its length is infinite
     start: np.ndarray  # (2,), where the finger is about to touch the slider, world, m
     end: np.ndarray  # (2,), where the push ends, world, m
@@ -48,7 +48,7 @@ class PlannedPush(NamedTuple):
 class PushChoice(NamedTuple):
     """A push that may come next."""
 
-    status: PlanStatus  # its kind
+    status: PushStatus  # its kind
     entry: int  # of the library
     target: np.ndarray  # (3,), pose of the slider that it is for, world, m and rad
     cost: float  # predicted control steps to the goal

@@ -12,6 +12,7 @@ changed by a motion of the world, so it is the distance of the final pose from t
 
 import hashlib
 import re
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,14 +24,12 @@ from jaxtyping import PRNGKeyArray
 from scipy.spatial import KDTree
 
 import pushjax
-from pushjax._internal.checks import check_count, check_type
-from pushjax.friction.friction_model import FrictionModel
+from pushjax._internal.checks import check_count
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
-from pushjax.planning.friction_samples import draw_friction
 from pushjax.planning.push_batch import simulate_pushes
-from pushjax.simulation.hand import Hand
+from pushjax.planning.scene import PushScene, draw_friction
 from pushjax.simulation.slider import Slider
 
 # Lengths in units of the surface's length, which is about the slider's radius.
@@ -39,9 +38,9 @@ STEP = 0.0275  # of the simulation, and between neighboring lengths of a push
 TRAVEL = 2.3  # longest push
 LEAST_MOTION = 0.005  # a push that moves the slider less than this is not valid
 
-FORMAT = 2  # of the file, and of what is computed here: raise it when either changes
+FORMAT = 3  # of the file, and of what is computed here: raise it when either changes
 SHAPES = {
-    "starts": ("pushes", "dof"),
+    "starts": ("pushes", 2),
     "directions": ("pushes", 2),
     "travel": ("lengths",),
     "outcomes": ("samples", "pushes", "lengths", 3),
@@ -49,8 +48,8 @@ SHAPES = {
     "length": (),
     "center": (2,),
     "slider": ("numbers",),
-    "radius": (),
-    "friction": (),
+    "radius": (1,),
+    "friction": ("friction",),
 }
 
 
@@ -59,17 +58,17 @@ class PushLibrary:
     """Outcomes of straight pushes of one slider, in its body frame.
 
     Attributes:
-        starts: Configurations of the hand where each push starts, (pushes, dof), body frame.
-        directions: Unit vectors along which the hand moves, (pushes, 2), body frame.
-        travel: Distances of the hand from its start, (lengths,), m.
+        starts: Centers of the finger where each push starts, (pushes, 2), body frame, m.
+        directions: Unit vectors along which the finger moves, (pushes, 2), body frame.
+        travel: Distances of the finger from its start, (lengths,), m.
         outcomes: Poses of the slider after each push, relative to its pose before, (samples, pushes, lengths, 3). There
             is one sample if friction is known.
         valid: Whether the push moves the slider and nothing failed or jammed in any sample, (pushes, lengths).
         length: Characteristic length of the slider's limit surface, m.
         center: Centroid of the slider, (2,), body frame, m.
         slider: Numbers of the slider, its outline and its limit surface, (numbers,).
-        radius: Radius of the hand's first finger, m.
-        friction: Coefficient of contact friction; the mean one if it is random.
+        radius: Radius of the finger, (1,), m.
+        friction: Numbers of the `pj.FrictionModel`, (numbers,).
         digest: Hash of everything that the outcomes depend on.
     """
 
@@ -81,115 +80,56 @@ class PushLibrary:
     length: float
     center: np.ndarray
     slider: np.ndarray
-    radius: float
-    friction: float
+    radius: np.ndarray
+    friction: np.ndarray
     digest: str
 
     @staticmethod
     def build(
-        slider: Slider,
-        radius: float,
+        scene: PushScene,
         *,
-        friction: float = 0.0,
         contacts: int = 240,
         angles: int = 9,
         max_angle: float = np.pi / 3,
-        model: FrictionModel | None = None,
         samples: int = 1,
         key: PRNGKeyArray | None = None,
+        cache: Path | None = None,
     ) -> "PushLibrary":
         """Simulate the pushes of a round finger from all around the slider.
 
         Args:
-            slider: The slider.
-            radius: Radius of the finger, m.
-            friction: Coefficient of contact friction.
+            scene: Slider, finger and friction; its fixtures do not matter.
             contacts: Number of places around the slider, at equal spacing.
             angles: Number of directions at each place.
             max_angle: Largest angle between a direction and the inward normal, rad.
-            model: Distribution of friction. If it is given, `friction` is not used.
-            samples: Number of draws from `model`. All pushes share them, so that differences between pushes are not
-                due to the draws.
-            key: Key of the draws, which are those of `draw_friction`.
+            samples: Number of draws of random friction. All pushes share them, so that differences between pushes are
+                not due to the draws.
+            key: Key of the draws, which are those of `FrictionFilter.init`.
+            cache: Folder in which the library is kept. The pushes are simulated only if it is not there.
 
         Returns:
             The library.
 
         Raises:
-            ValueError: If a number is out of its range, or if `model` is given without `key`.
+            ValueError: If a number is out of its range, the hand is not one round finger, `key` is missing for random
+                friction, or there are several samples of friction that is known.
         """
-        starts, directions = fan(slider, radius, contacts, angles, max_angle)
-        hand = Hand.finger(radius)
-        return PushLibrary.simulate(
-            slider, hand, starts, directions, friction=friction, model=model, samples=samples, key=key
-        )
-
-    @staticmethod
-    def simulate(
-        slider: Slider,
-        hand: Hand,
-        starts: np.ndarray,
-        directions: np.ndarray,
-        *,
-        friction: float = 0.0,
-        model: FrictionModel | None = None,
-        samples: int = 1,
-        key: PRNGKeyArray | None = None,
-    ) -> "PushLibrary":
-        """Simulate given straight pushes of any hand.
-
-        Args:
-            slider: The slider.
-            hand: The hand. The first two numbers of its configuration are a position, which moves; the others rest.
-            starts: Configurations of the hand at the start, (pushes, dof), in the body frame of the slider.
-            directions: Unit vectors of the motion, (pushes, 2), body frame.
-            friction: Coefficient of contact friction.
-            model: Distribution of friction, as in `build`.
-            samples: Number of draws from `model`.
-            key: Key of the draws.
-
-        Returns:
-            The library.
-
-        Raises:
-            ValueError: If `samples` is less than one, or if `model` is given without `key`.
-            TypeError: If `slider` is not a `Slider`.
-        """
-        check_type("slider", slider, Slider)
         check_count("samples", samples)
-        length = float(slider.surface.length)
-        steps = round(TRAVEL / STEP)
-        travel = length * STEP * np.arange(steps + 1)
-        pushes = len(starts)
-        paths = np.repeat(np.asarray(starts, np.float64)[:, None], steps + 1, axis=1)
-        paths[..., :2] += travel[:, None] * directions[:, None]
-        if model is None:
-            surfaces, mus, mean = [slider.surface], [friction], friction
-        else:
-            if key is None:
-                raise ValueError("key: draws from a FrictionModel need a PRNG key; got None")
-            draws = draw_friction(key, slider.surface, model, samples)
-            surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k, 0], draws.surface) for k in range(samples)]
-            mus, mean = np.asarray(draws.friction[:, 0]).tolist(), np.mean(np.asarray(model.friction))
-        outcomes, valid = [], np.ones((pushes, steps + 1), bool)
-        for surface, mu in zip(surfaces, mus, strict=True):
-            poses, valid_steps = simulate_pushes(Slider(slider.shape, surface), hand, paths, np.zeros((pushes, 3)), mu)
-            moved = np.linalg.norm(poses * np.array([1, 1, length]), axis=-1)
-            valid &= (np.arange(steps + 1) <= valid_steps[:, None]) & (moved > LEAST_MOTION * length)
-            outcomes.append(poses)
-        return PushLibrary(
-            starts=np.asarray(starts, np.float64),
-            directions=np.asarray(directions, np.float64),
-            travel=travel,
-            outcomes=np.stack(outcomes).astype(np.float32),
-            valid=valid,
-            length=length,
-            center=np.asarray(slider.shape.centroid, np.float64),
-            slider=_numbers(slider),
-            radius=float(hand.radius[0]),
-            friction=float(mean),
-            digest=digest(slider, hand, starts, directions, friction, model, samples, key),
-        )
+        starts, directions = fan(scene, contacts, angles, max_angle)
+        if scene.is_known and samples > 1:
+            raise ValueError(f"samples must be 1, because the scene's friction is known; got {samples}")
+        if not scene.is_known and key is None:
+            raise ValueError("key: draws of random friction need a PRNG key; got None")
+        wanted = digest(scene, starts, directions, samples, key)
+        if cache is None:
+            return _simulated(scene, starts, directions, samples, key, wanted)
+        path = cache / f"pushes-{wanted[:16]}.npz"
+        with suppress(FileNotFoundError, ValueError):  # there is none, or it is damaged
+            return PushLibrary.load(path, wanted)
+        built = _simulated(scene, starts, directions, samples, key, wanted)
+        cache.mkdir(parents=True, exist_ok=True)
+        built.save(path)
+        return built
 
     def save(self, path: str | Path) -> None:
         """Write the library to a file in NumPy's format "npz"."""
@@ -201,7 +141,7 @@ class PushLibrary:
 
         Args:
             path: The file.
-            digest: Digest that the library must have, from `push_library.digest`. None: any.
+            digest: Digest that the library must have. None: any.
 
         Raises:
             ValueError: If the file holds no library, or one of another slider, hand or set of pushes.
@@ -209,8 +149,12 @@ class PushLibrary:
         content = "a library of pushes"
         fields: dict[str, Any] = load_arrays(path, content, FORMAT, PushLibrary.__dataclass_fields__)
         check_arrays(path, content, fields, SHAPES)
-        fields |= {name: float(fields[name]) for name in ("length", "radius", "friction")}
-        library = PushLibrary(**fields | {"valid": fields["valid"].astype(bool), "digest": str(fields["digest"])})
+        cast = {
+            "length": float(fields["length"]),
+            "valid": fields["valid"].astype(bool),
+            "digest": str(fields["digest"]),
+        }
+        library = PushLibrary(**fields | cast)
         if digest is not None and library.digest != digest:
             raise ValueError(
                 f"{path} holds a library of another slider, hand, friction or set of pushes; build it again "
@@ -218,13 +162,21 @@ class PushLibrary:
             )
         return library
 
-    def check_made_for(self, slider: Slider, radius: float) -> None:
-        """Raise ValueError if this is the library of another slider or finger."""
-        numbers = _numbers(slider)
-        if numbers.shape != self.slider.shape or not np.allclose(numbers, self.slider, rtol=1e-5, atol=1e-7):
-            raise ValueError("library was made for another slider: its outline or limit surface differ from `slider`'s")
-        if not np.isclose(radius, self.radius, rtol=1e-5):
-            raise ValueError(f"library was made for a finger with a radius of {self.radius:.6g} m; got {radius!r}")
+    def check_made_for(self, scene: PushScene) -> None:
+        """Check that slider, finger and friction are those of a scene.
+
+        Args:
+            scene: The scene; its fixtures do not matter.
+
+        Raises:
+            ValueError: If one of them is another.
+        """
+        for name, given in _numbers(scene).items():
+            expected = getattr(self, name)
+            if given.shape != expected.shape or not np.allclose(given, expected, rtol=1e-5, atol=1e-7):
+                numbers = ", ".join(f"{number:.4g}" for number in given)
+                wanted = ", ".join(f"{number:.4g}" for number in expected)
+                raise ValueError(f"library was made for another {name} than the scene's, {numbers}; expected {wanted}")
 
     @cached_property
     def entries(self) -> np.ndarray:
@@ -298,8 +250,7 @@ def pose_features(poses: np.ndarray, center: np.ndarray, length: float) -> np.nd
 
 
 def fan(
-    slider: Slider,
-    radius: float,  # of the finger, m
+    scene: PushScene,
     contacts: int = 240,  # places around the slider at equal spacing; in reflex corners some are left out
     angles: int = 9,  # directions at each place
     max_angle: float = np.pi / 3,  # between a direction and the inward normal, rad
@@ -308,26 +259,66 @@ def fan(
     # The starts are centers of the finger, m, a small gap away from the slider; the directions are unit vectors.
     check_count("contacts", contacts)
     check_count("angles", angles)
-    if not radius >= 0:
-        raise ValueError(f"radius must not be negative; got {radius!r}")
     if not 0 <= max_angle < np.pi / 2:
         raise ValueError(f"max_angle must be at least 0 and less than pi / 2; got {max_angle!r}")
-    gap = GAP * float(slider.surface.length)
-    curve = offset_curve(outline_vertices(slider.shape), radius + gap, contacts)
+    distance = scene.radius + GAP * scene.length
+    curve = offset_curve(outline_vertices(scene.slider.shape), distance, contacts)
     angle = np.linspace(-max_angle, max_angle, angles) if angles > 1 else np.zeros(1)
     (x, y), c, s = curve.normals.T[..., None], np.cos(angle), np.sin(angle)
     directions = np.stack([c * x - s * y, s * x + c * y], axis=-1).reshape(-1, 2)
     return np.repeat(curve.points, angles, axis=0), directions
 
 
-def _numbers(slider: Slider) -> np.ndarray:
-    """Return all leaves of a slider as one vector, (numbers,)."""
-    return np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in jax.tree.leaves(slider)])
+def _simulated(
+    scene: PushScene,
+    starts: np.ndarray,  # (pushes, 2), centers of the finger, body frame, m
+    directions: np.ndarray,  # (pushes, 2), unit vectors, body frame
+    samples: int,  # of friction
+    key: PRNGKeyArray | None,  # of the samples
+    name: str,  # digest of all this
+) -> PushLibrary:
+    """Simulate straight pushes."""
+    slider, length = scene.slider, scene.length
+    steps = round(TRAVEL / STEP)
+    travel = length * STEP * np.arange(steps + 1)
+    paths = starts[:, None] + travel[:, None] * directions[:, None]
+    if key is None:
+        surfaces, mus = [slider.surface], [scene.mean_friction]
+    else:
+        draws = draw_friction(key, slider.surface, scene.friction, samples)
+        surfaces = [jax.tree.map(lambda leaf, k=k: leaf[k, 0], draws.surface) for k in range(samples)]
+        mus = np.asarray(draws.friction[:, 0]).tolist()
+    outcomes, valid, start = [], np.ones((len(starts), steps + 1), bool), np.zeros((len(starts), 3))
+    for surface, mu in zip(surfaces, mus, strict=True):
+        poses, valid_steps = simulate_pushes(Slider(slider.shape, surface), scene.hand, paths, start, mu)
+        moved = np.linalg.norm(poses * np.array([1, 1, length]), axis=-1)
+        valid &= (np.arange(steps + 1) <= valid_steps[:, None]) & (moved > LEAST_MOTION * length)
+        outcomes.append(poses)
+    return PushLibrary(
+        starts=starts,
+        directions=directions,
+        travel=travel,
+        outcomes=np.stack(outcomes).astype(np.float32),
+        valid=valid,
+        length=length,
+        center=np.asarray(slider.shape.centroid, np.float64),
+        digest=name,
+        **_numbers(scene),
+    )
 
 
-def digest(slider, hand, starts, directions, friction=0.0, model=None, samples=1, key=None) -> str:
-    """Return the hash of what the outcomes of `PushLibrary.simulate` depend on; the arguments are the same."""
-    parts = (slider, hand, model, np.asarray(starts), np.asarray(directions), np.asarray(friction))
+def _numbers(scene: PushScene) -> dict[str, np.ndarray]:
+    """Return the numbers of slider, finger and friction, (numbers,) each."""
+    parts = {"slider": scene.slider, "radius": scene.radius, "friction": scene.friction}
+    return {
+        name: np.concatenate([np.asarray(leaf, np.float64).ravel() for leaf in jax.tree.leaves(part)])
+        for name, part in parts.items()
+    }
+
+
+def digest(scene: PushScene, starts: np.ndarray, directions: np.ndarray, samples: int, key: Any) -> str:
+    """Return the hash of everything that the outcomes of pushes depend on."""
+    parts = (scene.slider, scene.hand, scene.friction, starts, directions)
     # types and static fields, without the addresses of functions, which differ from process to process
     structure = re.sub("0x[0-9a-f]+", "", str(jax.tree.structure(parts)))
     content = hashlib.sha256(

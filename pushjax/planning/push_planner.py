@@ -10,28 +10,32 @@ Farther away: the push with that least sum.
 
 from copy import copy
 from functools import cached_property
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning.cost_to_go import CostToGo, cost_to_go, digest_of_costs
+from pushjax.planning.cost_to_go import CostToGo, cached_cost_to_go
 from pushjax.planning.coverage_table import CoverageTable, Measure
-from pushjax.planning.finger_control import Pace
+from pushjax.planning.finger_control import SpeedLimits
 from pushjax.planning.free_space import GRID_STRIDE, FreeSpace
-from pushjax.planning.planned_push import PlannedPush, PlanStatus, PushChoice
+from pushjax.planning.obstacles import Obstacles
+from pushjax.planning.planned_push import PlannedPush, PushChoice, PushStatus
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.roadmap import Roadmap, ShortestTransits, Transit, run_ups
-from pushjax.planning.workspace import Extent, Workspace
+from pushjax.planning.scene import PushScene
+from pushjax.planning.workspace import BoundingBoxTable, Workspace
 from pushjax.simulation.pair import MAX_PENETRATION
-from pushjax.simulation.slider import Slider
 
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
-CHECKED, CHECKED_AT_A_TIME = 480, 24  # choices that are checked for collisions, best first, and how many at a time
-JUDGED = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
+MAX_COLLISION_CHECKS, COLLISION_BATCH = (
+    480,
+    24,
+)  # choices that are checked for collisions, best first, and how many at a time
+RISK_BATCH = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 # A slider outside of the workspace must come back by twice this, or, where no push does that, go no farther out than
@@ -39,7 +43,7 @@ BETWEEN = 6.0  # control steps between two pushes, for the cost to go
 OUTSIDE = 0.02
 AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
-RETRY = 10.0  # control steps of another push, if the last one misses the goal
+MISS_COST = 10.0  # control steps of another push, if the last one misses the goal
 NO_TRANSIT_TIME = 60.0  # control steps that count for a transit between two pushes that is not found
 # With known friction: a last push whose score is less than this part of the way from enough to one is at risk, and
 # costs so many control steps for each unit of score below it.
@@ -49,64 +53,76 @@ STEPS_PER_LENGTH = 20.0  # control steps for each length of distance from the go
 
 
 class PushPlanner:
-    """Chooses pushes that bring one slider to one goal.
+    """Chooses pushes that bring the slider of a scene to one goal.
+
+    Pushes in which slider or finger comes nearer to a fixture than a clearance are not chosen.
 
     Args:
-        slider: The slider.
-        radius: Radius of the finger, m.
-        library: Pushes of that slider and finger.
+        scene: Slider, finger, friction and fixtures.
+        library: Pushes of that slider and finger, with that friction.
         goal: The goal, (3,), world, m and rad. The slider must be within the workspace there.
-        workspace: Limits of finger and slider, and the fixtures that they stay out of. Pushes in which either comes
-            nearer to a fixture than a clearance are not chosen.
-        pace: Speeds of the finger.
-        measure: Score of final poses. None: the slider must cover 95 % of the goal.
+        workspace: Limits of finger and slider.
+        speeds: Speeds of the finger.
+        measure: Score of final poses. None: the slider must cover 95 % of the goal. Otherwise a function of poses
+            relative to the goal, (..., 3), whose values (...,) are from 0 to 1. Its attribute `enough` is the score
+            from which the slider is at the goal, and `reach` the largest distance from the goal, m, of such a pose.
         look_ahead: Whether to consider plans of two pushes.
-        value: Cost to go. None: it is computed when it is first needed. False: the distance to the goal instead.
-        retry: If the library has several samples of friction: control steps that a last push costs more, times the
+        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
+        miss_cost: If the library has several samples of friction: control steps that a last push costs more, times the
             probability that it misses the goal. Other pushes are chosen by their mean outcome, because the next push
             is planned from where they end.
+        cache: Folder in which the cost to go is kept. It is computed only if it is not there.
 
     Raises:
-        ValueError: For a library of another slider or finger, and for a goal at which the slider overlaps a fixture or
-            reaches out of the workspace.
+        ValueError: For a library of another slider, finger or friction, and for a goal at which the slider overlaps a
+            fixture or reaches out of the workspace.
     """
 
     def __init__(
         self,
-        slider: Slider,
-        radius: float,
+        scene: PushScene,
         library: PushLibrary,
         goal: np.ndarray,
         workspace: Workspace,
-        pace: Pace,
+        speeds: SpeedLimits,
         *,
         measure: Measure | None = None,
         look_ahead: bool = True,
-        value: CostToGo | bool | None = None,
-        retry: float = RETRY,
+        cost_to_go: bool = True,
+        miss_cost: float = MISS_COST,
+        cache: Path | None = None,
     ):
-        library.check_made_for(slider, radius)
-        self.slider, self.radius, self.sampled, self.retry = slider, radius, library, retry
-        self.goal, self.workspace, self.pace = np.asarray(goal, float), workspace, pace
-        self.vertices, length = outline_vertices(slider.shape), library.length
+        library.check_made_for(scene)
+        self.scene, self.library_samples, self.miss_cost = scene, library, miss_cost
+        self.goal, self.workspace, self.speeds = np.asarray(goal, float), workspace, speeds
+        self.vertices, length = outline_vertices(scene.slider.shape), library.length
         workspace.check_goal(self.goal, self.vertices)
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
-        self.look_ahead, self.extent, self.clearance = look_ahead, Extent(self.vertices), CLEARANCE * length
+        self.look_ahead, self.cost_to_go, self.cache = look_ahead, cost_to_go, cache
+        self.bounding_boxes, self.clearance = BoundingBoxTable(self.vertices), CLEARANCE * length
         self._weigh(None)
-        # pushes are looked up in this library; `reweighted` changes `library`, but keeps this one and its tree
-        self.searched = library = self.library
-        starts = library.starts[:, :2]
-        self.run_up = run_ups(self.vertices, radius, self.clearance, starts, library.directions, RUN_UP * length)
+        # pushes are looked up in this library; `reweighted` changes `mean_library`, but keeps this one and its tree
+        self.indexed_library = library = self.mean_library
+        starts, ahead = library.starts, library.directions
+        self.run_up = run_ups(self.vertices, scene.radius, self.clearance, starts, ahead, RUN_UP * length)
         self.usable = np.isfinite(self.run_up)
-        goals = starts - np.where(self.usable, self.run_up, 0)[:, None] * library.directions
-        self.roadmap = Roadmap(self.vertices, radius, self.clearance, goals)
-        self.space = self._free_space() if workspace.obstacles.any else None
+        goals = starts - np.where(self.usable, self.run_up, 0)[:, None] * ahead
+        self.obstacles = Obstacles.of(scene.fixtures)
+        self.roadmap = Roadmap(self.vertices, scene.radius, self.clearance, goals, self.obstacles)
+        half = np.abs(self.vertices).max() / 2  # the slider's origin is at least about this far from a wall
+        around = self.goal[:2] + AROUND * length * np.array([[-1.0], [1.0]])
+        # lowest and highest position of the slider's origin for which tables are made
+        self.table_low = np.maximum(workspace.slider_low + half, around[0])
+        self.table_high = np.minimum(workspace.slider_high - half, around[1])
+        self.space = None
+        if self.obstacles.any:
+            given = workspace, self.roadmap, library, self.clearance, self.goal, self.table_low, self.table_high
+            self.space = FreeSpace(*given)
         push, index = library.entries.T
         self.push, self.travel = push, library.travel[index]
-        self.push_time = pace.push_time(self.travel)
-        self.ends = (starts[push] + self.travel[:, None] * library.directions[push]).astype(np.float32)
+        self.push_time = speeds.push_time(self.travel)
+        self.ends = (starts[push] + self.travel[:, None] * ahead[push]).astype(np.float32)
         self.coarse = np.flatnonzero((index % STRIDE == 0) & self.usable[push])
-        self._value = value
 
     def reweighted(self, weight: np.ndarray) -> "PushPlanner":
         """Return a planner with other weights of the library's samples. It keeps the tables, and the cost to go.
@@ -130,51 +146,31 @@ class PushPlanner:
             points: Centers of the finger, (..., 2), world.
         """
         apart = signed_distances(self.vertices, to_body(pose, points))
-        if self.space is not None:
-            apart = np.minimum(apart, self.workspace.obstacles.point_clearance(points))
-        return apart - self.radius
+        return np.minimum(apart, self.obstacles.point_clearance(points)) - self.scene.radius
 
     def _weigh(self, weight: np.ndarray | None) -> None:
         """Set the mean outcomes of pushes by weights of the library's samples."""
-        self.weight, self.library = weight, self.sampled.averaged(weight)
+        self.weight, self.mean_library = weight, self.library_samples.averaged(weight)
 
     @cached_property
     def value(self) -> CostToGo | None:
         """Cost to go, or None if the distance to the goal takes its place."""
-        if isinstance(self._value, CostToGo):
-            return self._value
-        if self._value is False:
+        if not self.cost_to_go:
             return None
-        return cost_to_go(self.library, self.goal, self.workspace, **self._costs())
-
-    def _costs(self) -> dict[str, Any]:
-        """Return the other arguments of `cost_to_go`."""
-        low, high = self._positions(self.library.length)
-        return {
-            "push_time": self.push_time,
-            "usable": self.usable,
-            "tolerance": self.measure.reach,
-            "between": BETWEEN,
-            "low": low,
-            "high": high,
-            "vertices": self.vertices,
-            "space": self.space,
-        }
-
-    def value_digest(self) -> str:
-        """Return a hash of what the cost to go depends on, by which it may be kept in a file."""
-        return digest_of_costs(self.library, self.goal, self.workspace, **self._costs())
-
-    def _positions(self, length: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lowest and the highest position of the slider's origin for which tables are made."""
-        half = np.abs(self.vertices).max() / 2  # the slider's origin is at least about this far from a wall
-        around = self.goal[:2] + AROUND * length * np.array([[-1.0], [1.0]])
-        low = np.maximum(self.workspace.slider_low + half, around[0])
-        return low, np.minimum(self.workspace.slider_high - half, around[1])
-
-    def _free_space(self) -> FreeSpace:
-        given = self.workspace, self.roadmap, self.library, self.clearance, self.goal
-        return FreeSpace(*given, *self._positions(self.library.length))
+        return cached_cost_to_go(
+            self.cache,
+            self.mean_library,
+            self.goal,
+            self.workspace,
+            self.push_time,
+            usable=self.usable,
+            tolerance=self.measure.reach,
+            between=BETWEEN,
+            low=self.table_low,
+            high=self.table_high,
+            vertices=self.vertices,
+            space=self.space,
+        )
 
     @cached_property
     def after_push(self) -> np.ndarray:
@@ -183,7 +179,7 @@ class PushPlanner:
         A row is a place of the finger around the slider; `place` is that of each entry.
         """
         lengths = self.roadmap.between(self.places)
-        return np.where(np.isfinite(lengths), self.pace.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
+        return np.where(np.isfinite(lengths), self.speeds.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -191,31 +187,31 @@ class PushPlanner:
 
         Pushes of different directions share a start. Of the points where their run-ups begin, one is taken.
         """
-        _, first = np.unique(self.library.starts[self.usable, :2], axis=0, return_index=True)
+        _, first = np.unique(self.mean_library.starts[self.usable], axis=0, return_index=True)
         return self.roadmap.goals[self.usable][first]
 
     @cached_property
     def place(self) -> np.ndarray:
         """Index of the place that is nearest to the finger at the end of each entry, (entries,)."""
-        finger = to_body(self.library.relative, self.ends)
+        finger = to_body(self.mean_library.relative, self.ends)
         return np.asarray(KDTree(self.places).query(finger)[1])
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self.after_push, self.place, self.searched.tree, self.space and self.space.distances
+        _ = self.value, self.after_push, self.place, self.indexed_library.tree, self.space and self.space.distances
 
     def is_at_goal(self, pose: np.ndarray) -> bool:
-        """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by the planner's `measure`."""
+        """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by `measure`."""
         error = compose(inverse(self.goal), np.asarray(pose, float))
         return bool(self.measure(error) > self.measure.enough)
 
-    def choose(self, pose: np.ndarray, finger: np.ndarray, shake: np.ndarray | None = None) -> PlannedPush:
+    def choose(self, pose: np.ndarray, finger: np.ndarray, cost_noise: np.ndarray | None = None) -> PlannedPush:
         """Choose the next push.
 
         Args:
             pose: Pose of the slider, (3,), world, m and rad.
             finger: Center of the finger, (2,), world, m.
-            shake: Control steps that are added to the cost of each push, (pushes,), for another choice than before.
+            cost_noise: Control steps that are added to the cost of each push, (pushes,), to choose another one.
 
         Returns:
             The push. Its status says what it is for, or why there is none.
@@ -223,36 +219,36 @@ class PushPlanner:
         pose = np.asarray(pose, float)
         transits = self.roadmap.transits(finger, pose, self.workspace)
         nowhere = Transit(np.asarray(finger, float)[None], np.inf, transits.status)
-        none = PlannedPush(PlanStatus.NO_TRANSIT, nowhere, finger, finger, pose, np.inf)
+        none = PlannedPush(PushStatus.NO_TRANSIT, nowhere, finger, finger, pose, np.inf)
         reachable = np.isfinite(transits.lengths) & self.usable
-        starts = to_world(pose, self.library.starts[:, :2])
+        starts = to_world(pose, self.mean_library.starts)
         reachable &= self.workspace.allows_finger(starts)
         if self.space is not None:
-            if self.space.slider_distance(pose) < -MAX_PENETRATION * self.library.length:
-                return none._replace(status=PlanStatus.START_IN_FIXTURE)
+            if self.space.slider_distance(pose) < -MAX_PENETRATION * self.mean_library.length:
+                return none._replace(status=PushStatus.START_IN_FIXTURE)
             reachable &= self.space.finger_free(to_world(pose, self.roadmap.goals), starts)
         if not reachable.any():
             return none
-        transit_time = self.pace.free_time(np.where(reachable, transits.lengths + np.nan_to_num(self.run_up), np.inf))
-        if shake is not None:
-            transit_time = transit_time + shake
+        transit_time = self.speeds.free_time(np.where(reachable, transits.lengths + np.nan_to_num(self.run_up), np.inf))
+        if cost_noise is not None:
+            transit_time = transit_time + cost_noise
         found = [self._one_push(pose, transit_time), *self._more_pushes(pose, transit_time)]
         best = min((each for each in found if each is not None), key=lambda each: each.cost, default=None)
         if best is None:
-            return none._replace(status=PlanStatus.NO_PUSH)
+            return none._replace(status=PushStatus.NO_PUSH)
         return self._planned(best, transits, pose)
 
     def _planned(self, best: PushChoice, transits: ShortestTransits, pose: np.ndarray) -> PlannedPush:
         push = int(self.push[best.entry])
         transit = self.roadmap.transit(transits, push, pose)
-        start = to_world(pose, self.library.starts[push, :2])
+        start = to_world(pose, self.mean_library.starts[push])
         end = to_world(pose, self.ends[best.entry].astype(float))
         return PlannedPush(best.status, transit, start, end, best.target, best.cost)
 
     def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> PushChoice | None:
         """Return the push that reaches the goal at the least cost: its control steps, and its risk of missing."""
         relative = compose(inverse(pose), self.goal)
-        near = self.searched.tree.query_ball_point(self.library.features(relative), self.measure.reach)
+        near = self.indexed_library.tree.query_ball_point(self.mean_library.features(relative), self.measure.reach)
         entries = np.asarray(near, int)
         entries = entries[np.isfinite(transit_time[self.push[entries]])]
         entries = entries[self.workspace.allows_finger(to_world(pose, self.ends[entries]))]
@@ -264,7 +260,7 @@ class PushPlanner:
         best = self._least(cost, (np.broadcast_to(pose, back.shape), entries))
         if best is None:
             return None
-        return PushChoice(PlanStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
+        return PushChoice(PushStatus.ONE_PUSH, int(entries[best]), self.goal, float(cost[best]))
 
     def _with_risk(self, spent: np.ndarray, back: np.ndarray, entries: np.ndarray, *, must_reach: bool) -> np.ndarray:
         """Return the costs of last pushes, with their risk; infinite for some that cannot have the least cost."""
@@ -274,8 +270,8 @@ class PushPlanner:
         cost = np.full(len(entries), np.inf)
         order = np.argsort(spent, kind="stable")
         order = order[np.isfinite(spent[order])]
-        for begin in range(0, len(order), JUDGED):
-            some = order[begin : begin + JUDGED]
+        for begin in range(0, len(order), RISK_BATCH):
+            some = order[begin : begin + RISK_BATCH]
             if self.space is None and spent[some[0]] > cost.min():  # a fixture may forbid the best
                 break
             risk, may_reach = self._risk(back[some], entries[some])
@@ -285,14 +281,14 @@ class PushPlanner:
     def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the risk of missing the goal, in control steps, and whether it may be reached, as `_with_risk`."""
         enough = self.measure.enough
-        score = self.measure(compose(back, self.library.relative[entries]))
-        if len(self.sampled.outcomes) == 1:
+        score = self.measure(compose(back, self.mean_library.relative[entries]))
+        if len(self.library_samples.outcomes) == 1:
             safe = enough + SAFE_SCORE * (1 - enough)
             return RISK_COST * np.maximum(safe - score, 0), score > enough
-        push, index = self.library.entries[entries].T
-        reached = self.measure(compose(back, self.sampled.outcomes[:, push, index])) > enough
+        push, index = self.mean_library.entries[entries].T
+        reached = self.measure(compose(back, self.library_samples.outcomes[:, push, index])) > enough
         chance = np.average(reached, axis=0, weights=self.weight)
-        return self.retry * (1 - chance), (chance > 0) | (score > enough)
+        return self.miss_cost * (1 - chance), (chance > 0) | (score > enough)
 
     def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> list[PushChoice]:
         """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
@@ -310,21 +306,21 @@ class PushPlanner:
         k = self._least(total, (np.broadcast_to(pose, reached.shape), entries))
         if k is None:
             return []
-        return [PushChoice(PlanStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
+        return [PushChoice(PushStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
 
     def _first_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
         reachable = np.isfinite(transit_time)
         entries = self.coarse[reachable[self.push[self.coarse]]]
         if self.space is not None:
-            likely = self.space.probably_free(self.library, pose, np.flatnonzero(reachable))
-            entries = entries[likely[self.push[entries], self.library.entries[entries, 1] // GRID_STRIDE]]
+            likely = self.space.probably_free(self.mean_library, pose, np.flatnonzero(reachable))
+            entries = entries[likely[self.push[entries], self.mean_library.entries[entries, 1] // GRID_STRIDE]]
         here = pose.astype(np.float32)
         entries = entries[self.workspace.allows_finger(to_world(here, self.ends[entries]))]
-        reached = compose(here, self.library.relative[entries])
-        outside = self.extent.outside(reached, self.workspace)
+        reached = compose(here, self.mean_library.relative[entries])
+        outside = self.bounding_boxes.outside(reached, self.workspace)
         # a slider that is outside must come back, or at least not go farther if it cannot
-        now, allowance = float(self.extent.outside(here, self.workspace)), OUTSIDE * self.library.length
+        now, allowance = float(self.bounding_boxes.outside(here, self.workspace)), OUTSIDE * self.mean_library.length
         good = outside <= max(0.0, now - 2 * allowance)
         if not good.any():
             good = outside <= now + allowance
@@ -334,9 +330,9 @@ class PushPlanner:
         """Return the control steps from poses to the goal."""
         if self.value is not None:
             return self.value.nearest(poses) if quick else INTERPOLATION_FACTOR * self.value(poses)
-        goal = self.library.features(self.goal.astype(np.float32))
-        apart = np.sqrt(((self.library.features(poses) - goal) ** 2).sum(-1))
-        return STEPS_PER_LENGTH * apart / self.library.length
+        goal = self.mean_library.features(self.goal.astype(np.float32))
+        apart = np.sqrt(((self.mean_library.features(poses) - goal) ** 2).sum(-1))
+        return STEPS_PER_LENGTH * apart / self.mean_library.length
 
     def _two_pushes(
         self, pose: np.ndarray, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray
@@ -344,12 +340,12 @@ class PushPlanner:
         """Return the best of the first pushes that a second one continues to the goal."""
         goal = self.goal.astype(np.float32)
         wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
-        distance, second = self.searched.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
+        distance, second = self.indexed_library.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
         first, column = np.nonzero(np.isfinite(distance))
         if not len(first):
             return None
         second, distance = second[first, column], distance[first, column]
-        starts = self.library.starts[self.push[second], :2].astype(np.float32)
+        starts = self.mean_library.starts[self.push[second]].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
         between = self.after_push[self.place[entries[first]], self.push[second]]
@@ -359,19 +355,19 @@ class PushPlanner:
         if k is None:
             return None
         best = first[k]
-        return PushChoice(PlanStatus.TWO_PUSHES, int(entries[best]), reached[best].astype(float), float(total[k]))
+        return PushChoice(PushStatus.TWO_PUSHES, int(entries[best]), reached[best].astype(float), float(total[k]))
 
     def _least(self, cost: np.ndarray, *pushes: tuple[np.ndarray, np.ndarray]) -> int | None:
         """Return the index of the least finite cost of a choice whose pushes are all free, or None."""
         # `pushes` are the poses of the slider before each push, (choices, 3), and its entries, (choices,). Only the
-        # `CHECKED` choices of least cost are considered.
+        # `MAX_COLLISION_CHECKS` choices of least cost are considered.
         if self.space is None:
             best = int(np.argmin(cost))
             return best if np.isfinite(cost[best]) else None
-        order = np.argsort(cost, kind="stable")[:CHECKED]
+        order = np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
         order = order[np.isfinite(cost[order])]
-        for some in np.split(order, range(CHECKED_AT_A_TIME, len(order), CHECKED_AT_A_TIME)):
-            free = [self.space.free(self.library, poses[some], entries[some]) for poses, entries in pushes]
+        for some in np.split(order, range(COLLISION_BATCH, len(order), COLLISION_BATCH)):
+            free = [self.space.free(self.mean_library, poses[some], entries[some]) for poses, entries in pushes]
             free = np.all(free, axis=0)
             if free.any():
                 return int(some[np.argmax(free)])

@@ -14,7 +14,6 @@ that has them.
 """
 
 from collections.abc import Sequence
-from enum import IntEnum
 from itertools import chain
 from typing import NamedTuple
 
@@ -25,47 +24,26 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, check_count, check_type, checked_array
-from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
 from pushjax.metrics import mean_pose
 from pushjax.planning.between_pushes import TIGHT, transits_between
 from pushjax.planning.costs import Cost, FinalPose, HandClearance, Mean, Missed, Risk
-from pushjax.planning.goal import Goal
+from pushjax.planning.goal import Goal, PlanStatus
 from pushjax.planning.obstacles import OVERLAP_TOLERANCE, Obstacles
 from pushjax.planning.push_problem import Outcomes, PushProblem, lay_out, objective, push_problem, samples_of
 from pushjax.planning.push_sequence import PushSequence
 from pushjax.planning.roadmap import Transit, TransitStatus
+from pushjax.planning.scene import PushScene
 from pushjax.planning.search import Candidates, CrossEntropy, Search, Selection
-from pushjax.simulation.arguments import check_slider_and_hand, checked_fixtures
-from pushjax.simulation.fixtures import Fixtures
-from pushjax.simulation.hand import Hand
 from pushjax.simulation.pair import MAX_PENETRATION
-from pushjax.simulation.slider import Slider, fixture_overlaps
+from pushjax.simulation.slider import fixture_overlaps
 
 UNSEEN_SAMPLES = 256  # samples of the predicted outcomes
 HAND_IN_FIXTURE_COST = 10.0  # least cost of a hand that runs into a fixture
 MISSED_WIDTH = 0.5  # width of the smooth transition of `Missed` in the default cost, in tolerances
-WARM_UP = (Selection(64), CrossEntropy(iterations=6, population=16, elites=4))
-SEARCH = (Selection(16), CrossEntropy(iterations=10, population=32))
-
-
-class PushPlanStatus(IntEnum):
-    """Whether a plan of pushes does what was asked for.
-
-    Attributes:
-        FOUND: It reaches the goal with at least the probability that was asked for.
-        UNLIKELY: The best plan that was found reaches the goal less surely.
-        NO_TRANSIT: No plan that was found can be carried out. In the best one, the finger does not get from push to
-            push without touching slider or fixtures.
-        HAND_IN_FIXTURE: No plan that was found can be carried out. In the best one, the hand runs into a fixture in a
-            push.
-    """
-
-    FOUND = 0
-    UNLIKELY = 1
-    NO_TRANSIT = 2
-    HAND_IN_FIXTURE = 3
+NOMINAL_STAGE = (Selection(64), CrossEntropy(iterations=6, population=16, elites=4))
+ROBUST_STAGE = (Selection(16), CrossEntropy(iterations=10, population=32))
 
 
 class PushPlan(NamedTuple):
@@ -78,14 +56,14 @@ class PushPlan(NamedTuple):
         transits: Transits of the finger to the start of each push, and its last retreat, (pushes + 1). Empty for other
             hands.
         parameters: Its parameters, as in `PushSequence`, (size,), also of pushes that are left out.
-        outcomes: Predicted poses under friction that the search has not seen.
+        outcomes: Predicted poses under friction that the search has not seen, as of `push_outcomes`.
         success: Predicted probability of success: the fraction of these samples that reach the goal, and that the
             finger does not touch between pushes. Zero for a plan that cannot be carried out.
         cost: Its cost in the search.
         history: Least cost after each iteration of the search under sampled friction, (iterations,).
     """
 
-    status: PushPlanStatus
+    status: PlanStatus
     path: np.ndarray
     pose: np.ndarray
     transits: tuple[Transit, ...]
@@ -98,21 +76,18 @@ class PushPlan(NamedTuple):
 
 def plan_pushes(
     key: PRNGKeyArray,
-    slider: Slider,
-    hand: Hand,
+    scene: PushScene,
     start: ArrayLike,
     goal: Goal,
     *,
-    model: FrictionModel,
     pushes: PushSequence,
     cost: Cost | None = None,
     risk: Risk | None = None,
     samples: int = 32,
     candidates: int = 2048,
-    warm_up: Sequence[Search] = WARM_UP,
-    search: Sequence[Search] = SEARCH,
+    nominal_search: Sequence[Search] = NOMINAL_STAGE,
+    search: Sequence[Search] = ROBUST_STAGE,
     success: float = 0.9,
-    fixtures: Fixtures = (),
     finger: ArrayLike | None = None,
 ) -> PushPlan:
     """Plan pushes that bring a slider to a goal, as surely as can be under friction that is not known.
@@ -121,23 +96,20 @@ def plan_pushes(
 
     Args:
         key: PRNG key of everything random.
-        slider: The slider.
-        hand: The hand, of round fingers.
+        scene: Slider, hand (of round fingers), friction and fixtures. The slider may run into fixtures, and then moves
+            as in a simulation; the hand stays out of them, in pushes and, if it is one finger, between them.
         start: Pose of the slider at the start, (3,), world, m and rad, or samples of a belief, (poses, 3). Sample k of
             the friction starts at pose k modulo the number of poses. So of more poses than samples only the first are
             used, `samples` in the search and 256 in the prediction.
         goal: The goal.
-        model: Distribution of limit surface and contact friction.
         pushes: How many pushes, and what is free in each.
         cost: Cost of a push; by default, `Missed` with a smooth transition and a thousandth of the squared error.
         risk: What is minimized over the samples of the cost; by default the mean.
         samples: Number of samples of friction in the search.
         candidates: Number of random plans that the search starts from.
-        warm_up: Searches under the mean friction.
-        search: Searches under sampled friction, which start from the result of `warm_up`.
+        nominal_search: Searches under the mean friction.
+        search: Searches under sampled friction, which start from the result of `nominal_search`.
         success: Probability of success that is asked for.
-        fixtures: Walls and fixed bodies. The slider may run into them, and then moves as in a simulation; the hand
-            stays out of them, in pushes and, if it is one finger, between them.
         finger: Where the finger is at first, (2,), world, m; for a hand of one finger. By default it is where its
             first push begins.
 
@@ -155,39 +127,38 @@ def plan_pushes(
     check_count("candidates", candidates)
     if not 0 <= success <= 1:
         raise ValueError(f"success must be a probability; got {success!r}")
-    check_slider_and_hand(slider, hand)
-    pushes.check_hand(hand)
+    check_type("scene", scene, PushScene)
+    pushes.check_hand(scene.hand)
     cost = Missed(goal, MISSED_WIDTH) + 0.001 * FinalPose(goal) if cost is None else cost
     risk = Mean() if risk is None else risk
-    fixtures = checked_fixtures(fixtures, jnp.result_type(float))
-    if fixtures:
-        cost = cost + HAND_IN_FIXTURE_COST * HandClearance(hand, fixtures, TIGHT * pushes.clearance)
+    if scene.fixtures:
+        cost = cost + HAND_IN_FIXTURE_COST * HandClearance(scene.hand, scene.fixtures, TIGHT * pushes.clearance)
     criteria = (pushes, cost, risk)
-    problem = push_problem(key, slider, hand, start, model, samples, fixtures, criteria)
+    problem = push_problem(key, scene, start, samples, criteria)
     _check_poses(problem, goal)
     finger_start = _checked_finger(finger, problem)
-    found, history = _search(jax.random.fold_in(key, 1), problem, candidates, warm_up, search)
-    unseen = push_problem(jax.random.fold_in(key, 2), slider, hand, start, model, UNSEEN_SAMPLES, fixtures, criteria)
+    found, history = _search(jax.random.fold_in(key, 1), problem, candidates, nominal_search, search)
+    unseen = push_problem(jax.random.fold_in(key, 2), scene, start, UNSEEN_SAMPLES, criteria)
     plans = (
         _judged(parameters, float(least), problem, unseen, goal, success, finger_start)
         for parameters, least in zip(found.parameters, found.cost, strict=True)
     )
     first = next(plans)
-    possible = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)
+    possible = (PlanStatus.FOUND, PlanStatus.UNLIKELY)
     best = next((plan for plan in chain([first], plans) if plan.status in possible), first)
     return best._replace(history=history)
 
 
 def _search(
-    key: PRNGKeyArray, problem: PushProblem, candidates: int, warm_up: Sequence[Search], search: Sequence[Search]
+    key: PRNGKeyArray, problem: PushProblem, candidates: int, nominal_search: Sequence[Search], search: Sequence[Search]
 ) -> tuple[Candidates, np.ndarray]:
     """Return the best candidates, and the least cost after each iteration under sampled friction."""
-    keys = iter(jax.random.split(key, 1 + len(warm_up) + len(search)))
+    keys = iter(jax.random.split(key, 1 + len(nominal_search) + len(search)))
     mean_start = mean_pose(problem.start)[None]
     nominal = eqx.tree_at(lambda p: (p.draws, p.start), problem, (problem.mean, mean_start))
     found = Candidates(problem.pushes.sample(next(keys), candidates), np.full(candidates, np.inf))
     history = [np.zeros(0)]
-    for each in warm_up:
+    for each in nominal_search:
         found, _ = each(next(keys), objective(nominal), found)
     for each in search:
         found, costs = each(next(keys), objective(problem), found)
@@ -210,24 +181,24 @@ def _judged(
     path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
     good = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed)
     transits, has_transits = (), True
-    if _is_one_finger(problem.hand):
+    if problem.scene.has_one_finger:
         between = transits_between(
-            outline_vertices(problem.slider.shape),
-            float(problem.hand.radius[0]),
+            outline_vertices(problem.scene.slider.shape),
+            float(problem.scene.hand.radius[0]),
             float(problem.pushes.clearance),
             path,
             poses,
             np.asarray(outcomes.poses),
             finger,
-            problem.fixtures,
+            problem.scene.fixtures,
         )
         good, transits = good & ~between.touched, between.transits
         has_transits = between.status == TransitStatus.FOUND
     hits = _hand_in_fixture(problem, path)
     probability = float(np.mean(good)) if has_transits and not hits else 0.0
-    status = PushPlanStatus.FOUND if probability >= success else PushPlanStatus.UNLIKELY
-    status = status if has_transits else PushPlanStatus.NO_TRANSIT
-    status = PushPlanStatus.HAND_IN_FIXTURE if hits else status
+    status = PlanStatus.FOUND if probability >= success else PlanStatus.UNLIKELY
+    status = status if has_transits else PlanStatus.NO_TRANSIT
+    status = PlanStatus.HAND_IN_FIXTURE if hits else status
     return PushPlan(status, path, poses, transits, parameters, outcomes, probability, cost, np.zeros(0))
 
 
@@ -241,23 +212,25 @@ def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tu
 
 def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
     """Return whether a finger runs into a fixture along paths, (pushes, steps + 1, dof)."""
-    if not problem.fixtures:
+    if not problem.scene.fixtures:
         return False
-    centers = np.asarray(problem.hand.poses(jnp.asarray(path)), float)[..., :2]
-    apart = Obstacles.of(problem.fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
-    return bool(np.any(apart < np.asarray(problem.hand.radius)))
+    centers = np.asarray(problem.scene.hand.poses(jnp.asarray(path)), float)[..., :2]
+    apart = Obstacles.of(problem.scene.fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
+    return bool(np.any(apart < np.asarray(problem.scene.hand.radius)))
 
 
 def _check_poses(problem: PushProblem, goal: Goal) -> None:
     """Raise an error if the slider overlaps a fixture at the start, or at the goal."""
-    if not problem.fixtures:
+    if not problem.scene.fixtures:
         return
-    length = float(problem.slider.surface.length)
+    length = float(problem.scene.slider.surface.length)
     for name, poses, allowed in (
         ("start", problem.start, MAX_PENETRATION * length),  # a rollout pushes out what overlaps less
         ("goal", goal.pose[None], OVERLAP_TOLERANCE * length),
     ):
-        depth = np.asarray(fixture_overlaps(problem.slider, problem.fixtures, poses.astype(problem.start.dtype)))
+        depth = np.asarray(
+            fixture_overlaps(problem.scene.slider, problem.scene.fixtures, poses.astype(problem.start.dtype))
+        )
         if depth.max() > allowed:
             raise ValueError(
                 f"{name} must be a pose at which the slider overlaps no fixture; got an overlap of "
@@ -269,19 +242,15 @@ def _checked_finger(finger: ArrayLike | None, problem: PushProblem) -> np.ndarra
     """Return where the finger is at first, after checks, or None if that is free."""
     if finger is None:
         return None
-    if not _is_one_finger(problem.hand):
+    if not problem.scene.has_one_finger:
         raise ValueError("finger is for a hand of one finger; this hand has another configuration")
     given = checked_array("finger", finger, (2,), problem.start.dtype)
-    center, radius = np.asarray(given, float), problem.hand.radius[0]
+    center, radius = np.asarray(given, float), problem.scene.hand.radius[0]
     in_body = to_body(np.asarray(mean_pose(problem.start), float), center)
-    from_slider = float(signed_distances(outline_vertices(problem.slider.shape), in_body) - radius)
+    from_slider = float(signed_distances(outline_vertices(problem.scene.slider.shape), in_body) - radius)
     if from_slider < 0:
         raise ValueError(f"finger must not overlap the slider at the start; got an overlap of {-from_slider:.3g} m")
-    from_fixtures = float(Obstacles.of(problem.fixtures).point_clearance(center) - radius)
+    from_fixtures = float(Obstacles.of(problem.scene.fixtures).point_clearance(center) - radius)
     if from_fixtures < 0:
         raise ValueError(f"finger must not overlap a fixture at the start; got an overlap of {-from_fixtures:.3g} m")
     return center
-
-
-def _is_one_finger(hand: Hand) -> bool:
-    return hand.dof == 2 and len(hand.fingers) == 1

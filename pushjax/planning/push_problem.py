@@ -9,20 +9,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_key, checked_array, common_dtype
+from pushjax._internal.checks import (
+    ArrayLike,
+    as_float,
+    check_finite,
+    check_key,
+    check_type,
+    checked_array,
+    common_dtype,
+)
 from pushjax._internal.jit import jit, quick_jit
-from pushjax.friction.friction_model import FrictionModel
 from pushjax.metrics import mean_pose
 from pushjax.planning.costs import Cost, Risk
-from pushjax.planning.friction_samples import draw_friction, mean_friction
 from pushjax.planning.goal import Goal
 from pushjax.planning.push_sequence import PushSequence
+from pushjax.planning.scene import PushScene, draw_friction, mean_friction
 from pushjax.planning.search import Objective
-from pushjax.simulation.arguments import check_slider_and_hand
-from pushjax.simulation.fixtures import Fixtures
-from pushjax.simulation.hand import Hand
 from pushjax.simulation.random_rollout import Draws, rollout_under_draws
-from pushjax.simulation.slider import Slider
 from pushjax.simulation.trajectory import Trajectory
 
 FAILURE = 1e3  # cost of a rollout that fails, such as a push that would start inside the slider
@@ -31,15 +34,10 @@ SAMPLES_AT_A_TIME = 2048  # samples that are simulated together, so that their d
 
 
 class Outcomes(NamedTuple):
-    """Where pushes end under sampled friction.
+    """Where pushes end under sampled friction."""
 
-    Attributes:
-        poses: Poses of the slider before the first push and after each, (samples, pushes + 1, 3), world.
-        failed: Whether a rollout failed, (samples,).
-    """
-
-    poses: Float[Array, "samples pushes+1 3"]
-    failed: Bool[Array, "samples"]
+    poses: Float[Array, "samples pushes+1 3"]  # of the slider before the first push and after each, world
+    failed: Bool[Array, "samples"]  # whether a rollout failed
 
     @property
     def pose(self) -> Float[Array, "samples 3"]:
@@ -63,21 +61,19 @@ class PushProblem(eqx.Module):
     """What candidates are evaluated on."""
 
     pushes: Any  # `PushSequence`; None where nothing is searched, as for cost and risk
-    slider: Slider
-    hand: Hand
+    scene: PushScene
     start: Float[Array, "samples 3"]  # of the slider, world, m and rad
     mean: Draws  # friction under which the slider is moved to where the path of each later push is laid out
     draws: Draws  # sampled friction, one for each start
     cost: Any  # `Cost` of one sample
     risk: Any  # `Risk` of the costs of all samples
-    fixtures: Fixtures
 
     def lay_out(self, parameters: Array) -> tuple[Float[Array, "pushes steps+1 dof"], Float[Array, "pushes+1 3"]]:
         """Return the paths of all pushes, and the poses before the first and after each, under the mean friction."""
         draw = jax.tree.map(lambda leaf: leaf[0], self.mean)
 
         def push(pose: Array, numbers: Array) -> tuple[Array, tuple[Array, Array]]:
-            path = self.pushes.path(numbers, self.slider, self.hand, pose)
+            path = self.pushes.path(numbers, self.scene.slider, self.scene.hand, pose)
             after = self.rollout(draw, path, pose).pose[-1]
             return after, (path, after)
 
@@ -87,7 +83,8 @@ class PushProblem(eqx.Module):
 
     def rollout(self, draw: Draws, path: Array, pose: Array) -> Trajectory:
         """Push once under sampled friction."""
-        return rollout_under_draws(draw, self.slider.shape, self.hand, path, pose, None, None, None, self.fixtures)
+        shape, hand, fixtures = self.scene.slider.shape, self.scene.hand, self.scene.fixtures
+        return rollout_under_draws(draw, shape, hand, path, pose, None, None, None, fixtures)
 
     def rollouts(self, draw: Draws, paths: Array, pose: Array) -> Trajectory:
         """Push several times; the result has a leading axis of pushes."""
@@ -176,64 +173,52 @@ def simulated(paths: Array, problem: PushProblem) -> Outcomes:
 
 
 def push_outcomes(
-    key: PRNGKeyArray,
-    slider: Slider,
-    hand: Hand,
-    start: ArrayLike,
-    path: ArrayLike,
-    *,
-    model: FrictionModel,
-    samples: int = 256,
-    fixtures: Fixtures = (),
+    key: PRNGKeyArray, scene: PushScene, start: ArrayLike, path: ArrayLike, *, samples: int = 256
 ) -> Outcomes:
     """Simulate pushes in a row under sampled friction. Each sample keeps its friction for all pushes.
 
     Args:
         key: PRNG key of everything random.
-        slider: The slider.
-        hand: The hand. It is put at the start of each path, wherever it was before.
+        scene: Slider, hand, friction, and the fixtures that the slider may run into. The hand is put at the start of
+            each path, wherever it was before.
         start: Pose of the slider at the start, (3,), or samples of a belief, (poses, 3), world, m and rad. Sample k
             starts at pose k modulo the number of poses.
         path: Paths of the hand, (pushes, steps + 1, dof), world.
-        model: Distribution of limit surface and contact friction.
         samples: Number of samples.
-        fixtures: Walls and fixed bodies that the slider may run into.
 
     Returns:
-        Poses before the first push and after each, and whether a rollout failed.
+        `poses` before the first push and after each, (samples, pushes + 1, 3), and whether a rollout `failed`,
+        (samples,). The final ones are `pose`, and `success(goal)` is the fraction that reaches a goal.
 
     Raises:
         ValueError: For a count below one, and for a start or paths that are not finite or of another shape.
-        TypeError: For arguments of other types.
     """
-    check_slider_and_hand(slider, hand)
-    problem = push_problem(key, slider, hand, start, model, samples, fixtures, None)
-    paths = checked_array("path", path, ("pushes", "steps + 1", hand.dof), problem.start.dtype)
+    problem = push_problem(key, scene, start, samples)
+    paths = checked_array("path", path, ("pushes", "steps + 1", scene.hand.dof), problem.start.dtype)
     return simulated(paths, problem)
 
 
 def push_problem(
     key: PRNGKeyArray,
-    slider: Slider,
-    hand: Hand,
+    scene: PushScene,
     start: ArrayLike,
-    model: FrictionModel,
     samples: int,
-    fixtures: Fixtures,
-    criteria: tuple[PushSequence, Cost, Risk] | None,  # of a search; None where nothing is searched
+    criteria: tuple[PushSequence, Cost, Risk] | None = None,  # of a search; None where nothing is searched
 ) -> PushProblem:
     """Check the arguments that planning and simulation share, cast them to one dtype, and sample the friction."""
     check_key(key)
-    dtype = common_dtype(slider, hand, start)
+    check_type("scene", scene, PushScene)
+    dtype = common_dtype(scene.slider, scene.hand, start)
     poses = as_float(start, dtype, "start")
     if poses.ndim not in (1, 2) or poses.shape[-1] != 3 or not poses.size:
         raise ValueError(f"start has shape {poses.shape}; expected (3,) or (poses, 3)")
     check_finite("start", poses)
-    draws = draw_friction(key, slider.surface, model, samples)
+    surface, model = scene.slider.surface, scene.friction
+    draws = draw_friction(key, surface, model, samples)
     poses = poses.reshape(-1, 3)[np.arange(samples) % (poses.size // 3)]
     pushes, cost, risk = criteria or (None, None, None)
-    parts = (pushes, slider, hand, poses, mean_friction(slider.surface, model), draws, cost, risk, fixtures)
-    return jax.tree.map(lambda leaf: leaf.astype(dtype), PushProblem(*parts))
+    problem = PushProblem(pushes, scene, poses, mean_friction(surface, model), draws, cost, risk)
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), problem)
 
 
 def objective(problem: PushProblem) -> Objective:

@@ -33,6 +33,7 @@ ARC_STEP = np.pi / 4  # largest angle between neighboring points around a corner
 OUTSIDE = 1e-3  # points are outside of the arc by this part of its radius, so that segments along it keep the distance
 DISK_POINTS = 16  # around a disk
 RETREATS = 24  # directions in which a retreat is tried
+UNLIMITED, NO_OBSTACLES = Workspace.unlimited(), Obstacles()
 
 
 class TransitStatus(IntEnum):
@@ -76,22 +77,23 @@ class Roadmap:
         radius: float,  # of the finger, m
         clearance: float,  # that the finger keeps from the polygon on its way, m
         goals: np.ndarray,  # (goals, 2), ends of the transits, body frame, m; not reached if nearer than the clearance
+        obstacles: Obstacles = NO_OBSTACLES,  # walls and fixed bodies, world frame
         obstacle_clearance: float | None = None,  # that the finger keeps from obstacles, m; None: as from the polygon
     ):
         check_positive("clearance", clearance)
         # distances of the finger's center from obstacles and from the polygon that a transit keeps, m
         self.min_obstacle_distance = radius + (clearance if obstacle_clearance is None else obstacle_clearance)
         self.vertices, self.radius, self.min_distance = vertices, radius, radius + clearance
-        self.clearance, self.goals = clearance, np.asarray(goals, float)
+        self.clearance, self.goals, self.obstacles = clearance, np.asarray(goals, float), obstacles
         points = _corner_points(vertices, self.min_distance * (1 + OUTSIDE))
         self.nodes = points[signed_distances(vertices, points) >= self.min_distance]
         self.goal_clearance = signed_distances(vertices, self.goals)
         # (nodes, goals), m, infinite where segments come too near
         self.links = self._lengths(self.nodes[:, None], self.goals, end_distance=self.goal_clearance)
 
-    def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace) -> ShortestTransits:
+    def transits(self, start: np.ndarray, pose: np.ndarray, workspace: Workspace = UNLIMITED) -> ShortestTransits:
         """Find the shortest transits from one point, (2,), world, m, to all goals, for a pose of the polygon, (3,)."""
-        body_start, obstacles = to_body(pose, np.asarray(start, float)), workspace.obstacles.in_frame(pose)
+        body_start, obstacles = to_body(pose, np.asarray(start, float)), self.obstacles.in_frame(pose)
         begin, status = self._retreat(body_start, pose, workspace, obstacles)
         if status != TransitStatus.FOUND:
             return self._no_transits(body_start, status)
@@ -136,10 +138,10 @@ class Roadmap:
         self,
         start: np.ndarray,  # (2,), center of the finger, world, m
         pose: np.ndarray,  # (3,), of the polygon, world, m and rad
-        workspace: Workspace,
+        workspace: Workspace = UNLIMITED,
     ) -> Transit:
         """Return the shortest straight transit to where the finger has its clearance, only the start if it has it."""
-        obstacles = workspace.obstacles.in_frame(pose)
+        obstacles = self.obstacles.in_frame(pose)
         points, status = self._retreat(to_body(pose, np.asarray(start, float)), pose, workspace, obstacles)
         length = float(np.linalg.norm(points[-1] - points[0])) if status == TransitStatus.FOUND else np.inf
         return Transit(to_world(pose, points), length, status)

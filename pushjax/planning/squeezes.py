@@ -21,7 +21,6 @@ References: Goldberg, Orienting polygonal parts without sensors, 1993. Zhou, Pao
 probabilistic planning framework for planar grasping under uncertainty, 2017.
 """
 
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -34,8 +33,8 @@ from pushjax._internal.checks import ArrayLike, check_count, check_key, check_po
 from pushjax._internal.jit import quick_jit
 from pushjax.contact.status import Status
 from pushjax.friction.friction_model import FrictionModel
-from pushjax.planning.friction_samples import draw_friction
-from pushjax.planning.goal import ANGLE_TOLERANCE, symmetric_turns
+from pushjax.planning.goal import ANGLE_TOLERANCE, PlanStatus, symmetric_turns
+from pushjax.planning.scene import draw_friction
 from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.random_rollout import Draws, rollout_under_draws
@@ -99,30 +98,12 @@ class Squeezes(eqx.Module):
         return jnp.concatenate([jnp.broadcast_to(jaw, (self.steps + 1, 3)), distance], axis=1)
 
 
-class SqueezeStatus(IntEnum):
-    """Whether a plan of squeezes does what was asked for.
-
-    Attributes:
-        FOUND: At its end the slider is held, and its pose is known, at least as surely as was asked for.
-        UNLIKELY: The best plan that was found is less sure.
-    """
-
-    FOUND = 0
-    UNLIKELY = 1
-
-
 class SqueezeOutcomes(NamedTuple):
-    """What squeezes do to samples of a belief.
+    """What squeezes do to samples of a belief."""
 
-    Attributes:
-        poses: Poses of the slider before the first squeeze and after each, (samples, squeezes + 1, 3), world.
-        held: Whether the jaw holds the slider at the end of each squeeze, (samples, squeezes).
-        failed: Whether the simulation of a squeeze failed in some step, (samples, squeezes).
-    """
-
-    poses: np.ndarray
-    held: np.ndarray
-    failed: np.ndarray
+    poses: np.ndarray  # of the slider before the first squeeze and after each, (samples, squeezes + 1, 3), world
+    held: np.ndarray  # whether the jaw holds the slider at the end of each squeeze, (samples, squeezes)
+    failed: np.ndarray  # whether the simulation of a squeeze failed in some step, (samples, squeezes)
 
 
 class SqueezePlan(NamedTuple):
@@ -135,11 +116,13 @@ class SqueezePlan(NamedTuple):
         success: Predicted probability that nothing fails, and the slider is held at the end, within the tolerances of
             `pose`.
         entropy: Predicted entropy of the pose before the first squeeze and after each, (squeezes + 1,), nats.
-        outcomes: Prediction for all samples of the belief, under friction that the search has not seen.
+        outcomes: Prediction for all samples of the belief, under friction that the search has not seen: the `poses`
+            before the first squeeze and after each, (samples, squeezes + 1, 3), and whether the slider is `held` and
+            the simulation `failed`, (samples, squeezes).
         history: Least cost after each squeeze in the search, (squeezes,).
     """
 
-    status: SqueezeStatus
+    status: PlanStatus
     jaws: np.ndarray
     pose: np.ndarray
     success: float
@@ -223,7 +206,7 @@ def plan_squeezes(
     likeliest, near = most_likely(outcomes.poses[:, -1], turns, position_tolerance, angle_tolerance)
     probability = float(np.mean(near & outcomes.held[:, -1] & ~outcomes.failed.any(axis=1)))
     entropies = entropy(np.moveaxis(outcomes.poses, 1, 0), turns, length, width)
-    status = SqueezeStatus.FOUND if probability >= success else SqueezeStatus.UNLIKELY
+    status = PlanStatus.FOUND if probability >= success else PlanStatus.UNLIKELY
     pose = outcomes.poses[likeliest, -1]
     return SqueezePlan(status, jaws[0], pose, probability, entropies, outcomes, np.array(history))
 

@@ -12,7 +12,6 @@ Reference: Lynch & Mason 1996. Zhou & Mason 2017.
 """
 
 from collections.abc import Sequence
-from enum import IntEnum
 from typing import NamedTuple
 
 import jax
@@ -25,28 +24,13 @@ from pushjax.friction.friction_model import FrictionModel
 from pushjax.geometry.polygon import Polygon
 from pushjax.geometry.se2_numpy import compose, inverse
 from pushjax.planning.dubins import DubinsPath, dubins
-from pushjax.planning.friction_samples import draw_friction
+from pushjax.planning.goal import PlanStatus
 from pushjax.planning.line_contact import LineContact, Turn, hand_front, line_contacts, tightest_turn
+from pushjax.planning.scene import draw_friction
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
 STEP = 0.05  # default length of a step, in units of the length of the limit surface
-
-
-class StableStatus(IntEnum):
-    """Whether there is a stable push, or why not.
-
-    Attributes:
-        FOUND: There is one.
-        NOT_STABLE: On no edge does the contact stick for every sampled friction, not even when it pushes straight
-            ahead.
-        OUT_OF_REACH: No contact can turn to either side without slip. Then no push is planned, not even to a pose
-            straight ahead.
-    """
-
-    FOUND = 0
-    NOT_STABLE = 1
-    OUT_OF_REACH = 2
 
 
 class StableContact(NamedTuple):
@@ -82,7 +66,7 @@ class StablePush(NamedTuple):
         dubins: Path of the contact's reference frame; None if there is none.
     """
 
-    status: StableStatus
+    status: PlanStatus
     reason: str
     path: Float[Array, "steps+1 dof"] | None = None
     pose: Float[Array, "steps+1 3"] | None = None
@@ -219,18 +203,18 @@ def shortest_push(
             raise ValueError(f"steps must be at least 3, one for each part of the path; got {steps}")
     if not contacts:
         reason = "on no edge does the contact stick for every sampled friction, not even when it pushes straight ahead"
-        return StablePush(StableStatus.NOT_STABLE, reason)
+        return StablePush(PlanStatus.NOT_STABLE, reason)
     paths = [
         dubins(compose(ends[0], each.reference), compose(ends[1], each.reference), *each.turn.radii)
         for each in contacts
     ]
     found = [(path, each) for path, each in zip(paths, contacts, strict=True) if path is not None]
     if not found:
-        return StablePush(StableStatus.OUT_OF_REACH, "no contact can turn to either side without slip")
+        return StablePush(PlanStatus.OUT_OF_REACH, "no contact can turn to either side without slip")
     path, best = min(found, key=lambda pair: pair[0].length)
     count = steps or max(3, int(np.ceil(path.length / step)))
     pose = compose(path.poses(count), inverse(best.reference))
     hand = compose(pose, best.contact.hand)
     rows = np.concatenate([hand, np.tile(best.opening, (len(hand), 1))], axis=1)
     reason = f"edge {best.contact.edge}, {path.word}, {path.length:.3f} m"
-    return StablePush(StableStatus.FOUND, reason, jnp.asarray(rows), jnp.asarray(pose), best, path)
+    return StablePush(PlanStatus.FOUND, reason, jnp.asarray(rows), jnp.asarray(pose), best, path)

@@ -1,61 +1,48 @@
-"""Where a finger and a slider may move: a rectangle for each, without the walls and fixed bodies in it."""
+"""Where a finger and a slider may move: a rectangle for each. Fixtures are not considered here."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pushjax._internal.checks import check_finite
 from pushjax.geometry.se2_numpy import to_world
-from pushjax.planning.obstacles import Obstacles
-from pushjax.simulation.fixtures import Fixture, Wall
 
 ROUNDING = 1e-7  # m, by which a slider at the goal may be out of the workspace
 
 
 class Workspace(NamedTuple):
-    """A rectangle for the center of a finger, one for the whole slider, and the obstacles among which both move.
-
-    The rectangles are parallel to the world's axes.
+    """A rectangle for the center of a finger, and one for the whole slider, both parallel to the world's axes.
 
     Attributes:
         finger_low: Lowest x and y of the finger's center, (2,), world, m.
         finger_high: Highest x and y of the finger's center, (2,), world, m.
         slider_low: Lowest x and y of any point of the slider, (2,), world, m.
         slider_high: Highest x and y of any point of the slider, (2,), world, m.
-        obstacles: Walls at any angle and fixed bodies that neither the finger nor the slider may run into.
     """
 
     finger_low: np.ndarray
     finger_high: np.ndarray
     slider_low: np.ndarray
     slider_high: np.ndarray
-    obstacles: Obstacles = Obstacles()
 
     @staticmethod
-    def rectangle(
-        low: tuple[float, float], high: tuple[float, float], fixtures: Sequence[Wall | Fixture] = ()
-    ) -> "Workspace":
+    def rectangle(low: tuple[float, float], high: tuple[float, float]) -> "Workspace":
         """Return a workspace with the same limits for finger and slider.
 
         Args:
             low: Lowest x and y, m.
             high: Highest x and y, m.
-            fixtures: Walls and fixed bodies that neither the slider nor the finger may run into.
-
-        Raises:
-            TypeError: If `fixtures` is anything else than a sequence of `Wall` and `Fixture`.
         """
         lowest, highest = np.asarray(low, float), np.asarray(high, float)
-        return Workspace(lowest, highest, lowest, highest, Obstacles.of(fixtures))
+        return Workspace(lowest, highest, lowest, highest)
 
     @staticmethod
-    def unlimited(fixtures: Sequence[Wall | Fixture] = ()) -> "Workspace":
-        """Return a workspace without limits, with walls and fixed bodies as in `rectangle`."""
-        return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf), fixtures)
+    def unlimited() -> "Workspace":
+        """Return a workspace without limits."""
+        return Workspace.rectangle((-np.inf, -np.inf), (np.inf, np.inf))
 
     def allows_finger(self, points: np.ndarray) -> np.ndarray:
-        """Return whether points (..., 2), world, m, are within the finger's limits; obstacles are not considered."""
+        """Return whether points (..., 2), world, m, are within the finger's limits."""
         return np.all((points >= self.finger_low) & (points <= self.finger_high), axis=-1)
 
     def check_goal(self, goal: np.ndarray, vertices: np.ndarray) -> None:
@@ -72,7 +59,7 @@ class Workspace(NamedTuple):
             )
 
 
-class Extent:
+class BoundingBoxTable:
     """Table over the angle of how far a slider, (vertices, 2), reaches beyond its origin along the world's axes."""
 
     def __init__(self, vertices: np.ndarray, angles: int = 720):
@@ -88,7 +75,7 @@ class Extent:
 
     def outside(self, poses: np.ndarray, workspace: Workspace) -> np.ndarray:
         """Return the largest distance along x or y by which the slider is beyond its limits, zero within, (...,), m."""
-        # Poses are (..., 3), world, m and rad. Obstacles are not considered.
+        # Poses are (..., 3), world, m and rad.
         cell = np.round(poses[..., 2] * (self.angles / (2 * np.pi))).astype(np.int32) % self.angles
         reach = self.reach[cell]
         (x, y), low, high = (poses[..., 0], poses[..., 1]), workspace.slider_low, workspace.slider_high

@@ -12,8 +12,9 @@ import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.experiments.plan import experiment
 from pushjax.geometry.se2_numpy import to_world
-from pushjax.planning import Outcomes, PushPlan, PushPlanStatus
+from pushjax.planning import PlanStatus, PushPlan
 from pushjax.planning.between_pushes import transits_between
+from pushjax.planning.push_problem import Outcomes
 
 RADIUS, FRICTION = 0.005, 0.25
 BLOCK = 0.03 * np.array([(-1.5, -1), (1.5, -1), (1.5, 1), (-1.5, 1)])
@@ -33,7 +34,7 @@ def push_through_the_middle(slider, hand, goal, fixtures, options, seed):
     between = transits_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
     outcomes = Outcomes(samples, np.zeros(20, bool))
     nothing = np.zeros(0)
-    yield PushPlan(PushPlanStatus.FOUND, path, poses, between.transits, nothing, outcomes, 1.0, 0.0, nothing)
+    yield PushPlan(PlanStatus.FOUND, path, poses, between.transits, nothing, outcomes, 1.0, 0.0, nothing)
 
 
 @pytest.fixture(
@@ -112,7 +113,7 @@ def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys
         path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
         between = transits_between(notched, RADIUS, options.clearance, path, still, still[None])
         outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
-        yield PushPlan(PushPlanStatus.NO_TRANSIT, path, still, between.transits, nothing, outcomes, 0.0, 0.0, nothing)
+        yield PushPlan(PlanStatus.NO_TRANSIT, path, still, between.transits, nothing, outcomes, 0.0, 0.0, nothing)
 
     monkeypatch.setattr(experiment, "_plans", into_the_notch)
     cli.main(["plan", *SIMPLE, "--out", str(tmp_path)])
@@ -129,7 +130,7 @@ def test_fixtures_of_a_plan(tmp_path, monkeypatch, capsys):
         given.extend(fixtures)
         path, still = np.array([[(-0.06, 0.0), (0.0, 0.0)]]), np.zeros((2, 3))
         outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
-        yield PushPlan(PushPlanStatus.HAND_IN_FIXTURE, path, still, (), nothing, outcomes, 0.0, 0.0, nothing)
+        yield PushPlan(PlanStatus.HAND_IN_FIXTURE, path, still, (), nothing, outcomes, 0.0, 0.0, nothing)
 
     monkeypatch.setattr(experiment, "_plans", into_the_disk)
     fixtures = ["wall@0,-0.1,1.5707963267948966", "disk:0.02@0.1,0.05,0", "rectangle:0.1x0.02@0,0.2,0.5"]
@@ -164,7 +165,7 @@ def test_fixtures_that_cannot_be(fixture, message, tmp_path, capsys):
 def test_attempts_end_with_the_first_that_is_sure_enough():
     def plans():
         for status, success in ((2, 0.0), (1, 0.4), (1, 0.7), (0, 0.95), (0, 1.0)):
-            yield PushPlan(PushPlanStatus(status), None, None, (), None, None, success, 0.0, None)
+            yield PushPlan(PlanStatus(status), None, None, (), None, None, success, 0.0, None)
 
     counted = []
     best = experiment._best(plans(), 5, lambda done, total: counted.append((done, total)))

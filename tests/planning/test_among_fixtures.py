@@ -12,18 +12,16 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+from planning_parts import ENOUGH, FRICTION, RADIUS, SPEEDS, TABLE, scene_of
 
 import pushjax as pj
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
-from pushjax.planning import Observation, Pace, PlanStatus, PositionControl, PushController, PushPlanner, Workspace
-from pushjax.planning.push_library import PushLibrary
+from pushjax.planning import Observation, PositionControl, PushController, PushLibrary, PushPlanner, PushStatus
 from pushjax.planning.roadmap import TransitStatus
 
 shapely = pytest.importorskip("shapely")
 
-RADIUS, FRICTION, ENOUGH = 0.015, 0.1, 0.95
 GOAL = np.array([0.40, 0.25, 0.8])
-PACE = Pace(0.05, 0.02, 0.02)
 BAR, TRIANGLE = pj.Polygon.rectangle(0.04, 0.20), pj.Polygon([(-0.04, -0.03), (0.04, -0.03), (0.0, 0.04)])
 FIXTURES = (  # a bar in front of the goal, a post in the way around it on one side, and a wedge near the starts
     pj.Fixture(BAR, (0.27, 0.25, 0.0)),
@@ -37,21 +35,16 @@ WORLD = shapely.union_all(
 STEPS = 32  # of the simulation of a control step
 
 
-@pytest.fixture(scope="module")
-def slider():
-    return pj.Slider(pj.Polygon.rectangle(0.10, 0.06), pj.Ellipsoid(np.eye(3), 0.05))
+def placed(pose):
+    return shapely.Polygon(to_world(np.asarray(pose, float), np.asarray(scene_of().slider.shape.vertices, float)))
 
 
-def placed(slider, pose):
-    return shapely.Polygon(to_world(np.asarray(pose, float), np.asarray(slider.shape.vertices, float)))
-
-
-def starts(slider, count, low=0.06, high=0.20):
+def starts(count, low=0.06, high=0.20):
     """Return random poses of slider and finger that touch nothing, before the bar if not told otherwise."""
     rng, found = np.random.default_rng(0), []
     while len(found) < count:
         pose = np.array([rng.uniform(low, high), rng.uniform(0.06, 0.44), rng.uniform(-3, 3)])
-        finger, block = rng.uniform(0.03, 0.47, 2), placed(slider, pose)
+        finger, block = rng.uniform(0.03, 0.47, 2), placed(pose)
         apart = min(WORLD.distance(shapely.Point(finger)), block.distance(shapely.Point(finger))) - RADIUS
         if block.distance(WORLD) > 0.005 and apart > 0.001 and block.within(shapely.box(0, 0, 0.5, 0.5)):
             found.append((pose, finger))
@@ -59,11 +52,10 @@ def starts(slider, count, low=0.06, high=0.20):
 
 
 @pytest.fixture(scope="module")
-def sparse(slider):
+def sparse():
     """A planner with few pushes."""
-    pushes = PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=32, angles=3)
-    table = Workspace.rectangle((0.0, 0.0), (0.5, 0.5), FIXTURES)
-    return PushPlanner(slider, RADIUS, pushes, GOAL, table, PACE)
+    scene = scene_of(fixtures=FIXTURES)
+    return PushPlanner(scene, PushLibrary.build(scene, contacts=32, angles=3), GOAL, TABLE, SPEEDS)
 
 
 def clearances(planner, pose, entry):
@@ -71,24 +63,24 @@ def clearances(planner, pose, entry):
 
     The last is negative outside of the workspace.
     """
-    library = planner.library
+    library = planner.mean_library
     push, index = library.entries[entry]
-    block = [placed(planner.slider, each) for each in compose(pose, library.outcomes[0][push, : index + 1])]
+    block = [placed(each) for each in compose(pose, library.outcomes[0][push, : index + 1])]
     end = library.starts[push] + library.travel[index] * library.directions[push]
     begin, end = to_world(pose, np.stack([planner.roadmap.goals[push], end]))
     apart = WORLD.distance(shapely.Point(begin)) - RADIUS if 0 <= begin.min() and begin.max() <= 0.5 else -1.0
     return min(map(WORLD.distance, block)), WORLD.distance(shapely.LineString([begin, end])) - RADIUS, apart
 
 
-def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
+def test_pushes_that_are_allowed_run_into_no_fixture(sparse):
     rng, space, allowed = np.random.default_rng(1), sparse.space, 0
     before_run_up = sparse.roadmap.min_obstacle_distance - RADIUS
     wanted = np.array([sparse.clearance, sparse.clearance, before_run_up])
     assert space.slider_clearance == pytest.approx(sparse.clearance)  # the goal is farther away
-    for pose, _ in starts(slider, 8, high=0.44):
-        before = placed(slider, pose).distance(WORLD)
+    for pose, _ in starts(8, high=0.44):
+        before = placed(pose).distance(WORLD)
         entries = rng.choice(len(sparse.push), 60, replace=False)
-        free = space.free(sparse.library, np.broadcast_to(pose, (60, 3)), entries)
+        free = space.free(sparse.mean_library, np.broadcast_to(pose, (60, 3)), entries)
         for entry, good in zip(entries, free, strict=True):
             beyond = clearances(sparse, pose, entry) - wanted
             if good:
@@ -101,22 +93,22 @@ def test_pushes_that_are_allowed_run_into_no_fixture(slider, sparse):
     assert 80 < allowed < 400
 
 
-def test_the_grid_of_distances(slider, sparse):
+def test_the_grid_of_distances(sparse):
     """Where the slider is near, the grid is off by less than three quarters of the spacing of its positions."""
     rng, grid = np.random.default_rng(2), sparse.space.distances
     poses = np.column_stack([rng.uniform(0.1, 0.4, (800, 2)), rng.uniform(-9, 9, 800)])
-    apart = np.array([placed(slider, pose).distance(WORLD) for pose in poses])
+    apart = np.array([placed(pose).distance(WORLD) for pose in poses])
     near = (apart > 0) & (apart < sparse.clearance)
     assert near.sum() > 10
     assert np.abs(grid(poses) - apart)[near].max() < 0.75 * grid.spacing
     assert (grid(poses)[apart > 3 * sparse.clearance] > sparse.clearance).all()
-    overlap = np.array([placed(slider, pose).intersection(WORLD).area for pose in poses]) > 3e-4
+    overlap = np.array([placed(pose).intersection(WORLD).area for pose in poses]) > 3e-4
     assert (grid(poses)[overlap] < 0).all()
 
 
-def test_plans_run_into_no_fixture(slider, sparse):
+def test_plans_run_into_no_fixture(sparse):
     kinds = set()
-    for pose, finger in starts(slider, 16, high=0.44):
+    for pose, finger in starts(16, high=0.44):
         plan = sparse.choose(pose, finger)
         kinds.add(plan.status)
         if plan.status.failed:
@@ -124,14 +116,14 @@ def test_plans_run_into_no_fixture(slider, sparse):
         transit = shapely.LineString([*plan.transit.points, plan.start, plan.end])
         first = min(RADIUS + sparse.clearance, WORLD.distance(shapely.Point(finger)))
         assert WORLD.distance(transit) >= first - 1e-5
-        if plan.status != PlanStatus.ONE_PUSH:
-            assert placed(slider, plan.target).distance(WORLD) >= 0.9 * sparse.clearance
-    assert {PlanStatus.COST_TO_GO, PlanStatus.TWO_PUSHES} <= kinds
+        if plan.status != PushStatus.ONE_PUSH:
+            assert placed(plan.target).distance(WORLD) >= 0.9 * sparse.clearance
+    assert {PushStatus.COST_TO_GO, PushStatus.TWO_PUSHES} <= kinds
 
 
-def test_cost_to_go_knows_the_fixtures(slider, sparse):
+def test_cost_to_go_knows_the_fixtures(sparse):
     """Behind the bar it costs more than without the bar."""
-    free = PushPlanner(slider, RADIUS, sparse.library, GOAL, Workspace.rectangle((0, 0), (0.5, 0.5)), PACE)
+    free = PushPlanner(scene_of(), sparse.mean_library, GOAL, TABLE, SPEEDS)
     behind = np.array([[0.17, 0.25, angle] for angle in np.linspace(0, 2 * np.pi, 12)])
     assert sparse.value is not None
     assert free.value is not None
@@ -140,16 +132,14 @@ def test_cost_to_go_knows_the_fixtures(slider, sparse):
     assert (more > -2).all()
 
 
-def test_poses_in_fixtures(slider, sparse):
+def test_poses_in_fixtures(sparse):
     with pytest.raises(ValueError, match=r"goal must be a pose at which the slider overlaps no fixture; got \[0.27"):
-        PushPlanner(slider, RADIUS, sparse.library, np.array([0.27, 0.3, 0]), sparse.workspace, PACE)
+        PushPlanner(sparse.scene, sparse.mean_library, np.array([0.27, 0.3, 0]), TABLE, SPEEDS)
     inside = sparse.choose(np.array([0.26, 0.25, 0.0]), np.array([0.1, 0.4]))
-    assert inside.status == PlanStatus.START_IN_FIXTURE
+    assert inside.status == PushStatus.START_IN_FIXTURE
     assert inside.status.failed
     finger = sparse.choose(np.array([0.12, 0.25, 0.0]), np.array([0.27, 0.3]))
-    assert (finger.status, finger.transit.status) == (PlanStatus.NO_TRANSIT, TransitStatus.START_IN_FIXTURE)
-    with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Fixture"):
-        Workspace.unlimited(FIXTURES[0])
+    assert (finger.status, finger.transit.status) == (PushStatus.NO_TRANSIT, TransitStatus.START_IN_FIXTURE)
 
 
 class Episode(NamedTuple):
@@ -163,13 +153,13 @@ class Episode(NamedTuple):
 
 def play(made, pose, finger, fixtures, steps=150):
     """Play one episode in a plant with these fixtures."""
-    hand, memory, slider = pj.Hand.finger(RADIUS), made.initial_memory(), made.planner.slider
+    state, scene = made.initial_state(), made.scene
     apart, success = [], False
     while not success and len(apart) < steps:
-        action, memory = made(jax.random.key(0), Observation(finger, pose), memory)
+        action, state = made(jax.random.key(0), Observation(finger, pose), state)
         path = finger + np.linspace(0, 1, STEPS + 1)[:, None] * (action - finger)
-        done = pj.rollout(slider, hand, path, pose=pose, friction=FRICTION, fixtures=fixtures)
-        block = min(placed(slider, each).distance(WORLD) for each in np.asarray(done.pose))
+        done = pj.rollout(scene.slider, scene.hand, path, pose=pose, friction=FRICTION, fixtures=fixtures)
+        block = min(placed(each).distance(WORLD) for each in np.asarray(done.pose))
         hand_at = np.asarray(done.configuration, float)  # it stops at a jam
         apart.append((block, WORLD.distance(shapely.LineString(hand_at)) - RADIUS))
         pose, finger = np.asarray(done.pose[-1], float), hand_at[-1]
@@ -180,19 +170,18 @@ def play(made, pose, finger, fixtures, steps=150):
 
 
 @pytest.mark.long
-def test_a_box_gets_around_fixtures(slider):
+def test_a_box_gets_around_fixtures():
     """The same controller and settings: that knows of the fixtures, that does not, and on a table without them."""
-    pushes = PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=120, angles=7)
+    pushes = PushLibrary.build(scene_of(), contacts=120, angles=7)
     episodes = {}
     for name, known, there in (
         ("fixtures that it knows", FIXTURES, FIXTURES),
         ("fixtures that it does not know", (), FIXTURES),
         ("no fixtures", (), ()),
     ):
-        table = Workspace.rectangle((0.0, 0.0), (0.5, 0.5), known)
-        planner = PushPlanner(slider, RADIUS, pushes, GOAL, table, PACE)
+        planner = PushPlanner(scene_of(fixtures=known), pushes, GOAL, TABLE, SPEEDS)
         made = PushController(planner, PositionControl())
-        found = episodes[name] = [play(made, *start, there) for start in starts(slider, 20)]
+        found = episodes[name] = [play(made, *start, there) for start in starts(20)]
         reached = [each.steps for each in found if each.success]
         print(
             f"{name}: {len(reached)} of {len(found)} in {np.mean(reached):.1f} steps; slider at places of fixtures "

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from planning_parts import PLUS, RADIUS, L, T
 
 from pushjax.geometry.polygon_numpy import inside, offset_curve, segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
@@ -10,12 +11,7 @@ from pushjax.planning.workspace import Workspace
 
 shapely = pytest.importorskip("shapely")
 
-RADIUS, CLEARANCE = 0.015, 0.005
-L = np.array([(0, 0), (0.1, 0), (0.1, 0.03), (0.03, 0.03), (0.03, 0.12), (0, 0.12)])
-PLUS = 0.03 * np.array(
-    [(1, -3), (1, -1), (3, -1), (3, 1), (1, 1), (1, 3), (-1, 3), (-1, 1), (-3, 1), (-3, -1), (-1, -1), (-1, -3)]
-)
-T = 0.03 * np.array([(-2, 1), (-2, 0), (-0.5, 0), (-0.5, -3), (0.5, -3), (0.5, 0), (2, 0), (2, 1)])
+CLEARANCE = 0.005
 
 
 def star(rng):
@@ -73,7 +69,7 @@ def found_transits():
         roadmap = Roadmap(vertices, RADIUS, CLEARANCE, np.concatenate([anywhere, touching]))
         pose = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-4, 4)])
         for start in to_world(pose, starts):
-            transits = roadmap.transits(start, pose, Workspace.unlimited())
+            transits = roadmap.transits(start, pose)
             for goal in rng.choice(len(roadmap.goals), 8, replace=False):
                 found.append(
                     (vertices, pose, start, roadmap.goals[goal], roadmap.transit(transits, int(goal), pose), transits)
@@ -119,7 +115,7 @@ def test_transits_are_shortest():
     square = 0.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
     apart = RADIUS + CLEARANCE
     roadmap = Roadmap(square, RADIUS, CLEARANCE, np.array([[0.0, 0.05 + 1.01 * apart]]))
-    transits = roadmap.transits(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3), Workspace.unlimited())
+    transits = roadmap.transits(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3))
     best = 2 * 0.05 + 0.1 + np.pi * apart
     assert best < transits.lengths[0] < 1.06 * best
 
@@ -150,9 +146,9 @@ def test_why_there_is_no_way():
     pose = np.zeros(3)
     near = offset_curve(L, RADIUS + 0.2 * CLEARANCE, 20).points
     roadmap = Roadmap(L, RADIUS, CLEARANCE, np.concatenate([[[0.3, 0.3]], near]))
-    in_slider = roadmap.transits(np.array([0.01, 0.01]), pose, Workspace.unlimited())
+    in_slider = roadmap.transits(np.array([0.01, 0.01]), pose)
     assert roadmap.transit(in_slider, 0, pose).status == TransitStatus.START_IN_SLIDER
-    free = roadmap.transits(np.array([-0.2, 0.0]), pose, Workspace.unlimited())
+    free = roadmap.transits(np.array([-0.2, 0.0]), pose)
     assert roadmap.transit(free, 0, pose).status == TransitStatus.FOUND
     assert roadmap.transit(free, 3, pose).status == TransitStatus.GOAL_BLOCKED
     walls = Workspace.rectangle((-0.3, -0.3), (0.2, 0.2))

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 import pushjax as pj
+from pushjax.planning import PushScene
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 
 RADIUS, STEPS, NOISE = 0.01, 8, 2e-4
 SLIDER = pj.Slider(pj.Polygon.rectangle(0.1, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), 0.04))
-HAND, MODEL = pj.Hand.finger(RADIUS), pj.FrictionModel(20, (0.1, 0.5))
+HAND = pj.Hand.finger(RADIUS)
+SCENE = PushScene(SLIDER, HAND, pj.FrictionModel(20, (0.1, 0.5)))
 # of x, y and length * theta together, of the difference of two poses with the noise
 ERROR = float(NOISE * np.sqrt(2))
 WORLDS, SEEN, UNSEEN, DRAWN = 32, 10, 4, 32
@@ -39,7 +41,7 @@ class Worlds(NamedTuple):
 
 @pytest.fixture(scope="module")
 def made():
-    return FrictionFilter(SLIDER, HAND, MODEL, samples=128, error=ERROR)
+    return FrictionFilter(SCENE, samples=128, error=ERROR)
 
 
 @jax.jit
@@ -171,7 +173,7 @@ def test_bad_input(made):
         ({"effective": 200.0}, "effective"),
     ):
         with pytest.raises(ValueError, match=words):
-            FrictionFilter(SLIDER, HAND, MODEL, **settings)
+            FrictionFilter(SCENE, **settings)
     belief = made.init(jax.random.key(0))
     with pytest.raises(ValueError, match="path"):
         made.update(belief, np.zeros(3), np.zeros((3, 3)), np.zeros(3))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from planning_parts import RADIUS, T
 
 import pushjax as pj
 from pushjax.geometry.se2_numpy import to_body, to_world
@@ -11,9 +12,8 @@ from pushjax.planning.roadmap import Roadmap, TransitStatus
 
 shapely = pytest.importorskip("shapely")
 
-RADIUS, CLEARANCE = 0.015, 0.005
+CLEARANCE = 0.005
 APART = RADIUS + CLEARANCE
-T = 0.03 * np.array([(-2, 1), (-2, 0), (-0.5, 0), (-0.5, -3), (0.5, -3), (0.5, 0), (2, 0), (2, 1)])
 BAR = np.array([(-0.1, -0.004), (0.1, -0.004), (0.1, 0.004), (-0.1, 0.004)])
 ROUNDED = 2e-5  # of a disk of 5 cm by a polygon
 
@@ -94,9 +94,9 @@ def random_transits(count, seed):
         slider, bodies = shapely.Polygon(to_world(pose, vertices)), shapely.union_all([body(each) for each in fixtures])
         if slider.intersects(bodies):
             continue
-        limits = Workspace.rectangle((-0.4, -0.4), (0.4, 0.4), fixtures)
+        limits = Workspace.rectangle((-0.4, -0.4), (0.4, 0.4))
         goals = rng.uniform(-0.3, 0.3, (8, 2))
-        roadmap = Roadmap(vertices, RADIUS, CLEARANCE, to_body(pose, goals))
+        roadmap = Roadmap(vertices, RADIUS, CLEARANCE, to_body(pose, goals), Obstacles.of(fixtures))
         # as far as the points around the corners are, which are 45 degrees apart at most
         free = shapely.box(-0.4, -0.4, 0.4, 0.4).difference(slider.union(bodies).buffer(1.09 * APART, quad_segs=32))
         parts = getattr(free, "geoms", [free])

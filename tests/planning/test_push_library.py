@@ -6,31 +6,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from planning_parts import FRICTION, RADIUS, SPEEDS, TABLE, poses_reaching, scene_of
 
 import pushjax as pj
-from pushjax.experiments.pusht_mpc import player
+from pushjax import planning
 from pushjax.geometry import se2, se2_numpy
-from pushjax.planning.controller import PushController
-from pushjax.planning.cost_to_go import CostToGo, cost_to_go
-from pushjax.planning.finger_control import Pace, PositionControl
-from pushjax.planning.friction_filter import FrictionFilter
-from pushjax.planning.push_library import PushLibrary, digest, fan, pose_features
-from pushjax.planning.push_planner import PushPlanner
-from pushjax.planning.workspace import Extent, Workspace
+from pushjax.planning import FrictionFilter, PositionControl, PushController, PushLibrary, PushPlanner, Workspace
+from pushjax.planning.cost_to_go import CostToGo, cached_cost_to_go, cost_to_go, digest_of_costs
+from pushjax.planning.push_library import fan, pose_features
+from pushjax.planning.workspace import BoundingBoxTable
 
-RADIUS, FRICTION = 0.01, 0.2
 GOAL = np.array([0.25, 0.3, 0.7])
 FLOAT32 = 2e-6  # of positions around 0.3 m, after a hundred steps
+FEW = {"contacts": 12, "angles": 1}
 
 
 @pytest.fixture(scope="module")
-def slider():
-    return pj.Slider(pj.Polygon.rectangle(0.1, 0.06), pj.Ellipsoid(np.diag([1.0, 1.0, 1.2]), 0.04))
+def scene():
+    return scene_of()
 
 
 @pytest.fixture(scope="module")
-def library(slider):
-    return PushLibrary.build(slider, RADIUS, friction=FRICTION, contacts=60, angles=5)
+def library(scene):
+    return PushLibrary.build(scene, contacts=60, angles=5)
 
 
 def test_numpy_poses_agree_with_se2():
@@ -61,15 +59,14 @@ def test_features_are_a_distance_of_poses():
     assert apart(se2_numpy.compose(move, a), se2_numpy.compose(move, near)) == pytest.approx(apart(a, near), rel=1e-6)
 
 
-def test_an_outcome_is_that_of_a_push_anywhere(slider, library):
+def test_an_outcome_is_that_of_a_push_anywhere(scene, library):
     """A push of the library, moved with the slider to another pose, ends at the composed pose."""
     rng = np.random.default_rng(2)
     entry = int(rng.choice(np.flatnonzero(library.entries[:, 1] == 60)))
     push, index = library.entries[entry]
     pose = np.array([0.2, -0.1, 2.0])
     path = library.starts[push] + library.travel[: index + 1, None] * library.directions[push]
-    hand = pj.Hand.finger(RADIUS)
-    moved = pj.rollout(slider, hand, se2.transform(pose, path), pose=pose, friction=FRICTION)
+    moved = pj.rollout(scene.slider, scene.hand, se2.transform(pose, path), pose=pose, friction=FRICTION)
     np.testing.assert_allclose(moved.pose[-1], se2_numpy.compose(pose, library.relative[entry]), atol=1e-5)
 
 
@@ -90,7 +87,7 @@ def test_every_push_moves_the_slider_away_from_the_finger(library):
 
 def test_poses_reaching_a_goal(library):
     """From each of them its push leads to the goal, and the tree finds it there."""
-    back = se2_numpy.compose(GOAL, se2_numpy.inverse(library.relative))
+    back = poses_reaching(library, GOAL)
     reached = se2_numpy.compose(back, library.relative)
     np.testing.assert_allclose(reached[:, :2], np.broadcast_to(GOAL[:2], reached[:, :2].shape), atol=FLOAT32)
     some = back[::501]
@@ -106,17 +103,14 @@ def test_poses_reaching_a_goal(library):
         assert found == pytest.approx(np.linalg.norm(features - library.features(each), axis=1).min(), rel=1e-4)
 
 
-def test_files(slider, library, tmp_path):
+def test_files(library, tmp_path):
     file = tmp_path / "pushes.npz"
     library.save(file)
-    starts, directions = fan(slider, RADIUS, 60, 5)
-    wanted = digest(slider, pj.Hand.finger(RADIUS), starts, directions, FRICTION)
-    read = PushLibrary.load(file, wanted)
+    read = PushLibrary.load(file, library.digest)
     for name in PushLibrary.__dataclass_fields__:
         assert np.array_equal(getattr(read, name), getattr(library, name)), name
-    other = digest(slider, pj.Hand.finger(RADIUS), starts, directions, 0.3)
     with pytest.raises(ValueError, match="another slider, hand, friction or set of pushes"):
-        PushLibrary.load(file, other)
+        PushLibrary.load(file, "another")
     (tmp_path / "text.npz").write_text("no library")
     with pytest.raises(ValueError, match="does not hold a library"):
         PushLibrary.load(tmp_path / "text.npz")
@@ -150,7 +144,7 @@ def test_a_file_is_written_as_a_whole_or_not_at_all(library, tmp_path, monkeypat
         ({"outcomes": np.zeros(3)}, r"outcomes has shape \(3,\)"),
         ({"valid": np.ones((2, 2), bool)}, r"valid has shape \(2, 2\)"),
         ({"starts": np.full((300, 2), np.nan)}, "starts must be finite numbers"),
-        ({"friction": "much"}, "friction must be finite numbers"),
+        ({"friction": np.array(["much"])}, "friction must be finite numbers"),
     ],
 )
 def test_content_of_files_is_checked(library, tmp_path, changes, message):
@@ -162,30 +156,35 @@ def test_content_of_files_is_checked(library, tmp_path, changes, message):
         PushLibrary.load(tmp_path / "x.npz")
 
 
-def test_damaged_files_of_the_cache_are_built_again(slider, tmp_path, monkeypatch):
-    monkeypatch.setattr(player, "fan", lambda slider, radius: fan(slider, radius, 12, 1))
-    built, loaded = player.library(slider, tmp_path)
-    assert not loaded
+def test_a_cache_has_one_file_for_each_library(scene, tmp_path):
+    """It is read again, unless it is damaged."""
+    built = PushLibrary.build(scene, **FEW, cache=tmp_path)
     (file,) = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:100])
-    again, loaded = player.library(slider, tmp_path)
-    assert not loaded
-    assert player.library(slider, tmp_path)[1]
-    np.testing.assert_array_equal(again.outcomes, built.outcomes)
+    np.testing.assert_array_equal(PushLibrary.build(scene, **FEW, cache=tmp_path).outcomes, built.outcomes)
+    written = file.stat().st_mtime_ns
+    assert PushLibrary.build(scene, **FEW, cache=tmp_path).digest == built.digest
+    assert file.stat().st_mtime_ns == written
+    thin = pj.Polygon.rectangle(0.1, 0.05)
+    for other, pushes in ((scene_of(thin), FEW), (scene_of(friction=0.3), FEW), (scene, FEW | {"angles": 2})):
+        PushLibrary.build(other, **pushes, cache=tmp_path)
+    assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_a_planner_takes_the_library_of_its_slider_and_finger(slider, library):
-    table, pace = Workspace.rectangle((0, 0), (0.5, 0.5)), Pace(0.05, 0.02, 0.02)
-    planner = PushPlanner(slider, RADIUS, library, GOAL, table, pace)
-    assert PushController(planner, PositionControl()).friction == FRICTION
-    thin = pj.Slider(pj.Polygon.rectangle(0.1, 0.05), slider.surface)
-    for other in (thin, pj.Slider(slider.shape, pj.Ellipsoid(np.eye(3), 0.04))):
-        with pytest.raises(ValueError, match="library was made for another slider"):
-            PushPlanner(other, RADIUS, library, GOAL, table, pace)
-    with pytest.raises(ValueError, match=r"a finger with a radius of 0\.01 m; got 0\.015"):
-        PushPlanner(slider, 0.015, library, GOAL, table, pace)
-    learning = FrictionFilter(slider, pj.Hand.finger(0.02), pj.FrictionModel(20, (0.1, 0.5)), samples=8)
-    with pytest.raises(ValueError, match=r"a finger with a radius of 0\.01 m; got 0\.02"):
+def test_a_planner_takes_the_library_of_its_scene(scene, library):
+    planner = PushPlanner(scene, library, GOAL, TABLE, SPEEDS)
+    slider, model = scene.slider, pj.FrictionModel(20, (0.1, 0.5))
+    for name, other in (
+        ("slider", scene_of(pj.Polygon.rectangle(0.1, 0.05))),
+        ("slider", planning.PushScene(pj.Slider(slider.shape, pj.Ellipsoid(np.eye(3), 0.04)), scene.hand, FRICTION)),
+        ("radius", planning.PushScene(slider, pj.Hand.finger(0.02), FRICTION)),
+        ("friction", scene_of(friction=0.2)),
+        ("friction", scene_of(friction=model)),
+    ):
+        with pytest.raises(ValueError, match=f"library was made for another {name} than the scene's"):
+            PushPlanner(other, library, GOAL, TABLE, SPEEDS)
+    learning = FrictionFilter(scene_of(friction=model), samples=8)
+    with pytest.raises(ValueError, match="library was made for another friction"):
         PushController(planner, PositionControl(), friction_filter=learning, prior=learning.init(jax.random.key(0)))
 
 
@@ -197,79 +196,70 @@ def test_a_planner_takes_the_library_of_its_slider_and_finger(slider, library):
         ((0.2, np.nan, 0.0), "goal must be finite"),
     ],
 )
-def test_goals_out_of_the_workspace(slider, library, goal, message):
-    table, pace = Workspace.rectangle((0, 0), (0.5, 0.5)), Pace(0.05, 0.02, 0.02)
+def test_goals_out_of_the_workspace(scene, library, goal, message):
     with pytest.raises(ValueError, match=message):
-        PushPlanner(slider, RADIUS, library, np.array(goal), table, pace)
+        PushPlanner(scene, library, np.array(goal), TABLE, SPEEDS)
 
 
-def test_a_hash_tells_costs_apart(slider, library):
-    def digest_of(goal=GOAL, side=0.5, push=0.02, fixtures=()):
-        table = Workspace.rectangle((0, 0), (side, side), fixtures)
-        return PushPlanner(slider, RADIUS, library, goal, table, Pace(0.05, push, 0.02)).value_digest()
-
-    wall = pj.Wall(jnp.zeros(2), jnp.array([1.0, 0.0]))
-    others = digest_of(GOAL + 0.01), digest_of(side=0.6), digest_of(push=0.03), digest_of(fixtures=(wall,))
-    assert digest_of() == digest_of()
-    assert len({digest_of(), *others}) == 5
-
-
-def test_random_friction(slider, library):
+def test_random_friction(scene):
     """Outcomes under drawn friction scatter, less with a better known surface; without noise they do not."""
-    few = slice(0, 120, 12)
-    starts, directions = library.starts[few], library.directions[few]
-    hand, key = pj.Hand.finger(RADIUS), jax.random.key(0)
+    key = jax.random.key(0)
 
     def simulated(dof, friction):
-        model = pj.FrictionModel(dof=dof, friction=friction)
-        many = PushLibrary.simulate(slider, hand, starts, directions, model=model, samples=12, key=key)
-        assert many.outcomes.shape == (12, 10, len(library.travel), 3)
+        many = PushLibrary.build(scene_of(friction=pj.FrictionModel(dof, friction)), **FEW, samples=12, key=key)
+        assert many.outcomes.shape == (12, 12, len(many.travel), 3)
         return many, many.features(many.outcomes.astype(float)).std(axis=0).max(-1)
 
-    exact, none = simulated(None, (FRICTION, FRICTION))
-    np.testing.assert_allclose(exact.outcomes[0], library.outcomes[0, few], atol=1e-6)
-    assert none.max() < 1e-6
+    known = PushLibrary.build(scene, **FEW)
     loose, wide = simulated(10, (0.05, 0.4))
-    _, narrow = simulated(1000, (0.19, 0.21))
+    tight, narrow = simulated(1000, (0.09, 0.11))
     at_end = loose.valid[:, -1]
     assert at_end.sum() >= 4
     assert (wide[at_end, -1] > 3 * narrow[at_end, -1]).all()
+    np.testing.assert_allclose(tight.averaged().relative[:, :2].mean(0), known.relative[:, :2].mean(0), atol=0.002)
     weight = np.random.default_rng(4).dirichlet(np.ones(12))
     mean = np.average(loose.outcomes.astype(float), axis=0, weights=weight)
     np.testing.assert_allclose(loose.averaged(weight).outcomes[0], mean, atol=1e-5)
     with pytest.raises(ValueError, match="weight"):
         loose.averaged(np.ones(3) / 3)
     with pytest.raises(ValueError, match="key"):
-        PushLibrary.simulate(slider, hand, starts, directions, model=pj.FrictionModel(10, 0.2), samples=2)
+        PushLibrary.build(scene_of(friction=pj.FrictionModel(10, 0.2)), samples=2)
+    with pytest.raises(ValueError, match="samples must be 1, because the scene's friction is known; got 2"):
+        PushLibrary.build(scene, samples=2, key=key)
 
 
-def test_bad_numbers(slider):
+def test_bad_numbers(scene):
     for name, bad in {"contacts": 0, "angles": 2.5, "max_angle": 2.0}.items():
         with pytest.raises(ValueError, match=name):
-            fan(slider, RADIUS, **{name: bad})
-    with pytest.raises(ValueError, match="radius"):
-        fan(slider, -1.0)
+            fan(scene, **{name: bad})
+    with pytest.raises(ValueError, match="hand must be one round finger"):
+        PushLibrary.build(planning.PushScene(scene.slider, pj.Hand.two_fingers(RADIUS)))
+    with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Wall"):
+        scene_of(fixtures=pj.Wall(jnp.zeros(2), jnp.array([1.0, 0.0])))
+    with pytest.raises(ValueError, match="resample_every must be None for a plan"):
+        scene_of(friction=pj.FrictionModel(50, 0.3, resample_every=2))
 
 
 @pytest.fixture(scope="module")
-def costs(slider, library):
+def costs(scene, library):
     limits = Workspace.rectangle((0.0, 0.0), (0.5, 0.6))
-    pace = Pace(0.05, 0.02, 0.02)
-    time = pace.push_time(library.travel[library.entries[:, 1]])
-    vertices = np.asarray(slider.shape.vertices)
-    usable = np.ones(len(library.starts), bool)
-    low, high = np.array([0.04, 0.04]), np.array([0.46, 0.56])
-    value = cost_to_go(
-        library, GOAL, limits, time, usable=usable, tolerance=0.006, between=5.0, low=low, high=high, vertices=vertices
-    )
-    return value, limits, time, vertices
+    given = library, GOAL, limits, SPEEDS.push_time(library.travel[library.entries[:, 1]])
+    settings = {"low": np.array([0.04, 0.04]), "high": np.array([0.46, 0.56]), "tolerance": 0.006, "between": 5.0}
+    vertices = np.asarray(scene.slider.shape.vertices)
+    return given, settings | {"usable": np.ones(len(library.starts), bool), "vertices": vertices}
 
 
-def test_cost_to_go_of_pushes(library, costs):
+@pytest.fixture(scope="module")
+def value(costs):
+    given, settings = costs
+    return cost_to_go(*given, **settings)
+
+
+def test_cost_to_go_of_pushes(costs, value):
     """From where one push reaches the goal the cost is about that of the push, and it grows with the distance."""
-    value, limits, time, vertices = costs
-    back = se2_numpy.compose(GOAL, se2_numpy.inverse(library.relative))
-    within = Extent(vertices).outside(back, limits) == 0
+    (library, _, limits, time), vertices = costs[0], costs[1]["vertices"]
+    back = poses_reaching(library, GOAL)
+    within = BoundingBoxTable(vertices).outside(back, limits) == 0
     within &= limits.allows_finger(se2_numpy.to_world(back, library.starts[library.entries[:, 0]]))
     excess = value.nearest(back[within]) - (time[within] + 5)
     assert np.median(excess) < 5
@@ -280,16 +270,16 @@ def test_cost_to_go_of_pushes(library, costs):
     np.testing.assert_allclose(value(GOAL + np.array([0, 0, 2 * np.pi])), at_goal, rtol=1e-4)
 
 
-def test_cost_to_go_is_a_fixed_point(library, costs):
+def test_cost_to_go_is_a_fixed_point(costs, value):
     """No push of the library leads to a cell from which the goal is nearer by more than the push costs."""
-    value, limits, time, vertices = costs
+    (library, _, limits, time), vertices = costs[0], costs[1]["vertices"]
     rng = np.random.default_rng(4)
     gains = []
     for _ in range(40):
         cell = np.array([*rng.integers(6, 30, 2), rng.integers(36)])
         here = np.array([*(value.origin + value.spacing * cell[:2]), cell[2] * np.pi / 18])
         reached = se2_numpy.compose(here, library.relative)
-        good = Extent(vertices).outside(reached, limits) == 0
+        good = BoundingBoxTable(vertices).outside(reached, limits) == 0
         good &= limits.allows_finger(se2_numpy.to_world(here, library.starts[library.entries[:, 0]]))
         best = np.min((time + 5 + value(reached))[good])
         gains.append(float(value(here)) - best)
@@ -298,26 +288,31 @@ def test_cost_to_go_is_a_fixed_point(library, costs):
     assert max(gains) < 20
 
 
-def test_files_of_costs(costs, tmp_path):
-    value = costs[0]
-    value.save(tmp_path / "cost.npz")
-    read = CostToGo.load(tmp_path / "cost.npz")
+def test_files_of_costs(costs, value, tmp_path, monkeypatch):
+    """One for each goal, workspace and speed, and for each set of fixtures."""
+    given, settings = costs
+    monkeypatch.setattr("pushjax.planning.cost_to_go.cost_to_go", lambda *given, **settings: value)
+    read = [cached_cost_to_go(tmp_path, *given, **settings) for _ in range(2)][1]
     assert all(np.array_equal(a, b) for a, b in zip(read, value, strict=True))
-    value._replace(spacing=np.zeros(2)).save(tmp_path / "cost")
+    assert read is not value
+    (file,) = tmp_path.iterdir()
+    library, goal, limits, time = given
+    others = (library, goal + 0.01, limits, time), (library, goal, TABLE, time), (library, goal, limits, time + 1)
+    hashes = [digest_of_costs(*each, **settings) for each in (given, *others)]
+    hashes += [digest_of_costs(*given, **settings | {"between": 4.0})]
+    assert len(set(hashes)) == 5
+    value._replace(spacing=np.zeros(2)).save(file)
     with pytest.raises(ValueError, match=r"does not hold a cost to go: spacing has shape \(2,\)"):
-        CostToGo.load(tmp_path / "cost")
-    (tmp_path / "text.npz").write_text("none")
-    with pytest.raises(ValueError, match="does not hold a cost to go"):
-        CostToGo.load(tmp_path / "text.npz")
+        CostToGo.load(file)
 
 
-def test_extent_is_that_of_the_corners(slider):
-    vertices = np.asarray(slider.shape.vertices, float)
+def test_bounding_boxes_are_those_of_the_corners(scene):
+    vertices = np.asarray(scene.slider.shape.vertices, float)
     rng = np.random.default_rng(5)
     where = np.column_stack([rng.uniform(0, 0.5, (200, 2)), rng.uniform(-9, 9, 200)])
     limits = Workspace.rectangle((0.1, 0.05), (0.4, 0.5))
     corners = se2_numpy.to_world(where[:, None], vertices)
     over = np.maximum(limits.slider_low - corners, corners - limits.slider_high).max((1, 2))
-    found = Extent(vertices).outside(where, limits)
+    found = BoundingBoxTable(vertices).outside(where, limits)
     assert (found >= np.maximum(over, 0) - 1e-6).all()  # never too small
     assert (found - np.maximum(over, 0)).max() < 0.001

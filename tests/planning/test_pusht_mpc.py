@@ -6,43 +6,36 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pytest
+from planning_parts import ENOUGH, PLUS, SPEEDS, TABLE, L, poses_reaching, scene_of
 
 import pushjax as pj
 from pushjax.experiments import pusht_mpc
-from pushjax.experiments.pusht_mpc import experiment, player, setting
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning import push_planner
-from pushjax.planning.controller import Observation, PushController
+from pushjax.planning import (
+    FrictionFilter,
+    Observation,
+    PositionControl,
+    PushController,
+    PushLibrary,
+    PushPlanner,
+    PushStatus,
+    push_planner,
+    pusht_controller,
+    pusht_observation,
+)
 from pushjax.planning.coverage_table import CoverageTable
-from pushjax.planning.finger_control import FingerState, Pace, PositionControl
-from pushjax.planning.friction_filter import FrictionBelief, FrictionFilter
-from pushjax.planning.planned_push import PlanStatus
+from pushjax.planning.finger_control import FingerState
+from pushjax.planning.friction_filter import FrictionBelief
 from pushjax.planning.push_batch import LEG, simulate_pushes
-from pushjax.planning.push_library import PushLibrary
-from pushjax.planning.push_planner import PushPlanner
-from pushjax.planning.workspace import Workspace
+from pushjax.planning.pusht import PIXEL
 
-RADIUS, ENOUGH = 0.015, 0.95
 GOAL = np.array([0.25, 0.25, 0.8])
-LIMITS = Workspace.rectangle((0.0, 0.0), (0.5, 0.5))
-PACE = Pace(0.05, 0.02, 0.02)
 
 
-def block(vertices):
-    """Return a slider with the limit surface of gym-pusht's T."""
-    return pj.Slider(pj.Polygon(vertices), pj.Ellipsoid(np.eye(3), 0.05))
-
-
-def made_controller(slider, contacts, angles, friction=0.0):
-    pushes = PushLibrary.build(slider, RADIUS, friction=friction, contacts=contacts, angles=angles)
-    planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
+def made_controller(scene, **settings):
+    planner = PushPlanner(scene, PushLibrary.build(scene, **settings), GOAL, TABLE, SPEEDS)
     return PushController(planner, PositionControl())
-
-
-def poses_reaching(library, goal):
-    """Return the pose from which each entry of a library reaches the goal."""
-    return compose(goal, inverse(library.relative))
 
 
 class Outcome(NamedTuple):
@@ -57,30 +50,28 @@ def play(made, seed, steps=150, slider=None, friction=None):
 
     Limit surface and friction of the plant are those of the model, if they are not given.
     """
-    rng, hand = np.random.default_rng(seed), pj.Hand.finger(RADIUS)
-    slider, friction = slider or made.planner.slider, made.friction if friction is None else friction
+    rng, scene = np.random.default_rng(seed), made.scene
+    slider, friction = slider or scene.slider, scene.mean_friction if friction is None else friction
     while True:
         pose = np.array([*rng.uniform(0.12, 0.38, 2), rng.uniform(-3, 3)])
         finger = rng.uniform(0.05, 0.45, 2)
-        if signed_distances(made.planner.vertices, to_body(pose, finger)) > RADIUS:
+        if signed_distances(made.planner.vertices, to_body(pose, finger)) > scene.radius:
             break
-    memory = made.initial_memory()
+    state = made.initial_state()
     for step in range(steps):
-        action, memory = made(jax.random.key(seed), Observation(finger, pose), memory)
+        action, state = made(jax.random.key(seed), Observation(finger, pose), state)
         path = finger + np.linspace(0, 1, LEG + 1)[:, None] * (action - finger)
-        poses, _ = simulate_pushes(slider, hand, path[None], pose[None], friction)
+        poses, _ = simulate_pushes(slider, scene.hand, path[None], pose[None], friction)
         pose, finger = poses[0, -1].astype(float), action
         covered = float(made.planner.measure(compose(inverse(GOAL), pose)))
         if covered > ENOUGH:
-            return Outcome(covered, step + 1, memory.pushes, memory.belief)
-    return Outcome(covered, steps, memory.pushes, memory.belief)
+            return Outcome(covered, step + 1, state.pushes, state.belief)
+    return Outcome(covered, steps, state.pushes, state.belief)
 
 
 @pytest.fixture(scope="module")
 def rectangle():
-    half = np.array([0.05, 0.03])
-    corners = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    return made_controller(block(corners), contacts=120, angles=7, friction=0.1)
+    return made_controller(scene_of(), contacts=120, angles=7)
 
 
 def test_a_rectangle_gets_to_the_goal(rectangle):
@@ -90,14 +81,13 @@ def test_a_rectangle_gets_to_the_goal(rectangle):
 
 
 @pytest.fixture(scope="module")
-def adapting(rectangle):
+def adapting():
     """A controller for the same rectangle that does not know its friction."""
-    slider, model, key = rectangle.planner.slider, pj.FrictionModel(20, (0.05, 0.5)), jax.random.key(5)
-    pushes = PushLibrary.build(slider, RADIUS, contacts=60, angles=5, model=model, samples=12, key=key)
-    planner = PushPlanner(slider, RADIUS, pushes, GOAL, LIMITS, PACE)
-    learning = FrictionFilter(slider, rectangle.hand, model, samples=12, effective=2.0)
-    prior = learning.init(key)
-    return PushController(planner, PositionControl(), friction_filter=learning, prior=prior)
+    scene, key = scene_of(friction=pj.FrictionModel(20, (0.05, 0.5))), jax.random.key(5)
+    pushes = PushLibrary.build(scene, contacts=60, angles=5, samples=12, key=key)
+    planner = PushPlanner(scene, pushes, GOAL, TABLE, SPEEDS)
+    learning = FrictionFilter(scene, samples=12, effective=2.0)
+    return PushController(planner, PositionControl(), friction_filter=learning, prior=learning.init(key))
 
 
 @pytest.mark.slow
@@ -106,7 +96,7 @@ def test_an_adapting_controller_finds_the_friction_of_the_plant(adapting):
     found = []
     for seed, sample in enumerate((2, 8)):
         surface, mu = jax.tree.map(lambda leaf, k=sample: leaf[k], (adapting.prior.surface, adapting.prior.friction))
-        outcome = play(adapting, seed, slider=pj.Slider(adapting.planner.slider.shape, surface), friction=float(mu))
+        outcome = play(adapting, seed, slider=pj.Slider(adapting.scene.slider.shape, surface), friction=float(mu))
         assert outcome.covered > ENOUGH
         found.append(float(outcome.belief.weight[sample]))
     assert min(found) > 0.4, found
@@ -116,7 +106,8 @@ def test_weights_choose_among_the_samples_of_a_library(adapting):
     """With all weight on one sample, pushes are chosen as from a library of that sample alone."""
     planner, pose, finger = adapting.planner, np.array([0.38, 0.12, -2.0]), np.array([0.1, 0.4])
     one = planner.reweighted(np.eye(12)[3])
-    np.testing.assert_allclose(one.library.relative, planner.sampled.outcomes[3][planner.sampled.valid], atol=1e-6)
+    samples = planner.library_samples
+    np.testing.assert_allclose(one.mean_library.relative, samples.outcomes[3][samples.valid], atol=1e-6)
     assert one.value is planner.value
     targets = [each.choose(pose, finger).target for each in (one, planner.reweighted(np.eye(12)[4]))]
     assert not np.allclose(*targets)
@@ -144,15 +135,15 @@ def test_no_control_step_both_corrects_a_push_and_plans_one(rectangle, monkeypat
 def test_risk_is_left_out_only_where_it_does_not_matter(adapting, monkeypatch):
     """All risks at once give the same pushes."""
     planner = adapting.planner.reweighted(np.arange(12) / 66)
-    near = np.flatnonzero((planner.library.entries[:, 1] == 30) & planner.usable[planner.push])[::20]
+    near = np.flatnonzero((planner.mean_library.entries[:, 1] == 30) & planner.usable[planner.push])[::20]
     far = GOAL + np.random.default_rng(4).normal(size=(4, 3)) * np.array([0.04, 0.04, 0.5])
-    poses = np.concatenate([poses_reaching(planner.library, GOAL)[near], far])
+    poses = np.concatenate([poses_reaching(planner.mean_library, GOAL)[near], far])
     finger = np.array([0.02, 0.02])
-    monkeypatch.setattr(push_planner, "JUDGED", 4)
+    monkeypatch.setattr(push_planner, "RISK_BATCH", 4)
     few = [planner.choose(pose, finger) for pose in poses]
-    monkeypatch.setattr(push_planner, "JUDGED", 10**6)
+    monkeypatch.setattr(push_planner, "RISK_BATCH", 10**6)
     every = [planner.choose(pose, finger) for pose in poses]
-    assert {PlanStatus.ONE_PUSH, PlanStatus.TWO_PUSHES} <= {push.status for push in few}
+    assert {PushStatus.ONE_PUSH, PushStatus.TWO_PUSHES} <= {push.status for push in few}
     assert [push.cost for push in few] == [push.cost for push in every]
     np.testing.assert_array_equal([push.end for push in few], [push.end for push in every])
 
@@ -165,21 +156,23 @@ def test_a_filter_needs_a_prior(adapting):
 def test_one_push_where_one_is_enough(rectangle):
     """A start from which an entry of the library leads to the goal: that is what is chosen, and it arrives."""
     planner = rectangle.planner
-    index = np.flatnonzero((planner.library.entries[:, 1] == 50) & planner.usable[planner.push])[40]
-    pose = poses_reaching(planner.library, GOAL)[index].astype(float)
+    index = np.flatnonzero((planner.mean_library.entries[:, 1] == 50) & planner.usable[planner.push])[40]
+    pose = poses_reaching(planner.mean_library, GOAL)[index].astype(float)
     finger = to_world(pose, planner.roadmap.goals[planner.push[index]])
     push = planner.choose(pose, finger)
-    assert push.status == PlanStatus.ONE_PUSH
+    assert push.status == PushStatus.ONE_PUSH
     assert push.cost < 15
     path = np.linspace(push.start, push.end, LEG + 1)
-    reached, _ = simulate_pushes(planner.slider, rectangle.hand, path[None], pose[None], rectangle.friction)
+    reached, _ = simulate_pushes(
+        planner.scene.slider, planner.scene.hand, path[None], pose[None], planner.scene.mean_friction
+    )
     assert planner.measure(compose(inverse(GOAL), reached[0, -1].astype(float))) > ENOUGH
 
 
 def test_same_key_same_actions(rectangle):
     seen = Observation(np.array([0.1, 0.4]), np.array([0.3, 0.2, 1.0]))
-    memory = rectangle.initial_memory()._replace(pushes=9)  # costs are random after some pushes
-    first, second = (rectangle(jax.random.key(3), seen, memory)[0] for _ in range(2))
+    state = rectangle.initial_state()._replace(pushes=9)  # costs are random after some pushes
+    first, second = (rectangle(jax.random.key(3), seen, state)[0] for _ in range(2))
     assert np.array_equal(first, second)
 
 
@@ -193,21 +186,20 @@ def test_the_goal_is_where_the_slider_covers_it(rectangle):
 def test_why_there_is_no_push(rectangle):
     planner, pose = rectangle.planner, np.array([0.25, 0.25, 0.0])
     inside = planner.choose(pose, pose[:2])
-    assert inside.status == PlanStatus.NO_TRANSIT
+    assert inside.status == PushStatus.NO_TRANSIT
     assert inside.status.failed
     outside = planner.choose(np.array([2.0, 2.0, 0.0]), np.array([0.1, 0.1]))
     assert outside.status.failed
-    action, memory = rectangle(jax.random.key(0), Observation(pose[:2], pose), rectangle.initial_memory())
+    action, state = rectangle(jax.random.key(0), Observation(pose[:2], pose), rectangle.initial_state())
     np.testing.assert_array_equal(action, pose[:2])  # the finger waits
-    assert memory.status == PlanStatus.NO_TRANSIT
-    assert memory.waited == 1
+    assert state.status == PushStatus.NO_TRANSIT
+    assert state.waited == 1
 
 
 def test_coverage_is_that_of_shapely():
     shapely = pytest.importorskip("shapely")
-    slider = setting.slider()
-    vertices = outline_vertices(slider.shape) + np.array([0.02, -0.01])  # about a frame away from the center
-    center, length = np.asarray(slider.shape.centroid) + np.array([0.02, -0.01]), 0.055
+    shape = pj.Polygon(L)
+    vertices, center, length = outline_vertices(shape), np.asarray(shape.centroid), 0.055
     measure = CoverageTable(vertices, center, length, ENOUGH)
     rng = np.random.default_rng(0)
     errors = rng.uniform(-1, 1, (200, 3)) * np.array([0.006, 0.006, 0.1])
@@ -223,20 +215,23 @@ def test_coverage_is_that_of_shapely():
     assert measure(np.array([0.0, 0.0, 2 * np.pi])) == pytest.approx(1, abs=1e-6)
 
 
-def test_the_finger_moves_as_in_gym_pusht():
+def test_the_finger_moves_as_in_gym_pusht(monkeypatch, tmp_path):
     pytest.importorskip("gym_pusht")
-    plant, control = player.make_plant(), setting.finger_control()
+    few = PushLibrary.build
+    monkeypatch.setattr(PushLibrary, "build", lambda scene, **settings: few(scene, contacts=12, angles=1, **settings))
+    made = pusht_controller(cost_to_go=False, feedback=False, cache=tmp_path)
+    plant, control = pusht_mpc.make_plant(), made.control
     seen, info = plant.reset(seed=0)
     rng = np.random.default_rng(0)
-    state = FingerState(setting.PIXEL * info["pos_agent"], setting.PIXEL * np.array(info["vel_agent"]))
+    state = FingerState(PIXEL * info["pos_agent"], PIXEL * np.array(info["vel_agent"]))
     for _ in range(10):
         target = rng.uniform(0.1, 0.4, 2)
         action = control.action(state, target)
         state = control.after(state, action)
         motion = control.motion(state, action)
-        seen, _, _, _, info = plant.step(action / setting.PIXEL)
-        np.testing.assert_allclose(state.position, setting.PIXEL * seen[:2], atol=1e-9)
-        np.testing.assert_allclose(state.velocity, setting.PIXEL * np.array(info["vel_agent"]), atol=1e-8)
+        seen, _, _, _, info = plant.step(action / PIXEL)
+        np.testing.assert_allclose(state.position, pusht_observation(seen).finger, atol=1e-9)
+        np.testing.assert_allclose(state.velocity, PIXEL * np.array(info["vel_agent"]), atol=1e-8)
         assert motion.shape == (10, 2)
         if ((action > 0) & (action < 0.512)).all():
             np.testing.assert_allclose(state.position, target, atol=1e-9)
@@ -255,51 +250,32 @@ def test_bad_options():
 
 
 def test_interval_of_a_probability():
-    low, high = experiment.clopper_pearson(0, 20)
+    low, high = pusht_mpc.clopper_pearson(0, 20)
     assert (low, high) == (0, pytest.approx(1 - 0.025 ** (1 / 20)))
-    low, high = experiment.clopper_pearson(500, 500)
+    low, high = pusht_mpc.clopper_pearson(500, 500)
     assert (low, high) == (pytest.approx(0.025 ** (1 / 500)), 1)
-    assert experiment.clopper_pearson(5, 10) == (pytest.approx(0.1871, abs=1e-4), pytest.approx(0.8129, abs=1e-4))
+    assert pusht_mpc.clopper_pearson(5, 10) == (pytest.approx(0.1871, abs=1e-4), pytest.approx(0.8129, abs=1e-4))
 
 
 @pytest.mark.long
 def test_pusht(monkeypatch, tmp_path):
     pytest.importorskip("gym_pusht")
-    monkeypatch.setattr(player, "cache_folder", lambda: tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     record = pusht_mpc.run(seed=70000, episodes=5)
     assert record["success"] == 1
     assert record["steps_of_successes"]["largest"] < 120
     assert "success in 5 of 5" in pusht_mpc.summary(record)
-    again, setup = player.controller(tmp_path)
-    assert setup["library_from_file"]
-    assert player.play(player.make_plant(), again, 70000).steps == record["rows"][0]["steps"]
+    again = pusht_controller()  # from the files of the first
+    assert len(list(tmp_path.rglob("*.npz"))) == 2
+    assert pusht_mpc.play(pusht_mpc.make_plant(), again, 70000).steps == record["rows"][0]["steps"]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["L", "plus"])
-def test_other_blocks(name):
+@pytest.mark.parametrize("vertices", [L, 0.6 * PLUS], ids=["L", "plus"])
+def test_other_blocks(vertices):
     """The same code and settings for two other blocks; L and plus have reflex corners as the T has."""
-    corners = {
-        "L": [(0, 0), (90, 0), (90, 30), (60, 30), (30, 30), (30, 75), (30, 120), (0, 120)],
-        "plus": [
-            (1, -3),
-            (1, -1),
-            (3, -1),
-            (3, 1),
-            (1, 1),
-            (1, 3),
-            (-1, 3),
-            (-1, 1),
-            (-3, 1),
-            (-3, -1),
-            (-1, -1),
-            (-1, -3),
-        ],
-    }[name]
-    scale = 1e-3 if name == "L" else 0.018
-    vertices = scale * np.array(corners, float)
-    vertices -= np.asarray(pj.Polygon(vertices).centroid)
-    made = made_controller(block(vertices), contacts=240, angles=9)
+    centered = vertices - np.asarray(pj.Polygon(vertices).centroid)
+    made = made_controller(scene_of(pj.Polygon(centered), friction=0.0))
     outcomes = [play(made, seed) for seed in range(20)]
-    print(name, [each.steps for each in outcomes])
+    print([each.steps for each in outcomes])
     assert sum(each.covered > ENOUGH for each in outcomes) >= 19

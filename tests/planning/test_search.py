@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.planning import CrossEntropy, Goal, PushPlanStatus, PushSequence, Selection, plan_pushes, push_outcomes
+from pushjax.planning import (
+    CrossEntropy,
+    Goal,
+    PlanStatus,
+    PushScene,
+    PushSequence,
+    Selection,
+    plan_pushes,
+    push_outcomes,
+)
 from pushjax.planning.search import Candidates, Objective
 
 KEY = jax.random.key(0)
@@ -48,6 +57,11 @@ def slider():
     return pj.Slider.uniform(BLOCK, degree=2)
 
 
+@pytest.fixture(scope="module")
+def scene(slider):
+    return PushScene(slider, HAND, MODEL)
+
+
 @pytest.mark.parametrize("hand", [HAND, pj.Hand.two_fingers(RADIUS)], ids=["finger", "two fingers"])
 def test_a_push_starts_before_its_first_contact(slider, hand):
     """Shapely: disks touch the block where the path is as long as the clearance, and not before."""
@@ -86,37 +100,36 @@ def test_a_bent_push_ends_where_a_straight_one_does(slider):
 
 
 SETTINGS = {
-    "model": MODEL,
     "pushes": PushSequence(1, length=0.08, steps=8),
     "samples": 16,
     "candidates": 256,
-    "warm_up": (Selection(8), CrossEntropy(iterations=6, population=32)),
+    "nominal_search": (Selection(8), CrossEntropy(iterations=6, population=32)),
     "search": (CrossEntropy(iterations=4, population=32),),
 }
 
 
 @pytest.fixture(scope="module")
-def easy(slider):
+def easy(slider, scene):
     """A goal that one push reaches: the mean of where such a push ends."""
     path = pj.line((-0.06, 0.0), (-0.03, 0.0), steps=8)[None]
-    done = push_outcomes(KEY, slider, HAND, np.zeros(3), path, model=MODEL)
+    done = push_outcomes(KEY, scene, np.zeros(3), path)
     return Goal(
         np.asarray(done.pose).mean(axis=0), length=slider.surface.length, position_tolerance=0.008, angle_tolerance=0.3
     )
 
 
 @pytest.fixture(scope="module")
-def plan(slider, easy):
-    return plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
+def plan(scene, easy):
+    return plan_pushes(KEY, scene, np.zeros(3), easy, **SETTINGS)
 
 
 @pytest.mark.slow
-def test_a_plan_knows_how_surely_it_succeeds(slider, easy, plan):
-    assert plan.status is PushPlanStatus.FOUND
+def test_a_plan_knows_how_surely_it_succeeds(slider, scene, easy, plan):
+    assert plan.status is PlanStatus.FOUND
     assert plan.success >= 0.9
     assert np.all(np.diff(plan.history) <= 1e-9)
     other = jax.random.key(7)
-    done = push_outcomes(other, slider, HAND, np.zeros(3), plan.path, model=MODEL)
+    done = push_outcomes(other, scene, np.zeros(3), plan.path)
     assert not np.any(done.failed)
     error = np.sqrt(0.25 / 256)  # largest standard error of a frequency
     np.testing.assert_allclose(done.success(easy), plan.success, atol=4 * np.sqrt(2) * error)
@@ -135,35 +148,35 @@ def test_outcomes_are_those_of_random_rollouts(slider, plan):
     np.testing.assert_allclose(ours.std(axis=0), spread, rtol=0.35)
 
 
-def test_same_key_same_bits(slider, easy, plan):
-    again = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS)
+def test_same_key_same_bits(slider, scene, easy, plan):
+    again = plan_pushes(KEY, scene, np.zeros(3), easy, **SETTINGS)
     np.testing.assert_array_equal(again.parameters, plan.parameters)
     np.testing.assert_array_equal(again.outcomes.pose, plan.outcomes.pose)
     np.testing.assert_array_equal(again.history, plan.history)
 
 
-def test_a_belief_over_the_start(slider, easy, plan):
+def test_a_belief_over_the_start(slider, scene, easy, plan):
     """The spread of the start is added to that of friction."""
     belief = np.random.default_rng(0).normal(size=(16, 3)) * [0.0, 0.02, 0.0]
-    done = push_outcomes(KEY, slider, HAND, belief, plan.path, model=MODEL)
+    done = push_outcomes(KEY, scene, belief, plan.path)
     assert done.success(easy) < plan.success - 0.1
 
 
-def test_a_belief_around_half_a_turn(slider, easy):
+def test_a_belief_around_half_a_turn(slider, scene, easy):
     """Pushes are laid out from the mean direction: the belief and the goal of an easy plan, turned by half a turn."""
     start = np.array([[0, 0, np.pi - 0.05], [0, 0, 0.05 - np.pi]])
     turned = easy.pose * np.array([-1, -1, 1]) + np.array([0, 0, np.pi])
     goal = Goal(turned, length=slider.surface.length, **TOLERANCES)
-    plan = plan_pushes(KEY, slider, HAND, start, goal, **SETTINGS)
+    plan = plan_pushes(KEY, scene, start, goal, **SETTINGS)
     assert np.cos(plan.pose[0, 2]) == pytest.approx(-1, abs=1e-6)
     assert plan.success > 0.9
 
 
-def test_pushes_that_move_nothing_are_left_out(slider, easy):
+def test_pushes_that_move_nothing_are_left_out(slider, scene):
     """At the goal already, the best push is one that misses the block: the plan has none."""
     here = Goal((0, 0, 0), length=slider.surface.length, **TOLERANCES)
-    plan = plan_pushes(KEY, slider, HAND, np.zeros(3), here, **SETTINGS)
-    assert plan.status is PushPlanStatus.FOUND
+    plan = plan_pushes(KEY, scene, np.zeros(3), here, **SETTINGS)
+    assert plan.status is PlanStatus.FOUND
     assert plan.success == 1
     assert plan.path.shape[0] == len(plan.transits) == 0
     np.testing.assert_array_equal(plan.pose, np.zeros((1, 3)))
@@ -181,7 +194,7 @@ def test_poses_in_fixtures_are_refused(slider, easy):
     fixture = pj.Fixture(pj.Disk(0.01), (0.0, -0.2, 0.0))
 
     def plan(start=(0, 0, 0), goal=easy, **settings):
-        return plan_pushes(KEY, slider, HAND, start, goal, **SETTINGS | {"fixtures": (fixture,)} | settings)
+        return plan_pushes(KEY, PushScene(slider, HAND, MODEL, (fixture,)), start, goal, **SETTINGS | settings)
 
     with pytest.raises(ValueError, match="goal must be a pose at which the slider overlaps no fixture; got an overlap"):
         plan(goal=Goal((0, -0.2, 0)))
@@ -189,40 +202,40 @@ def test_poses_in_fixtures_are_refused(slider, easy):
         plan(start=(0, -0.22, 0))
     with pytest.raises(ValueError, match=r"finger must not overlap a fixture at the start; got an overlap of 0.013 m"):
         plan(finger=(0.0, -0.202))
-    with pytest.raises(TypeError, match="fixtures: expected a sequence of Wall and Fixture; got one Fixture"):
-        plan(fixtures=fixture)
 
 
 @pytest.mark.long
-def test_the_hand_stays_out_of_fixtures(slider, easy, plan):
+def test_the_hand_stays_out_of_fixtures(slider, scene, easy, plan):
     shapely = pytest.importorskip("shapely")
     start, after = plan.path[0, :2]
     aside = 0.012 * np.array([start[1] - after[1], after[0] - start[0]]) / np.linalg.norm(after - start)
     fixture = pj.Fixture(pj.Disk(0.01), (*(start + aside), 0.0))  # 3 mm too near to where the push of the plan begins
     body = shapely.Point(*fixture.pose[:2]).buffer(0.01, quad_segs=64)
     assert body.distance(shapely.LineString(plan.path[0])) < RADIUS
-    around = plan_pushes(KEY, slider, HAND, np.zeros(3), easy, **SETTINGS | {"fixtures": (fixture,)})
-    assert around.status is PushPlanStatus.FOUND
+    around = plan_pushes(KEY, PushScene(slider, HAND, MODEL, (fixture,)), np.zeros(3), easy, **SETTINGS)
+    assert around.status is PlanStatus.FOUND
     for line in (*around.path, *(transit.points for transit in around.transits if len(transit.points) > 1)):
         assert body.distance(shapely.LineString(line)) >= RADIUS - 1e-6
     # and if there is no other push, the status says so
     here = pj.Fixture(fixture.shape, (0.062, 0.0, 0.0))
-    only = {"pushes": One(1, length=0.08, steps=8), "candidates": 1, "warm_up": (), "search": (), "fixtures": (here,)}
-    stuck = plan_pushes(KEY, slider, HAND, np.zeros(3), Goal((-0.04, 0, 0)), **SETTINGS | only)
-    assert stuck.status is PushPlanStatus.HAND_IN_FIXTURE
+    only = {"pushes": One(1, length=0.08, steps=8), "candidates": 1, "nominal_search": (), "search": ()}
+    stuck = plan_pushes(
+        KEY, PushScene(slider, HAND, MODEL, (here,)), np.zeros(3), Goal((-0.04, 0, 0)), **SETTINGS | only
+    )
+    assert stuck.status is PlanStatus.HAND_IN_FIXTURE
     assert stuck.success == 0
 
 
-def test_an_unreachable_goal_has_a_status(slider):
+def test_an_unreachable_goal_has_a_status(slider, scene):
     goal = Goal((1.0, 0.0, 0.0), length=slider.surface.length, **TOLERANCES)
-    plan = plan_pushes(KEY, slider, HAND, np.zeros(3), goal, **SETTINGS)
-    assert plan.status is PushPlanStatus.UNLIKELY
+    plan = plan_pushes(KEY, scene, np.zeros(3), goal, **SETTINGS)
+    assert plan.status is PlanStatus.UNLIKELY
     assert plan.success == 0
 
 
 def test_bad_input(slider, easy):
     def plan(hand=HAND, start=(0, 0, 0), **settings):
-        return plan_pushes(KEY, slider, hand, start, easy, **SETTINGS | settings)
+        return plan_pushes(KEY, PushScene(slider, hand, MODEL), start, easy, **SETTINGS | settings)
 
     with pytest.raises(ValueError, match="candidates must be a whole number, at least 1; got 0"):
         plan(candidates=0)
@@ -240,8 +253,6 @@ def test_bad_input(slider, easy):
         plan(hand=pj.Hand.parallel_jaw(0.02, 0.01))
     with pytest.raises(ValueError, match=r"opening has 0 number\(s\), which does not fit a hand of 4 coordinates"):
         plan(hand=pj.Hand.two_fingers(RADIUS))
-    with pytest.raises(ValueError, match="resample_every must be None for a plan"):
-        plan(model=pj.FrictionModel(50, 0.3, resample_every=2))
     with pytest.raises(ValueError, match="elites must be at most the population of 4; got 5"):
         CrossEntropy(population=4, elites=5)
     with pytest.raises(ValueError, match="width must be positive; got 0"):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.planning import Squeezes, SqueezeStatus, plan_squeezes, squeeze_outcomes, squeezes
-from pushjax.planning.squeezes import distances, entropy, most_likely
+from pushjax.planning import PlanStatus, Squeezes, plan_squeezes, squeezes
+from pushjax.planning.squeezes import distances, entropy, most_likely, squeeze_outcomes
 
 KEY = jax.random.key(0)
 WIDTH, HEIGHT, RADIUS = 0.05, 0.035, 0.02
@@ -86,7 +86,7 @@ def test_a_disk_is_squeezed_from_two_sides(closed_form):
     plan = plan_squeezes(
         KEY, DISK, HAND, uniform(150), model=KNOWN, squeezes=Squeezes(0.08, angles=12), count=2, symmetry=ROUND
     )
-    assert plan.status is SqueezeStatus.FOUND
+    assert plan.status is PlanStatus.FOUND
     assert plan.success == 1
     first, second = plan.jaws[:, 2]
     assert abs(np.sin(second - first)) == pytest.approx(1)
@@ -100,10 +100,10 @@ def test_a_rectangle_is_oriented(closed_form, beam):
     """One squeeze leaves two angles, long side or short side flat. The next ones make one of them."""
     settings = {"model": KNOWN, "squeezes": Squeezes(0.08), "symmetry": 2, "beam": beam}
     one = plan_squeezes(KEY, RECTANGLE, HAND, uniform(200), count=1, **settings)
-    assert one.status is SqueezeStatus.UNLIKELY
+    assert one.status is PlanStatus.UNLIKELY
     assert one.success < 0.9
     three = plan_squeezes(KEY, RECTANGLE, HAND, uniform(200), count=3, **settings)
-    assert three.status is SqueezeStatus.FOUND
+    assert three.status is PlanStatus.FOUND
     assert three.success == 1
     assert three.entropy[-1] < 0.05
     unseen = squeeze_outcomes(
@@ -143,7 +143,7 @@ def test_a_squeeze_that_fails_is_no_success(monkeypatch):
     plan = plan_squeezes(KEY, DISK, HAND, start, model=KNOWN, squeezes=Squeezes(0.08, angles=8), count=2, samples=4)
     assert np.all(plan.jaws[:, 2] > 0.1)
     assert plan.success == 0.75
-    assert plan.status is SqueezeStatus.UNLIKELY
+    assert plan.status is PlanStatus.UNLIKELY
 
 
 def test_offsets_are_along_the_pads():
@@ -198,7 +198,7 @@ def test_a_simulated_rectangle_is_oriented():
     assert len(off) > 150
     assert np.quantile(np.abs(np.sin(off[:, 2])), 0.97) < 0.02
     plan = plan_squeezes(KEY, RECTANGLE, HAND, uniform(200), symmetry=2, **settings)
-    assert plan.status is SqueezeStatus.FOUND
+    assert plan.status is PlanStatus.FOUND
     assert np.all(np.diff(plan.entropy) < 0)
     # where a block really is, from a pose and with friction that the plan has not seen, it says beforehand
     real = squeeze_outcomes(jax.random.key(9), RECTANGLE, HAND, uniform(200, 2), plan.jaws, **settings)

@@ -8,9 +8,9 @@ import pytest
 
 import pushjax as pj
 from pushjax._internal.jit import quick_jit
-from pushjax.planning import StableStatus, shortest_push, stable_contacts, stable_push
-from pushjax.planning.friction_samples import draw_friction
+from pushjax.planning import PlanStatus, shortest_push, stable_contacts, stable_push
 from pushjax.planning.line_contact import LineContact, tightest_turn
+from pushjax.planning.scene import draw_friction
 
 WIDTH, HEIGHT, RADIUS, SPACING = 0.09, 0.06, 0.005, 0.04
 BLOCK, HAND = pj.Polygon.rectangle(WIDTH, HEIGHT), pj.Hand.two_fingers(RADIUS)
@@ -138,14 +138,14 @@ def test_a_pad_longer_than_the_edge():
 def test_why_there_is_no_push(slider):
     key, there = jax.random.key(1), (0.2, 0.0, 0.0)
     slippery = stable_push(key, slider, HAND, np.zeros(3), there, model=pj.FrictionModel(20, 0.02), opening=(SPACING,))
-    assert slippery.status is StableStatus.NOT_STABLE
+    assert slippery.status is PlanStatus.NOT_STABLE
     assert slippery.path is None
     assert "not even when it pushes straight ahead" in slippery.reason
     straight = [
         each._replace(turn=each.turn._replace(left=0.0, right=0.0))
         for each in stable_contacts(key, slider, HAND, model=MODEL, opening=(SPACING,), samples=1)
     ]
-    assert shortest_push(straight, np.zeros(3), there).status is StableStatus.OUT_OF_REACH
+    assert shortest_push(straight, np.zeros(3), there).status is PlanStatus.OUT_OF_REACH
 
 
 def test_bad_input(slider):

@@ -23,7 +23,7 @@ from pushjax.experiments.plan.options import Options
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
 from pushjax.identification.pushes_of_recordings import MAX_SLIDER_SIZE
-from pushjax.planning import FinalPose, Goal, PushPlan, PushPlanStatus, PushSequence, finger_motion, plan_pushes
+from pushjax.planning import FinalPose, Goal, PlanStatus, PushPlan, PushScene, PushSequence, finger_motion, plan_pushes
 from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.roadmap import TransitStatus
 from pushjax.simulation.fixtures import Fixtures
@@ -31,7 +31,7 @@ from pushjax.simulation.fixtures import Fixtures
 WAY_POINTS_FILE = "way_points.csv"
 MAX_PUSH_LENGTH = 2.5  # in units of the limit surface's length
 STEPS = 12  # number of steps of each push
-POSSIBLE = (PushPlanStatus.FOUND, PushPlanStatus.UNLIKELY)  # the finger can do what the plan says
+POSSIBLE = (PlanStatus.FOUND, PlanStatus.UNLIKELY)  # the finger can do what the plan says
 
 
 def run(
@@ -107,14 +107,11 @@ def _plans(
     for attempt in range(options.attempts):
         yield plan_pushes(
             jax.random.fold_in(jax.random.key(seed), attempt),
-            slider,
-            hand,
+            PushScene(slider, hand, pj.FrictionModel(options.dof, options.friction), fixtures),
             np.array(options.start),
             goal,
-            model=pj.FrictionModel(options.dof, options.friction),
             pushes=PushSequence(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
             success=options.success,
-            fixtures=fixtures,
             finger=options.finger,
             **search_options,
         )
@@ -141,7 +138,7 @@ def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) 
     for plan in plans:
         made.append(plan)
         progress(len(made), attempts)
-        if plan.status == PushPlanStatus.FOUND:
+        if plan.status == PlanStatus.FOUND:
             break
     return max(made, key=lambda plan: (plan.status in POSSIBLE, plan.success))
 
@@ -182,16 +179,16 @@ def _write_way_points(path: Path, motion: FingerMotion) -> Path:
 
 def summary(record: dict[str, Any]) -> str:
     """Return the text that the command prints for a record of `run`."""
-    spread, status = record["spread"], PushPlanStatus[record["status"]]
-    if status == PushPlanStatus.NO_TRANSIT:
+    spread, status = record["spread"], PlanStatus[record["status"]]
+    if status == PlanStatus.NO_TRANSIT:
         blocked = next(
             k for k, transit in enumerate(record["transits"]) if transit["status"] != TransitStatus.FOUND.name
         )
         lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['transits'][blocked]['status']})"]
-    elif status == PushPlanStatus.HAND_IN_FIXTURE:
+    elif status == PlanStatus.HAND_IN_FIXTURE:
         lines = ["no plan: in the best one that was found the finger runs into a fixture in a push"]
     elif not len(record["path"]):
-        words = "no push is needed" if status == PushPlanStatus.FOUND else "no push that helps was found"
+        words = "no push is needed" if status == PlanStatus.FOUND else "no push that helps was found"
         lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
     else:
         lines = [
@@ -200,7 +197,7 @@ def summary(record: dict[str, Any]) -> str:
             f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
             f"{spread['theta_deg']:.1f} deg",
         ]
-        if status != PushPlanStatus.FOUND:
+        if status != PlanStatus.FOUND:
             asked = f"less than the {record['settings']['success']:.0%} asked for"
             lines.insert(1, f"  {asked}: try more --attempts, more --pushes, or a smaller range of --friction")
         lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]

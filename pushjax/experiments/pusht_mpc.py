@@ -5,26 +5,47 @@ is `gym-pusht`, which simulates with pymunk. The controller sees the observation
 the finger and of the T, and the angle. Policies that see pixels solve a harder task.
 """
 
+import os
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from scipy.stats import beta
 
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
-from pushjax.experiments.pusht_mpc import player, setting
+from pushjax.planning import PushController, pusht_controller, pusht_observation
+from pushjax.planning.pusht import PIXEL
+from pushjax.tasks.push_t import SIZE
 
+INSTALL = "gym-pusht is not installed; `pip install gym-pusht` gets it"
+STEPS = 300  # usual limit of an episode
 PUBLISHED = (
     {"policy": "diffusion policy (LeRobot)", "success": 0.638, "episodes": 500, "sees": "pixels"},
     {"policy": "diffusion policy (LeRobot, later card)", "success": 0.654, "episodes": 500, "sees": "pixels"},
     {"policy": "VQ-BeT (LeRobot)", "success": 0.638, "episodes": 500, "sees": "pixels"},
 )
 # The same rule: coverage above 0.95 within 300 steps. The first is on its model card (huggingface.co/lerobot).
+
+
+@dataclass
+class Episode:
+    """Result of one episode."""
+
+    seed: int  # of the start
+    success: bool = False  # whether the coverage was above 0.95 at the end of a control step
+    steps: int = 0  # control steps
+    largest_coverage: float = 0.0  # at the end of a control step
+    final_coverage: float = 0.0
+    pushes: int = 0  # planned pushes
+    seconds: list[float] = field(default_factory=list)  # time of the controller in each control step
+    # processor time of the same; other programs on the machine change it less than `seconds`
+    processor_seconds: list[float] = field(default_factory=list)
 
 
 def run(
@@ -65,29 +86,70 @@ def run(
     for name, value in (given | {"observation_noise": observation_noise}).items():
         if not (np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must not be negative; got {value!r}")
-    plant = player.make_plant()
+    plant = make_plant()
     began = time.perf_counter()
-    push_controller, setup = player.controller(
-        lookahead=lookahead,
+    controller = pusht_controller(
+        look_ahead=lookahead,
         cost_to_go=cost_to_go,
         feedback=feedback,
-        friction_in_model=friction_in_model,
-        observation_noise=observation_noise * setting.PIXEL,
+        friction=friction_in_model,
+        noise=observation_noise * PIXEL,
     )
-    setup["total"] = time.perf_counter() - began
+    setup = time.perf_counter() - began
     noise = {"actuation_noise": actuation_noise, "observation_noise": observation_noise}
     played = []
     for k in range(episodes):
-        played.append(player.play(plant, push_controller, seed + k, **noise))
+        played.append(play(plant, controller, seed + k, **noise))
         progress(k + 1, episodes)
     switches = {"lookahead": lookahead, "cost_to_go": cost_to_go, "feedback": feedback}
     settings: dict[str, Any] = {"seed": seed, "episodes": episodes} | switches | given | noise
-    settings["pace"] = push_controller.planner.pace._asdict()
+    settings["speeds"] = controller.planner.speeds._asdict()
     rows = [{name: value for name, value in asdict(each).items() if "seconds" not in name} for each in played]
     return result_record("pusht-mpc", settings, **_figures(played), setup_seconds=setup, published=PUBLISHED, rows=rows)
 
 
-def _figures(played: list[player.Episode]) -> dict[str, Any]:
+def make_plant() -> Any:
+    """Return the environment, or raise ValueError if its package is not installed."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import gym_pusht  # noqa: F401  # registers the environment
+        import gymnasium
+    except ImportError:
+        raise ValueError(INSTALL) from None
+    return gymnasium.make("gym_pusht/PushT-v0", obs_type="state", disable_env_checker=True)
+
+
+def play(
+    plant: Any,
+    controller: PushController,
+    seed: int,
+    *,
+    actuation_noise: float = 0.0,
+    observation_noise: float = 0.0,
+) -> Episode:
+    """Play one episode; noise is in px, and on the observed angle px over the surface's length."""
+    rng = np.random.default_rng([seed, 1])
+    turn = observation_noise * PIXEL / controller.length
+    scale = np.array([observation_noise] * 4 + [turn])
+    seen, _ = plant.reset(seed=seed)
+    state, episode, key = controller.initial_state(), Episode(seed), jax.random.key(seed)
+    while True:
+        noisy = seen + scale * rng.standard_normal(5)
+        began, began_processor = time.perf_counter(), time.process_time()
+        action, state = controller(key, pusht_observation(noisy), state)
+        episode.seconds.append(time.perf_counter() - began)
+        episode.processor_seconds.append(time.process_time() - began_processor)
+        action = action / PIXEL + actuation_noise * rng.standard_normal(2)
+        seen, _, terminated, truncated, info = plant.step(np.clip(action, 0, SIZE))
+        episode.steps += 1
+        episode.final_coverage = float(info["coverage"])
+        episode.largest_coverage = max(episode.largest_coverage, episode.final_coverage)
+        if terminated or truncated or episode.steps == STEPS:
+            episode.success, episode.pushes = bool(terminated), state.pushes
+            return episode
+
+
+def _figures(played: list[Episode]) -> dict[str, Any]:
     """Return the figures over all episodes."""
     successes, count = sum(each.success for each in played), len(played)
     steps = [each.steps for each in played if each.success]
@@ -142,7 +204,7 @@ def summary(record: dict[str, Any]) -> str:
         )
     lines += [
         "  (the task's clock gives 100 ms)",
-        f"  set up in {setup['total']:.1f} s" + (", the library from a file" if setup["library_from_file"] else ""),
+        f"  set up in {setup:.1f} s",
         "The planner reads the exact positions. Published policies that see pixels, by the same rule:",
     ]
     lines += [f"  {each['policy']}: {each['success']:.1%} of {each['episodes']}" for each in record["published"]]
