@@ -75,7 +75,7 @@ def timed(
         dtype: Floating types. Default: both.
         batch: How many at once. Default: 2000; fit 200; monte_carlo 2000 and 100 000.
         cores: How many of the machine's cores may be used (Linux). Times of one core need --cores 1. Default: all.
-        peers: push, grasp, fit, solve: also by MuJoCo and MJX, cvxpy, scipy, jaxopt: pip install '.[bench]'.
+        peers: push, grasp, fit, solve: also by MuJoCo and MJX, cvxpy, scipy: pip install '.[bench]'.
         baseline: A JSON of this command: ends with an error if a row costs 1.5 times as many multiply-adds as it did
             there.
         out: Folder for pictures.

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 import pushjax as pj
-from benchmarks import grasps, tasks
+from benchmarks import grasps, reference_push
 from benchmarks.timing import on_cpu
 from pushjax.testing.problems import random_contacts_problem
 
@@ -34,8 +34,8 @@ class Work(NamedTuple):
 
 def push(dtype: str, batch: int, model: str = "quartic", steps: int | None = None) -> Work:
     """Make a program for random pushes in the range of the fan, each with its own surface and friction."""
-    by_steps = tasks.errors(model, dtype)
-    steps = tasks.fewest_steps(by_steps) if steps is None else steps  # within `tasks.ALLOWED_MM`
+    by_steps = reference_push.errors(model, dtype)
+    steps = reference_push.fewest_steps(by_steps) if steps is None else steps  # within `reference_push.ALLOWED_MM`
     one, args = each_push(model, dtype, batch, steps)
 
     modes = jax.vmap(lambda *each: one(*each).mode)(*jax.tree.map(lambda leaf: leaf[: min(batch, 500)], args))
@@ -53,24 +53,26 @@ def gradient(dtype: str, batch: int) -> Work:
 def grasp(dtype: str, batch: int, steps: int | None = None, varied: bool = False) -> Work:
     """Make a program for random grasps with one surface or `varied` ones: two fingers turn the askew square."""
     by_steps = grasps.errors(dtype) if steps is None else {}
-    steps = tasks.fewest_steps(by_steps) if steps is None else steps
+    steps = reference_push.fewest_steps(by_steps) if steps is None else steps
     one, args = each_grasp(grasps.hand(dtype), dtype, batch, steps)
 
     name = "grasp_two_fingers"
     if varied:
-        surface = tasks.task("quartic", dtype).slider.surface
+        surface = reference_push.task("quartic", dtype).slider.surface
         name, args = "grasp_surfaces", (*args, _surfaces(surface, jax.random.key(0), batch))
     return Work(name, dtype, batch, steps, final_poses(one, batch), args, by_steps.get(steps))
 
 
 def push_t(dtype: str, batch: int, where: str = "side") -> Work:
     """Make a program for random 50 mm pushes of a T on its bar ("side"), of its convex hull or into an inner corner."""
-    here = tasks.task("quartic", dtype)
-    block = tasks.cast(tasks.t_block(hull=where == "hull"), dtype)
+    here = reference_push.task("quartic", dtype)
+    block = reference_push.cast(reference_push.t_block(hull=where == "hull"), dtype)
     here = here._replace(slider=pj.Slider(block, here.slider.surface))
     _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)  # the pushes of the square
     if where == "corner":  # where every finger touches bar and stem
-        start = jnp.array([-tasks.SIDE / 4 + tasks.RADIUS, tasks.SIDE / 8 + tasks.RADIUS], dtype)
+        start = jnp.array(
+            [-reference_push.SIDE / 4 + reference_push.RADIUS, reference_push.SIDE / 8 + reference_push.RADIUS], dtype
+        )
         diagonal = jnp.array([[-1, -1], [1, -1]], dtype) / 2**0.5  # from the normal of the side to that of the corner
         path = start[None, None] + (path - path[:, :1]) @ diagonal
 
@@ -80,7 +82,7 @@ def push_t(dtype: str, batch: int, where: str = "side") -> Work:
 
 def push_two_fingers(dtype: str, batch: int) -> Work:
     """Make a program for the final poses of random pushes of the square by two fingers side by side, by 50 mm."""
-    here = tasks.task("quartic", dtype)._replace(hand=grasps.hand(dtype))
+    here = reference_push.task("quartic", dtype)._replace(hand=grasps.hand(dtype))
     _, (_, path, friction) = each_push("quartic", dtype, batch, MANY_STEPS)
     path = path.at[..., 1].multiply(0.5)  # both fingers stay on the side
     still = jnp.zeros_like(path[..., 0])
@@ -93,7 +95,7 @@ def grasp_jaw(dtype: str, batch: int) -> Work:
     """Make a program for the final poses of random grasps of the askew square by a parallel jaw."""
     # Each begins where the first pad touches, and ends 1 mm before the straight square would be held, as in `grasp`.
     one, (pose, path) = each_grasp(grasps.jaw(dtype), dtype, batch, MANY_STEPS)
-    diameter, share = 2 * tasks.RADIUS, jnp.linspace(0, 1, MANY_STEPS + 1, dtype=dtype)
+    diameter, share = 2 * reference_push.RADIUS, jnp.linspace(0, 1, MANY_STEPS + 1, dtype=dtype)
     centers = grasps.opening_at(grasps.touching_jaw(pose)[:, None] + diameter, share[None])  # as of round fingers
     path = path.at[..., 3].set(centers - diameter)
 
@@ -103,7 +105,7 @@ def grasp_jaw(dtype: str, batch: int) -> Work:
 def solve(dtype: str, batch: int, contacts: int) -> Work:
     """Make a program for the twists of random contact problems with `contacts` contacts."""
     draw = jax.vmap(lambda key: random_contacts_problem(key, contacts=contacts))
-    problem = tasks.cast(draw(jax.random.split(jax.random.key(contacts), batch)), dtype)
+    problem = reference_push.cast(draw(jax.random.split(jax.random.key(contacts), batch)), dtype)
 
     def motion(*args):
         return in_tiles(lambda s, c: pj.solve_contacts(s, c).twist, args, batch)
@@ -113,8 +115,8 @@ def solve(dtype: str, batch: int, contacts: int) -> Work:
 
 def sampling(dtype: str, batch: int) -> Work:
     """Make a program for random quartics, certified convex, from the default sampler of `FrictionModel`."""
-    surface = tasks.task("quartic", dtype).slider.surface
-    random = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype).around(surface)
+    surface = reference_push.task("quartic", dtype).slider.surface
+    random = reference_push.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype).around(surface)
     keys = jax.random.split(jax.random.key(0), batch)
 
     def surfaces(keys):
@@ -135,17 +137,19 @@ def fit(dtype: str, batch: int, degree: int) -> Work:
 
 def pairs(dtype: str, batch: int) -> tuple:
     """Return wrenches and twists, (batch, PAIRS, 3), and lengths, (batch,), of the square on its 64 points."""
-    support = tasks.cast(pj.Support.uniform(pj.Polygon.rectangle(tasks.SIDE, tasks.SIDE)), "float64")
+    support = reference_push.cast(
+        pj.Support.uniform(pj.Polygon.rectangle(reference_push.SIDE, reference_push.SIDE)), "float64"
+    )
     keys = jax.random.split(jax.random.key(0), batch)
-    return tasks.cast(jax.jit(jax.vmap(lambda key: support.wrench_twist_pairs(key, PAIRS)))(keys), dtype)
+    return reference_push.cast(jax.jit(jax.vmap(lambda key: support.wrench_twist_pairs(key, PAIRS)))(keys), dtype)
 
 
 def monte_carlo(dtype: str, batch: int) -> Work:
     """Make a program for pushes under random friction from end to end: from a key to NumPy arrays and their summary."""
     steps = 8  # within 0.1 mm, as in `push`; the tip touches in all of them
-    here = tasks.task("quartic", dtype)
-    path = tasks.paths(jnp.array([0.01], dtype), jnp.array([0.2], dtype), steps)[0]
-    model = tasks.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype)
+    here = reference_push.task("quartic", dtype)
+    path = reference_push.paths(jnp.array([0.01], dtype), jnp.array([0.2], dtype), steps)[0]
+    model = reference_push.cast(pj.FrictionModel(dof=20, friction=(0.15, 0.35)), dtype)
 
     def summary(key):
         pushes = pj.monte_carlo(key, batch, here.slider, here.hand, path, pose=here.pose, model=model)
@@ -173,7 +177,7 @@ def in_tiles(function: Callable, args: tuple, batch: int) -> Any:
 def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
     """Return the function of one push, and the surface, path and friction of each push."""
     # All of these differ between pushes, so that no work can be shared.
-    here = tasks.task(model, dtype)
+    here = reference_push.task(model, dtype)
     keys = jax.random.split(jax.random.key(0), 4)
 
     def uniform(key, low, high):
@@ -183,16 +187,16 @@ def each_push(model: str, dtype: str, batch: int, steps: int) -> tuple[Callable[
         return here._replace(slider=pj.Slider(here.slider.shape, surface)).push(path, friction)
 
     surface = _surfaces(here.slider.surface, keys[0], batch)
-    offset = uniform(keys[1], -tasks.MAX_OFFSET, tasks.MAX_OFFSET)
-    angle = uniform(keys[2], -tasks.MAX_ANGLE, tasks.MAX_ANGLE)
-    path = tasks.paths(offset, angle, steps)
+    offset = uniform(keys[1], -reference_push.MAX_OFFSET, reference_push.MAX_OFFSET)
+    angle = uniform(keys[2], -reference_push.MAX_ANGLE, reference_push.MAX_ANGLE)
+    path = reference_push.paths(offset, angle, steps)
     return one, (surface, path, uniform(keys[3], 0.15, 0.35))
 
 
 def each_grasp(hand: pj.Hand, dtype: str, batch: int, steps: int) -> tuple[Callable[..., pj.Trajectory], tuple]:
     """Return the function of one grasp by a hand with an opening, and the pose and path of each grasp."""
     # All grasps have the same surface, unless the function's third argument gives another.
-    slider, friction = tasks.task("quartic", dtype).slider, jnp.asarray(grasps.FRICTION, dtype)
+    slider, friction = reference_push.task("quartic", dtype).slider, jnp.asarray(grasps.FRICTION, dtype)
 
     def one(pose: Any, path: Any, surface: Any = slider.surface) -> pj.Trajectory:
         return pj.rollout(pj.Slider(slider.shape, surface), hand, path, pose=pose, friction=friction)

@@ -1,4 +1,4 @@
-"""The grasp of the benchmarks, in which two fingers turn the askew square of `tasks`, and its converged answer.
+"""The grasp of the benchmarks, in which two fingers turn an askew square, and its converged answer.
 
 The fingers close along y until the opening is 1 mm more than the straight square needs. By then they have turned the
 square nearly straight, but do not hold it yet. They stop there because `pushjax` locates a jam to one step only, and
@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import pushjax as pj
-from benchmarks import tasks
+from benchmarks import reference_push
 
 FRICTION = 0.1
 # Start pose of the square: largest offset in x and y (m), least and largest |angle| (rad).
 MAX_OFFSET, MIN_ANGLE, MAX_ANGLE = 5e-3, 0.2, 0.4
 PAD = (0.05, 0.01)  # width and thickness of a pad of the parallel jaw, m
 # Opening (distance between the fingers' centers) at which both fingers touch the straight square, m.
-STRAIGHT_OPENING = tasks.SIDE + 2 * tasks.RADIUS
+STRAIGHT_OPENING = reference_push.SIDE + 2 * reference_push.RADIUS
 CLEARANCE = 1e-3  # m, by how much the opening at the end exceeds STRAIGHT_OPENING
 # Angle at which the square fits the opening at the end, rad.
 END_ANGLE = float(np.arccos(STRAIGHT_OPENING / (STRAIGHT_OPENING + CLEARANCE)))
@@ -29,12 +29,12 @@ END_ANGLE = float(np.arccos(STRAIGHT_OPENING / (STRAIGHT_OPENING + CLEARANCE)))
 
 def hand(dtype: str) -> pj.Hand:
     """Return the hand of two fingers, in `dtype`."""
-    return tasks.cast(pj.Hand.two_fingers(tasks.RADIUS), dtype)
+    return reference_push.cast(pj.Hand.two_fingers(reference_push.RADIUS), dtype)
 
 
 def jaw(dtype: str) -> pj.Hand:
     """Return the parallel jaw, in `dtype`."""
-    return tasks.cast(pj.Hand.parallel_jaw(*PAD), dtype)
+    return reference_push.cast(pj.Hand.parallel_jaw(*PAD), dtype)
 
 
 def touching(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
@@ -51,7 +51,7 @@ def touching_jaw(pose: Float[Array, "n 3"]) -> Float[Array, "n"]:
     # The square must be turned by less than 45 degrees.
     x, y, theta = pose.T
     cos, sin, turn = jnp.cos(theta), jnp.sin(theta), jnp.sign(theta)
-    half, edge = tasks.SIDE / 2, PAD[0] / 2
+    half, edge = reference_push.SIDE / 2, PAD[0] / 2
 
     def height(side):  # of the highest point of the square above (1) or below (-1) the hand's middle, within the pad
         corner = turn * (side * x - half * sin) + half * cos
@@ -95,12 +95,12 @@ def fan() -> np.ndarray:
 
 def final_poses(steps: int, dtype: str) -> np.ndarray:
     """Return the final poses of the fan in float64, (27, 3), as computed in `steps` steps in `dtype`."""
-    here = tasks.task("quartic", dtype)._replace(hand=hand(dtype))
+    here = reference_push.task("quartic", dtype)._replace(hand=hand(dtype))
     return np.asarray(_final(here, jnp.asarray(fan(), dtype), jnp.asarray(steps)), np.float64)
 
 
 @jax.jit
-def _final(here: tasks.Task, poses: Float[Array, "n 3"], steps: Array) -> Array:
+def _final(here: reference_push.Task, poses: Float[Array, "n 3"], steps: Array) -> Array:
     """Return the final poses of grasps, step by step, so that one program does any number of steps."""
 
     def one(pose: Array, first: Array) -> Array:
@@ -119,12 +119,12 @@ def _final(here: tasks.Task, poses: Float[Array, "n 3"], steps: Array) -> Array:
 @cache
 def reference() -> np.ndarray:
     """Return the converged final poses of the fan: in float64, with steps of some 2 um."""
-    return final_poses(tasks.REFERENCE_STEPS, "float64")
+    return final_poses(reference_push.REFERENCE_STEPS, "float64")
 
 
 @cache
 def errors(dtype: str) -> dict[int, float]:
     """Return the largest error of the fan, mm, for each number of steps."""
-    length = float(tasks.square("quartic").surface.length)
+    length = float(reference_push.square("quartic").surface.length)
     exact = reference()
-    return {n: float(tasks.error_mm(final_poses(n, dtype), exact, length).max()) for n in tasks.STEPS}
+    return {n: float(reference_push.error_mm(final_poses(n, dtype), exact, length).max()) for n in reference_push.STEPS}

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import tasks
+from benchmarks import reference_push
 from benchmarks.timing import both_dtypes
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
@@ -57,26 +57,26 @@ def run(scale: float = 1.0, seed: int = 0, progress: ProgressCallback = no_progr
 def _steps(model: str, dtype: str, allowed_mm: float) -> int | None:
     """Return the fewest steps within the allowed error, or None if there is no such number."""
     try:
-        return tasks.fewest_steps(tasks.errors(model, dtype), allowed_mm)
+        return reference_push.fewest_steps(reference_push.errors(model, dtype), allowed_mm)
     except ValueError:
         return None
 
 
 def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
     apart, flips, failed, same = [], 0, 0, True
-    length = float(tasks.square(model).surface.length)
-    kinds = {dtype: tasks.task(model, dtype) for dtype in ("float32", "float64")}
+    length = float(reference_push.square(model).surface.length)
+    kinds = {dtype: reference_push.task(model, dtype) for dtype in ("float32", "float64")}
     for chunk in range(-(-pushes // CHUNK)):
         rng = np.random.default_rng((seed, steps, chunk))
-        offset = rng.uniform(-tasks.MAX_OFFSET, tasks.MAX_OFFSET, CHUNK).astype(np.float32)
-        angle = rng.uniform(-tasks.MAX_ANGLE, tasks.MAX_ANGLE, CHUNK).astype(np.float32)
+        offset = rng.uniform(-reference_push.MAX_OFFSET, reference_push.MAX_OFFSET, CHUNK).astype(np.float32)
+        angle = rng.uniform(-reference_push.MAX_ANGLE, reference_push.MAX_ANGLE, CHUNK).astype(np.float32)
         friction = rng.uniform(0.15, 0.35, CHUNK).astype(np.float32)
         # The paths and frictions in float64 are exactly those in float32, so that only the arithmetic differs.
-        path = tasks.paths(jnp.asarray(offset), jnp.asarray(angle), steps)
+        path = reference_push.paths(jnp.asarray(offset), jnp.asarray(angle), steps)
         found = {d: _pushed(here, path.astype(d), jnp.asarray(friction, d)) for d, here in kinds.items()}
         one, two = (tuple(np.asarray(part) for part in found[d]) for d in ("float32", "float64"))
         here = min(CHUNK, pushes - chunk * CHUNK)
-        apart.append(tasks.error_mm(one[0].astype(float), two[0], length)[:here])
+        apart.append(reference_push.error_mm(one[0].astype(float), two[0], length)[:here])
         flips += int((one[1] != two[1])[:here].sum())
         failed += int(one[2][:here].sum() + two[2][:here].sum())
         for dtype, before in (("float32", one), ("float64", two)):
@@ -97,7 +97,7 @@ def _row(model: str, steps: int, pushes: int, seed: int) -> dict[str, Any]:
 
 
 @jax.jit
-def _pushed(here: tasks.Task, path: jax.Array, friction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _pushed(here: reference_push.Task, path: jax.Array, friction: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     def one(path, friction):
         push = here.push(path, friction)
         return push.pose[-1], push.mode[:, 0], jnp.sum(push.failed)

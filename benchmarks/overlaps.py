@@ -4,21 +4,22 @@ Shapely computes the penetration depth; it shares no code with the library. Ever
 convex or not, with corners or without, from random starts and with random friction, in fine and coarse steps and in
 both floating types. A step is wrong if its status is MOVING, FREE, JAMMED or GRASPED, and a finger is deeper inside the
 slider than before the step and deeper than a limit. The limit is 0.1 mm with 300 steps, and a fifth of the hand's
-displacement in the step with 60 steps. A push that ends GRASPED or JAMMED has to be confirmed (see `held.unconfirmed`).
+displacement in the step with 60 steps. A push that ends GRASPED or JAMMED has to be confirmed by
+shapely and linear programs (see `unconfirmed`).
 """
 
 from collections.abc import Callable
-from itertools import product
-from typing import Any, Literal, get_args
+from itertools import pairwise, product
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
+from scipy.optimize import linprog
 
 import pushjax as pj
-from benchmarks.held import unconfirmed
-from benchmarks.survey import (
+from benchmarks.random_pushes import (
     HANDS,
     MM,
     SCENES,
@@ -26,6 +27,7 @@ from benchmarks.survey import (
     Survey,
     fixtures_seen_by_slider,
     outline_of,
+    rollout,
     seen_by_slider,
     simulate,
 )
@@ -35,6 +37,7 @@ from pushjax.simulation.hand import RoundFinger
 
 Dtype = Literal["float64", "float32"]
 SHOWN = 6  # wrong, failed and unconfirmed pushes of each row that are printed
+FINER = 256  # parts into which the step of a jam is divided to confirm it
 
 
 def run(
@@ -48,7 +51,7 @@ def run(
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
-    """Simulate and judge random pushes of every outline by every hand.
+    """Simulate and check random pushes of every outline by every hand.
 
     Args:
         shapes: Names of outlines.
@@ -62,7 +65,7 @@ def run(
         keep: Called with the record so far.
 
     Returns:
-        The record, with the figures of `judged` for each scene, hand, outline, number of steps and floating type.
+        The record, with the figures of `checked` for each scene, hand, outline, number of steps and floating type.
 
     Raises:
         ValueError: If an outline, a hand or a scene is unknown.
@@ -75,7 +78,7 @@ def run(
     record = result_record("overlaps", {"starts": starts, "seed": seed}, rows=rows)
     cells = list(product(scenes, hands, shapes, steps, dtype))
     for scene, hand, shape, count, kind in cells:
-        found = judged(simulate(shape, hand, starts, count, np.dtype(kind), seed, scene), count)
+        found = checked(simulate(shape, hand, starts, count, np.dtype(kind), seed, scene), count)
         rows.append({"scene": scene, "hand": hand, "shape": shape, "steps": count, "dtype": kind} | found)
         keep(record)
         progress(len(rows), len(cells))
@@ -93,9 +96,9 @@ def summary(record: dict[str, Any]) -> str:
             f"deepest {row['deepest_mm']:.3f} mm; {row['failed']:3} failed, {len(row['unconfirmed'])} unconfirmed; "
             f"{row['ends']}"
         )
-        told = [row[kind][:SHOWN] for kind in ("steps_wrong", "failures", "unconfirmed")]
-        if any(told):
-            lines.append(f"       {told}")
+        listed = [row[kind][:SHOWN] for kind in ("steps_wrong", "failures", "unconfirmed")]
+        if any(listed):
+            lines.append(f"       {listed}")
     return "\n".join(lines)
 
 
@@ -107,19 +110,19 @@ def allowed(survey: Survey, steps: int) -> float:
     return 0.2 * float(np.max(np.linalg.norm(np.diff(where, axis=1), axis=-1)))
 
 
-def judged(survey: Survey, steps: int) -> dict[str, Any]:
+def checked(survey: Survey, steps: int) -> dict[str, Any]:
     """Return which pushes are wrong, failed or unconfirmed, and how many end with each status."""
     depth = penetration_depths(survey)
     status = survey.push.status
-    told = np.isin(status, [pj.Status.MOVING, pj.Status.FREE, pj.Status.JAMMED, pj.Status.GRASPED])
+    answered = np.isin(status, [pj.Status.MOVING, pj.Status.FREE, pj.Status.JAMMED, pj.Status.GRASPED])
     limit = allowed(survey, steps)
-    wrong = told & (depth[:, 1:] > limit) & (depth[:, 1:] > depth[:, :-1] + 0.01 * limit)
+    wrong = answered & (depth[:, 1:] > limit) & (depth[:, 1:] > depth[:, :-1] + 0.01 * limit)
     bad = np.flatnonzero(wrong.any(axis=1)).tolist()
-    failed = np.flatnonzero((~told).any(axis=1)).tolist()
-    first = [int(np.argmax(~told[i])) for i in failed]
+    failed = np.flatnonzero((~answered).any(axis=1)).tolist()
+    first = [int(np.argmax(~answered[i])) for i in failed]
     return {
         "wrong": len(bad),
-        "deepest_mm": float(1e3 * np.max(np.where(told, depth[:, 1:], 0))),
+        "deepest_mm": float(1e3 * np.max(np.where(answered, depth[:, 1:], 0))),
         "steps_wrong": [
             (i, int(np.argmax(wrong[i])), round(1e3 * float(depth[i, 1:][wrong[i]].max()), 3)) for i in bad
         ],
@@ -176,3 +179,142 @@ def _pads(body: shapely.Polygon, edge, corners: np.ndarray) -> np.ndarray:
     width = 2 * shapely.area(shared) / np.maximum(shapely.length(shared), 1e-12)  # between half the width and the width
     depth[near] = np.maximum(depth[near], 2 * width * (width > 2 * depth[near]))
     return depth.reshape(shape)
+
+
+def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
+    """Return the index of each push that ends GRASPED or JAMMED although the slider is not held, and the reason."""
+    # GRASPED promises that every finger is within reach of the slider: within four times the largest displacement in
+    # the step, or 1e-4 of the surface's length. A jam needs forces at the places in reach, inside their friction cones,
+    # that balance each other and on which the hand does work. A linear program searches for them, for polygons only. A
+    # hand that jams stops at the start of that step. If nothing holds the slider there yet, the step is repeated in
+    # `FINER` parts. It has to jam in one of them, with such forces.
+    status = survey.push.status[:, -1]
+    ended = np.flatnonzero((status == pj.Status.GRASPED) | (status == pj.Status.JAMMED)).tolist()
+    body, found = outline_of(survey.shape), []
+    where = np.asarray(survey.hand.poses(jnp.asarray(survey.path)), float)
+    for i in ended:
+        at = int(np.argmax(survey.push.status[i] == status[i]))
+        step = where[i, at + 1, :, :2] - where[i, at, :, :2]
+        reach = max(1e-4 * float(survey.slider.surface.length), 4 * float(np.max(np.abs(step).sum(axis=-1))))
+        pose = np.asarray(survey.push.pose[i, -1], float)
+        fingers = _placed(survey, pose, np.asarray(survey.push.configuration[i, -1]))
+        away = [finger.away(body) for finger in fingers[: len(step)]]
+        if status[i] == pj.Status.GRASPED and max(away) > 1.01 * reach:
+            found.append((int(i), f"a finger is {1e3 * max(away):.3f} mm away"))
+        elif isinstance(survey.shape, pj.Polygon):
+            mu = float(survey.friction[i])
+            if not _jams(body, fingers, _turned(step, pose), mu, reach) and not _jams_later(survey, body, i, at, reach):
+                found.append((int(i), "nothing holds it"))
+    return found
+
+
+def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Return the steps (fingers, 2) in the body frame of the slider."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return steps @ np.array([[c, -s], [s, c]])
+
+
+def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
+    """Return whether push `i` jams within step `at`, done in `FINER` parts."""
+    path = pj.line(survey.path[i, at], survey.path[i, at + 1], FINER)
+    again = jax.jit(rollout, static_argnums=5)
+    push = again(survey.slider, survey.hand, path, survey.push.pose[i, at], survey.friction[i], survey.scene)
+    stopped = int(push.stopped)
+    if stopped < 0:
+        return False
+    pose = np.asarray(push.pose[-1], float)
+    fingers = _placed(survey, pose, np.asarray(push.configuration[-1]))
+    where = np.asarray(survey.hand.poses(path[stopped : stopped + 2]), float)[..., :2]
+    # It jams within that part, or while an overlap is pushed out. Until then the slider turns as it did before.
+    if stopped > 0:
+        turns = np.ptp(push.pose[stopped - 1 : stopped + 1, 2])
+    else:
+        way = np.max(np.linalg.norm(where[1] - where[0], axis=-1))  # displacement in one part
+        turns = np.ptp(survey.push.pose[i, at - 1 : at + 1, 2]) * max(1.0, survey.push.overlap[i, at - 1] / way) / FINER
+    friction = 1.01 * float(survey.friction[i]) + float(turns)
+    return _jams(body, fingers, _turned(where[1] - where[0], pose), friction, reach)
+
+
+class Disk(NamedTuple):
+    """A round finger in the body frame of the slider."""
+
+    center: np.ndarray  # (2,), m
+    radius: float  # m
+
+    def away(self, body: shapely.Polygon) -> float:
+        """Return the distance from the body, m; not more than -radius if the center lies inside the body."""
+        return body.distance(shapely.Point(self.center)) - self.radius
+
+    def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the closest point (2,), m, and inward normal (2,) of each edge and vertex of the body within reach."""
+        found = []
+        for a, b in pairwise(_ring(body)):
+            length = np.linalg.norm(b - a)
+            along = (b - a) / length
+            at = (self.center - a) @ along
+            for point in (a, a + along * at) if 0 < at < length else (a,):
+                off = point - self.center
+                size = float(np.linalg.norm(off))
+                if abs(size - self.radius) <= reach and size > 0:
+                    found.append((point, off / size))
+        return found
+
+
+class Plate(NamedTuple):
+    """A pad in the body frame of the slider."""
+
+    solid: shapely.Polygon
+
+    def away(self, body: shapely.Polygon) -> float:
+        """Return the distance from the body, m."""
+        return body.distance(self.solid)
+
+    def places(self, body: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Find the corners of pad and body within reach of an edge of the other; returns are those of `Disk.places`."""
+        return _corners(body, self.solid, reach) + [(p, -n) for p, n in _corners(self.solid, body, reach)]
+
+
+def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disk | Plate]:
+    """Return the fingers, and then the fixtures, in the body frame of the slider."""
+    seen = seen_by_slider(survey.hand, pose, configuration)
+    radii = [float(finger.radius) if isinstance(finger, RoundFinger) else 0.0 for finger in survey.hand.fingers]
+    bodies = [*zip(radii, seen, strict=True), *fixtures_seen_by_slider(survey.scene, pose)]
+    return [Disk(where[0], radius) if len(where) == 1 else Plate(shapely.Polygon(where)) for radius, where in bodies]
+
+
+def _jams(body: shapely.Polygon, fingers: list[Disk | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:
+    """Return whether forces at the places in reach can balance each other while the fingers do work on them."""
+    # steps: displacements of the fingers, (fingers, 2), m, body frame; the fixtures at the end of `fingers` have none
+    wrenches, works = [], []
+    still = np.zeros((len(fingers) - len(steps), 2))
+    for finger, step in zip(fingers, np.concatenate([steps, still]), strict=True):
+        for point, normal in finger.places(body, reach):
+            tangent = np.array([-normal[1], normal[0]])
+            for force in (normal + mu * tangent, normal - mu * tangent):
+                wrenches.append([*force, (point[0] * force[1] - point[1] * force[0]) / 0.05])
+                works.append(force @ step)
+    if not wrenches:
+        return False
+    columns = np.array(wrenches).T
+    balance = np.vstack([columns, np.ones(columns.shape[1])])  # forces that balance and are not all zero
+    best = linprog(-np.array(works), A_eq=balance, b_eq=[0, 0, 0, 1], bounds=(0, None))
+    return best.success and -best.fun > 0
+
+
+def _ring(body: shapely.Polygon) -> np.ndarray:
+    """Return the vertices of a polygon, counterclockwise, with the first one again at the end."""
+    return np.asarray(shapely.geometry.polygon.orient(body).exterior.coords)
+
+
+def _corners(body: shapely.Polygon, other: shapely.Polygon, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Find corners of `other` within reach of an edge of `body`: the points on the edge, and the normals into it."""
+    tips = np.asarray(other.exterior.coords)[:-1]
+    found = []
+    for a, b in pairwise(_ring(body)):
+        size = np.linalg.norm(b - a)
+        along = (b - a) / size
+        normal = np.array([-along[1], along[0]])
+        height, at = (tips - a) @ normal, (tips - a) @ along
+        near = (np.abs(height) <= reach) & (at >= -reach) & (at <= size + reach)
+        found += [(a + along * at[k], normal) for k in np.flatnonzero(near)]
+    return found

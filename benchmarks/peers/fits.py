@@ -61,13 +61,8 @@ class Program:
         cp = cvxpy()
         n = len(monomials(degree))
         self.a, self.factor, self.slope = cp.Variable(n), cp.Parameter((n, n)), cp.Parameter(n)
-        matrix = cp.Variable((3, 3) if degree == 2 else (9, 9), PSD=True)
-        basis = np.stack([gram(unit, degree) for unit in np.eye(n)], axis=-1)
-        matching = []
-        for places, coefficients in _classes(basis, degree):
-            matching.append(sum(matrix[place] for place in places) == coefficients @ self.a)
         loss = cp.sum_squares(self.factor @ self.a) - 2 * self.slope @ self.a
-        self.problem, self.solver = cp.Problem(cp.Minimize(loss), matching), cp.CLARABEL
+        self.problem, self.solver = cp.Problem(cp.Minimize(loss), convexity(self.a, degree)), cp.CLARABEL
 
     def solve(self, factor: np.ndarray, slope: np.ndarray) -> tuple[float, np.ndarray]:
         """Solve the program for these parameters, (n, n) and (n,); return the minimum and the coefficients, (n,)."""
@@ -89,15 +84,20 @@ def quadratic(wrench, twist, length: float, degree: int) -> tuple[np.ndarray, np
     powers = monomials(degree)
     f, v = wrench / [1, 1, length], twist * [1, 1, length]
     f, v = f / np.mean(np.linalg.norm(f, axis=1)), v / np.linalg.norm(v, axis=1, keepdims=True)
-    values = np.prod(f[:, None] ** powers, axis=2)
-    gradients = []
-    for k in range(3):
-        lowered = np.maximum(powers - np.eye(3, dtype=int)[k], 0)
-        gradients.append(powers[:, k] * np.prod(f[:, None] ** lowered, axis=2))
+    values, gradients = values_and_gradients(f, degree)
     along = np.sum([g * v[:, k : k + 1] for k, g in enumerate(gradients)], axis=0)
     misfit = np.sum([g.T @ g for g in gradients], axis=0) - along.T @ along
     hessian = (misfit + VALUE_WEIGHT * values.T @ values) / len(f) + RIDGE * np.eye(len(powers))
     return np.linalg.cholesky(hessian).T, VALUE_WEIGHT * values.mean(axis=0), along
+
+
+def values_and_gradients(f: np.ndarray, degree: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the monomials of H at wrenches without units, (pairs, 3), and their three derivatives, each (pairs, n)."""
+    powers, gradients = monomials(degree), []
+    for k in range(3):
+        lowered = np.maximum(powers - np.eye(3, dtype=int)[k], 0)
+        gradients.append(powers[:, k] * np.prod(f[:, None] ** lowered, axis=2))
+    return np.prod(f[:, None] ** powers, axis=2), gradients
 
 
 def gram(a: np.ndarray, degree: int) -> np.ndarray:
@@ -118,16 +118,18 @@ def gram(a: np.ndarray, degree: int) -> np.ndarray:
     return tensor * (2.0 if degree == 2 else 12.0)
 
 
-def _classes(basis: np.ndarray, degree: int):
-    """Return the linear conditions that tie the positive semidefinite matrix to the coefficients `a`."""
-    # Each condition is a pair: entries of the matrix, and a row. The sum of the entries is the coefficient of one
-    # monomial of the form, z_i z_j or z_i z_j F_k F_l. The product of the row with `a` is the same coefficient.
+def convexity(a: Any, degree: int) -> list[Any]:
+    """Return the constraints of cvxpy that tie the coefficients `a`, a variable, to a positive semidefinite matrix."""
+    # In each, the sum of some entries of the matrix is the coefficient of one monomial of the form, z_i z_j or
+    # z_i z_j F_k F_l.
+    matrix = cvxpy().Variable((3, 3) if degree == 2 else (9, 9), PSD=True)
+    basis = np.stack([gram(unit, degree) for unit in np.eye(len(monomials(degree)))], axis=-1)
     if degree == 2:
-        return [([(i, j)], basis[i, j]) for i in range(3) for j in range(i, 3)]
+        return [matrix[i, j] == basis[i, j] @ a for i in range(3) for j in range(i, 3)]
     found = []
     for i, j, k, m in np.ndindex(3, 3, 3, 3):
         if i <= j and k <= m:
             places = {(i, j, k, m), (j, i, k, m), (i, j, m, k), (j, i, m, k)}
-            total = sum(basis[p] for p in places)
-            found.append(([(3 * p[0] + p[2], 3 * p[1] + p[3]) for p in places], total))
+            entries = sum(matrix[3 * p[0] + p[2], 3 * p[1] + p[3]] for p in places)
+            found.append(entries == sum(basis[p] for p in places) @ a)
     return found

@@ -50,7 +50,7 @@ from benchmarks.peers.mujoco import (
     slip,
 )
 from benchmarks.peers.scene import Scene, Settings, build, engine
-from benchmarks.tasks import error_mm
+from benchmarks.reference_push import error_mm
 
 SETTINGS = replace(
     Settings(),

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.peers.scene import Scene, Settings, build, engine
-from benchmarks.tasks import error_mm
+from benchmarks.reference_push import error_mm
 
 SETTLE = 400  # time until the slider lies still, in time constants of normal contact
 AWAY = 10.0  # m; where the slider settles, out of the tip's reach

@@ -1,25 +1,29 @@
 """Benchmark rows of other programs.
 
-Pushes and grasps are by MuJoCo and MJX, fits by cvxpy and jaxopt, contact problems by scipy and jaxopt.
+Pushes and grasps are by MuJoCo and MJX, fits by cvxpy, contact problems by scipy.
 
 MuJoCo and MJX each run at their largest timestep that stays within 0.1 mm of their own converged answer.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 import pushjax as pj
-from benchmarks import cases, grasps, tasks
-from benchmarks.peers import by_jaxopt, contacts, coulomb, fits, grasp, mjx, mujoco
+from benchmarks import cases, grasps, reference_push
+from benchmarks.peers import contacts, coulomb, fits, grasp, mjx, mujoco
 from benchmarks.peers.scene import Scene, Settings, engine
+from pushjax import plot
+from pushjax.plot.style import STYLE, curve_styles
 
-HALF = tasks.SIDE / 2
+HALF = reference_push.SIDE / 2
 SUPPORTS = {
     "three": ((-0.03, -0.02), (0.03, -0.02), (0.0, 0.03)),
     "four": ((-HALF, -HALF), (HALF, -HALF), (HALF, HALF), (-HALF, HALF)),
@@ -40,8 +44,6 @@ def check(case: Sequence[str]) -> None:
         engine()
     if "fit" in case:
         fits.cvxpy()
-    if {"fit", "solve"} & set(case):
-        by_jaxopt.jaxopt()
 
 
 def rows(case: Sequence[str]) -> list[dict[str, Any]]:
@@ -61,7 +63,7 @@ def _grasps() -> list[dict[str, Any]]:
     """Return the row of MuJoCo on four supports, with its error against rigid contact."""
     scene = Scene(SUPPORTS["four"], friction_tip=grasps.FRICTION)
     table, pose = grasp.accuracy(scene, grasp.SUPPORTED, grasp.Fingers())
-    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    at = mujoco.largest(table, 1e-3 * reference_push.ALLOWED_MM)
     poses = np.resize(grasps.fan(), (TIMED, 3))
     _, each = _repeated(lambda: grasp.grasp(scene, grasp.SUPPORTED, grasp.Fingers(), at.timestep, poses), TIMED)
     both = np.abs(pose[:, 2]) - np.abs(grasps.reference()[:, 2])  # geometry determines the rigid angle
@@ -72,7 +74,7 @@ def _grasps() -> list[dict[str, Any]]:
             "supports": "four",
             "timestep_s": at.timestep,
             "error_mm": at.error_mm,
-            "rigid_error_mm": float(1e3 * tasks.LENGTH * np.abs(both).max()),
+            "rigid_error_mm": float(1e3 * reference_push.LENGTH * np.abs(both).max()),
             "by_timestep": [row._asdict() for row in table],
         }
         | each
@@ -80,7 +82,7 @@ def _grasps() -> list[dict[str, Any]]:
 
 
 def _fits() -> list[dict[str, Any]]:
-    """Return the rows of cvxpy and of jaxopt, with the worst ratios of pushjax's loss to theirs."""
+    """Return the rows of cvxpy, with the worst ratios of pushjax's loss to theirs."""
     found = []
     for degree, name in ((4, "fit_quartic"), (2, "fit_ellipsoid")):
         wrench, twist, length = (np.asarray(part) for part in cases.pairs("float64", FITS))
@@ -88,16 +90,14 @@ def _fits() -> list[dict[str, Any]]:
         for dtype in ("float32", "float64"):
             work = cases.fit(dtype, FITS, degree)
             ours[dtype] = np.asarray(jax.jit(work.function)(*work.args)[1].loss, float)
-        for peer, solver in (("cvxpy", fits.fit), ("jaxopt", by_jaxopt.fit)):
-            theirs, each = _repeated(lambda fit=solver, these=(wrench, twist, length, degree): fit(*these), FITS)
-            ratio = {dtype: float((loss / theirs.loss).max()) for dtype, loss in ours.items()}
-            clipped = {"clipped": theirs.clipped} if isinstance(theirs, fits.Fitted) else {}
-            found.append(each | {"of": name, "peer": peer, "loss_over_theirs": ratio} | clipped)
+        theirs, each = _repeated(lambda these=(wrench, twist, length, degree): fits.fit(*these), FITS)
+        ratio = {dtype: float((loss / theirs.loss).max()) for dtype, loss in ours.items()}
+        found.append(each | {"of": name, "peer": "cvxpy", "loss_over_theirs": ratio, "clipped": theirs.clipped})
     return found
 
 
 def _problems() -> list[dict[str, Any]]:
-    """Return the rows of scipy and jaxopt on problems that have a motion, with the fraction of motions they find."""
+    """Return the rows of scipy on problems that have a motion, with the fraction of motions that it finds."""
     found = []
     for m in range(1, MOST_CONTACTS + 1):
         work = cases.solve("float64", 4 * PROBLEMS, m)
@@ -105,9 +105,8 @@ def _problems() -> list[dict[str, Any]]:
         moving = np.flatnonzero(np.any(np.asarray(jax.jit(work.function)(*work.args)) != 0, axis=1))[:PROBLEMS]
         kept = jax.tree.map(lambda leaf, k=moving: leaf[k], problem)
         these = surface.coefficients[moving], surface.length[moving], kept
-        for peer, solver in (("scipy", contacts.solve), ("jaxopt", by_jaxopt.solve)):
-            theirs, each = _repeated(lambda solve=solver, these=these: solve(*these), len(moving))
-            found.append(each | {"of": f"solve_{m}", "peer": peer, "found": float(theirs.found.mean())})
+        theirs, each = _repeated(lambda these=these: contacts.solve(*these), len(moving))
+        found.append(each | {"of": f"solve_{m}", "peer": "scipy", "found": float(theirs.found.mean())})
     return found
 
 
@@ -129,7 +128,7 @@ PEERS: dict[str, Callable[[], list[dict[str, Any]]]] = {
 def _mujoco(name: str) -> dict[str, Any]:
     scene, settings = Scene(SUPPORTS[name]), Settings()
     table = mujoco.accuracy(scene, settings)
-    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    at = mujoco.largest(table, 1e-3 * reference_push.ALLOWED_MM)
     found, each = _repeated(lambda: mujoco.timed(scene, settings, at.timestep, TIMED), TIMED)
     return each | {
         "of": "push_quartic",
@@ -148,7 +147,7 @@ def _mjx(name: str) -> dict[str, Any]:
     starts, ends = (np.resize(part, (BATCH, 2)) for part in mujoco.fan(scene))
     batch = mjx.Batch(scene, mjx.SETTINGS, mjx.CONVERGED, starts, ends)
     table = mjx.accuracy(batch)
-    at = mujoco.largest(table, 1e-3 * tasks.ALLOWED_MM)
+    at = mujoco.largest(table, 1e-3 * reference_push.ALLOWED_MM)
     found, each = _repeated(lambda: batch.pushed(at.timestep, mjx.softened(at.timestep)), BATCH)
     return each | {
         "of": "push_quartic",
@@ -168,7 +167,7 @@ def _mjx(name: str) -> dict[str, Any]:
 def _exact_error_mm(name: str, pose: np.ndarray) -> float:
     """Return the largest error (mm) of the final poses of `mujoco.fan`, (n, 3), against exact Coulomb friction."""
     exact = _exact(name)  # once for each push of the fan, which `pose` repeats
-    return float(tasks.error_mm(pose[: len(exact)], exact).max())
+    return float(reference_push.error_mm(pose[: len(exact)], exact).max())
 
 
 @cache
@@ -181,9 +180,9 @@ def _exact(name: str) -> np.ndarray:
 @cache
 def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) -> list[float]:
     """Return the slip (µm) along the side, without rolling, of the tip in straight sticking pushes by pushjax."""
-    here = tasks.task("quartic", dtype)
+    here = reference_push.task("quartic", dtype)
     offset = jnp.asarray(offsets, dtype)
-    push = jax.jit(jax.vmap(here.push))(tasks.paths(offset, jnp.zeros_like(offset), steps))
+    push = jax.jit(jax.vmap(here.push))(reference_push.paths(offset, jnp.zeros_like(offset), steps))
     for off, mode in zip(offsets, np.asarray(push.mode), strict=True):
         if not np.all(mode == pj.ContactMode.STICKING):
             raise ValueError(f"a push {1e3 * off:g} mm off the middle does not stick")
@@ -194,21 +193,23 @@ def slip_um(dtype: str, offsets: tuple[float, ...] = STICKS, steps: int = 50) ->
 @cache
 def same_fan_error_mm(dtype: str, steps: int) -> float:
     """Return pushjax's largest error (mm) over MuJoCo's pushes on four supports, against its converged answer."""
-    return float(tasks.error_mm(_same_fan(dtype, steps), _same_fan("float64", tasks.REFERENCE_STEPS)).max())
+    return float(
+        reference_push.error_mm(_same_fan(dtype, steps), _same_fan("float64", reference_push.REFERENCE_STEPS)).max()
+    )
 
 
 def _same_fan(dtype: str, steps: int) -> np.ndarray:
     """Return the final poses of MuJoCo's pushes by pushjax, (pushes, 3), m and rad."""
-    here = tasks.task("quartic", dtype)._replace(slider=tasks.cast(_on_four(), dtype))
+    here = reference_push.task("quartic", dtype)._replace(slider=reference_push.cast(_on_four(), dtype))
     offset, angle = (jnp.asarray(part, dtype) for part in np.array(mujoco.PUSHES).T)
-    return np.asarray(jax.jit(jax.vmap(here.push))(tasks.paths(offset, angle, steps)).pose[:, -1], float)
+    return np.asarray(jax.jit(jax.vmap(here.push))(reference_push.paths(offset, angle, steps)).pose[:, -1], float)
 
 
 @cache
 def _on_four() -> pj.Slider:
     """Return the square on the four supports, with the quartic fitted to their limit surface."""
     pairs = pj.Support.points(np.array(SUPPORTS["four"])).wrench_twist_pairs(jax.random.key(0), 400)
-    return pj.Slider(tasks.square("quartic").shape, pj.fit_limit_surface(*pairs, degree=4))
+    return pj.Slider(reference_push.square("quartic").shape, pj.fit_limit_surface(*pairs, degree=4))
 
 
 def _straight(scene: Scene, offsets: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -241,9 +242,6 @@ def compare(rows: list[dict[str, Any]], peers: list[dict[str, Any]]) -> None:
 
 def draw(record: dict[str, Any], out: Path) -> str:
     """Draw computing time against error of pushes by number of steps; save to the folder `out` and return the path."""
-    from benchmarks.peers.figure import speed_figure
-    from pushjax import plot
-
     curves: dict[str, list[tuple[float, float]]] = {}
     for row in record["by_steps"]:
         point = row["processor_s"] / row["batch"], row["pose_error_mm"]
@@ -253,12 +251,26 @@ def draw(record: dict[str, Any], out: Path) -> str:
         points = [(1e-6 * row["us_per_push"], row["error_mm"]) for row in peer["by_timestep"] if row["error_mm"] > 0]
         if points:
             curves[f"{NAMES[peer['peer']]}, {peer['supports']} supports"] = points
-    return str(plot.save(speed_figure(curves, tasks.ALLOWED_MM), out / "bench.png"))
+    return str(plot.save(speed_figure(curves, reference_push.ALLOWED_MM), out / "bench.png"))
+
+
+def speed_figure(curves: Mapping[str, Sequence[tuple[float, float]]], allowed_mm: float) -> Figure:
+    """Plot the time of a push (s) against the error of its final pose (mm), with a line at the allowed error."""
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(figsize=(6.8, 3.8), layout="constrained")
+        for name, points, look in curve_styles(curves):
+            times, errors = zip(*sorted(points), strict=True)
+            axes.loglog(errors, [1e6 * t for t in times], ms=4, lw=1.1, label=name, **look)
+        axes.axvline(allowed_mm, color="0.6", lw=0.9, ls="--")
+        axes.set(xlabel="worst error of a final pose / mm", ylabel="time of one core per push / µs")
+        axes.set_title("What accuracy costs")
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return figure
 
 
 def summary(peers: list[dict[str, Any]], rows: list[dict[str, Any]]) -> list[str]:
     """Return the lines that the command prints, from the peers' rows and pushjax's after `compare`."""
-    lines = ["", f"the same by others; simulators within {tasks.ALLOWED_MM} mm of their own converged answer:"]
+    lines = ["", f"the same by others; simulators within {reference_push.ALLOWED_MM} mm of their own converged answer:"]
     for peer in peers:
         each = f"{1e3 * peer['processor_s_each']:.2f} ms of CPU time"
         lines.append(f"  {peer['of']}, {peer['peer']}: {each}{_more(peer)}")
