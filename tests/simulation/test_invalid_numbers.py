@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from support.slopes import slopes
 
 import pushjax as pj
 
@@ -34,16 +35,23 @@ def push(given) -> pj.Trajectory:
     return pj.rollout(slider, hand, given["path"], pose=given["pose"], friction=given["friction"], fixtures=walls)
 
 
-def loss(batch, shift):
-    """Sum over a batch, of which all members share `shift`; and what the pushes gave."""
+def ends(batch, shift):
+    """Return ends and twists of a batch, of which all members share `shift`; and what the pushes gave."""
 
     def of_one(given):
         found = push(jax.tree.map(jnp.add, given, shift))
-        end = jnp.where(jnp.isfinite(found.pose[-1]), found.pose[-1], 0.0)
-        return jnp.sum(end * jnp.array([1.0, 2.0, 0.3])) + jnp.sum(found.twist), (found.pose, found.status)
+        return (jnp.where(jnp.isfinite(found.pose[-1]), found.pose[-1], 0.0), found.twist), (found.pose, found.status)
 
-    values, found = jax.vmap(of_one)(batch)
-    return jnp.sum(values), found
+    return jax.vmap(of_one)(batch)
+
+
+@jax.jit
+def program(batch, shift):
+    """Return poses and statuses, forward derivatives by everything, and reverse derivatives of a weighted sum."""
+    along = jax.tree.map(jnp.ones_like, (batch, shift))
+    weights = jnp.tile(jnp.array([1.0, 2.0, 0.3]), (2, 1)), jnp.ones((2, STEPS, 3))
+    _, found, forward, reverse = slopes(lambda both: ends(*both), (batch, shift), along, weights)
+    return found, forward, reverse
 
 
 def broken():
@@ -63,41 +71,30 @@ def test_a_bad_member_of_a_batch_changes_nothing_for_the_others(walls):
     def stacked(members):
         return {k: jnp.asarray(np.stack([m[k] for m in members])) for k in GOOD if walls or k != "wall"}
 
-    program = jax.jit(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True))
     none = {k: jnp.zeros(v.shape) for k, v in GOOD.items() if walls or k != "wall"}
-    (_, (poses, status)), (slope, _) = program(stacked([GOOD, GOOD]), none)
+    (poses, status), ahead, (slope, _) = program(stacked([GOOD, GOOD]), none)
     assert (status[0] == pj.Status.MOVING).all()
     assert np.all(slope["pose"][0] != 0)
     for name, member, must_be_invalid in broken():
         if name.startswith("wall") and not walls:
             continue
-        (_, found), (own, shared) = program(stacked([GOOD, member]), none)
-        for new, old in ((found[0], poses), (found[1], status), *((own[k], slope[k]) for k in own)):
+        # no number on the way is NaN where it could reach a derivative
+        batch = stacked([GOOD, member])
+        with jax.debug_nans(name == "path[1, 1] NaN"):
+            found, forward, (own, shared) = program(batch, none)
+        once = (poses, status, ahead, slope)
+        for new, old in zip(jax.tree.leaves((*found, forward, own)), jax.tree.leaves(once), strict=True):
             np.testing.assert_array_equal(new[0], old[0], err_msg=name)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((forward, own))), name
         for k in own:
-            assert np.isfinite(own[k]).all(), (name, k)
             np.testing.assert_allclose(shared[k], slope[k][0] + own[k][1], rtol=1e-5, atol=1e-7, err_msg=name)
+        if name == "path[1, 1] NaN":
+            assert not own["path"][1, 1].any()
+            assert own["path"][1, 3].any()
         invalid = np.asarray(found[1][1]) == pj.Status.INVALID
         if must_be_invalid:
             rows = np.isin(np.arange(STEPS), [0, 1]) if name.startswith("path") else np.ones(STEPS, bool)
             assert invalid[rows].all(), (name, found[1][1])
-
-
-def test_forward_mode_and_debug_nans():
-    """A member with NaN in its path has a finite derivative in forward mode, too, with `jax_debug_nans` on."""
-    path = GOOD["path"].copy()
-    path[3] = np.nan
-    given = {k: jnp.asarray(v) for k, v in GOOD.items() if k != "wall"}
-
-    def end(given):
-        return push(given).pose[-1]
-
-    with jax.debug_nans(True):
-        for derivative in (jax.jacfwd, jax.jacrev):
-            slope = jax.jit(derivative(end))({**given, "path": path})
-            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
-            assert not np.asarray(slope["path"][:, 3]).any()
-            assert np.asarray(slope["path"][:, 5]).any()
 
 
 def test_friction_that_is_not_valid_counts_also_without_a_contact():
