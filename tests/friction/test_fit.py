@@ -41,13 +41,16 @@ def normalized(wrench, twist, length):
     return f / np.linalg.norm(f, axis=1).mean(), v / np.linalg.norm(v, axis=1)[:, None]
 
 
+evaluated = jax.jit(jax.vmap(lambda surface, wrench: (surface.value(wrench), surface.twist(wrench)), (None, 0)))
+
+
 def stated_loss(surface: pj.LimitSurface, wrench, twist, length) -> float:
     """Compute the loss from the surface's own value and gradient."""
     scale = np.linalg.norm(wrench * [1, 1, 1 / length], axis=1).mean()
     _, v = normalized(wrench, twist, length)
-    h = np.asarray(jax.vmap(surface.value)(jnp.asarray(wrench)))
+    h, gradient = map(np.asarray, evaluated(surface, wrench))
     # H(scale F) as a function of F has the gradient scale * grad H
-    g = scale * np.asarray(jax.vmap(surface.twist)(jnp.asarray(wrench))) * [1, 1, length]
+    g = scale * gradient * [1, 1, length]
     s = np.maximum(0, np.sum(g * v, axis=1))
     if isinstance(surface, pj.Quartic):
         a = np.asarray(surface.coefficients) * scale**4
@@ -124,7 +127,7 @@ def test_reported_loss_and_angle_are_those_of_the_surface(name, degree):
 
 def test_ellipsoid_is_the_minimum(rng):
     """Degree two is convex in its coefficients: no symmetric change of A lowers the loss."""
-    wrench, twist, length = pairs_of("uniform", 100)
+    wrench, twist, length = pairs_of("uniform")
     surface = pj.fit_limit_surface(wrench, twist, length, degree=2)
     base = stated_loss(surface, wrench, twist, length)
     for _ in range(20):
@@ -165,12 +168,12 @@ def test_an_ellipsoid_and_its_square_are_recovered(rng):
     """From pairs of a known ellipsoid, degree two finds it, and degree four its square, up to the ridge."""
     m = rng.normal(size=(3, 3))
     truth = pj.Ellipsoid(m @ m.T + np.eye(3), 0.03)
-    twist = rng.normal(size=(300, 3)) * [1, 1, 1 / 0.03]
-    wrench = jax.vmap(truth.wrench)(jnp.asarray(twist))
+    twist = rng.normal(size=(400, 3)) * [1, 1, 1 / 0.03]
+    wrench = jax.jit(jax.vmap(truth.wrench))(jnp.asarray(twist))
     for degree in (2, 4):
         surface, report = pj.fit_limit_surface(wrench, twist, 0.03, degree=degree, report=True, ridge=1e-9)
         assert report.angle < 1e-3
-        assert np.allclose(jax.vmap(surface.value)(wrench), 1, atol=1e-3)
+        assert np.allclose(evaluated(surface, wrench)[0], 1, atol=1e-3)
 
 
 def test_scale_of_wrenches_and_twists_does_not_matter():
@@ -205,11 +208,10 @@ def test_opposed_twists_are_clipped_not_fitted():
 
 
 def test_batches_equal_single_fits():
-    support = supports()["uniform"]
-    batch = jax.vmap(lambda key: support.wrench_twist_pairs(key, 60))(jax.random.split(jax.random.key(2), 5))
+    batch = [np.stack(parts) for parts in zip(*(pairs_of(name) for name in supports()), strict=True)]
     surfaces, reports = jax.jit(jax.vmap(lambda w, v, l: pj.fit_limit_surface(w, v, l, report=True)))(*batch)
     assert reports.converged.all()
-    for k in range(5):
+    for k in range(len(supports())):
         single = pj.fit_limit_surface(*(part[k] for part in batch))
         assert np.allclose(surfaces.coefficients[k], single.coefficients, rtol=1e-4, atol=1e-5)
 
