@@ -120,3 +120,21 @@ def test_a_folder_without_any_condition(tmp_path):
     (tmp_path / "three_point_push").mkdir()
     with pytest.raises(ValueError, match=r"hardboard_3pts1\.npz, or published logs named .* found none"):
         experiment.run(tmp_path)
+
+
+def test_published_logs_take_the_place_of_a_file(data, converted):
+    ours = conditions.load(converted / "three_point_push", "plywood", "3pts2")
+    originals = conditions.load(data / "raw" / "three_point_push", "plywood", "3pts2")
+    assert (originals.surface, originals.object) == (ours.surface, ours.object) == ("plywood", "3pts2")
+    assert len(originals) == len(ours)
+    assert conditions.load(data / "raw" / "three_point_push", "plywood", "3pts9") is None
+
+
+def test_paths_end_where_the_robot_was_told_to_stop(data, converted):
+    name = "three_point_push/hardboard_3pts1.npz"
+    log = load_recordings(converted / name)
+    with np.load(data / name) as archive:
+        expected = archive["tip_end_commanded_xy"][archive["valid"]]
+    pushes = conditions.recorded(log, conditions.GEOMETRIES["measured"], 10)
+    np.testing.assert_allclose(pushes.path[:, -1], expected, rtol=0, atol=3e-8)  # the curated path is float32
+    np.testing.assert_array_equal(pushes.end, log.end)
