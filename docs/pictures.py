@@ -29,7 +29,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
 
 import pushjax as pj
 from pushjax import planning, plot
-from pushjax.datasets import find_data
+from pushjax.datasets import Recording, find_data
 from pushjax.experiments import demo, squeeze, stochastic_push
 from pushjax.experiments.pusht_mpc import make_plant
 from pushjax.experiments.table2 import conditions
@@ -101,7 +101,7 @@ def real() -> Figure:
     if data is None:
         raise SystemExit("real: set PUSHJAX_DATA to the folder of real data")
     log, geometry = conditions.load(data / "three_point_push", *REAL), conditions.GEOMETRIES["measured"]
-    if log is None:
+    if log is None or log.length is None:
         raise SystemExit(f"real: {data} has no log of {', '.join(map(str, REAL))}")
     pushes, block = conditions.recorded(log, geometry, STEPS), conditions.outline(log, geometry)
     slider = pj.Slider(block, conditions.ideal_surface(log, "quartic", jax.random.key(0)))
@@ -116,7 +116,7 @@ def real() -> Figure:
     shown = {}
     for name, share in SHOWN.items():
         k = order[round(share * (len(order) - 1))]
-        measured = plot.RecordedPush(np.stack([pushes.start[k], pushes.end[k]]), np.asarray(pushes.path[k]))
+        measured = Recording(k, np.asarray(pushes.path[k]), np.stack([pushes.start[k], pushes.end[k]]))
         shown[f"{name}: {off[k]:.1f} mm"] = measured, np.asarray(predicted[k])
     return plot.real_figure(block, shown, hand)
 
