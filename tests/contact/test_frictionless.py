@@ -4,27 +4,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from contact_batches import first, flat_push, problems
 from scipy.optimize import linprog
+from support.slopes import slopes
 
 import pushjax as pj
 from pushjax.contact.frictionless import Frictionless
-from pushjax.testing.problems import random_contacts_problem
 
 PROBLEMS = 300
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_conditions_hold_and_jams_have_no_motion(count):
-    with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(count), PROBLEMS)
-        contacts = jax.vmap(lambda key: random_contacts_problem(key, contacts=count).contacts)(keys)
-        factor = np.random.default_rng(0).normal(size=(PROBLEMS, 3, 3))
-        matrix, length = factor @ factor.transpose(0, 2, 1) + 0.3 * np.eye(3), 0.03
+    contacts = first(problems(count, seed=count).contacts, PROBLEMS)
+    factor = np.random.default_rng(0).normal(size=(PROBLEMS, 3, 3))
+    matrix, length = factor @ factor.transpose(0, 2, 1) + 0.3 * np.eye(3), 0.03
 
-        def solved(matrix, contacts):
-            return pj.solve_contacts(pj.Ellipsoid(matrix, length), contacts, solver=Frictionless())
+    def solved(matrix, contacts):
+        return pj.solve_contacts(pj.Ellipsoid(matrix, length), contacts, solver=Frictionless())
 
-        motion = jax.jit(jax.vmap(solved))(jnp.asarray(matrix), contacts)
+    motion = jax.jit(jax.vmap(solved))(jnp.asarray(matrix), contacts)
     point, normal, gap = (np.asarray(getattr(contacts, name)) for name in ("point", "normal", "gap"))
     lever = point[..., 0] * normal[..., 1] - point[..., 1] * normal[..., 0]
     rows = np.concatenate([normal, lever[..., None]], axis=-1)
@@ -53,31 +52,31 @@ def test_conditions_hold_and_jams_have_no_motion(count):
 
 
 def test_only_for_ellipsoids():
-    contacts = random_contacts_problem(jax.random.key(0), contacts=2).contacts
     quartic = pj.Quartic([1.0, *[0.0] * 14], 0.03)
     with pytest.raises(ValueError, match="Frictionless needs an ellipsoid; the surface has degree 4"):
-        pj.solve_contacts(quartic, contacts, solver=Frictionless())
+        pj.solve_contacts(quartic, flat_push(), solver=Frictionless())
 
 
 def test_derivatives_are_those_without_friction():
     """The coefficients of friction, which the solver ignores, have no influence on derivatives."""
-    with jax.enable_x64(True):
-        point, normal = np.array([[-0.03, 0.01], [-0.03, -0.02]]), np.array([[1.0, 0.0], [1.0, 0.0]])
-        surface = pj.Ellipsoid(np.diag([1.0, 1.0, 1.3]), 0.03)
+    point, normal = np.array([[-0.03, 0.01], [-0.03, -0.02]]), np.array([[1.0, 0.0], [1.0, 0.0]])
+    surface = pj.Ellipsoid(np.diag([1.0, 1.0, 1.3]), 0.03)
 
-        @jax.jit
-        def twist(displacement, mu):
-            contacts = pj.Contacts(point, normal, displacement, mu)
-            return pj.solve_contacts(surface, contacts, solver=Frictionless()).twist
+    @jax.jit
+    @jax.vmap
+    def program(displacement, along, weights):
+        def twist(inputs):
+            return pj.solve_contacts(surface, pj.Contacts(point, normal, *inputs), solver=Frictionless()).twist, None
 
-        at, mu = jnp.array([[1e-3, 2e-4], [1.2e-3, -1e-4]]), jnp.array([0.3, 0.3])
-        by_displacement, by_friction = jax.jacrev(twist, argnums=(0, 1))(at, mu)
-        forward = jax.jacfwd(twist)(at, mu)
-        differences = np.zeros((3, 2, 2))
-        for i, k in np.ndindex(2, 2):
-            change = np.zeros((2, 2))
-            change[i, k] = 1e-8
-            differences[:, i, k] = (twist(at + change, mu) - twist(at - change, mu)) / 2e-8
-        assert (np.asarray(by_friction) == 0).all()
-    np.testing.assert_allclose(by_displacement, differences, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(forward, by_displacement, rtol=1e-9, atol=1e-12)
+        mu = jnp.array([0.3, 0.3])
+        value, _, forward, (by_displacement, by_friction) = slopes(twist, (displacement, mu), (along, 0 * mu), weights)
+        return value, forward, by_displacement, by_friction
+
+    # each row is a derivative along one entry of the displacements, and of one entry of the twist
+    at, entries, weights = np.array([[1e-3, 2e-4], [1.2e-3, -1e-4]]), np.eye(4).reshape(4, 2, 2), np.eye(4, 3)
+    ahead, behind = (np.asarray(program(at + t * entries, entries, weights)[0]) for t in (1e-8, -1e-8))
+    _, forward, by_displacement, by_friction = program(at + 0 * entries, entries, weights)
+    assert not np.any(by_friction)
+    reverse = np.asarray(by_displacement)[:3].reshape(3, 4)
+    np.testing.assert_allclose(reverse, (ahead - behind).T / 2e-8, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(forward).T, reverse, rtol=1e-9, atol=1e-12)
