@@ -1,5 +1,4 @@
 from .environment import Environment as Environment
-from .environment import FiveValues as FiveValues
 from .environment import TaskParams as TaskParams
 from .environment import TaskState as TaskState
 from .push_along_wall import PushAlongWall as PushAlongWall

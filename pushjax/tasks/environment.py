@@ -25,7 +25,7 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.control_step import ControlStepResult, control_step
-from pushjax.tasks.parts import with_noise
+from pushjax.tasks.shared import with_noise
 from pushjax.tasks.spaces import Space
 
 
@@ -330,42 +330,3 @@ def _step(env: Environment, key: PRNGKeyArray, state: TaskState, action: Any, pa
         terminated | truncated, new_episode, (observation, state), key, state.next_start, params
     )
     return *next_episode, reward, terminated, truncated, info
-
-
-class FiveValues:
-    """An environment with the interface of gymnax 0.0.9: `step` and `step_env` return five values.
-
-    They are observation, state, reward, done and a dictionary, where done is terminated or truncated. Everything else
-    is that of the environment.
-
-    Args:
-        env: The environment.
-    """
-
-    def __init__(self, env: Environment):
-        self.env = env
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "env":  # while it is copied or unpickled
-            raise AttributeError(name)
-        return getattr(self.env, name)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, FiveValues) and self.env == other.env
-
-    def __hash__(self) -> int:
-        return hash((FiveValues, self.env))
-
-    def step(self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any = None):
-        """Take one control step, as `Environment.step`."""
-        observation, state, reward, terminated, truncated, info = self.env.step(key, state, action, params)
-        return observation, state, reward, terminated | truncated, info
-
-    def step_env(self, key: PRNGKeyArray, state: TaskState, action: ArrayLike, params: Any):
-        """Take one control step, as `Environment.step_env`."""
-        observation, state, reward, terminated, info = self.env.step_env(key, state, action, params)
-        return observation, state, reward, terminated | self.env.is_truncated(state, params), info
-
-    def is_terminal(self, state: TaskState, params: Any) -> Bool[Array, ""]:
-        """Whether the episode has ended."""
-        return self.env.is_terminated(state, params) | self.env.is_truncated(state, params)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_positive, check_type
+from pushjax._internal.checks import ArrayLike, as_float, check_positive, check_type, checked_array
 from pushjax._internal.jit import eager_context
 from pushjax.friction.ellipsoid import Ellipsoid
 from pushjax.friction.friction_model import FrictionModel
@@ -33,8 +33,8 @@ from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.environment import Environment, TaskParams, TaskState
-from pushjax.tasks.parts import checked, placed, shared_params, with_noise
 from pushjax.tasks.render import render
+from pushjax.tasks.shared import placed, shared_params, with_noise
 from pushjax.tasks.spaces import Box, Dict, Space
 
 Observation = Literal["state", "environment_state_agent_pos", "pixels", "pixels_agent_pos"]
@@ -87,7 +87,7 @@ class PushT(Environment):
     which the agent moves, px. The reward is the coverage of the goal divided by 0.95, at most 1. An episode terminates
     when the coverage is above 0.95, and is truncated after 300 control steps.
 
-    The interface is that of gymnax 1.x (`Environment`); `FiveValues` gives that of gymnax 0.0.9.
+    The interface is that of gymnax 1.x (`Environment`).
 
     Attributes:
         observation: What is observed. "state": agent x and y, block x and y (of its body's origin) and angle modulo 2
@@ -290,8 +290,8 @@ class PushT(Environment):
             ValueError: For a wrong shape; where it is not traced, also for values that are not finite.
         """
         params = self.default_params if params is None else params
-        row = checked("observation", as_float(observation, params.goal.dtype, "observation"), (5,), signed=True)
-        speed = checked("velocity", as_float(velocity, params.goal.dtype, "velocity"), (2,), signed=True)
+        row = checked_array("observation", as_float(observation, params.goal.dtype, "observation"), (5,))
+        speed = checked_array("velocity", as_float(velocity, params.goal.dtype, "velocity"), (2,))
         center = placed(-params.origin[None], row[2:])[0]
         return TaskState(jnp.concatenate([center, row[4:]]), row[:2], speed, jnp.zeros((), jnp.int32))
 
@@ -315,13 +315,13 @@ def _block(
         vertices, middle = np.asarray(block.vertices, float), np.asarray(block.centroid, float)
         keypoints = vertices
     if center is not None:
-        middle = np.asarray(checked("center", center, (2,), signed=True), float)
+        middle = np.asarray(checked_array("center", center, (2,)), float)
     shape = Polygon(as_float((vertices - middle) * meters))
     if physics == "table":
         slider = Slider.uniform(shape)
     else:
         default = T_LENGTH if block is None else _gyration_radius(shape) / meters
-        reach = checked("length", default if length is None else length, ())
+        reach = checked_array("length", default if length is None else length, (), non_negative=True)
         check_positive("length", reach)
         slider = Slider(shape, Ellipsoid(as_float(np.eye(3)), reach * meters))
     return slider, as_float(-middle), as_float(keypoints - middle)

@@ -15,7 +15,7 @@ from pushjax._internal.checks import ArrayLike, as_float, check_count, check_sha
 from pushjax._internal.jit import quick_jit
 from pushjax.simulation.fixtures import Wall
 from pushjax.simulation.hand import Hand, RoundFinger
-from pushjax.tasks.parts import placed
+from pushjax.tasks.shared import placed
 
 WORKSPACE = 512.0  # side of the drawn square, px
 WALL_LOW, WALL_HIGH = 5.0, 506.0  # center lines of the walls, px

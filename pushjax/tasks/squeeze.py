@@ -12,7 +12,7 @@ from pushjax.contact.status import Status
 from pushjax.simulation.hand import Hand
 from pushjax.tasks.control_step import ControlStepResult
 from pushjax.tasks.environment import TaskState
-from pushjax.tasks.parts import placed
+from pushjax.tasks.shared import placed
 from pushjax.tasks.table_task import HALF_WIDTH, TableParams, TableTask, draw_beside, draw_pose
 
 WIDTH, THICKNESS = 0.06, 0.012  # m, of the pads

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type
+from pushjax._internal.checks import ArrayLike, as_float, check_count, check_type, checked_array
 from pushjax._internal.jit import eager_context
 from pushjax._math.vec import cos_sin, norm
 from pushjax.friction.friction_model import FrictionModel
@@ -26,8 +26,8 @@ from pushjax.geometry.intersection import intersection_area
 from pushjax.geometry.polygon import Polygon
 from pushjax.simulation.slider import Slider
 from pushjax.tasks.environment import Environment, TaskParams, TaskState
-from pushjax.tasks.parts import checked, placed, shared_params, with_noise
 from pushjax.tasks.render import render_table
+from pushjax.tasks.shared import placed, shared_params, with_noise
 from pushjax.tasks.spaces import Box
 
 BLOCK = (0.09, 0.06)  # m, sides of the default block
@@ -138,7 +138,7 @@ class TableTask(Environment):
         return TableParams(
             **shared_params(slider, place, friction, model, noise, success_coverage, max_steps_in_episode),
             corners=as_float(corners),
-            wall_friction=checked("wall_friction", wall_friction, ()),
+            wall_friction=checked_array("wall_friction", wall_friction, (), non_negative=True),
             symmetry=_symmetry(corners),
         )
 
@@ -211,7 +211,7 @@ class TableTask(Environment):
             ValueError: For a wrong shape; where it is not traced, also for values that are not finite.
         """
         dtype = (self.default_params if params is None else params).goal.dtype
-        values = checked("row", as_float(row, dtype, "row"), (len(self.MOTION) + 3,), signed=True)
+        values = checked_array("row", as_float(row, dtype, "row"), (len(self.MOTION) + 3,))
         return TaskState(values[-3:], values[:-3], jnp.zeros_like(values[:-3]), jnp.zeros((), jnp.int32))
 
 

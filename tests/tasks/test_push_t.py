@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pushjax as pj
-from pushjax.tasks import FiveValues, PushT
+from pushjax.tasks import PushT
 
 BATCH = 64
 ENV = PushT()
@@ -102,17 +102,6 @@ def test_block_with_a_center_and_a_length_of_its_own():
 
 
 # Steps of a box: its programs are small, because a finger touches a convex block in one place
-
-
-def test_five_values():
-    env = FiveValues(OPEN)
-    params = OPEN.params(block=BOX, max_steps_in_episode=1)
-    _, state = env.reset(jax.random.key(0), params)
-    observation, state, reward, done, _ = env.step(jax.random.key(1), state, jnp.array([9.0, 9.0]), params)
-    assert (observation.shape, reward.shape) == ((5,), ())
-    assert bool(done)
-    assert int(state.time) == 0
-    assert env.name == "PushT"
 
 
 def test_friction_is_drawn_at_the_reset(box, box_steps):

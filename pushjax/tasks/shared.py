@@ -1,4 +1,4 @@
-"""Parts that tasks share: checked parameters, noise, and points of bodies."""
+"""What the tasks share: the check of their common parameters, noise, and the corners of bodies in the world."""
 
 from typing import Any
 
@@ -27,18 +27,16 @@ def shared_params(
         check_type("model", model, FrictionModel)
     return {
         "slider": slider,
-        "friction": None if friction is None else checked("friction", friction, ()),
-        "goal": checked("goal", goal, (3,), signed=True),
+        "friction": None if friction is None else checked_array("friction", friction, (), non_negative=True),
+        "goal": checked_array("goal", goal, (3,)),
         "model": model,
         "surfaces": None if model is None else model.around(slider.surface),
-        "success_coverage": checked("success_coverage", success_coverage, ()),
+        "success_coverage": checked_array("success_coverage", success_coverage, (), non_negative=True),
         "max_steps_in_episode": int(max_steps_in_episode),
-    } | {name: None if value is None else checked(name, value, ()) for name, value in noise.items()}
-
-
-def checked(name: str, value: ArrayLike, shape: tuple[int, ...], *, signed: bool = False) -> Array:
-    """Return an argument as an array that is finite and, unless `signed`, not negative."""
-    return checked_array(name, value, shape, non_negative=not signed)
+    } | {
+        name: None if value is None else checked_array(name, value, (), non_negative=True)
+        for name, value in noise.items()
+    }
 
 
 def with_noise(key: PRNGKeyArray, values: Array, deviation: Array | None) -> Array:
