@@ -13,8 +13,7 @@ from pushjax._internal.jit import quick_jit
 from pushjax._internal.xla import compute_once
 from pushjax._math.vec import Vec2
 from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, signed_area
-from pushjax.geometry.spline import SAMPLES, SplineOutline
-from pushjax.geometry.spline_segment import spline_segments
+from pushjax.geometry.spline import SAMPLES, SplineOutline, spline_segments
 
 # Intervals per segment over which the arc length is integrated. The speed is smooth within an interval.
 ARC_NODES = 8

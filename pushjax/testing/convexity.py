@@ -10,11 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._math.directions import fibonacci_hemisphere
-from pushjax.friction.quartic import MONOMIALS
+from pushjax.testing.batch import HESSIANS, UPPER
 
 # Number of directions F, on the half sphere, at which the Hessian is evaluated; how many of them are refined; and the
 # rounds of refinement.
 DIRECTIONS, REFINED, ROUNDS = 200, 4, 12
+# (entry of the Hessian, product of two coordinates of F, coefficient of the quartic)
+HESSIAN_TABLE = np.stack([HESSIANS[:, i, j].T for i, j in UPPER])
 BATCH = 20_000  # quartics that are checked at once, to bound the memory
 
 
@@ -56,7 +58,7 @@ def _sweep(c: Float[Array, "n 15"]) -> Float[Array, "n"]:
     """Return the smallest curvature of each quartic; see `least_curvatures`."""
     c = c / jnp.max(jnp.abs(c), axis=1, keepdims=True)
     directions = jnp.asarray(fibonacci_hemisphere(DIRECTIONS), c.dtype)
-    table = jnp.asarray(_HESSIAN, c.dtype)  # (6, 6, 15): Hessian entry, product of two coordinates of F, coefficient
+    table = jnp.asarray(HESSIAN_TABLE, c.dtype)
     hessians = jnp.einsum("epm,rp,nm->ern", table, _products(directions), c)
     lowest = _least_eigenvalue(*hessians)
     best = jax.lax.top_k(-lowest.T, REFINED)[1].T  # (refined, n)
@@ -106,23 +108,3 @@ def _eigenvector(entries, value):
     best = jnp.argmax(squared)
     tiny = squared[best] <= jnp.finfo(value.dtype).tiny
     return jnp.where(tiny, jnp.array([1.0, 0, 0]), crosses[best] / jnp.sqrt(jnp.where(tiny, 1.0, squared[best])))
-
-
-def _hessian_table() -> np.ndarray:
-    """Return the Hessian of each monomial: (entry of the Hessian, product of two coordinates, monomial)."""
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    products = [np.bincount(pair, minlength=3) for pair in pairs]
-    table = np.zeros((6, 6, len(MONOMIALS)))
-    for m, exponent in enumerate(MONOMIALS):
-        for e, (i, j) in enumerate(pairs):
-            remaining = exponent.copy()
-            factor = remaining[i]
-            remaining[i] -= 1
-            factor *= remaining[j]
-            if factor > 0:
-                remaining[j] -= 1
-                table[e, [tuple(p) for p in products].index(tuple(remaining)), m] = factor
-    return table
-
-
-_HESSIAN = _hessian_table()

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.testing.batch import ProblemBatch, products
+from pushjax.testing.batch import UPPER, ProblemBatch, products
 from pushjax.testing.condition_violations import CLEAN, level, violations
 
 # Number of starts that are followed together, so that their numbers stay in the processor's cache.
@@ -13,9 +13,7 @@ CHUNK = 4000
 # |residual|^2 below this factor of its value. DAMPING: range of the initial damping, as powers of ten. RHO_SPREAD:
 # standard deviation of log(rho) between starts. MODE_SHARE: fraction of starts that begin with a guess of the modes.
 MOST_STEPS, STALLED, DAMPING, RHO_SPREAD, MODE_SHARE = 120, 0.97, (-8.0, -2.0), 1.0, 0.8
-# UPPER: the (row, column) of each of the six distinct entries of a symmetric 3 x 3 matrix. FULL: for each entry of the
-# matrix, its index in UPPER.
-UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+# For each entry of a symmetric 3 x 3 matrix, its index in `UPPER`.
 FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
