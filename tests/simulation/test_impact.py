@@ -1,5 +1,7 @@
 """When a finger first touches a slider, compared with shapely, which shares no code."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,8 @@ LENGTH = 0.04
 ANGLE = 2 * np.pi * np.arange(14) / 14
 STAR = np.where(np.arange(14) % 2, 0.02, 0.05)[:, None] * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1)
 L = np.array([(0, 0), (120, 0), (120, 40), (40, 40), (40, 80), (0, 80)]) * 1e-3 - np.array([0.05, 0.03])
+# with as many vertices as the star, so that they share programs
+L = np.concatenate([np.linspace(L[0], L[1], 9, endpoint=False), L[1:]])
 WAVY = (0.04 + 0.008 * np.cos(4 * ANGLE))[:, None] * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1)
 SHAPES = {
     "disk": pj.Disk(0.045, (0.01, 0.0)),
@@ -23,14 +27,16 @@ SHAPES = {
     "square": pj.Polygon.rectangle(0.09, 0.09),
     "L": pj.Polygon(L),
     "star": pj.Polygon(STAR),
-    "oval": pj.Curve(STAR[::2] * np.array([1.4, 1.0])),
+    "oval": pj.Curve(0.05 * np.array([1.4, 1.0]) * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1)),
     "wavy": pj.Curve.through(WAVY),
 }
 PAD = Pad(pj.Polygon.rectangle(0.05, 0.01))
 
 
-def body(shape) -> shapely.Polygon:
+@functools.cache
+def body(name: str) -> shapely.Polygon:
     """Return an outline as a dense polygon; its own vertices if it is one."""
+    shape = SHAPES[name]
     return shapely.Polygon(shape.vertices if isinstance(shape, pj.Polygon) else shape.boundary(20_000))
 
 
@@ -42,8 +48,14 @@ def fraction(shape, finger, start, path, angle=None, turning=None):
     return time_of_impact((motion,), outline, frame, jnp.full_like(zero, LENGTH))
 
 
-fractions = jax.jit(jax.vmap(fraction, (None, None, 0, 0)))
+PATHS = 300  # of every batch
+straight = jax.jit(jax.vmap(fraction, (None, None, 0, 0)))
 turned_fractions = jax.jit(jax.vmap(fraction, (None, None, 0, 0, 0, 0)))
+
+
+def fractions(shape, finger, start, path) -> np.ndarray:
+    rows = (np.resize(x, (PATHS, 2)) for x in (start, path))
+    return np.asarray(straight(shape, finger, *rows))[: len(start)]
 
 
 def random_paths(rng, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -59,11 +71,11 @@ def random_paths(rng, count: int) -> tuple[np.ndarray, np.ndarray]:
 def test_a_round_finger_touches_where_shapely_says(name, radius, dtype, rng):
     """It never touches earlier; and if pieces of the slider are known to be convex, never later."""
     shape = jax.tree.map(lambda leaf: leaf.astype(dtype), SHAPES[name])
-    start, path = (x.astype(dtype) for x in random_paths(rng, 300))
-    other = body(SHAPES[name])
+    start, path = (x.astype(dtype) for x in random_paths(rng, PATHS))
+    other = body(name)
     outside = shapely.distance(other, shapely.points(start)) > radius + 1e-5
     start, path = start[outside], path[outside]
-    found = np.asarray(fractions(shape, RoundFinger(dtype(radius)), start, path))
+    found = fractions(shape, RoundFinger(dtype(radius)), start, path)
     assert found.dtype == dtype
     end = start + found[:, None] * path.astype(float)
     free = shapely.linestrings(np.stack([start, end], axis=1))
@@ -80,15 +92,17 @@ def test_a_round_finger_touches_where_shapely_says(name, radius, dtype, rng):
         assert np.all(gap[hits] < close * size[hits])
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("name", ["square", "L", "ellipse", "wavy"])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [*((name, np.float64) for name in ("square", "L", "ellipse", "wavy")), ("L", np.float32), ("wavy", np.float32)],
+)
 def test_a_pad_that_turns_touches_where_shapely_says(name, dtype, rng):
     """On its way, which is an arc, it does not pass through; and a pad that stops early is near."""
     shape = jax.tree.map(lambda leaf: leaf.astype(dtype), SHAPES[name])
     start, path = random_paths(rng, 60)
     path /= np.maximum(1, np.linalg.norm(path, axis=1, keepdims=True) / 0.3)
     angle, turning = rng.uniform(-3, 3, 60), rng.uniform(-1, 1, 60)
-    other, corners = body(SHAPES[name]), np.asarray(PAD.shape.vertices, float)
+    other, corners = body(name), np.asarray(PAD.shape.vertices, float)
     pad = jax.tree.map(lambda leaf: leaf.astype(dtype), PAD)
     numbers = (x.astype(dtype) for x in (start, path, angle, turning))
     found = np.asarray(turned_fractions(shape, pad, *numbers), float)
@@ -125,7 +139,7 @@ def test_derivatives_of_the_instant(name, rng):
     step = 1e-6 * np.eye(2)
     for k in range(2):
         ahead, behind = (fractions(shape, finger, start + s * step[k], path) for s in (1, -1))
-        difference = (np.asarray(ahead) - np.asarray(behind)) / 2e-6
+        difference = (ahead - behind) / 2e-6
         off = np.abs(slope[2][:, k] - difference) / (1 + np.abs(difference))
         assert np.mean(off < 1e-4) > 0.95  # except if it grazes or changes edges within the step
 
@@ -139,34 +153,14 @@ def test_a_finger_that_touches_begins_at_once(name):
     found = fractions(shape, RoundFinger(radius), on + radius * normal, -0.02 * normal)
     np.testing.assert_allclose(found, 0, atol=1e-6)
     still = fractions(shape, RoundFinger(radius), on + 2 * radius * normal, 0 * normal)
-    np.testing.assert_array_equal(still[np.asarray(still) > 0], 1)
-    assert np.mean(np.asarray(still) == 1) > 0.7
+    np.testing.assert_array_equal(still[still > 0], 1)
+    assert np.mean(still == 1) > 0.7
 
 
 @pytest.mark.parametrize("name", ["square", "L", "ellipse", "wavy"])
 def test_a_path_that_is_nan_begins_at_once(name):
     """The fraction itself is a number; what follows makes the step INVALID."""
     start, path = np.array([[0.2, 0.0], [0.2, 0.0]]), np.array([[np.nan, 0.0], [-0.3, 0.0]])
-    found = np.asarray(fractions(SHAPES[name], RoundFinger(0.005), start, path))
+    found = fractions(SHAPES[name], RoundFinger(0.005), start, path)
     assert found[0] == 0
     assert 0 < found[1] < 1
-
-
-def test_a_finger_that_touches_may_leave_and_cross_a_hollow(rng):
-    """It then pushes the other side from where it meets it; the one that it leaves does not matter."""
-    arms = [(-50, -50), (50, -50), (50, 50), (25, 50), (25, -20), (-25, -20), (-25, 50), (-50, 50)]
-    slider = pj.Slider(pj.Polygon(np.array(arms) * 1e-3), pj.Ellipsoid(np.eye(3), 0.04))
-    gap = np.repeat([0.0, 1e-12, -1e-6, 1e-4], 6)
-    start = np.stack([-0.019 + gap, rng.uniform(0, 0.04, 24)], axis=1)
-    end = start + np.stack([rng.uniform(0.0385, 0.0405, 24), rng.uniform(-2e-3, 2e-3, 24)], axis=1)
-
-    @jax.jit
-    @jax.vmap
-    def poses(start, end):
-        paths = (start[None] + (end - start)[None] * jnp.linspace(0, 1, n + 1)[:, None] for n in (1, 64))
-        hand = pj.Hand.finger(0.006)
-        return [pj.rollout(slider, hand, path, pose=(0.0, 0.0, 0.0), friction=0.3).pose[-1] for path in paths]
-
-    coarse, fine = poses(start, end)
-    np.testing.assert_allclose(coarse, fine, atol=2e-4)
-    assert np.max(np.abs(fine)) > 1e-3
