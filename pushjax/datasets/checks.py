@@ -40,7 +40,7 @@ def checked_recording(
     path: Path,
     index: int,
     hand: Floats,
-    pose: Floats,  # NaN where the object was not seen, as `force` where there is none; angles may be wrapped
+    pose: Floats,  # NaN where the object was not tracked, as `force` where there is none; angles may be wrapped
     *,
     force: Floats | None = None,
     time: Floats | None = None,
@@ -56,13 +56,13 @@ def checked_recording(
         message, row = fault
         line = lines[row] if lines else None
         return LogError(path, f"{message} in row {row} of the push", push=index, line=line)
-    seen = np.isfinite(pose[:, 0])
-    largest = float(np.max(np.abs(pose[seen, 2])))
+    tracked = np.isfinite(pose[:, 0])
+    largest = float(np.max(np.abs(pose[tracked, 2])))
     if largest > MAX_TURNS * 2 * np.pi:
         message = f"object_theta is up to {largest:.4g} rad; expected at most two turns from zero: is it in degrees?"
         return AnglesInDegrees(path, message, push=index, line=first_line)
     pose, hand = pose.copy(), hand.copy()
-    pose[seen, 2] = np.unwrap(pose[seen, 2])
+    pose[tracked, 2] = np.unwrap(pose[tracked, 2])
     if hand.shape[1] > 2:
         hand[:, 2] = np.unwrap(hand[:, 2])
     return Recording(index, hand, pose, force, time, **others)
@@ -81,7 +81,7 @@ def _find_fault(hand: Floats, pose: Floats, force: Floats | None, time: Floats |
             return fault
     for row, where in ((0, "first"), (len(pose) - 1, "last")):
         if np.isnan(pose[row, 0]):
-            return f"expected the object to be seen in the {where} row, found no {', '.join(OBJECT)}", row
+            return f"expected the object to be tracked in the {where} row, found no {', '.join(OBJECT)}", row
     back = np.flatnonzero(np.diff(time) < 0) if time is not None else []
     if time is not None and len(back):
         row = int(back[0]) + 1

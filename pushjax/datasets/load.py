@@ -44,11 +44,11 @@ def load_recordings(path: str | PathLike[str]) -> Recordings:
 
     - `.csv`: one row for each sample, one push after another. The columns are `push` (a number or name), `hand_x`,
       `hand_y`, `object_x`, `object_y`, `object_theta` and, if known, `hand_theta`, `hand_distance`, `time`, `force_x`,
-      `force_y`, in any order. The cells of the object are blank where it was not seen, those of the force where there
-      was none.
+      `force_y`, in any order. The cells of the object are blank where it was not tracked, those of the force where
+      there was none.
     - `.npz` with `path` (n, k, dof), either `start` and `end` (n, 3) or `pose` (n, k, 3), and, if known, `force`
-      (n, k, 2), `time` (n, k) and what else `Recordings.save` writes. `pose` is NaN where the object was not seen. The
-      path of a push with fewer than k samples ends with rows of NaN.
+      (n, k, 2), `time` (n, k) and what else `Recordings.save` writes. `pose` is NaN where the object was not tracked.
+      The path of a push with fewer than k samples ends with rows of NaN.
     - `.txt`, `.txt.gz`: an original log of the aluminum triangle, as by `load_triangle_log`.
     - `.json`, `.h5`, `.hdf5`: a log of the MIT pushing data set (`pip install '.[hdf5]'` for the latter two).
 

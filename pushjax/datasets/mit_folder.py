@@ -135,15 +135,15 @@ def _known_part(path: Path, push: Recording) -> Recording:
     """Return a push from its first to its last sample with object and force; LogError if one between lacks them."""
     assert push.force is not None  # these files always have force and time
     assert push.time is not None
-    known = push.seen & np.isfinite(push.force[:, 0])
+    known = push.tracked & np.isfinite(push.force[:, 0])
     rows = np.flatnonzero(known)
     if len(rows) < 2 or push.time[rows[-1]] == push.time[rows[0]]:
         raise LogError(path, f"expected a span of time with tip, object and force, found {len(rows)} such samples")
-    # the force has no gaps, so an unknown sample is one at which the object was not seen
+    # the force has no gaps, so an unknown sample is one at which the object was not tracked
     lost = push.time[rows[0] : rows[-1]][~known[rows[0] : rows[-1]]]
     if len(lost):
         span = f"{lost[0]:.2f} to {lost[-1]:.2f} s"
-        raise LogError(path, f"expected the object to be seen throughout, found it lost from {span}")
+        raise LogError(path, f"expected the object to be tracked throughout, found it lost from {span}")
     kept = slice(rows[0], rows[-1] + 1)
     return Recording(0, push.hand[kept], push.pose[kept], push.force[kept], push.time[kept])
 

@@ -24,7 +24,7 @@ _PUSH = "push"
 _REQUIRED = (_PUSH, *HAND[:2], *OBJECT)
 _OPTIONAL_GROUPS = (("hand_theta",), ("hand_theta", "hand_distance"), ("time",), FORCE)
 COLUMNS = (_PUSH, *HAND, *OBJECT, "time", *FORCE)
-# A row may lack all numbers of the object's pose, if the object was not seen, or of the force, if none was measured.
+# A row may lack all numbers of the object's pose, if the object was not tracked, or of the force, if none was measured.
 _MAY_BE_BLANK = (*OBJECT, *FORCE)
 
 # Arrays of an archive, with their shapes for n pushes of k samples. Arrays `about_...` have n rows of any shape. Only
@@ -74,7 +74,7 @@ def load_csv(path: Path) -> Recordings:
     label_column = names.index(_PUSH)
     # Rows that are too short to have a label form a push of their own, which becomes a problem.
     pushes = groupby(rows, key=lambda row: row.cells[label_column].strip() if label_column < len(row.cells) else "")
-    # A push becomes a problem if a cell is bad, or if the object is not seen in its first or last row.
+    # A push becomes a problem if a cell is bad, or if the object is not tracked in its first or last row.
     return collect_checked(
         path,
         (_read_push(path, index, names, list(rows_of_push)) for index, (_, rows_of_push) in enumerate(pushes)),

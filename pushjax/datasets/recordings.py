@@ -66,8 +66,8 @@ class Recording:
         hand: (m, dof) configurations of the hand as `pushjax.Hand` takes them, in m and rad, world frame. With dof = 2
             they are the center (x, y) of a finger. With more, the third is the angle theta, which is continuous, and
             the fourth is the distance d of the hand.
-        pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one seen
-            sample to the next. NaN where the object was not seen; the first and the last sample are never NaN.
+        pose: (m, 3) pose of the body frame in the world: x, y (m), theta (rad). Theta takes the short way from one
+            tracked sample to the next. NaN where the object was not tracked, but never in the first and last sample.
         force: (m, 2) forces on the object, in N, world frame, NaN where there is none; None if no force was recorded.
         time: (m,) times, in s, non-decreasing, from an arbitrary origin; None if no time was recorded.
         wrench: (p, 3) wrenches on the object, of any scale, in the body frame about its origin, from the forces of the
@@ -86,8 +86,8 @@ class Recording:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(m,) whether the object was seen."""
+    def tracked(self) -> NDArray[np.bool_]:
+        """(m,) whether the object was tracked."""
         return np.isfinite(self.pose[:, 0])
 
 

@@ -12,7 +12,7 @@ from pushjax.datasets.recordings import Floats, LogError, Recording, interpolate
 # If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
 MAX_GAP = 0.5
 # If the object's time stamps go back by more than this (s), the cause is not jitter of the tracker but another clock.
-# The largest jitter seen is 0.007 s.
+# The largest jitter is 0.007 s.
 MAX_JITTER = 0.05
 
 
@@ -46,9 +46,9 @@ def align_streams(path: Path, hand: Stream, body: Stream, force: Stream) -> Reco
     pose = _interpolate_poses(time, seen_time, body.values)
     seen = np.flatnonzero(np.isfinite(pose[:, 0]))
     if len(seen) < 2:
-        message = f"expected the object to be seen at two samples of {hand.name} at least, found {len(seen)}"
+        message = f"expected the object to be tracked at two samples of {hand.name} at least, found {len(seen)}"
         return LogError(path, f"{message} that are not in a gap of {body.name} longer than {MAX_GAP:g} s", push=0)
-    # the hand's samples from the first to the last one at which the object is seen
+    # the hand's samples from the first to the last one at which the object is tracked
     span = slice(seen[0], seen[-1] + 1)
     object_force = interpolated(time[span], force_time, force.values)
     return checked_recording(path, 0, hand.values[span], pose[span], force=object_force, time=time[span])

@@ -39,7 +39,7 @@ LENGTH = float(np.hypot(CENTER_OF_MASS[0], CENTER_OF_MASS[1]))
 TIP_RADIUS = 0.001
 # From comments in the toolbox: mass in kg, and the gravity that it computes with, in m/s^2.
 MASS, GRAVITY = 1.518, 9.8
-# The sensor's axes are turned by 45 degrees from the finger's and are seen from below, so R_TOOL is a reflection. The
+# The sensor's axes are turned by 45 degrees from the finger's and are viewed from below, so R_TOOL is a reflection. The
 # sensor measures the reaction on the finger. The force on the object, in the finger's frame, is therefore
 # FORCE_SIGN * R_TOOL @ reading.
 R_TOOL = np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
@@ -72,7 +72,7 @@ def load_triangle_log(
 ) -> Recordings:
     """Read an original log, plain or gzip-compressed, which is recognized by content and not by name.
 
-    The object is seen at the first and the last sample of each push. The finger's path is the logged one, which ends
+    The object is tracked at the first and the last sample of each push. The finger's path is the logged one, which ends
     about a millimeter before the object comes to rest. The force is interpolated at the finger's samples. Each push has
     one pair of wrench and twist, as in the paper: the mean wrench (N, N m) of the samples that are at least as strong
     as the mean force, and the displacement (m, rad) in the body frame at the start.
@@ -193,7 +193,7 @@ def make_push(
         raise ValueError("expected the force to last after the first 30 % of the samples, found none there")
     pose = np.full((len(tip), 3), np.nan)
     pose[0], pose[-1] = start, end
-    # The object is seen only before and after the push. Its displacement is spread evenly over the kept samples, by
+    # The object is tracked only before and after the push. Its displacement is spread evenly over the kept samples, by
     # sample number and not by time, because the paper's pairs were made in this way.
     moved = end - start
     moved[2] = wrap_angle(moved[2])

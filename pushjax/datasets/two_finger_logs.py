@@ -23,7 +23,7 @@ from pushjax.datasets.triangle_text import Record, read_records
 
 SPACING = 0.05  # m, between the centers of the fingers
 PATH_STEPS = 120  # of the commanded path; the arc of a turn is off the chords between them by at most 1 um
-# At the end one finger touches the outline, as far as the motion capture and an unknown outline tell: its center is
+# At the end one finger touches the outline, as far as the motion capture and an unknown outline allow: its center is
 # between these distances from the outline, m. If not, the motion capture jumped or the hand did not reach the object.
 MIN_END_GAP, MAX_END_GAP = -0.002, 0.004
 MAX_TURN = np.radians(60)  # no action turns the object so far; the motion capture jumped
@@ -49,14 +49,14 @@ class Action(NamedTuple):
 def load_two_finger_logs(folder: str | PathLike[str]) -> Recordings:
     """Read all sessions in a folder of one arrangement of the supports.
 
-    The object is seen at the first and the last sample of each push. The hand's path is the commanded one, in 120 equal
-    steps. `Recordings.about` has "action" and "began".
+    The object is tracked at the first and the last sample of each push. The hand's path is the commanded one, in 120
+    equal steps. `Recordings.about` has "action" and "began".
 
     A push becomes a problem if its record is damaged, if neither finger is at the outline at the end, or if the object
     turns by more than 60 degrees. A session becomes a problem if one of its files cannot be read.
 
     Args:
-        folder: The folder, whose name tells the arrangement: it contains "3pts1", say, or the coordinates of the
+        folder: The folder, whose name gives the arrangement: it contains "3pts1", say, or the coordinates of the
             support points in the authors' form.
 
     Returns:

@@ -66,7 +66,9 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> 
     sparse = [push for push in kept if not _is_observed_often_enough(push, parts)]
     if 2 * len(sparse) <= len(kept):
         for push in sparse:
-            reason = f"the object was tracked {push.seen[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
+            reason = (
+                f"the object was tracked {push.tracked[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
+            )
             problems.append(LogError(recordings.source, reason, push=push.index))
         kept = [push for push in kept if _is_observed_often_enough(push, parts)]
     if not kept:
@@ -160,7 +162,7 @@ def observed_often_enough(recordings: Recordings, parts: int) -> bool:
 
 
 def _is_observed_often_enough(push: Recording, parts: int) -> bool:
-    return bool(push.seen[1:-1].sum() >= parts - 1)
+    return bool(push.tracked[1:-1].sum() >= parts - 1)
 
 
 def has_wrenches(recordings: Recordings) -> bool:
@@ -186,7 +188,7 @@ def _interpolated_columns(values: Floats, arc: Floats, query: Floats) -> Floats:
 
 def _slider_poses(push: Recording, arc: Floats, query: Floats) -> Floats:
     """Return the slider's poses (k, 3) at the hand's arc lengths `query` (k,), the first and last being the ends."""
-    pose = _interpolated_columns(push.pose[push.seen], arc[push.seen], query)
+    pose = _interpolated_columns(push.pose[push.tracked], arc[push.tracked], query)
     # A tracker that lags may show the slider moving after the hand has stopped, at equal arc lengths.
     pose[0], pose[-1] = push.pose[0], push.pose[-1]
     return pose
@@ -201,7 +203,8 @@ def _wrench_motion_pairs(
     """Return the mean wrench and the displacement in each part of each push, body frame; zero where unknown."""
     rows = [np.arange(len(push.hand), dtype=float) for push in pushes]
     all_poses = [
-        _interpolated_columns(push.pose[push.seen], row[push.seen], row) for push, row in zip(pushes, rows, strict=True)
+        _interpolated_columns(push.pose[push.tracked], row[push.tracked], row)
+        for push, row in zip(pushes, rows, strict=True)
     ]
     fingertips = [
         np.einsum("kji,kj->ki", rotation(q[:, 2]), p.hand - q[:, :2]) for p, q in zip(pushes, all_poses, strict=True)

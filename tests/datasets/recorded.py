@@ -86,4 +86,4 @@ def only_problem(found: Recordings) -> LogError:
 def same(a: Recording, b: Recording, tolerance: float) -> None:
     for name in ("hand", "pose", "force", "time"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=0, atol=tolerance, err_msg=name)
-    np.testing.assert_array_equal(a.seen, b.seen)
+    np.testing.assert_array_equal(a.tracked, b.tracked)

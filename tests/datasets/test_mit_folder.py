@@ -314,7 +314,7 @@ def test_a_lost_object_is_reported(download):
     for row, change, words in (
         (2, flipped, "while the tip goes 5 mm, found"),
         (4, spike, "the tracker jumps"),
-        (7, lambda rows: np.delete(rows, away, axis=0), "to be seen throughout, found it lost from 0.33 to 1.59 s"),
+        (7, lambda rows: np.delete(rows, away, axis=0), "to be tracked throughout, found it lost from 0.33 to 1.59 s"),
     ):
         write_streams(log(download, row), damaged(row, "object_pose", change))
         (problem,) = load_mit_folder(download, "abs", "rect1").problems

@@ -32,7 +32,7 @@ def test_streams_are_brought_to_the_tips_stamps(tmp_path, suffix):
     time = np.linspace(0.0, 0.8, 33)
     np.testing.assert_allclose(push.time, time, atol=1e-6)
     np.testing.assert_allclose(push.hand, np.column_stack([0.3 + SPEED * time, 0 * time]), atol=LINEAR)
-    assert push.seen.all()
+    assert push.tracked.all()
     # time stamps of 2.4e-7 s resolution, at up to 1.4e9
     expected = np.column_stack([0.4 + SPEED * time, 0.01 * time, 3.0 + 0.5 * time])
     np.testing.assert_allclose(push.pose - push.pose[0] + expected[0], expected, atol=1e-6)
@@ -100,28 +100,28 @@ def test_stamps_of_a_tracker_may_jitter_but_not_jump(tmp_path):
         fails(mit_log(tmp_path, made), f"stamps of {name} that do not go back at all", "in row 6")
 
 
-def test_an_object_lost_for_long_is_not_seen(tmp_path):
+def test_an_object_lost_for_long_is_not_tracked(tmp_path):
     lost = np.linspace(-0.3, 0.8, 34)
     lost = lost[(lost < 0.15) | (lost > 0.15 + MAX_GAP)]
     (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
     before, after = lost[lost < 0.15][-1], lost[lost > 0.15][0]
     hidden = (push.time > before + 1e-6) & (push.time < after - 1e-6)
-    np.testing.assert_array_equal(push.seen, ~hidden)
+    np.testing.assert_array_equal(push.tracked, ~hidden)
     assert np.isnan(push.pose[hidden]).all()
-    assert push.seen[[0, -1]].all()
+    assert push.tracked[[0, -1]].all()
     assert 0 < hidden.sum() < len(hidden)
     # samples that contain no numbers are left out
     made = tables()
     made["object_pose"][(made["object_pose"][:, 0] > START + 0.15) & (made["object_pose"][:, 0] < START + 0.66), 1:] = (
         np.nan
     )
-    np.testing.assert_array_equal(load_recordings(mit_log(tmp_path, made)).pushes[0].seen, push.seen)
+    np.testing.assert_array_equal(load_recordings(mit_log(tmp_path, made)).pushes[0].tracked, push.tracked)
 
 
-def test_a_push_begins_and_ends_where_the_object_is_seen(tmp_path):
+def test_a_push_begins_and_ends_where_the_object_is_tracked(tmp_path):
     lost = np.array([-0.3, 0.31, 0.33, 0.5, 0.6, 1.5])
     (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
-    assert push.seen.all()
+    assert push.tracked.all()
     np.testing.assert_allclose(push.time[[0, -1]], [0.325, 0.6], atol=1e-6)
 
 
@@ -132,10 +132,12 @@ def test_streams_that_do_not_overlap(tmp_path):
     )
     fails(mit_log(tmp_path, tables(body=later)), text.format("object_pose"))
     fails(mit_log(tmp_path, tables(wrench=later)), text.format("ft_wrench"))
-    fails(mit_log(tmp_path, tables(body=np.array([-1.0, 0.01]))), "seen at two samples of tip_pose at least, found 0")
+    fails(
+        mit_log(tmp_path, tables(body=np.array([-1.0, 0.01]))), "tracked at two samples of tip_pose at least, found 0"
+    )
     made = tables()
     made["object_pose"][:, 1:] = np.nan
-    fails(mit_log(tmp_path, made), "seen at two samples of tip_pose at least, found 0")
+    fails(mit_log(tmp_path, made), "tracked at two samples of tip_pose at least, found 0")
 
 
 @KINDS

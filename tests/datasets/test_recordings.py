@@ -39,13 +39,13 @@ def test_table_is_read_as_written(tmp_path):
     first, second = found.pushes
     assert (first.index, second.index) == (0, 1)
     np.testing.assert_array_equal(first.hand, [[0.10, 0.2], [0.11, 0.2], [0.12, 0.2]])
-    np.testing.assert_array_equal(first.seen, [True, False, True])
+    np.testing.assert_array_equal(first.tracked, [True, False, True])
     assert np.isnan(first.pose[1]).all()
     # from 3.1 to -3.1 the short way, through pi
     np.testing.assert_allclose(first.pose[[0, 2]], [[0.3, 0.4, 3.1], [0.3, 0.4, 2 * math.pi - 3.1]], atol=EXACT)
     assert first.force is None
     assert first.time is None
-    assert second.seen.all()
+    assert second.tracked.all()
 
 
 def test_columns_in_any_order_and_all_of_them(tmp_path):
@@ -79,8 +79,8 @@ def test_columns_in_any_order_and_all_of_them(tmp_path):
         (2, "0,0.1,nan,,,", "expected a finite number in column hand_y, found nan"),
         (2, "0,0.1,0.2,inf,0.4,1", "expected a finite number in column object_x, found inf"),
         (3, "0,0.1,0.2,0.3,0.4,1.2.3", "expected a number in column object_theta, found '1.2.3'"),
-        (1, "0,0.1,0.2,,,", "expected the object to be seen in the first row, found no object_x"),
-        (3, "0,0.1,0.2,nan,nan,nan", "expected the object to be seen in the last row, found no object_x"),
+        (1, "0,0.1,0.2,,,", "expected the object to be tracked in the first row, found no object_x"),
+        (3, "0,0.1,0.2,nan,nan,nan", "expected the object to be tracked in the last row, found no object_x"),
         (2, "0,0.1,0.2,0.3,,1", "for object_y (or none of object_x, object_y, object_theta), found none"),
         (2, "0,0.1,0.2,0.3", "expected 6 cells, as in the header, found 4"),
         (2, "0,0.1,0.2,0.3,0.4,1,7", "expected 6 cells, as in the header, found 7"),
@@ -96,12 +96,12 @@ def test_a_bad_row_costs_its_push_only(tmp_path, line, text, words):
     assert [push.index for push in found.pushes] == [1]
 
 
-def test_a_push_that_never_sees_the_object(tmp_path):
+def test_a_push_that_never_tracks_the_object(tmp_path):
     found = load_recordings(table(tmp_path, [*TABLE, "2,0.1,0.2,,,", "2,0.1,0.2,,,", "3,0.1,0.2,0.3,0.4,0.5"]))
     assert [push.index for push in found.pushes] == [0, 1]
     unseen, short = found.problems
     assert (unseen.push, unseen.line) == (2, 7)
-    assert "seen in the first row" in unseen.message
+    assert "tracked in the first row" in unseen.message
     assert (short.push, short.line) == (3, 9)
     assert "at least two rows, found 1" in short.message
 
@@ -168,7 +168,7 @@ def test_archive_of_both_ends(tmp_path):
     found = load_recordings(saved(tmp_path, given))
     assert [push.index for push in found.pushes] == [0, 1, 2]
     for index, push in enumerate(found.pushes):
-        assert push.seen.tolist() == [True, False, False, False, True]
+        assert push.tracked.tolist() == [True, False, False, False, True]
         np.testing.assert_array_equal(push.pose[0], given["start"][index])
         np.testing.assert_allclose(push.pose[-1], [*given["end"][index, :2], 2 * math.pi - 3.0], atol=EXACT)
         np.testing.assert_array_equal(push.hand[:, [0, 1, 3]], given["path"][index][:, [0, 1, 3]])
@@ -183,9 +183,9 @@ def test_archive_of_poses_all_along(tmp_path):
     pose[:, 1, :2] = np.nan
     found = load_recordings(saved(tmp_path, {"path": np.zeros((2, 4, 3), int), "pose": pose}))
     for push in found.pushes:
-        assert push.seen.tolist() == [True, False, True, True]
+        assert push.tracked.tolist() == [True, False, True, True]
         assert push.pose.dtype == push.hand.dtype == np.float64
-        np.testing.assert_allclose(push.pose[push.seen, 2], [3.0, 2 * math.pi - 3.0, 2 * math.pi - 2.8], atol=1e-6)
+        np.testing.assert_allclose(push.pose[push.tracked, 2], [3.0, 2 * math.pi - 3.0, 2 * math.pi - 2.8], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_archive_of_poses_all_along(tmp_path):
     [
         (lambda a: a["path"].__setitem__((1, 2, 1), np.nan), "for hand_y, found none in row 2 of the push"),
         (lambda a: a["start"].__setitem__((1, 0), np.inf), "for object_x (or none of"),
-        (lambda a: a["end"].__setitem__(1, np.nan), "expected the object to be seen in the last row"),
+        (lambda a: a["end"].__setitem__(1, np.nan), "expected the object to be tracked in the last row"),
         (
             lambda a: a.update(time=np.array([[0, 1, 2, 3, 4], [0, 1, 3, 2, 4], [0, 0, 0, 0, 0]])),
             "step of -1 s in row 3",

@@ -62,7 +62,7 @@ def test_text_log_gives_the_curated_pushes(both) -> None:
         turns = raw.pose[[0, -1], 2] - tidy.pose[[0, -1], 2]
         close(turns - 2 * math.pi * np.round(turns / (2 * math.pi)), 0, ANGLE_TOLERANCE)
         assert abs(raw.pose[-1, 2] - raw.pose[0, 2]) < math.pi
-        assert raw.seen.sum() == 2
+        assert raw.tracked.sum() == 2
         close(raw.hand, tidy.hand, TIP_TOLERANCE)
         close(raw.time, tidy.time, TIME_TOLERANCE)
         inside = np.isfinite(raw.force[:, 0]) & np.isfinite(tidy.force[:, 0])  # float32 may move a time past the end

@@ -34,8 +34,8 @@ def test_a_push_is_that_of_the_curated_arrays(converted, session):
     # the two take the plate's small tilt into account differently
     np.testing.assert_allclose(push.hand, same.hand, rtol=0, atol=3e-7)
     np.testing.assert_allclose(push.pose, same.pose, rtol=0, atol=3e-7)
-    assert push.seen[[0, -1]].all()
-    assert push.seen.sum() == 2
+    assert push.tracked[[0, -1]].all()
+    assert push.tracked.sum() == 2
     np.testing.assert_allclose(log.support_points, curated.support_points, atol=1e-12)
     np.testing.assert_allclose(log.support_force, curated.support_force, rtol=1e-9)
     np.testing.assert_allclose(log.vertices, curated.vertices, atol=1e-12)

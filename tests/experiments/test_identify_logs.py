@@ -178,7 +178,7 @@ def test_what_cannot_be_used_is_named_and_counted(report):
         "expected at least 0.0001 m",
         "tracker jumped",
         "in degrees?",
-        "to be seen in the last",
+        "to be tracked in the last",
     )
     assert len(record["problems"]) == len(reasons)
     for index, reason in enumerate(reasons):
@@ -323,13 +323,14 @@ def test_recordings_as_arrays(log, block, rollouts, surface):
 def test_a_push_that_was_seen_too_rarely_is_left_out(log, block):
     """One such push does not take the poses on the way, and the forces, from all others."""
     whole = load_recordings(log)
-    rare = replace(whole.pushes[3], seen=np.isin(np.arange(STEPS + 1), (0, 5, STEPS)))
-    recordings = replace(whole, pushes=(*whole.pushes[:3], rare, *whole.pushes[4:]))
+    tracked = np.isin(np.arange(STEPS + 1), (0, 5, STEPS))
+    rare = [replace(push, pose=np.where(tracked[:, None], push.pose, np.nan)) for push in whole.pushes]
+    recordings = replace(whole, pushes=(*whole.pushes[:3], rare[3], *whole.pushes[4:]))
     screened = screen(recordings, block, pj.Hand.finger(RADIUS), parts=3)
     assert "the object was tracked 1 times on the way; 3 parts need 2" in [p.message for p in screened.problems]
     assert pj.Pushes.of(screened, STEPS, parts=3, shape=block).wrench.shape == (15, 2 + 1, 3)
-    unseen = replace(recordings, pushes=tuple(replace(p, seen=rare.seen) for p in whole.pushes))
-    assert len(screen(unseen, block, pj.Hand.finger(RADIUS), parts=3).pushes) == 16  # their final poses are used
+    untracked = replace(recordings, pushes=tuple(rare))
+    assert len(screen(untracked, block, pj.Hand.finger(RADIUS), parts=3).pushes) == 16  # their final poses are used
 
 
 def test_a_part_that_only_turns_tells_about_the_torque(block):
@@ -347,9 +348,9 @@ def test_a_part_that_only_turns_tells_about_the_torque(block):
 def test_logs_that_tell_less_than_others(log, block):
     """If several logs are used together, only what all of them contain is used."""
     whole = screen(load_recordings(log), block, pj.Hand.finger(RADIUS))
-    unseen = replace(
-        whole, pushes=tuple(replace(p, seen=np.isin(np.arange(STEPS + 1), (0, STEPS))) for p in whole.pushes)
-    )
+    ends = np.isin(np.arange(STEPS + 1), (0, STEPS))[:, None]
+    pushes = tuple(replace(push, pose=np.where(ends, push.pose, np.nan)) for push in whole.pushes)
+    unseen = replace(whole, pushes=pushes)
     unfelt = replace(whole, pushes=tuple(replace(p, force=None) for p in whole.pushes))
     options = Options(surface="ellipsoid", steps=STEPS, parts=3, forces=True)
     for recordings, shapes in (([whole], (2, 3)), ([whole, unseen], (0, 0)), ([unfelt, whole], (2, 0))):

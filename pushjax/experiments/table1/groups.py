@@ -37,7 +37,7 @@ MAX_GAP, MAX_OVERLAP, MAX_AHEAD, MAX_TURN, MIN_PATH = 0.008, 0.006, 0.005, np.de
 
 
 def grouped(log: Recordings, seed: int) -> Recordings:
-    """Return the groups of pushes with all their samples; the training pushes are drawn at random."""
+    """Return the groups of pushes with all their samples; the training pushes are chosen at random."""
     slow, fast = (
         [push for push in log.pushes if abs(push.about["speed"] - speed) < SAME_SPEED] for speed in (SLOW, FAST)
     )
