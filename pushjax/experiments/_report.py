@@ -42,7 +42,8 @@ def table(rows: Sequence[dict[str, Any]], *columns: tuple[Any, ...]) -> Table:
 
 def as_text(parts: Sequence[str | Table]) -> str:
     """Return the paragraphs and tables of a report as text."""
-    console = Console(file=io.StringIO(), width=1000, color_system=None, markup=False, highlight=False, emoji=False)
+    text = io.StringIO()
+    console = Console(file=text, width=1000, color_system=None, markup=False, highlight=False, emoji=False)
     for part in parts:
         if isinstance(part, str):
             console.print(part)
@@ -52,8 +53,9 @@ def as_text(parts: Sequence[str | Table]) -> str:
             column.justify = "left" if k == 0 else "right"
         for row in part.rows:
             drawn.add_row(*row)
-        console.print(drawn)
-    return "\n".join(line.rstrip() for line in console.file.getvalue().splitlines())
+        console.print("", drawn, "", sep="\n")
+    lines = "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+    return lines.replace("\n\n\n", "\n\n").strip("\n")
 
 
 def saved(out: Path | None, figures: Callable[[], Mapping[str, Figure]]) -> list[str]:

@@ -10,13 +10,14 @@ from scipy.interpolate import PchipInterpolator
 from pushjax import plot
 from pushjax.experiments.identify_logs.findings import Findings, unit
 from pushjax.identification.uncertainty import DROP_AT_90
+from pushjax.plot.style import BLACK, BLUE, GRAY, ORANGE, STYLE, legend_below
 
 SHOWN = (("best", 0.0), ("median", 0.5), ("90th percentile", 0.9), ("worst", 1.0))
 
 
 def draw(findings: Findings, out: Path) -> list[str]:
     """Draw the three pictures into the folder `out` and return their paths."""
-    with plt.rc_context(plot.STYLE):
+    with plt.rc_context(STYLE):
         return [str(picture(findings, out)) for picture in (_pushes, _residuals, _profiles)]
 
 
@@ -31,19 +32,19 @@ def _pushes(findings: Findings, out: Path) -> Path:
         push = order[round(share * (len(order) - 1))]
         shape, hand = findings.slider.shape, findings.hand
         for pose, color, dash, label in (
-            (start[push], plot.GRAY, "-", "start"),
-            (end[push], plot.BLACK, "-", "measured end"),
-            (final[push], plot.BLUE, "--", "predicted end"),
+            (start[push], GRAY, "-", "start"),
+            (end[push], BLACK, "-", "measured end"),
+            (final[push], BLUE, "--", "predicted end"),
         ):
             plot.outline(panel, shape, pose, color, 1.5, linestyle=dash, label=label)
         fingers = np.asarray(hand.poses(jnp.asarray(path[push])))
         for k in range(fingers.shape[1]):
             label = "fingers' paths, as logged" if k == 0 else None
-            panel.plot(*(1e3 * fingers[:, k, :2]).T, color=plot.ORANGE, lw=1.2, label=label)
-        plot.hand_at(panel, hand, fingers[-1], plot.ORANGE, 1.2)
+            panel.plot(*(1e3 * fingers[:, k, :2]).T, color=ORANGE, lw=1.2, label=label)
+        plot.hand_at(panel, hand, fingers[-1], ORANGE, 1.2)
         panel.set(title=f"{word}: {off[push]:.2f} mm", xlabel="x / mm", ylabel="y / mm")
         panel.set_aspect("equal", adjustable="datalim")
-    plot.legend_below(figure, axes[0], columns=4)
+    legend_below(figure, axes[0], columns=4)
     return plot.save(figure, out / "identify_pushes.png")
 
 
@@ -56,22 +57,20 @@ def _residuals(findings: Findings, out: Path) -> Path:
         (axes[0], (0, 1), ("x / mm", "y / mm")),
         (axes[1], (0, 2), ("x / mm", "length · angle / mm")),
     ):
-        panel.plot(residual[:, a], residual[:, b], "o", color=plot.BLUE, ms=4, alpha=0.7)
+        panel.plot(residual[:, a], residual[:, b], "o", color=BLUE, ms=4, alpha=0.7)
         angle = np.linspace(0, 2 * np.pi, 100)
         for radius, dash in ((sigma, "-"), (2 * sigma, "--")):
-            panel.plot(radius * np.cos(angle), radius * np.sin(angle), dash, color=plot.GRAY, zorder=0)
+            panel.plot(radius * np.cos(angle), radius * np.sin(angle), dash, color=GRAY, zorder=0)
         panel.set(xlabel=f"predicted less measured {names[0]}", ylabel=f"predicted less measured {names[1]}")
         panel.set_aspect("equal", adjustable="datalim")
     axes[0].set_title(f"rings: one and two sigma, {sigma:.2g} mm")
     still = findings.deviation_mm(findings.rows(findings.pushes.start))
     for values, color, dash, label in (
-        (findings.deviation_mm(findings.final), plot.BLUE, "-", "predicted"),
-        (still, plot.GRAY, "--", "no motion"),
+        (findings.deviation_mm(findings.final), BLUE, "-", "predicted"),
+        (still, GRAY, "--", "no motion"),
     ):
-        order = np.sort(values)
-        share = 100 * np.arange(1, len(order) + 1) / len(order)
-        axes[2].step(order, share, dash, color=color, where="post", label=label)
-    axes[2].set(xscale="log", ylim=(0, 100), xlabel="deviation of the final pose / mm", ylabel="pushes below / %")
+        axes[2].ecdf(values, ls=dash, color=color, label=label)
+    axes[2].set(xscale="log", ylim=(0, 1), xlabel="deviation of the final pose / mm", ylabel="share of pushes below")
     axes[2].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)  # above the panel, off the curves
     return plot.save(figure, out / "identify_residuals.png")
 
@@ -90,11 +89,11 @@ def _profiles(findings: Findings, out: Path) -> Path:
         distance = np.sign(np.arange(len(each.normal)) - np.argmin(each.normal)) * np.sqrt(2 * each.normal)
         dense = np.linspace(distance[0], distance[-1], 200)
         value, drop = (PchipInterpolator(distance, y)(dense) for y in (scale * each.value, each.log_posterior_drop))
-        panel.plot(value, drop, "-", color=plot.BLUE, label="all else at its best")
-        panel.plot(scale * each.value, each.log_posterior_drop, "o", color=plot.BLUE, ms=3)
-        panel.plot(value, dense**2 / 2, "--", color=plot.ORANGE, label="normal")
-        panel.axhline(DROP_AT_90, color=plot.GRAY, lw=0.8, label="where a 90 % interval ends")
+        panel.plot(value, drop, "-", color=BLUE, label="all else at its best")
+        panel.plot(scale * each.value, each.log_posterior_drop, "o", color=BLUE, ms=3)
+        panel.plot(value, dense**2 / 2, "--", color=ORANGE, label="normal")
+        panel.axhline(DROP_AT_90, color=GRAY, lw=0.8, label="where a 90 % interval ends")
         panel.set(xlabel=each.label + (f" / {name}" if name else ""), ylim=(0, 5))
     axes[0, 0].set_ylabel("drop of the log posterior density")
-    plot.legend_below(figure, axes[0, 0], columns=3)
+    legend_below(figure, axes[0, 0], columns=3)
     return plot.save(figure, out / "identify_profiles.png")

@@ -16,11 +16,21 @@ from typing import Any
 import numpy as np
 
 import pushjax as pj
+from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import Recordings
 from pushjax.experiments._cell_cache import CellCache
 from pushjax.experiments._record import result_record
-from pushjax.experiments._tables import MODELS, Prediction, bootstrapped_ci95, deviation_mm
+from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._tables import (
+    MODELS,
+    Prediction,
+    bootstrapped_ci95,
+    by_object,
+    deviation_mm,
+    failures,
+    mean_figures,
+)
 from pushjax.experiments.table1.conditions import (
     NOT_IN_PAPER,
     OBJECTS,
@@ -79,7 +89,16 @@ def run(
                 todo.append((labels, partial(_cell, log, model, METHODS[name], condition, seed)))
     cells = CellCache("table1", out, settings).find_or_compute(todo, progress)
     means = {name: {model: _means_by_surface(cells, name, model) for model in MODELS} for name in method}
-    pictures = [] if out is None else _draw(cells, out)
+    title = "Straight pushes: final pose, predicted against measured"
+    pictures = saved(
+        out,
+        lambda: {
+            f"table1_{name}.png": plot.table_figure(
+                [cell for cell in cells if cell["method"] == name], f"{title} ({name.replace('_', '-')})", width=13.0
+            )
+            for name in method
+        },
+    )
     settings |= {"method": list(method), "surfaces": list(surface), "objects": list(object)}
     return result_record("table1", settings, cells=cells, means=means, pictures=pictures)
 
@@ -140,68 +159,55 @@ def _means_by_surface(cells: list[dict], method: str, model: str) -> dict[str, A
 
 
 def _mean_cell(cells: list[dict], model: str) -> dict[str, float | None]:
-    """Return the means over cells of one method and model."""
+    """Return the means over cells of one method and model; the paper's percentage is over all its surfaces."""
     toolbox = [cell["toolbox_mm"] for cell in cells]
-    return {
-        "mean_mm": float(np.mean([cell["mean_mm"] for cell in cells])),
-        "paper_mm": float(np.mean([cell["paper_mm"] for cell in cells])),
-        "toolbox_mm": None if None in toolbox else float(np.mean(toolbox)),
-        "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in cells])),
-        "paper_percent": PAPER_PERCENT[model],  # not of these cells: the paper has only the mean over all surfaces
-    }
+    by_toolbox = None if None in toolbox else float(np.mean(toolbox))
+    return mean_figures(cells, PAPER_PERCENT[model]) | {"toolbox_mm": by_toolbox}
 
 
-def _draw(cells: list[dict], out: Path) -> list[str]:
-    """Draw one picture per method into the folder `out` and return their paths."""
-    from pushjax import plot
-
-    title, drawn = "Straight pushes: final pose, predicted against measured", []
-    for name in dict.fromkeys(cell["method"] for cell in cells):
-        of_method = [cell for cell in cells if cell["method"] == name]
-        figure = plot.table_figure(of_method, f"{title} ({name.replace('_', '-')})", width=13.0)
-        drawn.append(str(plot.save(figure, out / f"table1_{name}.png")))
-    return drawn
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints: the paper's table with the computed one beside it."""
-    objects, surfaces = record["settings"]["objects"], record["settings"]["surfaces"]
-    lines = ["Mean deviation in mm, test pushes; the paper's in brackets."]
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report: the paper's table with the computed one beside it."""
+    parts: list[str | Table] = ["Mean deviation in mm, test pushes; the paper's in brackets."]
     for name, means in record["means"].items():
-        cells = [cell for cell in record["cells"] if cell["method"] == name]
-        lines += ["", f"{name:20}" + "".join(f"{object_name:>13}" for object_name in objects)]
-        for surface in surfaces:
-            for model in MODELS:
-                row = [c for c in cells if (c["surface"], c["model"]) == (surface, model)]
-                lines.append(f"{surface:9} {model:10}" + "".join(f"{_entry(c):>13}" for c in row))
-            row = [c for c in cells if (c["surface"], c["model"]) == (surface, "quartic")]
-            lines.append(f"{surface:9} {'no motion':10}" + "".join(f"{c['no_motion_mm']:13.2f}" for c in row))
-            floors = ("-" if c["noise_floor_mm"] is None else f"{c['noise_floor_mm']:.2f}" for c in row)
-            lines.append(f"{surface:9} {'noise':10}" + "".join(f"{floor:>13}" for floor in floors))
-        for model, mean in means.items():
-            for surface in surfaces if mean else ():
-                there = mean[surface]
-                toolbox = there["toolbox_mm"]
-                by_toolbox = "" if toolbox is None else f", the authors' toolbox on these pushes {toolbox:.2f}"
-                lines.append(
-                    f"{model:10}{surface:9} mean {there['mean_mm']:.2f} mm (paper {there['paper_mm']:.2f}"
-                    f"{by_toolbox}), {there['percent']:.2f} % of the motion"
-                )
-            if mean:
-                lines.append(
-                    f"{model:10}{'all':9} {mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %, "
-                    "of all three surfaces)"
-                )
-    lines.append("")
-    failed = sum(cell["failed_steps"] for cell in record["cells"])
-    if failed:
-        lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
-    lines.append("noise: a push against the mean of its repetitions. tri2 is in no mean: the tracker lost it.")
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+        parts.append(
+            by_object(
+                [cell for cell in record["cells"] if cell["method"] == name],
+                name,
+                *((model, model, _entry) for model in MODELS),
+                ("no motion", "quartic", lambda cell: f"{cell['no_motion_mm']:.2f}"),
+                ("noise", "quartic", lambda cell: _or_dash(cell["noise_floor_mm"])),
+            )
+        )
+        rows = [
+            {"model": model, "surface": surface} | (mean if surface == "all" else mean[surface])
+            for model, mean in means.items()
+            for surface in ((*record["settings"]["surfaces"], "all") if mean else ())
+        ]
+        parts.append(
+            table(
+                rows,
+                (f"{name}, means", "model"),
+                ("surface", "surface"),
+                ("mean / mm", "mean_mm", ".2f"),
+                ("paper / mm", "paper_mm", ".2f"),
+                ("authors' toolbox / mm", "toolbox_mm", ".2f"),
+                ("part of the motion / %", "percent", ".2f"),
+            )
+        )
+    percents = " and ".join(f"{percent:.2f} % ({model})" for model, percent in PAPER_PERCENT.items())
+    return [
+        *parts,
+        f"The paper's means over all three surfaces are {percents} of the motion.",
+        *failures(record["cells"]),
+        "noise: a push against the mean of its repetitions. tri2 is in no mean: the tracker lost it.",
+    ]
 
 
 def _entry(cell: dict[str, Any]) -> str:
     """Format a cell: the computed mean, and the paper's in brackets."""
     paper = "" if cell["paper_mm"] is None else f" ({cell['paper_mm']:.2f})"
     return f"{cell['mean_mm']:.2f}{paper}"
+
+
+def _or_dash(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

@@ -21,10 +21,20 @@ import jax
 import numpy as np
 
 import pushjax as pj
+from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import Recordings
 from pushjax.experiments._record import result_record
-from pushjax.experiments._tables import MODELS, Prediction, bootstrapped_ci95, deviation_mm
+from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._tables import (
+    MODELS,
+    Prediction,
+    bootstrapped_ci95,
+    by_object,
+    deviation_mm,
+    failures,
+    mean_figures,
+)
 from pushjax.experiments.table2 import methods
 from pushjax.experiments.table2.conditions import (
     CONDITIONS,
@@ -35,7 +45,6 @@ from pushjax.experiments.table2.conditions import (
     PAPER_NO_MOTION_MM,
     PAPER_PERCENT,
     SPLITS,
-    SURFACES,
     Geometry,
     ideal_surface,
     load_all,
@@ -46,7 +55,6 @@ from pushjax.experiments.table2.conditions import (
 from pushjax.experiments.table2.methods import FRICTIONS, ConditionData, Part
 
 Condition = tuple[str, str]  # surface and object
-COLUMN = 20  # width of a column of the printed table
 
 
 def run(
@@ -101,7 +109,16 @@ def run(
         cell for model in MODELS for name in method for cell in _cells(name, model, logs, pushes, assumed, seed, part)
     ]
     means = {name: {model: _mean(cells, name, model) for model in MODELS} for name in method}
-    pictures = [] if out is None else _draw(cells, out)
+    title = "Triangle on three points: final pose, predicted against measured"
+    pictures = saved(
+        out,
+        lambda: {
+            "table2.png" if name == "ideal" else f"table2_{name}.png": plot.table_figure(
+                [cell for cell in cells if cell["method"] == name], f"{title} ({name.replace('_', '-')})"
+            )
+            for name in method
+        },
+    )
     settings = {"seed": seed, "geometry": geometry, "steps": steps, "pairs": PAIRS, "frictions": FRICTIONS}
     settings |= assumed._asdict() | {"method": list(method), "train_share": methods.TRAIN_SHARE}
     return result_record("table2", settings, cells=cells, means=means, pictures=pictures)
@@ -182,15 +199,7 @@ def _cell(
 def _mean(cells: list[dict], method: str, model: str) -> dict[str, Any]:
     """Average the cells of one method and model that have figures; {} if none has."""
     selected = _with_figures(cell for cell in cells if (cell["method"], cell["model"]) == (method, model))
-    if not selected:
-        return {}
-    return {
-        "mean_mm": float(np.mean([cell["mean_mm"] for cell in selected])),
-        "paper_mm": float(np.mean([cell["paper_mm"] for cell in selected])),
-        "percent": float(100 * np.mean([cell["mean_mm"] / cell["no_motion_mm"] for cell in selected])),
-        "paper_percent": PAPER_PERCENT[model],
-        "conditions": len(selected),
-    }
+    return mean_figures(selected, PAPER_PERCENT[model]) | {"conditions": len(selected)} if selected else {}
 
 
 def _with_figures(cells: Iterable[dict]) -> list[dict]:
@@ -198,49 +207,28 @@ def _with_figures(cells: Iterable[dict]) -> list[dict]:
     return [cell for cell in cells if cell["mean_mm"] is not None]
 
 
-def _draw(cells: list[dict], out: Path) -> list[str]:
-    """Draw one picture per method into the folder `out` and return their paths."""
-    from pushjax import plot
-
-    title, drawn = "Triangle on three points: final pose, predicted against measured", []
-    for name in dict.fromkeys(cell["method"] for cell in cells):
-        mine = [cell for cell in cells if cell["method"] == name]
-        file = "table2.png" if name == "ideal" else f"table2_{name}.png"
-        drawn.append(str(plot.save(plot.table_figure(mine, f"{title} ({name.replace('_', '-')})"), out / file)))
-    return drawn
-
-
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints: the paper's table with the computed one beside it."""
-    lines = [f"Mean deviation in mm, test pushes, {SPLITS} splits; the paper's in brackets."]
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report: the paper's table with the computed one beside it."""
+    parts: list[str | Table] = [f"Mean deviation in mm, test pushes, {SPLITS} splits; the paper's in brackets."]
     for name, means in record["means"].items():
         cells = [cell for cell in record["cells"] if cell["method"] == name]
-        lines += ["", f"{name:22}" + "".join(f"{target:>{COLUMN}}" for target in OBJECTS)]
-        for surface in SURFACES:
-            rows = {model: [c for c in cells if (c["surface"], c["model"]) == (surface, model)] for model in MODELS}
-            for model, row in rows.items():
-                lines.append(f"{surface:10} {model:11}" + "".join(f"{_entry(cell):>{COLUMN}}" for cell in row))
-            still = zip(*rows.values(), PAPER_NO_MOTION_MM[surface], strict=True)
-            entries = (_no_motion_entry(of_object, paper) for *of_object, paper in still)
-            lines.append(f"{surface:10} {'no motion':11}" + "".join(f"{entry:>{COLUMN}}" for entry in entries))
-        for model, mean in means.items():
-            if mean:
-                count, every = mean["conditions"], len(CONDITIONS)
-                some = "" if count == every else f", on {count} of {every} conditions"
-                lines.append(
-                    f"{model:11} mean {mean['mean_mm']:.2f} mm (paper {mean['paper_mm']:.2f}{some}), "
-                    f"{mean['percent']:.2f} % of the motion (paper {mean['paper_percent']:.2f} %)"
-                )
-    lines.append("")
-    computed = _with_figures(record["cells"])
-    if len(computed) < len(record["cells"]):
-        lines.append("A cell with words could not be computed, for the reason that it gives; the means leave it out.")
-    failed = sum(cell["failed_steps"] for cell in computed)
-    if failed:
-        lines.append(f"{failed} steps failed; there the object was left where it was (see the JSON).")
-    lines.append("The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON.")
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+        lines = [(model, model, _entry) for model in MODELS]
+        parts.append(by_object(cells, name, *lines, ("no motion", "ellipsoid", _no_motion_entry)))
+        parts.append(
+            table(
+                [{"model": model} | mean for model, mean in means.items() if mean],
+                (f"{name}, means", "model"),
+                ("mean / mm", "mean_mm", ".2f"),
+                ("paper / mm", "paper_mm", ".2f"),
+                (f"conditions, of {len(CONDITIONS)}", "conditions"),
+                ("part of the motion / %", "percent", ".2f"),
+                ("paper / %", "paper_percent", ".2f"),
+            )
+        )
+    if len(_with_figures(record["cells"])) < len(record["cells"]):
+        parts.append("A cell with words could not be computed, for the reason that it gives; the means leave it out.")
+    interval = "The interval is of the mean over pushes, by bootstrap; over splits alone: ci95_mm in the JSON."
+    return [*parts, *failures(record["cells"]), interval]
 
 
 def _entry(cell: dict[str, Any]) -> str:
@@ -250,7 +238,7 @@ def _entry(cell: dict[str, Any]) -> str:
     return f"{cell['mean_mm']:.2f} ± {cell['ci95_bootstrap_mm']:.2f} ({cell['paper_mm']:.2f})"
 
 
-def _no_motion_entry(cells: Iterable[dict], paper: float) -> str:
-    """Format the deviation if nothing moved, which is the same in the cells of both models."""
-    known = _with_figures(cells)
-    return f"{known[0]['no_motion_mm']:.2f} ({paper:.2f})" if known else f"- ({paper:.2f})"
+def _no_motion_entry(cell: dict[str, Any]) -> str:
+    """Format the deviation if nothing moved."""
+    paper = PAPER_NO_MOTION_MM[cell["surface"]][OBJECTS.index(cell["object"])]
+    return f"{cell['no_motion_mm']:.2f} ({paper:.2f})" if "no_motion_mm" in cell else f"- ({paper:.2f})"

@@ -26,9 +26,10 @@ import numpy as np
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets import LogError, Recordings, load_recordings, load_two_finger_logs
 from pushjax.experiments._record import result_record
-from pushjax.experiments._tables import MODELS, deviation_mm
-from pushjax.experiments.two_finger import predictions
-from pushjax.experiments.two_finger.predictions import PAIRS, SPLITS, TRAIN_SHARE, predict, splits
+from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._tables import MODELS, deviation_mm, failures
+from pushjax.experiments.two_finger.picture import figure
+from pushjax.experiments.two_finger.predictions import FRICTIONS, PAIRS, RADII, SPLITS, TRAIN_SHARE, predict, splits
 from pushjax.experiments.two_finger.scores import MAX_STUCK_MOTION, days, object_scores
 
 OBJECTS = ("3pts1", "3pts3", "patch")
@@ -73,18 +74,9 @@ def run(
         by_day += [{"object": name} | day for day in days(log, errors)]
         shown.append((name, log, prediction.final, errors, tested))
         progress(index + 1, len(OBJECTS))
-    pictures = []
-    if out is not None:
-        from pushjax.experiments.two_finger.picture import draw
-
-        pictures.append(draw(shown, out))
+    pictures = saved(out, lambda: {"two_finger.png": figure(shown)})
     settings = {"seed": seed, "steps": steps, "model": model, "pairs": PAIRS, "stuck_mm": 1e3 * MAX_STUCK_MOTION}
-    settings |= {
-        "frictions": predictions.FRICTIONS,
-        "radii": predictions.RADII,
-        "splits": SPLITS,
-        "train_share": TRAIN_SHARE,
-    }
+    settings |= {"frictions": FRICTIONS, "radii": RADII, "splits": SPLITS, "train_share": TRAIN_SHARE}
     return result_record("two-finger", settings, cells=cells, days=by_day, pictures=pictures)
 
 
@@ -99,32 +91,32 @@ def load(folder: Path, name: str) -> Recordings:
     raise LogError(folder, f"expected {name}.npz, or a folder {name} of published logs; {fetched}")
 
 
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints: one line per object."""
-    lines = [f"Two-finger pushes, {record['settings']['model']}; test pushes, {SPLITS} splits by action.", ""]
-    lines.append(
-        f"{'object':8}{'pushes':>7}{'mean / mm':>14}{'no motion':>11}{'ratio':>8}{'median':>8}"
-        f"{'repeats differ':>16}{'friction':>10}{'radius / mm':>13}{'stick agrees':>14}"
-    )
-    for cell in record["cells"]:
-        interval = f"{cell['mean_mm']:.2f} ± {cell['ci95_bootstrap_mm']:.2f}"
-        floor = cell["repeats"].get("floor_mm")
-        lines.append(
-            f"{cell['object']:8}{cell['pushes']:7}{interval:>14}{cell['no_motion_mm']:11.1f}{cell['ratio']:8.1%}"
-            f"{cell['median_mm']:8.2f}{'-' if floor is None else f'{floor:.2f}':>16}{cell['friction']:10.2f}"
-            f"{cell['radius_mm']:13.2f}{cell['stick_agreement']:14.1%}"
-        )
-    lines.append("")
-    for cell in record["cells"]:
-        shares, repeats = cell["stuck"], cell["repeats"]
-        line = f"{cell['object']:8}stuck: both {shares['both']:.0%}, only measured {shares['only_measured']:.0%}, only "
-        line += f"predicted {shares['only_predicted']:.0%}, neither {shares['neither']:.0%}"
-        if repeats["pushes"]:
-            line += f"; {repeats['pushes']} repeated pushes agree in {repeats['floor_agreement']:.0%}"
-        lines.append(line)
-    failed = sum(cell["failed_steps"] for cell in record["cells"])
-    if failed:
-        lines.append(f"{failed} steps of the whole grid failed; there the object was left where it was (see the JSON).")
-    lines.append("The interval is of the mean over pushes, by bootstrap over actions.")
-    lines += [f"drew {path}" for path in record["pictures"]]
-    return "\n".join(lines)
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report: a line for each object."""
+    shares = ("both", "only_measured", "only_predicted", "neither")
+    return [
+        f"Two-finger pushes, {record['settings']['model']}; test pushes, {SPLITS} splits by action.",
+        table(
+            record["cells"],
+            ("object", "object"),
+            ("pushes", "pushes"),
+            ("mean / mm", lambda cell: f"{cell['mean_mm']:.2f} ± {cell['ci95_bootstrap_mm']:.2f}"),
+            ("no motion / mm", "no_motion_mm", ".1f"),
+            ("ratio", "ratio", ".1%"),
+            ("median / mm", "median_mm", ".2f"),
+            ("repeats differ / mm", lambda cell: cell["repeats"].get("floor_mm"), ".2f"),
+            ("friction", "friction", ".2f"),
+            ("radius / mm", "radius_mm", ".2f"),
+        ),
+        "Whether the object stuck to the hand, and how often prediction and measurement, and repeats, agree:",
+        table(
+            record["cells"],
+            ("object", "object"),
+            *((name.replace("_", " "), lambda cell, name=name: cell["stuck"][name], ".0%") for name in shares),
+            ("agree", "stick_agreement", ".1%"),
+            ("repeated pushes", lambda cell: cell["repeats"]["pushes"]),
+            ("repeats agree", lambda cell: cell["repeats"].get("floor_agreement"), ".0%"),
+        ),
+        *failures(record["cells"]),
+        "The interval is of the mean over pushes, by bootstrap over actions.",
+    ]

@@ -1,9 +1,8 @@
 """The picture of the two-finger pushes: for each object the distribution of deviations, and three test pushes."""
 
-from pathlib import Path
-
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from pushjax import plot
 from pushjax.datasets import Recordings
@@ -15,10 +14,10 @@ from pushjax.plot.style import BLACK, BLUE, GRAY, ORANGE, STYLE, legend_below
 Shown = tuple[str, Recordings, np.ndarray, np.ndarray, Tested]
 
 
-def draw(shown: list[Shown], out: Path) -> str:
+def figure(shown: list[Shown]) -> Figure:
     """Draw for each object the distribution of deviations, and three test pushes of the first random split."""
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
+        drawn, axes = plt.subplots(len(shown), 4, figsize=(14.0, 3.5 * len(shown)), layout="constrained")
         for row, (name, log, final, errors, tested) in zip(axes, shown, strict=True):
             each, no_motion = per_push(errors, tested), deviation_mm(log.start, log.end, log.length or 0.0)
             _distribution(row[0], name, each[np.isfinite(each)], no_motion)
@@ -30,8 +29,8 @@ def draw(shown: list[Shown], out: Path) -> str:
                 push = order[round(share * (len(order) - 1))]
                 _one_push(panel, log, push, final[at][push])
                 panel.set_title(f"{name}, {word}: {errors[at][push]:.1f} mm")
-        legend_below(figure, axes[0, 1], columns=5)
-        return str(plot.save(figure, out / "two_finger.png"))
+        legend_below(drawn, axes[0, 1], columns=5)
+        return drawn
 
 
 def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray) -> None:
@@ -40,10 +39,9 @@ def _distribution(axes, name: str, predicted: np.ndarray, no_motion: np.ndarray)
         (predicted, BLUE, "-", "predicted"),
         (no_motion, GRAY, "--", "no motion"),
     ):
-        order = np.sort(values)
-        axes.step(order, 100 * np.arange(1, len(order) + 1) / len(order), dash, color=color, where="post", label=label)
-    axes.set(xscale="log", xlim=(0.4, 200), ylim=(0, 100), title=f"{name}, test pushes")
-    axes.set(xlabel="deviation of the final pose / mm", ylabel="pushes below / %")
+        axes.ecdf(values, ls=dash, color=color, label=label)
+    axes.set(xscale="log", xlim=(0.4, 200), ylim=(0, 1), title=f"{name}, test pushes")
+    axes.set(xlabel="deviation of the final pose / mm", ylabel="share of pushes below")
     axes.legend(loc="upper left")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pushjax.datasets import Recordings
 from pushjax.datasets.recordings import Floats, rotation, wrap_angle
-from pushjax.experiments._tables import BOOTSTRAP_SAMPLES, deviation_mm, relative_motions
+from pushjax.experiments._tables import bootstrapped_ci95, deviation_mm, relative_motions
 from pushjax.experiments.two_finger import predictions
 from pushjax.experiments.two_finger.predictions import SPLITS, OnGrid, Tested, per_push
 
@@ -28,7 +28,7 @@ def object_scores(log: Recordings, prediction: OnGrid, errors: np.ndarray, teste
     mean = float(np.mean(means))
     push_errors = per_push(errors, tested)
     was_tested = np.isfinite(push_errors)
-    interval = _interval(push_errors[was_tested], action[was_tested], np.random.default_rng(seed))
+    interval = bootstrapped_ci95(push_errors[was_tested], np.random.default_rng(seed), action[was_tested])
     return {
         "mean_mm": mean,
         "no_motion_mm": no_motion,
@@ -48,16 +48,6 @@ def object_scores(log: Recordings, prediction: OnGrid, errors: np.ndarray, teste
         "jammed_pushes": float(np.mean([prediction.jammed[at].sum() for at in tested.chosen])),
         "repeats": _repeats(log, push_errors),
     } | _stick_agreement(log, prediction.final, tested)
-
-
-def _interval(push_errors: np.ndarray, group: np.ndarray, rng: np.random.Generator) -> float:
-    """Return half the width of the bootstrapped 95 % confidence interval of the mean of errors (n,)."""
-    # The bootstrap is over actions, because repeats of an action are not independent.
-    actions, action_of_push = np.unique(group, return_inverse=True)
-    total, count = np.bincount(action_of_push, push_errors), np.bincount(action_of_push)
-    resampled = rng.integers(len(actions), size=(BOOTSTRAP_SAMPLES, len(actions)))
-    means = total[resampled].sum(axis=1) / count[resampled].sum(axis=1)
-    return float(np.diff(np.quantile(means, [0.025, 0.975]))[0] / 2)
 
 
 def _stick_agreement(log: Recordings, final: np.ndarray, tested: Tested) -> dict[str, Any]:
