@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import binomtest
 
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
@@ -90,7 +90,7 @@ def run(
     began = time.perf_counter()
     controller = pusht_controller(
         look_ahead=lookahead,
-        cost_to_go=cost_to_go,
+        use_cost_to_go=cost_to_go,
         feedback=feedback,
         friction=friction_in_model,
         noise=observation_noise * PIXEL,
@@ -152,10 +152,11 @@ def play(
 def _figures(played: list[Episode]) -> dict[str, Any]:
     """Return the figures over all episodes."""
     successes, count = sum(each.success for each in played), len(played)
+    low, high = binomtest(successes, count).proportion_ci()  # exact, by Clopper and Pearson
     steps = [each.steps for each in played if each.success]
     return {
         "success": successes / count,
-        "success_ci95": clopper_pearson(successes, count),
+        "success_ci95": (float(low), float(high)),
         "mean_largest_coverage": float(np.mean([each.largest_coverage for each in played])),
         "mean_final_coverage": float(np.mean([each.final_coverage for each in played])),
         "steps_of_successes": {
@@ -174,13 +175,6 @@ def _times(episodes: Iterable[list[float]]) -> dict[str, float]:
     """Return mean, 95th percentile and largest of times, s."""
     times = np.concatenate(list(episodes))
     return {"mean": times.mean(), "percentile_95": np.percentile(times, 95), "largest": times.max()}
-
-
-def clopper_pearson(successes: int, count: int) -> tuple[float, float]:
-    """Return the exact 95 % confidence interval of a probability, from the number of successes."""
-    low = beta.ppf(0.025, successes, count - successes + 1) if successes else 0.0
-    high = beta.ppf(0.975, successes + 1, count - successes) if successes < count else 1.0
-    return float(low), float(high)
 
 
 def summary(record: dict[str, Any]) -> str:

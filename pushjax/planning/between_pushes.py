@@ -44,17 +44,11 @@ class Transits(NamedTuple):
 
 
 class FingerMotion(NamedTuple):
-    """The motion of a finger through all pushes of a plan, straight from each point to the next.
+    """The motion of a finger through all pushes of a plan, straight from each point to the next."""
 
-    Attributes:
-        time: Time at each point, (points,), s, from zero.
-        position: Center of the finger, (points, 2), world, m.
-        push: Number of the push that the finger makes up to each point, from one; zero between pushes, (points,).
-    """
-
-    time: np.ndarray
-    position: np.ndarray
-    push: np.ndarray
+    time: np.ndarray  # at each point, (points,), s, from zero
+    position: np.ndarray  # center of the finger, (points, 2), world, m
+    push: np.ndarray  # number of the push that the finger makes up to each point, from one; zero between pushes
 
 
 def transits_between(
@@ -96,6 +90,10 @@ def finger_motion(transits: tuple[Transit, ...], paths: np.ndarray, *, free: flo
         paths: Paths of the pushes, (pushes, steps + 1, 2), world, m.
         free: Speed between pushes, m/s.
         push: Speed in pushes, m/s.
+
+    Returns:
+        Points with `time`, (points,), s, `position` of the finger's center, (points, 2), world, m, and number of the
+        `push` that it makes up to each point, from one; zero between pushes.
 
     Raises:
         ValueError: For a speed that is not positive, if a transit was not found, and if there is none.

@@ -17,7 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from pushjax.geometry.se2_numpy import compose, inverse
+from pushjax.geometry.polygon_numpy import signed_distances
+from pushjax.geometry.se2_numpy import compose, inverse, to_body
 from pushjax.planning.finger_control import FingerControl, FingerState
 from pushjax.planning.friction_filter import BeliefStatus, FrictionBelief, FrictionFilter
 from pushjax.planning.planned_push import PlannedPush, PushStatus
@@ -233,12 +234,17 @@ class PushController:
         ahead = np.minimum(state.along + speed * SLOWER, total)
         targets = np.stack([np.interp(ahead, lengths, points[:, axis]) for axis in (0, 1)], axis=-1)
         motions = self.control.motion(finger, self.control.action(finger, targets))
-        apart = self.planner.finger_clearance(pose, motions).min(-1)
-        now = float(self.planner.finger_clearance(pose, finger.position))
+        apart = self._clearance(pose, motions).min(-1)
+        now = float(self._clearance(pose, finger.position))
         needed = min(CLOSE * self.length, now + 1e-3 * self.length)
         good = np.flatnonzero(apart >= needed)
         best = int(good[0]) if len(good) else int(np.argmax(apart))
         return targets[best], state._replace(along=float(ahead[best]), speed=float(ahead[best] - state.along))
+
+    def _clearance(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the distance of the finger at points (..., 2) from slider and fixtures, negative in one, (...,), m."""
+        apart = signed_distances(self.planner.vertices, to_body(pose, points))
+        return np.minimum(apart, self.planner.obstacles.point_clearance(points)) - self.scene.radius
 
     def _push(
         self, finger: FingerState, pose: np.ndarray, state: ControllerState, correct: bool

@@ -5,44 +5,22 @@ move the slider by the same displacements wherever it is. So for each angle, a p
 stands for all pushes into that cell, and one sweep of the iteration takes minima of shifted grids.
 """
 
-import hashlib
-from contextlib import suppress
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
-from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.free_space import POSITIONS, FreeSpace, PoseGrid, grid_spacing
 from pushjax.planning.push_library import PushLibrary
 from pushjax.planning.workspace import BoundingBoxTable, Workspace
 
-FORMAT = 1  # of the file, and of what is computed here: raise it when either changes
 NEVER = 1e3  # control steps; cost of poses from which the goal is not reached
 ANGLES = 36  # angles of the grid in a full turn
 SWEEPS = 12  # largest number of sweeps over the grid
 CHANGE = 0.5  # control steps; smaller changes end the iteration
 LAST_PUSHES = 6  # pushes to the goal that are tried from each cell, if some may run into an obstacle
 NEAR_CENTER = 0.35  # a push stands for a cell if it ends within this part of a cell from the cell's center
-
-
-class CostToGo(PoseGrid):
-    """Cost of the poses on a grid, in control steps, and of poses between them by interpolation."""
-
-    def save(self, path: str | Path) -> None:
-        """Write the grid to a file in NumPy's format "npz"."""
-        save_arrays(path, FORMAT, self._asdict())
-
-    @staticmethod
-    def load(path: str | Path) -> "CostToGo":
-        """Read what `save` wrote, or raise ValueError if the file does not hold a cost to go."""
-        found = load_arrays(path, "a cost to go", FORMAT, CostToGo._fields)
-        shapes = {"origin": (2,), "spacing": (), "values": ("positions", "positions", "angles")}
-        check_arrays(path, "a cost to go", found, shapes)
-        return CostToGo(found["origin"], float(found["spacing"]), found["values"])
 
 
 def cost_to_go(
@@ -58,7 +36,7 @@ def cost_to_go(
     high: np.ndarray,  # (2,), highest; the grid is square, so along the narrower axis it reaches beyond
     vertices: np.ndarray,  # (vertices, 2), of the slider, body frame, m
     space: FreeSpace | None = None,  # built with the same `low` and `high`; None: no obstacles
-) -> CostToGo:
+) -> PoseGrid:
     """Compute the cost to go by value iteration."""
     spacing = grid_spacing(low, high)
     axes = [corner + spacing * np.arange(POSITIONS) for corner in low]
@@ -88,30 +66,7 @@ def cost_to_go(
     # slider may be free, so the cell gets the cost of the best neighbor, after one more pause between pushes.
     if space is not None:
         values = np.where(met, _least_around(np.where(met, NEVER, values)) + between, values)
-    return CostToGo(np.asarray(low, np.float32), spacing, values)
-
-
-def cached_cost_to_go(cache: Path | None, *given: Any, **settings: Any) -> CostToGo:
-    """Read the cost to go from a folder, or compute it as `cost_to_go` does and keep it there."""
-    if cache is None:
-        return cost_to_go(*given, **settings)
-    path = cache / f"cost-{digest_of_costs(*given, **settings)[:16]}.npz"
-    with suppress(FileNotFoundError, ValueError):  # there is none, or it is damaged
-        return CostToGo.load(path)
-    value = cost_to_go(*given, **settings)
-    cache.mkdir(parents=True, exist_ok=True)
-    value.save(path)
-    return value
-
-
-def digest_of_costs(library: PushLibrary, *given: Any, space: FreeSpace | None = None, **more: Any) -> str:
-    """Return the hash of what `cost_to_go` depends on; the arguments are the same."""
-    settings = FORMAT, POSITIONS, ANGLES, SWEEPS, CHANGE, LAST_PUSHES, NEAR_CENTER
-    kept = None if space is None else (space.clearance, space.slider_clearance, *space.obstacles)
-    content = hashlib.sha256(f"{library.digest} {settings} {sorted(more)}".encode())
-    for leaf in jax.tree.leaves((given, kept, more)):
-        content.update(f"{np.shape(leaf)}".encode() + np.asarray(leaf, np.float64).tobytes())
-    return content.hexdigest()
+    return PoseGrid(np.asarray(low, np.float32), spacing, values)
 
 
 class _Moves(NamedTuple):

@@ -35,16 +35,15 @@ class Measure(Protocol):
 
 
 class CoverageTable:
-    """Area of the intersection of slider and goal, divided by the area of the slider, by linear interpolation.
+    """Area of the intersection of slider and goal, divided by the area of the slider, by linear interpolation."""
 
-    Args:
-        vertices: Vertices of the slider, counterclockwise, (vertices, 2), m.
-        center: Center of the slider, (2,), m.
-        length: Characteristic length of the slider, m.
-        enough: Coverage from which the slider is at the goal.
-    """
-
-    def __init__(self, vertices: np.ndarray, center: np.ndarray, length: float, enough: float):
+    def __init__(
+        self,
+        vertices: np.ndarray,  # (vertices, 2), of the slider, counterclockwise, m
+        center: np.ndarray,  # (2,), of the slider, m
+        length: float,  # of its limit surface, m
+        enough: float,  # coverage from which the slider is at the goal
+    ):
         self.center, self.length, self.enough = np.asarray(center, float), length, enough
         side, turn = np.linspace(-RANGE, RANGE, POSITIONS) * length, np.linspace(-RANGE, RANGE, ANGLES)
         errors = np.stack(np.meshgrid(side, side, turn, indexing="ij"), axis=-1)

@@ -28,19 +28,12 @@ ROUNDOFF = 1e-9  # rad. An arc that is less than this short of a full turn is no
 
 
 class DubinsPath(NamedTuple):
-    """A path of three parts, each of constant curvature.
+    """A path of three parts, each of constant curvature."""
 
-    Attributes:
-        word: The parts, such as "LSL": left turn, straight, left turn.
-        start: Pose at the start, (3,), m and rad.
-        curvature: Signed curvature of the parts, (3,), 1/m, positive to the left.
-        lengths: Lengths of the parts, (3,), m; zero for a part that is not needed.
-    """
-
-    word: str
-    start: np.ndarray
-    curvature: np.ndarray
-    lengths: np.ndarray
+    word: str  # the parts, such as "LSL": left turn, straight, left turn
+    start: np.ndarray  # pose at the start, (3,), m and rad
+    curvature: np.ndarray  # signed, of the parts, (3,), 1/m, positive to the left
+    lengths: np.ndarray  # of the parts, (3,), m; zero for a part that is not needed
 
     @property
     def length(self) -> float:
@@ -48,17 +41,8 @@ class DubinsPath(NamedTuple):
         return float(self.lengths.sum())
 
     def poses(self, steps: int) -> np.ndarray:
-        """Return poses along the path. The ends of the parts are among them, so that no step has two curvatures.
-
-        Args:
-            steps: Number of steps, at least one for each part of the path that has a length.
-
-        Returns:
-            Poses, (steps + 1, 3), m and rad; the angle is continuous.
-
-        Raises:
-            ValueError: If there are fewer steps than parts with a length.
-        """
+        """Return poses along the path, (steps + 1, 3), m and rad; the angle is continuous."""
+        # The ends of the parts are among them, so that no step has two curvatures.
         counts = _steps_of_parts(self.lengths, steps)
         pose, parts = self.start, [self.start[None]]
         for curvature, length, count in zip(self.curvature, self.lengths, counts, strict=True):
@@ -68,26 +52,13 @@ class DubinsPath(NamedTuple):
         return np.concatenate(parts)
 
 
-def dubins(start: ArrayLike, goal: ArrayLike, left: float, right: float) -> DubinsPath | None:
-    """Find the shortest path between two poses that goes forward, with bounded curvature.
-
-    Args:
-        start: Pose (x, y, heading) at the start, (3,), m and rad.
-        goal: Pose at the goal, (3,), m and rad; its heading modulo a full turn.
-        left: Radius of the tightest left turn, m; infinite if it cannot turn left.
-        right: Radius of the tightest right turn, m; infinite if it cannot turn right.
-
-    Returns:
-        The path; None if both radii are infinite, also where the goal is straight ahead.
-
-    Raises:
-        ValueError: If a pose is not finite or has another shape, or a radius is not positive.
-
-    Examples:
-        >>> path = dubins((0, 0, 0), (2, 2, 3.141592653589793), left=1.0, right=1.0)
-        >>> path.word, round(path.length, 3)
-        ('LSL', 5.142)
-    """
+def dubins(
+    start: ArrayLike,  # pose (x, y, heading), (3,), m and rad
+    goal: ArrayLike,  # pose, (3,); its heading modulo a full turn
+    left: float,  # radius of the tightest left turn, m; infinite if it cannot turn left
+    right: float,  # of the tightest right turn
+) -> DubinsPath | None:
+    """Find the shortest path between two poses that goes forward, or None if it can turn to neither side."""
     poses = []
     for name, value in (("start", start), ("goal", goal)):
         pose = np.asarray(value, np.float64)

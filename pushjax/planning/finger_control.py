@@ -7,15 +7,10 @@ import numpy as np
 
 
 class FingerState(NamedTuple):
-    """Where a finger is and how fast it moves.
+    """Where a finger is and how fast it moves."""
 
-    Attributes:
-        position: Center, (2,), world, m.
-        velocity: Its velocity, (2,), m/s.
-    """
-
-    position: np.ndarray
-    velocity: np.ndarray
+    position: np.ndarray  # center, (2,), world, m
+    velocity: np.ndarray  # (2,), m/s
 
 
 class FingerControl(Protocol):

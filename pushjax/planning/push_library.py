@@ -11,12 +11,14 @@ changed by a motion of the world, so it is the distance of the final pose from t
 """
 
 import hashlib
+import os
 import re
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import jax
 import numpy as np
@@ -27,7 +29,6 @@ import pushjax
 from pushjax._internal.checks import check_count
 from pushjax.geometry.polygon_numpy import offset_curve, outline_vertices
 from pushjax.geometry.se2_numpy import to_world
-from pushjax.planning.array_files import check_arrays, load_arrays, save_arrays
 from pushjax.planning.push_batch import simulate_pushes
 from pushjax.planning.scene import PushScene, draw_friction
 from pushjax.simulation.slider import Slider
@@ -39,18 +40,6 @@ TRAVEL = 2.3  # longest push
 LEAST_MOTION = 0.005  # a push that moves the slider less than this is not valid
 
 FORMAT = 3  # of the file, and of what is computed here: raise it when either changes
-SHAPES = {
-    "starts": ("pushes", 2),
-    "directions": ("pushes", 2),
-    "travel": ("lengths",),
-    "outcomes": ("samples", "pushes", "lengths", 3),
-    "valid": ("pushes", "lengths"),
-    "length": (),
-    "center": (2,),
-    "slider": ("numbers",),
-    "radius": (1,),
-    "friction": ("friction",),
-}
 
 
 @dataclass(frozen=True)
@@ -125,42 +114,44 @@ class PushLibrary:
             return _simulated(scene, starts, directions, samples, key, wanted)
         path = cache / f"pushes-{wanted[:16]}.npz"
         with suppress(FileNotFoundError, ValueError):  # there is none, or it is damaged
-            return PushLibrary.load(path, wanted)
+            found = PushLibrary.load(path)
+            if found.digest == wanted:
+                return found
         built = _simulated(scene, starts, directions, samples, key, wanted)
         cache.mkdir(parents=True, exist_ok=True)
         built.save(path)
         return built
 
     def save(self, path: str | Path) -> None:
-        """Write the library to a file in NumPy's format "npz"."""
-        save_arrays(path, FORMAT, {name: getattr(self, name) for name in self.__dataclass_fields__})
+        """Write the library to a file in NumPy's format "npz", as a whole or not at all."""
+        target = Path(path).expanduser()
+        partial = target.with_name(f".{target.name}-{os.getpid()}")
+        try:
+            with partial.open("wb") as file:
+                np.savez_compressed(
+                    file, format_version=FORMAT, **{name: getattr(self, name) for name in self.__dataclass_fields__}
+                )
+            os.replace(partial, target)
+        finally:
+            partial.unlink(missing_ok=True)
 
     @staticmethod
-    def load(path: str | Path, digest: str | None = None) -> "PushLibrary":
+    def load(path: str | Path) -> "PushLibrary":
         """Read a library that `save` wrote.
 
-        Args:
-            path: The file.
-            digest: Digest that the library must have. None: any.
-
         Raises:
-            ValueError: If the file holds no library, or one of another slider, hand or set of pushes.
+            ValueError: If the file holds no library, or one in another format.
         """
-        content = "a library of pushes"
-        fields: dict[str, Any] = load_arrays(path, content, FORMAT, PushLibrary.__dataclass_fields__)
-        check_arrays(path, content, fields, SHAPES)
-        cast = {
-            "length": float(fields["length"]),
-            "valid": fields["valid"].astype(bool),
-            "digest": str(fields["digest"]),
-        }
-        library = PushLibrary(**fields | cast)
-        if digest is not None and library.digest != digest:
-            raise ValueError(
-                f"{path} holds a library of another slider, hand, friction or set of pushes; build it again "
-                f"(its digest is {library.digest[:12]}, expected {digest[:12]})"
-            )
-        return library
+        try:
+            with np.load(Path(path).expanduser()) as file:
+                if (written := file["format_version"]) != FORMAT:
+                    raise ValueError(f"its format is {written}; this program reads {FORMAT}")
+                found: dict[str, Any] = {name: file[name] for name in PushLibrary.__dataclass_fields__}
+        except FileNotFoundError:
+            raise
+        except (KeyError, ValueError, TypeError, EOFError, OSError, BadZipFile) as error:
+            raise ValueError(f"{path} does not hold a library of pushes: {error}") from error
+        return PushLibrary(**found | {"length": float(found["length"]), "digest": str(found["digest"])})
 
     def check_made_for(self, scene: PushScene) -> None:
         """Check that slider, finger and friction are those of a scene.

@@ -3,38 +3,33 @@
 Costs are control steps: the transit around the slider to the start of the push, the push, and what comes after it.
 
 One push: the outcomes near the relative pose of the goal, by the library's k-d tree.
-Two pushes: the poses that promising first pushes lead to are looked up in the same tree. Promising are those for which
-    the transit, the push and the cost to go make the least sum.
-Farther away: the push with that least sum.
+Two pushes: the poses that first pushes of least transit, push and cost to go lead to are looked up in the same tree.
+Farther away: the push for which that sum is least.
 """
 
 from copy import copy
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
+from pushjax.geometry.polygon_numpy import outline_vertices
 from pushjax.geometry.se2_numpy import compose, inverse, to_body, to_world
-from pushjax.planning.cost_to_go import CostToGo, cached_cost_to_go
+from pushjax.planning.cost_to_go import cost_to_go
 from pushjax.planning.coverage_table import CoverageTable, Measure
 from pushjax.planning.finger_control import SpeedLimits
-from pushjax.planning.free_space import GRID_STRIDE, FreeSpace
+from pushjax.planning.free_space import GRID_STRIDE, FreeSpace, PoseGrid
 from pushjax.planning.obstacles import Obstacles
 from pushjax.planning.planned_push import PlannedPush, PushChoice, PushStatus
 from pushjax.planning.push_library import PushLibrary
-from pushjax.planning.roadmap import Roadmap, ShortestTransits, Transit, run_ups
+from pushjax.planning.roadmap import Roadmap, Transit, run_ups
 from pushjax.planning.scene import PushScene
 from pushjax.planning.workspace import BoundingBoxTable, Workspace
 from pushjax.simulation.pair import MAX_PENETRATION
 
 CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
-MAX_COLLISION_CHECKS, COLLISION_BATCH = (
-    480,
-    24,
-)  # choices that are checked for collisions, best first, and how many at a time
+MAX_COLLISION_CHECKS, COLLISION_BATCH = 480, 24  # choices that are checked, the best first, and how many at a time
 RISK_BATCH = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
 STRIDE = 4  # of the lengths of first pushes, one in so many is considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
@@ -67,11 +62,10 @@ class PushPlanner:
             relative to the goal, (..., 3), whose values (...,) are from 0 to 1. Its attribute `enough` is the score
             from which the slider is at the goal, and `reach` the largest distance from the goal, m, of such a pose.
         look_ahead: Whether to consider plans of two pushes.
-        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
+        use_cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or by the distance to the goal.
         miss_cost: If the library has several samples of friction: control steps that a last push costs more, times the
             probability that it misses the goal. Other pushes are chosen by their mean outcome, because the next push
             is planned from where they end.
-        cache: Folder in which the cost to go is kept. It is computed only if it is not there.
 
     Raises:
         ValueError: For a library of another slider, finger or friction, and for a goal at which the slider overlaps a
@@ -88,9 +82,8 @@ class PushPlanner:
         *,
         measure: Measure | None = None,
         look_ahead: bool = True,
-        cost_to_go: bool = True,
+        use_cost_to_go: bool = True,
         miss_cost: float = MISS_COST,
-        cache: Path | None = None,
     ):
         library.check_made_for(scene)
         self.scene, self.library_samples, self.miss_cost = scene, library, miss_cost
@@ -98,7 +91,7 @@ class PushPlanner:
         self.vertices, length = outline_vertices(scene.slider.shape), library.length
         workspace.check_goal(self.goal, self.vertices)
         self.measure = measure or CoverageTable(self.vertices, library.center, length, COVERED)
-        self.look_ahead, self.cost_to_go, self.cache = look_ahead, cost_to_go, cache
+        self.look_ahead, self.use_cost_to_go = look_ahead, use_cost_to_go
         self.bounding_boxes, self.clearance = BoundingBoxTable(self.vertices), CLEARANCE * length
         self._weigh(None)
         # pushes are looked up in this library; `reweighted` changes `mean_library`, but keeps this one and its tree
@@ -138,27 +131,16 @@ class PushPlanner:
         other._weigh(weight)
         return other
 
-    def finger_clearance(self, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return the distance of the finger from slider and fixtures, negative where it overlaps one, (...,), m.
-
-        Args:
-            pose: Pose of the slider, (3,), world.
-            points: Centers of the finger, (..., 2), world.
-        """
-        apart = signed_distances(self.vertices, to_body(pose, points))
-        return np.minimum(apart, self.obstacles.point_clearance(points)) - self.scene.radius
-
     def _weigh(self, weight: np.ndarray | None) -> None:
         """Set the mean outcomes of pushes by weights of the library's samples."""
         self.weight, self.mean_library = weight, self.library_samples.averaged(weight)
 
     @cached_property
-    def value(self) -> CostToGo | None:
+    def value(self) -> PoseGrid | None:
         """Cost to go, or None if the distance to the goal takes its place."""
-        if not self.cost_to_go:
+        if not self.use_cost_to_go:
             return None
-        return cached_cost_to_go(
-            self.cache,
+        return cost_to_go(
             self.mean_library,
             self.goal,
             self.workspace,
@@ -173,32 +155,27 @@ class PushPlanner:
         )
 
     @cached_property
-    def after_push(self) -> np.ndarray:
-        """Control steps of the transit from the end of a push in each row to the start of each push, (places, pushes).
-
-        A row is a place of the finger around the slider; `place` is that of each entry.
-        """
-        lengths = self.roadmap.between(self.places)
-        return np.where(np.isfinite(lengths), self.speeds.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
-
-    @cached_property
-    def places(self) -> np.ndarray:
-        """Points around the slider where run-ups begin, one for each different start of pushes, (places, 2), m.
-
-        Pushes of different directions share a start. Of the points where their run-ups begin, one is taken.
-        """
+    def _places(self) -> np.ndarray:
+        """Points around the slider where run-ups begin, one for each different start of pushes, (places, 2), m."""
+        # Pushes of different directions share a start. Of the points where their run-ups begin, one is taken.
         _, first = np.unique(self.mean_library.starts[self.usable], axis=0, return_index=True)
         return self.roadmap.goals[self.usable][first]
 
     @cached_property
-    def place(self) -> np.ndarray:
+    def _after_push(self) -> np.ndarray:
+        """Control steps of the transit from each place to the start of each push, (places, pushes)."""
+        lengths = self.roadmap.between(self._places)
+        return np.where(np.isfinite(lengths), self.speeds.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
+
+    @cached_property
+    def _place(self) -> np.ndarray:
         """Index of the place that is nearest to the finger at the end of each entry, (entries,)."""
         finger = to_body(self.mean_library.relative, self.ends)
-        return np.asarray(KDTree(self.places).query(finger)[1])
+        return np.asarray(KDTree(self._places).query(finger)[1])
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self.after_push, self.place, self.indexed_library.tree, self.space and self.space.distances
+        _ = self.value, self._after_push, self._place, self.indexed_library.tree, self.space and self.space.distances
 
     def is_at_goal(self, pose: np.ndarray) -> bool:
         """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by `measure`."""
@@ -232,18 +209,13 @@ class PushPlanner:
         transit_time = self.speeds.free_time(np.where(reachable, transits.lengths + np.nan_to_num(self.run_up), np.inf))
         if cost_noise is not None:
             transit_time = transit_time + cost_noise
-        found = [self._one_push(pose, transit_time), *self._more_pushes(pose, transit_time)]
+        found = self._one_push(pose, transit_time), self._more_pushes(pose, transit_time)
         best = min((each for each in found if each is not None), key=lambda each: each.cost, default=None)
         if best is None:
             return none._replace(status=PushStatus.NO_PUSH)
-        return self._planned(best, transits, pose)
-
-    def _planned(self, best: PushChoice, transits: ShortestTransits, pose: np.ndarray) -> PlannedPush:
-        push = int(self.push[best.entry])
+        push, end = int(self.push[best.entry]), to_world(pose, self.ends[best.entry].astype(float))
         transit = self.roadmap.transit(transits, push, pose)
-        start = to_world(pose, self.mean_library.starts[push])
-        end = to_world(pose, self.ends[best.entry].astype(float))
-        return PlannedPush(best.status, transit, start, end, best.target, best.cost)
+        return PlannedPush(best.status, transit, starts[push], end, best.target, best.cost)
 
     def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> PushChoice | None:
         """Return the push that reaches the goal at the least cost: its control steps, and its risk of missing."""
@@ -290,23 +262,23 @@ class PushPlanner:
         chance = np.average(reached, axis=0, weights=self.weight)
         return self.miss_cost * (1 - chance), (chance > 0) | (score > enough)
 
-    def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> list[PushChoice]:
+    def _more_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> PushChoice | None:
         """Return the best first of two pushes, if there is one, or else the best by the cost to go."""
         entries, reached = self._first_pushes(pose, transit_time)
         if not len(entries):
-            return []
+            return None
         spent = transit_time[self.push[entries]] + self.push_time[entries]
         total = spent + self._estimate(reached, quick=True)
         best = np.argpartition(total, min(CANDIDATES, len(total) - 1))[:CANDIDATES]
         entries, reached, spent = entries[best], reached[best], spent[best]
         two = self._two_pushes(pose, entries, reached, spent) if self.look_ahead else None
         if two is not None:
-            return [two]
+            return two
         total = spent + self._estimate(reached, quick=False)
         k = self._least(total, (np.broadcast_to(pose, reached.shape), entries))
         if k is None:
-            return []
-        return [PushChoice(PushStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))]
+            return None
+        return PushChoice(PushStatus.COST_TO_GO, int(entries[k]), reached[k].astype(float), float(total[k]))
 
     def _first_pushes(self, pose: np.ndarray, transit_time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the entries that can come next, and the poses that they lead to."""
@@ -344,11 +316,11 @@ class PushPlanner:
         first, column = np.nonzero(np.isfinite(distance))
         if not len(first):
             return None
-        second, distance = second[first, column], distance[first, column]
+        second = second[first, column]
         starts = self.mean_library.starts[self.push[second]].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
-        between = self.after_push[self.place[entries[first]], self.push[second]]
+        between = self._after_push[self._place[entries[first]], self.push[second]]
         total = np.where(allowed, spent[first] + between + self.push_time[second], np.inf)
         total = self._with_risk(total, inverse(wanted[first]), second, must_reach=False)
         k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))

@@ -43,7 +43,7 @@ FINGER_LIMITS, T_LIMITS = (2.0, 510.0), (8.0, 504.0)
 def pusht_controller(
     *,
     look_ahead: bool = True,
-    cost_to_go: bool = True,
+    use_cost_to_go: bool = True,
     feedback: bool = True,
     friction: float = 0.0,
     noise: float = 0.0,
@@ -56,11 +56,11 @@ def pusht_controller(
 
     Args:
         look_ahead: Whether plans of two pushes are considered.
-        cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or else by the distance to the goal.
+        use_cost_to_go: Whether pushes far from the goal are chosen by the cost to go, or by the distance to the goal.
         feedback: Whether the end of a push is corrected while it runs.
         friction: Coefficient of contact friction in the model; `gym-pusht` has none.
         noise: Standard deviation of the positions that are seen, m.
-        cache: Folder in which library and cost to go are kept. None: a folder in the user's cache folder.
+        cache: Folder in which the library is kept. None: a folder in the user's cache folder.
 
     Returns:
         The controller, with all of its programs compiled.
@@ -76,8 +76,8 @@ def pusht_controller(
     workspace = Workspace(*(np.full(2, each) for each in (finger_low, finger_high, low, high)))
     speeds = SpeedLimits(free=60 * PIXEL, push=24 * PIXEL, acceleration=20 * PIXEL)
     library = PushLibrary.build(scene, cache=cache)
-    goal, settings = pusht_pose(GOAL), {"look_ahead": look_ahead, "cost_to_go": cost_to_go, "cache": cache}
-    planner = PushPlanner(scene, library, goal, workspace, speeds, **settings)
+    given = scene, library, pusht_pose(GOAL), workspace, speeds
+    planner = PushPlanner(*given, look_ahead=look_ahead, use_cost_to_go=use_cost_to_go)
     planner.prepare()
     limits = np.zeros(2), np.full(2, SIZE * PIXEL)
     control = SpringDamper(STIFFNESS, DAMPING, PHYSICS_TIMESTEP, PHYSICS_STEPS, *limits)

@@ -44,16 +44,7 @@ class Search(eqx.Module):
     def __call__(
         self, key: PRNGKeyArray, objective: Objective, start: Candidates
     ) -> tuple[Candidates, Float[np.ndarray, "iterations"]]:
-        """Improve candidates.
-
-        Args:
-            key: PRNG key of everything random.
-            objective: What to minimize.
-            start: Candidates to start from.
-
-        Returns:
-            The best candidates that were found, and the least cost after each iteration.
-        """
+        """Return the best candidates that were found, and the least cost after each iteration."""
 
 
 class Selection(Search):

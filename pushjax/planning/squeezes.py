@@ -215,30 +215,13 @@ def squeeze_outcomes(
     key: PRNGKeyArray,
     slider: Slider,
     hand: Hand,
-    belief: ArrayLike,
-    jaws: ArrayLike,
+    belief: ArrayLike,  # samples of the slider's pose, (poses, 3), world, m and rad
+    jaws: ArrayLike,  # poses of the jaw in each squeeze, (squeezes, 3), world, m and rad
     *,
     model: FrictionModel,
     squeezes: Squeezes,
 ) -> SqueezeOutcomes:
-    """Simulate squeezes in a row under sampled friction. Each sample keeps its friction for all squeezes.
-
-    Args:
-        key: PRNG key of everything random.
-        slider: The slider.
-        hand: The jaw.
-        belief: Samples of the slider's pose, (poses, 3), world, m and rad.
-        jaws: Poses of the jaw in each squeeze, (squeezes, 3), world, m and rad.
-        model: Distribution of limit surface and contact friction.
-        squeezes: How the jaw closes.
-
-    Returns:
-        Poses after each squeeze, and whether the slider is held.
-
-    Raises:
-        ValueError: For a belief or jaws that are not finite or of another shape, or a hand with another configuration.
-        TypeError: For arguments of other types.
-    """
+    """Simulate squeezes in a row under sampled friction. Each sample keeps its friction for all squeezes."""
     poses = _checked(key, slider, hand, belief)
     placed = checked_array("jaws", jaws, ("squeezes", 3))
     draws = draw_friction(key, slider.surface, model, len(poses))

@@ -34,17 +34,11 @@ STEP = 0.05  # default length of a step, in units of the length of the limit sur
 
 
 class StableContact(NamedTuple):
-    """A hand against an edge of a slider that can carry it without slip.
+    """A hand against an edge of a slider that can carry it without slip."""
 
-    Attributes:
-        contact: Where the hand is.
-        turn: The tightest turns without slip.
-        opening: What a configuration of the hand has beyond its pose, (dof - 3,).
-    """
-
-    contact: LineContact
-    turn: Turn
-    opening: np.ndarray
+    contact: LineContact  # where the hand is
+    turn: Turn  # the tightest turns without slip
+    opening: np.ndarray  # what a configuration of the hand has beyond its pose, (dof - 3,)
 
     @property
     def reference(self) -> np.ndarray:
@@ -62,8 +56,9 @@ class StablePush(NamedTuple):
         reason: The status in a sentence.
         path: Path of the hand, (steps + 1, dof), world; None if there is none.
         pose: Poses of the slider along it, (steps + 1, 3), world; None if there is none.
-        contact: The contact that is used; None if there is none.
-        dubins: Path of the contact's reference frame; None if there is none.
+        contact: The contact that is used, as from `stable_contacts`; None if there is none.
+        dubins: Path of the contact's reference frame, of three parts with the `lengths` (3,), m, and the `curvature`
+            (3,), 1/m, positive to the left; None if there is none.
     """
 
     status: PlanStatus
@@ -97,7 +92,8 @@ def stable_contacts(
         margin: Fraction by which coefficient of friction and width of the contact are reduced, at least 0 and below 1.
 
     Returns:
-        The contacts, one an edge at most. None on an edge where a straight push is not stable for every sample.
+        The contacts, one an edge at most, with the largest curvatures of a turn without slip to the left and right,
+        `turn.left` and `turn.right`, 1/m. None on an edge where a straight push is not stable for every sample.
 
     Raises:
         ValueError: For a hand that touches an edge in one point only or is not a rigid body in x, y and theta, for a

@@ -1,20 +1,22 @@
-"""Distances from walls and fixed bodies, and transits of a finger among them, judged by shapely."""
+"""Distances from polygons, walls and fixed bodies, and transits of a finger among them; shapely is the judge."""
 
 import numpy as np
 import pytest
-from planning_parts import RADIUS, T
+from planning_parts import PLUS, RADIUS, L, T
 
 import pushjax as pj
+from pushjax.geometry.polygon_numpy import inside, offset_curve, segment_distances, signed_distances
 from pushjax.geometry.se2_numpy import to_body, to_world
 from pushjax.planning import Workspace
 from pushjax.planning.obstacles import Obstacles
-from pushjax.planning.roadmap import Roadmap, TransitStatus
+from pushjax.planning.roadmap import Roadmap, TransitStatus, run_ups
 
 shapely = pytest.importorskip("shapely")
 
 CLEARANCE = 0.005
 APART = RADIUS + CLEARANCE
 BAR = np.array([(-0.1, -0.004), (0.1, -0.004), (0.1, 0.004), (-0.1, 0.004)])
+LIMITS, LIMITED = Workspace.rectangle((-0.28, -0.28), (0.28, 0.28)), shapely.box(-0.28, -0.28, 0.28, 0.28)
 ROUNDED = 2e-5  # of a disk of 5 cm by a polygon
 
 
@@ -52,6 +54,35 @@ def body(fixture):
     return shapely.Polygon(to_world(pose, np.asarray(fixture.shape.vertices)))
 
 
+def polygons(count):
+    """Return blocks with reflex corners, and star-shaped polygons, counterclockwise."""
+    rng = np.random.default_rng(0)
+    return [L, PLUS, T, *(star(rng) for _ in range(count))]
+
+
+def test_distances_from_a_polygon_are_those_of_shapely():
+    rng = np.random.default_rng(1)
+    for vertices in polygons(20):
+        polygon = shapely.Polygon(vertices)
+        points = rng.uniform(-0.15, 0.15, (200, 2))
+        ends = rng.uniform(-0.15, 0.15, (200, 2))
+        assert np.array_equal(inside(vertices, points), shapely.contains_xy(polygon, points))
+        apart = np.array([polygon.exterior.distance(shapely.Point(p)) for p in points])
+        np.testing.assert_allclose(np.abs(signed_distances(vertices, points)), apart, atol=1e-12)
+        wanted = [shapely.LineString(pair).distance(polygon) for pair in zip(points, ends, strict=True)]
+        np.testing.assert_allclose(np.maximum(segment_distances(vertices, points, ends), 0), wanted, atol=1e-12)
+
+
+def test_offset_curve_is_at_its_distance():
+    for vertices in polygons(20):
+        curve = offset_curve(vertices, 0.02, 150)
+        polygon = shapely.Polygon(vertices)
+        apart = [polygon.distance(shapely.Point(p)) for p in curve.points]
+        np.testing.assert_allclose(apart, 0.02, rtol=1e-6)
+        on_outline = curve.points + 0.02 * curve.normals
+        assert max(polygon.exterior.distance(shapely.Point(p)) for p in on_outline) < 1e-9
+
+
 def test_distances_are_those_of_shapely():
     rng = np.random.default_rng(0)
     for world in range(40):
@@ -85,23 +116,23 @@ def test_a_frame_changes_no_distance():
 def random_transits(count, seed):
     """Yield transits in random worlds: slider, fixtures (shapely), start, goal, transit, and whether it must exist.
 
-    It must if start and goal are in one part of the plane that is a little farther away than the clearance.
+    It must if start and goal are in one part of the workspace that is a little farther away than the clearance.
     """
     rng = np.random.default_rng(seed)
     for _ in range(count):
-        vertices, fixtures = star(rng), [fixed(rng) for _ in range(rng.integers(1, 5))]
+        vertices, fixtures = star(rng), [fixed(rng) for _ in range(rng.integers(0, 5))]
         pose = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(-4, 4)])
         slider, bodies = shapely.Polygon(to_world(pose, vertices)), shapely.union_all([body(each) for each in fixtures])
         if slider.intersects(bodies):
             continue
-        limits = Workspace.rectangle((-0.4, -0.4), (0.4, 0.4))
         goals = rng.uniform(-0.3, 0.3, (8, 2))
         roadmap = Roadmap(vertices, RADIUS, CLEARANCE, to_body(pose, goals), Obstacles.of(fixtures))
         # as far as the points around the corners are, which are 45 degrees apart at most
-        free = shapely.box(-0.4, -0.4, 0.4, 0.4).difference(slider.union(bodies).buffer(1.09 * APART, quad_segs=32))
+        free = LIMITED.difference(slider.union(bodies).buffer(1.09 * APART, quad_segs=32))
         parts = getattr(free, "geoms", [free])
-        for start in rng.uniform(-0.3, 0.3, (3, 2)):
-            transits = roadmap.transits(start, pose, limits)
+        pushed = offset_curve(vertices, RADIUS + 1e-6, 3).points[:1]  # where a finger may be after a push
+        for start in np.concatenate([rng.uniform(-0.28, 0.28, (3, 2)), to_world(pose, pushed)]):
+            transits = roadmap.transits(start, pose, LIMITS)
             for k, goal in enumerate(goals):
                 ends = [shapely.Point(start), shapely.Point(goal)]
                 joined = any(all(part.contains(end) for end in ends) for part in parts)
@@ -122,20 +153,17 @@ def check_transits(count, seed):
         np.testing.assert_allclose(transit.points[[0, -1]], [start, goal], atol=1e-9)
         assert transit.length == pytest.approx(np.linalg.norm(np.diff(transit.points, axis=0), axis=1).sum())
         line, first = shapely.LineString(transit.points), shapely.Point(start)
-        for each in (
-            slider,
-            bodies,
-        ):  # a start that is nearer than the clearance is left by the transit that comes no nearer
+        assert LIMITS.allows_finger(transit.points[1:]).all()
+        solid = [slider] if bodies.is_empty else [slider, bodies]
+        for each in solid:  # a start that is nearer than the clearance is left without coming nearer
             assert each.distance(line) >= min(APART, each.distance(first)) - ROUNDED
-        if min(slider.distance(first), bodies.distance(first)) < APART - ROUNDED:
-            after = (
-                shapely.LineString(transit.points[1:]) if len(transit.points) > 2 else shapely.Point(transit.points[1])
-            )
+        if min(each.distance(first) for each in solid) < APART - ROUNDED:
+            after = shapely.LineString([*transit.points[1:], transit.points[-1]])
             assert slider.union(bodies).distance(after) >= APART - ROUNDED
     return found, must
 
 
-def test_transits_among_fixtures():
+def test_transits_in_random_worlds():
     found, must = check_transits(60, 2)
     assert found > 400
     assert must > 400
@@ -146,3 +174,46 @@ def test_transits_in_thousands_of_worlds():
     found, must = check_transits(2000, 3)
     print(f"{found} transits; {must} must exist")
     assert found >= must > 10_000
+
+
+def test_transits_are_shortest():
+    """Around a square, from the middle of one side to that of the other: two straight pieces and two quarter arcs."""
+    square = 0.05 * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
+    apart = RADIUS + CLEARANCE
+    roadmap = Roadmap(square, RADIUS, CLEARANCE, np.array([[0.0, 0.05 + 1.01 * apart]]))
+    transits = roadmap.transits(np.array([0.0, -0.05 - 1.01 * apart]), np.zeros(3))
+    best = 2 * 0.05 + 0.1 + np.pi * apart
+    assert best < transits.lengths[0] < 1.06 * best
+
+
+def test_why_there_is_no_way():
+    pose = np.zeros(3)
+    near = offset_curve(L, RADIUS + 0.2 * CLEARANCE, 20).points
+    roadmap = Roadmap(L, RADIUS, CLEARANCE, np.concatenate([[[0.3, 0.3]], near]))
+    in_slider = roadmap.transits(np.array([0.01, 0.01]), pose)
+    assert roadmap.transit(in_slider, 0, pose).status == TransitStatus.START_IN_SLIDER
+    free = roadmap.transits(np.array([-0.2, 0.0]), pose)
+    assert roadmap.transit(free, 0, pose).status == TransitStatus.FOUND
+    assert roadmap.transit(free, 3, pose).status == TransitStatus.GOAL_BLOCKED
+    walls = Workspace.rectangle((-0.3, -0.3), (0.2, 0.2))
+    assert (
+        roadmap.transit(roadmap.transits(np.array([-0.2, 0.0]), pose, walls), 0, pose).status
+        == TransitStatus.NO_TRANSIT
+    )
+    narrow = Workspace.rectangle((-RADIUS - 1e-3, -0.3), (-RADIUS, 0.3))
+    stuck = roadmap.transits(np.array([-RADIUS - 1e-4, 0.05]), pose, narrow)
+    assert roadmap.transit(stuck, 0, pose).status == TransitStatus.NO_RETREAT
+    with pytest.raises(ValueError, match="clearance must be positive"):
+        Roadmap(L, RADIUS, 0.0, near)
+
+
+def test_run_ups_do_not_touch():
+    polygon = shapely.Polygon(T)
+    curve = offset_curve(T, RADIUS + 0.002, 80)
+    lengths = run_ups(T, RADIUS, CLEARANCE, curve.points, curve.normals, 0.02)
+    assert np.isfinite(lengths).mean() > 0.9
+    for point, normal, length in zip(curve.points, curve.normals, lengths, strict=True):
+        if np.isfinite(length):
+            begin = point - length * normal
+            assert polygon.distance(shapely.LineString([begin, point])) >= RADIUS
+            assert polygon.distance(shapely.Point(begin)) >= RADIUS + CLEARANCE - 1e-9
