@@ -255,11 +255,11 @@ def _descend(logs: _Logs, state, keys, predictive: PredictiveModel, samples: int
         logs, state = carry
         value, gradient = _score(logs, key, predictive, samples, score)
         updates, state = optimizer.update(gradient, state)
-        logs = optax.apply_updates(logs, updates)
+        logs: Any = optax.apply_updates(logs, updates)
         return (logs, state), (value, logs)
 
-    (logs, state), (scores, iterates) = jax.lax.scan(step, (logs, state), keys)
-    return logs, state, scores, iterates
+    (last, state), (scores, iterates) = jax.lax.scan(step, (logs, state), keys)
+    return last, state, scores, iterates
 
 
 def _score(

@@ -15,14 +15,14 @@ SIDES = 4  # default number of a slider's sides
 class _Unknown(NamedTuple):
     """One unknown of identification."""
 
-    size: int | None  # number of its scalars; None if it depends on the problem
+    size: int  # number of its scalars; 0 if it depends on the problem
     unit: str = ""
     kind: str = ""  # "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither
 
 
 UNKNOWNS = {
     "friction": _Unknown(1),
-    "surface": _Unknown(None),  # the limit surface, whose prior is `Unknowns.surface_dof`
+    "surface": _Unknown(0),  # the limit surface, whose prior is `Unknowns.surface_dof`
     "pressure_center": _Unknown(2, "m"),
     "inset": _Unknown(1, "m", "calibration"),
     "overshoot": _Unknown(1, "m", "calibration"),
@@ -34,7 +34,7 @@ UNKNOWNS = {
     "log_gradient": _Unknown(2, "1/m", "table"),
     "log_hessian": _Unknown(3, "1/m^2", "table"),
     "friction_drift": _Unknown(1),
-    "friction_by_side": _Unknown(None),
+    "friction_by_side": _Unknown(0),
 }
 NAMES = tuple(UNKNOWNS)
 SIZES = {name: each.size for name, each in UNKNOWNS.items()}
@@ -48,11 +48,6 @@ CALIBRATION, TABLE = (
 def _optional_array(value: ArrayLike | None) -> Array | None:
     """Return the prior of an unknown as an array, or None for a parameter that is not estimated."""
     return None if value is None else as_float(value)
-
-
-def _prior(default: Any = None, *, kw_only: bool = True) -> Any:
-    """Return the field of a prior."""
-    return eqx.field(default=default, converter=_optional_array, kw_only=kw_only)
 
 
 def _shared_names(names: Sequence[str] | None) -> tuple[str, ...]:
@@ -99,20 +94,20 @@ class Unknowns(eqx.Module):
             scalar, if `sides` is less than one, if a name in `shared` is unknown, or if everything is None.
     """
 
-    friction: Float[Array, "2"] | None = _prior((0.0, 1.0), kw_only=False)
-    surface_dof: Float[Array, ""] | None = _prior(50.0)
-    pressure_center: Float[Array, ""] | None = _prior()
-    inset: Float[Array, ""] | None = _prior()
-    overshoot: Float[Array, ""] | None = _prior()
-    lag_distance: Float[Array, ""] | None = _prior()
-    hand_offset: Float[Array, ""] | None = _prior()
-    frame_offset: Float[Array, ""] | None = _prior()
-    overlap: Float[Array, ""] | None = _prior()
-    anisotropy: Float[Array, ""] | None = _prior()
-    log_gradient: Float[Array, ""] | None = _prior()
-    log_hessian: Float[Array, ""] | None = _prior()
-    friction_drift: Float[Array, ""] | None = _prior()
-    friction_by_side: Float[Array, ""] | None = _prior()
+    friction: Float[Array, "2"] | None = eqx.field(default=(0.0, 1.0), converter=_optional_array)
+    surface_dof: Float[Array, ""] | None = eqx.field(default=50.0, converter=_optional_array, kw_only=True)
+    pressure_center: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    inset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    overshoot: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    lag_distance: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    hand_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    frame_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    overlap: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    anisotropy: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    log_gradient: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    log_hessian: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    friction_drift: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
+    friction_by_side: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
     sides: int = eqx.field(default=SIDES, static=True, kw_only=True)
     shared: tuple[str, ...] = eqx.field(default=None, converter=_shared_names, static=True, kw_only=True)
 
