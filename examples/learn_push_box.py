@@ -89,9 +89,9 @@ def start(key: PRNGKeyArray, params: TableParams) -> Learner:
     """Return the state before the first update. Episodes are at different times, so that they do not end together."""
     policy_key, reset_key, time_key = jax.random.split(key, 3)
     observations, states = RESET(jax.random.split(reset_key, ENVIRONMENTS), params)
-    states = states.replace(time=jax.random.randint(time_key, (ENVIRONMENTS,), 0, params.max_steps_in_episode))
+    times = jax.random.randint(time_key, (ENVIRONMENTS,), 0, params.max_steps_in_episode, states.time.dtype)
     policy = Policy(policy_key)
-    return Learner(policy, OPTIMIZER.init(eqx.filter(policy, eqx.is_array)), states, observations)
+    return Learner(policy, OPTIMIZER.init(eqx.filter(policy, eqx.is_array)), states.replace(time=times), observations)
 
 
 def collect(learner: Learner, key: PRNGKeyArray, params: TableParams) -> tuple[Learner, tuple[Array, ...], Array]:
