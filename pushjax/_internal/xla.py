@@ -76,8 +76,8 @@ def tree_where(condition, yes, no):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
-def entry_at(tree, index: Int[Array, ""]):
-    """Return the entry with this index of every array of a pytree."""
+def entry_at(tree, index: Int[Array, "..."] | int):
+    """Return the entry, or the entries, with this index of every array of a pytree."""
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
@@ -107,4 +107,4 @@ def map_items(function: Callable, items: tuple) -> tuple:
     if len(items) == 1 or len({structure_and_shapes(item) for item in items}) > 1:
         return tuple(function(item) for item in items)
     stacked = jax.lax.map(function, jax.tree.map(lambda *leaves: jnp.stack(leaves), *items))
-    return tuple(jax.tree.map(lambda leaf, k=k: leaf[k], stacked) for k in range(len(items)))
+    return tuple(entry_at(stacked, k) for k in range(len(items)))

@@ -2,13 +2,13 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_shape, check_type, common_dtype
 from pushjax._internal.jit import quick_jit
+from pushjax._internal.xla import entry_at
 from pushjax.contact.contact_plane import Contact, LimitCurve
 from pushjax.contact.problem import Contacts, contacts_in_columns
 from pushjax.friction.limit_surface import LimitSurface
@@ -35,7 +35,7 @@ def friction_cone(normal: ArrayLike, friction: ArrayLike) -> Float[Array, "2 2"]
 
 def _first(contacts: Contacts) -> Contact:
     """Return the first contact."""
-    return jax.tree.map(lambda column: column[0], contacts_in_columns(contacts, contacts.friction))
+    return entry_at(contacts_in_columns(contacts, contacts.friction), 0)
 
 
 @quick_jit

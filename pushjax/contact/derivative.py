@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import combined, dot, products, repeated, summed
+from pushjax._math.arrays import combined, dot, products
+from pushjax._math.sums import repeated, summed
 from pushjax.contact.finish import Equations, Solution, System, in_units
 from pushjax.contact.force_distribution import of_chosen, shared_weights
 from pushjax.contact.scaled_problem import EdgeSet, ScaledProblem

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import combined, cross, dot, dual, products, summed, times
+from pushjax._math.arrays import combined, cross, dot, dual, products, times
+from pushjax._math.sums import summed
 from pushjax.contact.cubic import Roots
 from pushjax.contact.scaled_problem import NO_EDGE, ScaledProblem, violation_per_weight
 from pushjax.contact.tolerances import (

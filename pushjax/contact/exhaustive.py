@@ -45,7 +45,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from pushjax._internal.xla import tree_where
-from pushjax._math.arrays import dot, summed
+from pushjax._math.arrays import dot
+from pushjax._math.sums import summed
 from pushjax.contact.edge_sets import (
     Numbers,
     Sets,

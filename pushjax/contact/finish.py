@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.xla import tree_where
-from pushjax._math.arrays import combined, cross, dot, dual, products, repeated, solve, summed, times, unit
+from pushjax._math.arrays import combined, cross, dot, dual, products, solve, times, unit
+from pushjax._math.sums import repeated, summed
 from pushjax.contact.scaled_problem import NO_EDGE, EdgeSet, ScaledProblem, selected, violation_per_weight
 from pushjax.contact.status import ContactMode
 from pushjax.contact.tolerances import (

@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import ENTRIES, dot, summed
+from pushjax._math.arrays import ENTRIES, dot
+from pushjax._math.sums import summed
 
 MAX_NEWTON_ITERATIONS = 7
 LINE_SEARCH_ITERATIONS = 5  # in each Newton iteration

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import combined, dual, summed, times
+from pushjax._math.arrays import combined, dual, times
+from pushjax._math.sums import summed
 from pushjax.contact.edge_sets import along
 from pushjax.contact.scaled_problem import NO_EDGE, ContactSolver, EdgeSet, Found, ScaledProblem
 

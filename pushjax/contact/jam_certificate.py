@@ -27,7 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import cross, dot, summed, unit
+from pushjax._math.arrays import cross, dot, unit
+from pushjax._math.sums import summed
 from pushjax.contact.scaled_problem import ScaledProblem, selected
 
 # The unbalanced part that two or three edges may have and still balance, relative to their sum: roundoff of the numbers

@@ -22,7 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from pushjax._internal.xla import compute_once
-from pushjax._math.arrays import summed, times
+from pushjax._math.arrays import times
+from pushjax._math.sums import summed
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.contact.contact_plane import LimitCurve
 from pushjax.contact.edge_sets import Sets

@@ -19,6 +19,7 @@ from pushjax._internal.checks import (
     concrete,
 )
 from pushjax._internal.jit import quick_jit
+from pushjax._internal.xla import entry_at
 from pushjax._math.vec import Scalar, Vec2, Vec3
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.exhaustive import Continuing
@@ -233,7 +234,7 @@ def solve_problem(
     if isinstance(solver, StickingSolver):
         if count != 1:
             raise ValueError(f"solver: {type(solver).__name__} solves one contact; got {count}")
-        one = solve_single(form, jax.tree.map(lambda column: column[0], contacts.where(active)), solver)
+        one = solve_single(form, entry_at(contacts.where(active), 0), solver)
         infinite = jnp.full_like(one.twist.x, jnp.inf)
         force = Vec2(one.force.x[None], one.force.y[None])
         return ContactSolution(one.twist, one.wrench, force, one.mode[None], one.status, infinite, one.unique, guess)

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._math.arrays import repeated, summed
+from pushjax._math.sums import repeated, summed
 from pushjax.friction.polynomial import Polynomial
 
 NO_EDGE = -1  # the number of an edge or a contact that is not there

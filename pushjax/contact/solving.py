@@ -3,7 +3,7 @@
 In a rollout, one contact alone is tried first (`single_first`), for every example. Where it does not suffice, the cone
 edges that carried the force in the stage before mostly carry it again: their equations are solved and every condition
 is checked (`finish`). A search follows where they do not solve the problem. In a batch, guess and search are done only
-for the examples that need them (`batch_last`). Where there are several motions, the one that continues is then the
+for the examples that need them (`in_tiles`). Where there are several motions, the one that continues is then the
 answer, although another may have larger power, which `solve_contacts` gives.
 
 Derivatives are those of the solution (`derivative`), whatever found it.
@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from pushjax._internal.autodiff import search_result
-from pushjax._internal.batch_last import batch_last, in_search_tiles
+from pushjax._internal.tiles import in_search_tiles, in_tiles
 from pushjax._internal.trailing_batch import with_batch_last
 from pushjax._internal.xla import compute_once, tree_where
-from pushjax._math.arrays import summed
+from pushjax._math.sums import summed
 from pushjax.contact.contact_plane import Contact
 from pushjax.contact.derivative import differentiable_solution
 from pushjax.contact.exhaustive import Continuing
@@ -77,10 +77,10 @@ def _solve(arguments: tuple[Problem, EdgeSet | None], settings: tuple[ContactSol
     attempt = _without_friction if isinstance(solver, Frictionless) else partial(_attempt, *settings)
     arrays = _arrays(problem)
     if not isinstance(solver, Continuing) or guess is None:
-        return batch_last(attempt, jnp.ones((), bool), jnp.zeros((), bool), arrays, None)
+        return in_tiles(attempt, jnp.ones((), bool), jnp.zeros((), bool), arrays, None)
     contacts = contacts.where(active)
     suffices, one, is_own = solve_most_pressed(form, contacts)
-    together = batch_last(attempt, ~suffices, guess.exists(), arrays, guess)
+    together = in_tiles(attempt, ~suffices, guess.exists(), arrays, guess)
     # computed once, or each entry of the answer would compute all of it again
     modes = one.mode == ContactMode.STICKING, one.mode == ContactMode.SLIDING_LEFT
     floats = one.twist, one.wrench, one.force

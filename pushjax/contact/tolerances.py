@@ -3,11 +3,23 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._math.arrays import dot, summed
+from pushjax._math.arrays import dot
+from pushjax._math.sums import summed
 
 # Up to this factor above `max_twist_ratio`, a twist still shows that a motion exists. Beyond it, rows that are
 # dependent up to roundoff can give any number.
 TOO_FAST = 8
+
+
+def relative_tolerance(dtype) -> float:
+    """Tolerance on a condition, relative to the fastest pusher or the whole force: 4e-10, or 7e-5 in float32."""
+    return float(jnp.finfo(dtype).eps) ** 0.6
+
+
+def ill_conditioned_tolerance(dtype) -> float:
+    """Tolerance where the slider moves much faster than its pushers, which magnifies roundoff: 6e-9 in float64."""
+    # in float32 it is the same as `relative_tolerance`, because there are no digits to spare
+    return relative_tolerance(dtype) * (15 if jnp.finfo(dtype).bits > 32 else 1)
 
 
 def kinematic_tolerance(twist: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:
@@ -21,12 +33,6 @@ def kinematic_tolerance(twist: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]
     return jnp.where(is_slow(dot(twist, twist)), usual, 8 * eps * size)
 
 
-def ill_conditioned_tolerance(dtype) -> float:
-    """Tolerance where the slider moves much faster than its pushers, which magnifies roundoff: 6e-9 in float64."""
-    # in float32 it is the same as `relative_tolerance`, because there are no digits to spare
-    return relative_tolerance(dtype) * (15 if jnp.finfo(dtype).bits > 32 else 1)
-
-
 def max_twist_ratio(dtype) -> float:
     """Largest twist that can be an answer, in units of the fastest pusher: 4.5e7 in float64, 840 in float32."""
     # For a twist of this size roundoff alone violates a condition by 1e-8, or by 1e-4 in float32. `Motion` promises no
@@ -37,11 +43,6 @@ def max_twist_ratio(dtype) -> float:
 def is_slow(squared: Float[Array, "*rest"], factor: float = 1) -> Bool[Array, "*rest"]:
     """Whether a twist with this square is at most a multiple of `max_twist_ratio`."""
     return squared <= (factor * max_twist_ratio(squared.dtype)) ** 2
-
-
-def relative_tolerance(dtype) -> float:
-    """Tolerance on a condition, relative to the fastest pusher or the whole force: 4e-10, or 7e-5 in float32."""
-    return float(jnp.finfo(dtype).eps) ** 0.6
 
 
 def same_solution_tolerance(dtype) -> float:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from pushjax._internal.batch_last import batch_last, in_search_tiles
+from pushjax._internal.tiles import in_search_tiles, in_tiles
 from pushjax._math.arrays import FULL
 from pushjax._math.linalg import cholesky
 from pushjax.friction.sum_of_squares import MONOMIAL_SUMS
@@ -120,7 +120,7 @@ def max_feasible_scale(gram: Gram, reference: Gram, *, enough: float, tolerance:
         `converged`. Where not even the least of `INITIAL_SCALES` is feasible, the scale is minus infinity.
     """
     attempt, yes = partial(_attempt, enough, tolerance), jnp.ones((), bool)
-    return batch_last(attempt, yes, yes & (enough < np.inf), gram, reference)
+    return in_tiles(attempt, yes, yes & (enough < np.inf), gram, reference)
 
 
 class _Entries(NamedTuple):

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from pushjax._math.arrays import ENTRIES, FULL, dot, repeated, summed
+from pushjax._math.arrays import ENTRIES, FULL, dot
+from pushjax._math.sums import repeated, summed
 
 
 class Polynomial(NamedTuple):

@@ -33,23 +33,23 @@ def covered_cells(shape: Shape, points: int) -> tuple[np.ndarray, np.ndarray]:
             f"{float(shape.area) / float(np.prod(high - low)):.2g}; give `Support.points`, or turn its frame"
         )
     boxes = [_cells(low, high, spacing) for spacing in spacings]
-    distance = _distances(shape, np.concatenate([middles for middles, _ in boxes]).astype(dtype))
-    at_middles = np.split(distance, np.cumsum([len(middles) for middles, _ in boxes])[:-1])
-    # cells that are outside as a whole have no part in the support
+    center_distances = _distances(shape, np.concatenate([centers for centers, _ in boxes]).astype(dtype))
+    at_centers = np.split(center_distances, np.cumsum([len(centers) for centers, _ in boxes])[:-1])
+    # cells that lie outside as a whole bear nothing
     grids = [
-        (middles[distance <= 0.51 * np.hypot(*cell)], cell)
-        for (middles, cell), distance in zip(boxes, at_middles, strict=True)
+        (centers[distance <= 0.51 * np.hypot(*cell)], cell)
+        for (centers, cell), distance in zip(boxes, at_centers, strict=True)
     ]
-    most = max(len(middles) for middles, _ in grids)  # pad all to one length, to compile once
+    most = max(len(centers) for centers, _ in grids)  # pad all to one length, to compile once
     # samples nearer to the outline than this count half, because roundoff would decide whether they are inside
     tolerance = 64 * np.finfo(dtype).eps * max(np.abs(low).max(), np.abs(high).max())
     best: tuple[np.ndarray, np.ndarray] | None = None
-    for middles, cell in grids:
-        samples = _samples(middles, cell)
-        padded = np.concatenate([samples, np.broadcast_to(low, ((most - len(middles)) * SAMPLES**2, 2))])
-        depth = _distances(shape, padded.astype(dtype))[: len(samples)]
-        inside = np.where(depth < -tolerance, 1.0, np.where(depth <= tolerance, 0.5, 0.0))
-        found = _covered_parts(samples, middles, inside)
+    for centers, cell in grids:
+        samples = _samples(centers, cell)
+        padded = np.concatenate([samples, np.broadcast_to(low, ((most - len(centers)) * SAMPLES**2, 2))])
+        distance = _distances(shape, padded.astype(dtype))[: len(samples)]
+        inside = np.where(distance < -tolerance, 1.0, np.where(distance <= tolerance, 0.5, 0.0))
+        found = _covered_parts(samples, centers, inside)
         if best is None or abs(len(found[0]) - points) < abs(len(best[0]) - points):
             best = found
         if len(best[0]) == points:
@@ -66,22 +66,22 @@ def _cells(low: np.ndarray, high: np.ndarray, spacing: float) -> tuple[np.ndarra
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2), cell
 
 
-def _samples(middles: np.ndarray, cell: np.ndarray) -> np.ndarray:
+def _samples(centers: np.ndarray, cell: np.ndarray) -> np.ndarray:
     """Return the sample points of cells, shape (cells * SAMPLES^2, 2), m."""
     offset = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     offsets = np.stack(np.meshgrid(offset * cell[0], offset * cell[1], indexing="ij"), axis=-1).reshape(-1, 2)
-    return (middles[:, None] + offsets[None]).reshape(-1, 2)
+    return (centers[:, None] + offsets[None]).reshape(-1, 2)
 
 
-def _covered_parts(samples: np.ndarray, middles: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _covered_parts(samples: np.ndarray, centers: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each cell with a sample inside, the mean of its inside samples and the fraction of it inside."""
-    inside = inside.reshape(len(middles), -1)
+    inside = inside.reshape(len(centers), -1)
     fraction = inside.mean(axis=1)
     mean = (
         np.sum(samples.reshape(*inside.shape, 2) * inside[..., None], axis=1)
         / np.maximum(inside.sum(axis=1), 0.5)[:, None]
     )
-    mean = np.where((fraction == 1)[:, None], middles, mean)
+    mean = np.where((fraction == 1)[:, None], centers, mean)
     return mean[fraction > 0], fraction[fraction > 0]
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from pushjax._internal.checks import ArrayLike, checked_array, concrete, in_numpy
 from pushjax._internal.jit import quick_jit
-from pushjax._internal.xla import compute_once
+from pushjax._internal.xla import compute_once, entry_at
 from pushjax._math.vec import Vec2
 from pushjax.geometry.shape import Shape, equally_spaced, find_self_intersection, signed_area
 from pushjax.geometry.spline import SAMPLES, SplineOutline, spline_segments
@@ -197,7 +197,7 @@ def _evaluate(control: Any, parameter: Any, xp: Any = jnp) -> tuple[Vec2, Vec2, 
     """Return the point and its first and second derivative at parameters of any shape, counted in segments."""
     # with NumPy as `xp` in float64, whatever precision JAX runs in
     index = xp.floor(parameter).astype(int)
-    return spline_segments(control, xp).select(index % len(control)).evaluate(parameter - index, xp)
+    return entry_at(spline_segments(control, xp), index % len(control)).evaluate(parameter - index, xp)
 
 
 def _checked_signed_area(control: np.ndarray) -> float:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from pushjax._internal.xla import compute_once, tree_where
+from pushjax._internal.xla import compute_once, entry_at, tree_where
 from pushjax._math.roots import Proposal, bracketed_root
 from pushjax._math.vec import Scalar, Vec2
 from pushjax.geometry.shape import ClosestPoint, FacingPoints, Outline
@@ -56,10 +56,6 @@ class SplineSegment(NamedTuple):
         """Return the third derivative with respect to t, for t from -1 to 2, m."""
         right, left = jnp.where(t > 1, 6.0, 0.0), jnp.where(t < 0, 6.0, 0.0)
         return self.c3.scale(6) + self.right_jump.scale(right) - self.left_jump.scale(left)
-
-    def select(self, index: Any) -> "SplineSegment":
-        """Return the segment, or the segments, at an index of the array."""
-        return jax.tree.map(lambda field: field[index], self)
 
 
 def spline_segments(control: Float[Array, "controls 2"], xp: Any = jnp) -> SplineSegment:
@@ -134,7 +130,7 @@ class SplineOutline(Outline):
         # Positions are in intervals from the first node. The parameter can lie a little past the segment's ends.
         count = self.segments.c0.x.size
         index = jnp.clip(jnp.floor(position / SAMPLES).astype(int), 0, count - 1)
-        segment = self.segments.select(index)
+        segment = entry_at(self.segments, index)
         fixed_segment, x = jax.lax.stop_gradient((segment, x))
         initial = position / SAMPLES - index
 

@@ -39,26 +39,30 @@ def are_valid(bodies: Sequence[Shape | RoundFinger | Pad | Wall | Fixture], leng
         shape = body if isinstance(body, Shape) else getattr(body, "shape", None)
         if shape is not None:
             lengths = jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(shape)])
-            valid &= within(lengths, length, is_pose=False) & shape.is_valid()
+            valid &= are_moderate(lengths, length) & shape.is_valid()
             valid &= jnp.max(jnp.abs(lengths)) >= jnp.finfo(length.dtype).eps * length
         if isinstance(body, RoundFinger):
-            valid &= within(body.radius[None], length, is_pose=False) & (body.radius >= 0)
+            valid &= are_moderate(body.radius[None], length) & (body.radius >= 0)
         if isinstance(body, Wall):
-            valid &= within(body.point, length, is_pose=False) & (jnp.sum(body.normal**2) > 0)
+            valid &= are_moderate(body.point, length) & (jnp.sum(body.normal**2) > 0)
         if isinstance(body, Fixture):
-            valid &= within(body.pose, length)
+            valid &= poses_are_moderate(body.pose, length)
         if isinstance(body, Wall | Fixture):
             valid &= (body.friction >= 0) & (body.friction <= MAX_FRICTION)
     return valid
 
 
-def within(pose: Float[Array, "*rows coordinates"], length: Scalar, *, is_pose: bool = True) -> Bool[Array, "*rows"]:
-    """Return whether lengths and angles are no larger than a float resolves to a tenth of `length` and of a radian."""
-    pose, unit = jax.lax.stop_gradient((pose, jnp.broadcast_to(length, pose.shape[-1:])))
-    if is_pose and pose.shape[-1] == 3:  # (x, y, theta); all other numbers are lengths
-        unit = unit.at[2].set(1.0)
-    largest = min(0.1 / float(jnp.finfo(pose.dtype).eps), 1e9)
-    return jnp.all(jnp.abs(pose) <= largest * unit.reshape(*(1,) * (pose.ndim - 1), -1), axis=-1)
+def poses_are_moderate(poses: Float[Array, "*rows width"], length: Scalar) -> Bool[Array, "*rows"]:
+    """Return whether poses (x, y, theta) or centers (x, y) are moderate, in units of `length` and of a radian."""
+    unit = jnp.broadcast_to(length, poses.shape[-1:])
+    return are_moderate(poses, unit.at[2].set(1.0) if len(unit) == 3 else unit)
+
+
+def are_moderate(values: Float[Array, "*rows numbers"], unit: Float[Array, "*numbers"]) -> Bool[Array, "*rows"]:
+    """Return whether all numbers in a row are so small that a float resolves a tenth of their unit."""
+    values, unit = jax.lax.stop_gradient((values, jnp.broadcast_to(unit, values.shape[-1:])))
+    largest = min(0.1 / float(jnp.finfo(values.dtype).eps), 1e9)
+    return jnp.all(jnp.abs(values) <= largest * unit.reshape(*(1,) * (values.ndim - 1), -1), axis=-1)
 
 
 def valid_path(hand: Hand, path: Float[Array, "steps+1 dof"], length: Scalar) -> tuple[Array, Bool[Array, "steps+1"]]:
@@ -73,5 +77,5 @@ def valid_path(hand: Hand, path: Float[Array, "steps+1 dof"], length: Scalar) ->
         return jnp.where(mask, rows, jnp.where(jnp.any(valid), first, 0.0))
 
     poses = hand.poses(replaced(path))
-    valid &= jnp.all(within(poses, length), axis=1)
+    valid &= jnp.all(poses_are_moderate(poses, length), axis=1)
     return replaced(poses), valid

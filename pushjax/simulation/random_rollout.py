@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from pushjax._internal.checks import ArrayLike, check_key, check_type
 from pushjax._internal.jit import quick_jit
+from pushjax._internal.xla import entry_at
 from pushjax.contact.problem import check_solver, form_and_friction
 from pushjax.contact.scaled_problem import ContactSolver
 from pushjax.contact.sticking import StickingSolver
@@ -86,13 +87,10 @@ def rollout_under_draws(
     friction = jnp.broadcast_to(draws.friction[:, None], (len(draws.friction), len(hand.fingers)))
     surfaces_and_frictions = jax.vmap(form_and_friction)(draws.surface, friction.astype(pose.dtype))
 
-    def draw_at(index):
-        return jax.tree.map(lambda leaf: leaf[index], surfaces_and_frictions)
-
-    first_draw = draw_at(0)
+    first_draw = entry_at(surfaces_and_frictions, 0)
 
     def friction_at(step, pose):
-        return first_draw if resample_every is None else draw_at(step // resample_every)
+        return first_draw if resample_every is None else entry_at(surfaces_and_frictions, step // resample_every)
 
     return simulate(shape, hand, path, pose, solver, friction_on_table(table, friction_at), fixtures)
 

@@ -35,7 +35,7 @@ from pushjax.simulation.arguments import (
     warn_about_units,
 )
 from pushjax.simulation.detection import num_contacts
-from pushjax.simulation.domain import MAX_FRICTION, are_valid, replace_invalid, valid_path, within
+from pushjax.simulation.domain import MAX_FRICTION, are_valid, poses_are_moderate, replace_invalid, valid_path
 from pushjax.simulation.finger_motion import (
     finger_motions,
     fixture_motions,
@@ -245,7 +245,7 @@ def simulate(
     configuration = path[jnp.minimum(index, last_done)]
     configuration += jnp.where((index > last_done)[:, None], last_displacement[None], 0.0)
     poses = jnp.concatenate([first_pose[None], results.pose])
-    poses = jnp.where(within(pose, length), poses, pose)
+    poses = jnp.where(poses_are_moderate(pose, length), poses, pose)
     other_fields = {name: getattr(results, name) for name in Step.__dataclass_fields__ if name != "pose"}
     return Trajectory(pose=poses, configuration=configuration, **other_fields)
 
@@ -265,7 +265,7 @@ def prepared_push(
         are_valid((shape,), length),
         are_valid(hand.fingers, length),
         are_valid(fixtures, length),
-        within(pose, length),
+        poses_are_moderate(pose, length),
     )
     poses, row_valid = valid_path(hand, path, length)
     row_valid &= shape_valid & hand_valid & fixtures_valid & pose_valid

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from pushjax import tasks
 from pushjax._internal.checks import ArrayLike, as_float, check_count, check_finite, check_shape, check_type
+from pushjax._internal.xla import entry_at
 from pushjax.tasks import episodes
 from pushjax.tasks.environment import Environment, TaskState
 from pushjax.tasks.spaces import Box, Dict, Space
@@ -262,7 +263,7 @@ class TaskVectorEnv(VectorEnv):
         """
         if self.render_mode is None or self._states is None:
             return None
-        states = (jax.tree.map(lambda leaf, i=i: leaf[i], self._states) for i in range(self.num_envs))
+        states = (entry_at(self._states, i) for i in range(self.num_envs))
         return tuple(
             np.array(episodes.picture(self.task, state, None, self.params, self.render_size)) for state in states
         )

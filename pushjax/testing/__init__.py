@@ -24,5 +24,5 @@ from pushjax.testing.condition_violations import closing as closing
 from pushjax.testing.condition_violations import violations as violations
 from pushjax.testing.independent_search import SearchResult as SearchResult
 from pushjax.testing.independent_search import search as search
-from pushjax.testing.jam_check import squeeze_power as squeeze_power
-from pushjax.testing.jam_check import squeeze_power_enumerated as squeeze_power_enumerated
+from pushjax.testing.squeeze import squeeze_power as squeeze_power
+from pushjax.testing.squeeze import squeeze_power_enumerated as squeeze_power_enumerated

@@ -1,10 +1,10 @@
-"""Sums and repetitions of `_math.arrays`, which are primitives of their own, under every transformation."""
+"""Sums and repetitions of `_math.sums`, which are primitives of their own, under every transformation."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pushjax._math.arrays import repeated, summed
+from pushjax._math.sums import repeated, summed
 
 X = np.random.default_rng(0).normal(size=(3, 4, 5))
 CASES = [(lambda x, axis=axis: summed(x, axis), lambda x, axis=axis: jnp.sum(x, axis)) for axis in (0, -1, (0, 1))]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from pushjax._internal.compaction import flat_batch, tile_size
+from pushjax._internal.xla import entry_at
 
 # Examples that are computed together on a CPU by a program of many small kernels, most of whose time is that of their
 # start, and examples that are searched together, whose data are many times as large.
@@ -20,7 +21,7 @@ TILE, SEARCH_TILE = 256, 128
 Attempt = Callable[..., tuple[Any, Bool[Array, " batch"]]]
 
 
-def batch_last(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any) -> Any:
+def in_tiles(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array, ""], *args: Any) -> Any:
     """Return results of `attempt` for one example or a batch, under any nesting of `vmap`; zeros if not needed."""
     # The examples that need it are gathered into tiles, so that their data stay in the cache. Those that want a second
     # attempt, or have no first one, are gathered into tiles of their own, which follow. One program serves both. It
@@ -30,28 +31,28 @@ def batch_last(attempt: Attempt, needed: Bool[Array, ""], has_first: Bool[Array,
 
     # `vmap` asks for a batch several times. As a function of its own, it is traced for the first time only.
     @partial(jax.jit, static_argnums=0)
-    def in_tiles(batched: tuple[bool, ...], wanted: Array, args: Any) -> Any:
-        return _in_tiles(attempt, wanted, jax.tree.unflatten(structure, batched), args)
+    def of_batch(batched: tuple[bool, ...], wanted: Array, args: Any) -> Any:
+        return _tile_by_tile(attempt, wanted, jax.tree.unflatten(structure, batched), args)
 
     @jax.custom_batching.custom_vmap
     def single(wanted, args):
-        results = in_tiles((False,) * structure.num_leaves, wanted[None], args)
-        return jax.tree.map(lambda x: x[0], results)
+        results = of_batch((False,) * structure.num_leaves, wanted[None], args)
+        return entry_at(results, 0)
 
     @single.def_vmap
     def _(size, batched, wanted, args):
         wanted = wanted if batched[0] else jnp.broadcast_to(wanted, (size, 2))
-        return _batching_rule(in_tiles, size, batched[1], wanted, args)
+        return _batching_rule(of_batch, size, batched[1], wanted, args)
 
     return single(wanted, args)
 
 
-def _batching_rule(in_tiles: Callable[..., Any], size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
-    """Batching rule of `batch_last`: the results, and which leaves are batched (all)."""
+def _batching_rule(of_batch: Callable[..., Any], size: int, batched: Any, wanted: Array, args: Any) -> tuple[Any, Any]:
+    """Batching rule of `in_tiles`: the results, and which leaves are batched (all)."""
 
     @jax.custom_batching.custom_vmap
     def batch(wanted, args):
-        return in_tiles(tuple(jax.tree.leaves(batched)), wanted, args)
+        return of_batch(tuple(jax.tree.leaves(batched)), wanted, args)
 
     @batch.def_vmap
     def _(outer_size, outer_batched, wanted, args):
@@ -60,19 +61,19 @@ def _batching_rule(in_tiles: Callable[..., Any], size: int, batched: Any, wanted
         either = jax.tree.map(lambda inner, outer: inner or outer, batched, args_have_outer)
         flat_args = jax.tree.map(flat, args, batched, args_have_outer)
         flat_wanted = flat(wanted, True, wanted_has_outer)
-        results, all_batched = _batching_rule(in_tiles, outer_size * size, either, flat_wanted, flat_args)
+        results, all_batched = _batching_rule(of_batch, outer_size * size, either, flat_wanted, flat_args)
         return jax.tree.map(lambda x: x.reshape(outer_size, size, *x.shape[1:]), results), all_batched
 
     results = batch(wanted, args)
     return results, jax.tree.map(lambda _: True, results)
 
 
-def _in_tiles(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any) -> Any:
+def _tile_by_tile(attempt: Attempt, wanted: Bool[Array, "size 2"], batched: Any, args: Any) -> Any:
     """The results of a batch, with the batch first, tile by tile; `wanted` has the first and the second attempt."""
     size = wanted.shape[0]
     if not size:
         one = jax.tree.map(lambda x, b: jnp.zeros((1, *x.shape[1:]), x.dtype) if b else x, args, batched)
-        return jax.tree.map(lambda x: x[:0], _in_tiles(attempt, jnp.zeros((1, 2), bool), batched, one))
+        return jax.tree.map(lambda x: x[:0], _tile_by_tile(attempt, jnp.zeros((1, 2), bool), batched, one))
     tile = min(tile_size(TILE), size)
 
     @jax.jit  # traced once, for the shapes and for the loop

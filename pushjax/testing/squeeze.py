@@ -13,17 +13,6 @@ SINGULAR, REGULAR = 1e-13, 1e-6
 SHARE = 1e-10
 
 
-def _edges(batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normalized wrench (N, 2 m, 3) and the power (N, 2 m), in m, of each friction-cone edge."""
-    # Both are at unit normal force. The power is f . displacement - f_n gap.
-    rows, motion = batch.rows(), batch.approach()
-    signed_friction = batch.friction[..., None] * np.array([1.0, -1.0])
-    wrench = rows[:, :, None, 0] + signed_friction[..., None] * rows[:, :, None, 1]
-    power = motion[..., None, 0] + signed_friction * motion[..., None, 1]
-    n = len(batch)
-    return wrench.reshape(n, -1, 3), power.reshape(n, -1)
-
-
 def squeeze_power(batch: ProblemBatch) -> np.ndarray:
     """Return the largest work of the pushers on contact forces that balance each other, per newton of normal force.
 
@@ -106,3 +95,14 @@ def squeeze_power_enumerated(batch: ProblemBatch) -> np.ndarray:
     if rest.any():
         best[rest] = squeeze_power(batch.take(rest))
     return best
+
+
+def _edges(batch: ProblemBatch) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normalized wrench (N, 2 m, 3) and the power (N, 2 m), in m, of each friction-cone edge."""
+    # Both are at unit normal force. The power is f . displacement - f_n gap.
+    rows, motion = batch.rows(), batch.approach()
+    signed_friction = batch.friction[..., None] * np.array([1.0, -1.0])
+    wrench = rows[:, :, None, 0] + signed_friction[..., None] * rows[:, :, None, 1]
+    power = motion[..., None, 0] + signed_friction * motion[..., None, 1]
+    n = len(batch)
+    return wrench.reshape(n, -1, 3), power.reshape(n, -1)
