@@ -2,9 +2,9 @@
 
 The semi-axes are a along x and b along y; coordinates are relative to the center. The outline is parameterized by a
 unit vector q = (c, s) = (cos phi, sin phi). The point at q is p = (a c, b s), and the outward normal n is (b c, a s),
-normalized. A fixed number of bracketed iterations, which JAX does not differentiate, finds
-the root. One more, differentiable iteration then gives the root its derivatives. Derivatives are by phi, but angles
-appear only as small rotations of q.
+normalized. A fixed number of bracketed iterations, which JAX does not differentiate, finds the root. One more,
+differentiable iteration then gives the root its derivatives. Derivatives are by phi, but angles appear only as small
+rotations of q.
 
 Closest point to x: q is a critical point of the distance where f(q) = (a^2 - b^2) s c - a |x| s + b |y| c = 0. In the
 quadrant of (|x|, |y|), f falls through zero at exactly one q, and this is the closest point. The iterations use

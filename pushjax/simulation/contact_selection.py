@@ -19,8 +19,8 @@ from pushjax.simulation.candidate import Candidates, Features, Touches, pick
 # a polygon. The second is for a smooth outline, where a corner of a pad and its edge both find the same bump.
 SAME_PLACE, SAME_BUMP = 1e-3, 0.1
 # A candidate counts as nearer by this fraction of its distance from the middle of all candidates. So of candidates that
-# are equally near up to roundoff, the outermost is selected. Not so on a polygon that is not convex, where two more are
-# selected, and where a pad in an inner corner has to rest on that corner.
+# are equally near up to roundoff, the outermost is selected. This does not hold on a polygon that is not convex: there
+# two more candidates are selected, and a pad in an inner corner has to rest on that corner.
 SAME_DISTANCE = 1e-5
 
 
@@ -37,6 +37,7 @@ def select_contacts(
     separation = SAME_PLACE if isinstance(outline, PolygonOutline) else SAME_BUMP
     offset = places.point - _mean(places.point, places.exists)
     preferred = places.distance - (0.0 if shares_place else SAME_DISTANCE) * jnp.sqrt(offset.dot(offset))
+    # travel: how far the slider has to move to touch at each place while it stays in contact at those that are chosen
     eligible, travel = places.exists, jnp.zeros_like(preferred)
     chosen = [jnp.argmin(jnp.where(eligible, preferred, jnp.inf)).astype(jnp.int32)]
     present = [jnp.any(eligible)]
