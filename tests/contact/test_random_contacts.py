@@ -15,6 +15,7 @@ from pushjax.testing import ProblemBatch, violations
 CONDITIONS, RECORDED = 1e-8, 1e-6
 # The same problem in another order, frame or unit: roundoff times the condition of the selected set
 EQUIVALENT = 1e-6
+SLOW = pytest.mark.slow
 
 solve = pj.solve_contacts
 solve_all = jax.jit(jax.vmap(solve), compiler_options=AS_USERS)
@@ -39,8 +40,10 @@ def with_padding(contacts: pj.Contacts) -> pj.Contacts:
     return jax.vmap(fill)(contacts)
 
 
-@pytest.mark.parametrize("kind", [0, 1], ids=["ellipsoid", "quartic"])
-@pytest.mark.parametrize("count", [2, 3, 4])
+RECORDS = [(2, 1), *(pytest.param(count, kind, marks=SLOW) for count, kind in ((2, 0), (3, 0), (3, 1), (4, 0), (4, 1)))]
+
+
+@pytest.mark.parametrize(("count", "kind"), RECORDS)
 def test_recorded_problems(oracle, kind, count):
     record = np.load(oracle / "multi_contact.npz")
     rows = np.resize(np.flatnonzero((record["ls_type"] == kind) & (record["K"] == count)), BATCH)
@@ -72,8 +75,14 @@ def test_recorded_problems(oracle, kind, count):
     np.testing.assert_allclose(squeeze, record["squeeze_power"][rows], atol=1e-9)
 
 
-@pytest.mark.parametrize("degree", [2, 4])
-@pytest.mark.parametrize("count", [1, 2, 3, 4, *(pytest.param(m, marks=pytest.mark.long) for m in (5, 6, 7)), 8])
+NUMBERS = [
+    *((1, 2), (1, 4), (2, 2), (2, 4), (3, 4), (4, 4)),
+    *(pytest.param(count, degree, marks=SLOW) for count, degree in ((3, 2), (4, 2), (8, 2), (8, 4))),
+    *(pytest.param(count, degree, marks=pytest.mark.long) for count in (5, 6, 7) for degree in (2, 4)),
+]
+
+
+@pytest.mark.parametrize(("count", "degree"), NUMBERS)
 def test_random_problems(count, degree):
     """No answer is wrong and no problem stays open.
 
@@ -94,7 +103,7 @@ def test_random_problems(count, degree):
     assert not np.any(np.asarray(motion.twist)[still])
 
 
-@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=SLOW), 4])
 def test_closed_gripper_beside_a_fixture(rng, degree):
     """Two contacts that are exactly opposite and move together, and one that stays: every jam is one."""
     surface, contacts = problems(3, degree, slots=slots(3), gaps=0.0)
@@ -115,7 +124,7 @@ def test_closed_gripper_beside_a_fixture(rng, degree):
     assert counts["jammed"] > BATCH // 10
 
 
-@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("degree", [2, pytest.param(4, marks=SLOW)])
 def test_one_contact_has_the_same_answer(degree):
     surface, contacts = problems(1, degree)
     one = solve_all(surface, contacts)
@@ -133,7 +142,7 @@ def test_one_contact_has_the_same_answer(degree):
     assert worst[moving].max() < CONDITIONS
 
 
-@pytest.mark.slow
+@SLOW
 def test_order_frame_mirror_and_padding_do_not_matter():
     surface, contacts = problems(3, seed=3, slots=slots(3))
     order = np.random.default_rng(0).permutation(MOST)
@@ -181,7 +190,7 @@ def compare(a, b, order=slice(None)):
     np.testing.assert_allclose(a.margin, b.margin, rtol=1e-7, atol=1e-10)
 
 
-@pytest.mark.parametrize("degree", [2, 4])
+@pytest.mark.parametrize("degree", [pytest.param(2, marks=SLOW), 4])
 def test_a_receding_pusher_can_drag_the_slider_along(degree, rng):
     """Beyond 90 degrees of the motion cone, one contact pulls by friction and the others only just touch.
 
@@ -230,7 +239,7 @@ def test_a_receding_pusher_can_drag_the_slider_along(degree, rng):
     assert not np.any(other & np.asarray(motion.unique))
 
 
-@pytest.mark.slow
+@SLOW
 def test_float32():
     """In float32 no answer is wrong either.
 
@@ -254,7 +263,7 @@ def test_float32():
     assert np.mean(status[settled] == np.asarray(exact.status)[settled]) > 0.999
 
 
-@pytest.mark.slow
+@SLOW
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_projected_is_right_where_it_answers(count):
     surface, contacts = problems(count, seed=9, condition=100.0)

@@ -171,7 +171,7 @@ def frictionless(leaning: float, count: int, angle: float) -> pj.Contacts:
     return pj.Contacts(jnp.asarray(point), jnp.asarray(normal), jnp.asarray(1e-3 * normal), 0.0, active=active)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("count", [2, 3])
 def test_frictionless_fingers_jam_where_their_forces_balance_to_rounding(dtype, count):
     """At any angle they jam; tilted a little more than roundoff, they squeeze the slider out."""

@@ -134,9 +134,9 @@ def fan(steps: int, **kwargs) -> list[Push]:
 # --- recorded answers ---
 
 
-def six_corners(vertices: np.ndarray) -> np.ndarray:
-    """Return the same polygon with its longest edges split, so that all recorded shapes share one program."""
-    while len(vertices) < 6:
+def eight_corners(vertices: np.ndarray) -> np.ndarray:
+    """Return the same polygon with its longest edges split, so that all but the square share one program."""
+    while len(vertices) < 8:
         edge = np.roll(vertices, -1, axis=0) - vertices
         longest = np.argmax(np.hypot(edge[:, 0], edge[:, 1]))
         vertices = np.insert(vertices, longest + 1, vertices[longest] + edge[longest] / 2, axis=0)
@@ -165,7 +165,7 @@ def recorded_push(d, row: int, start: int = 0, squared: bool = True) -> Push:
         pose=d["obj_ref_tight"][row, start],
         friction=d["mu"][row],
         radius=d["finger_radius"][row],
-        vertices=six_corners(d["vertices"][row, : d["n_vertices"][row]]),
+        vertices=eight_corners(d["vertices"][row, : d["n_vertices"][row]]),
         surface=surface,
         length=d["rho"][row],
     )
@@ -313,7 +313,7 @@ def test_no_contact_with_the_extension_of_an_edge():
         assert not push.force.any()
 
 
-ANGLE = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.03], [0.03, 0.03], [0.03, 0.1], [0.0, 0.1]]) - 0.035
+ANGLE = eight_corners(np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.03], [0.03, 0.03], [0.03, 0.1], [0.0, 0.1]]) - 0.035)
 
 
 def test_from_one_wall_to_another_within_a_step():
@@ -337,6 +337,26 @@ def test_sliding_into_a_concave_corner():
     push = run_all([straight(start, -120, 0.05, 100, vertices=ANGLE, friction=0.1)])[0]
     assert np.isin(push.status, [Status.MOVING, Status.FREE]).all()
     assert push.gap.min() > -2e-5
+
+
+def test_a_finger_that_touches_may_leave_and_cross_a_hollow(rng):
+    """It then pushes the other side from where it meets it; the one that it leaves does not matter."""
+    arms = [(-50, -50), (50, -50), (50, 50), (25, 50), (25, -20), (-25, -20), (-25, 50), (-50, 50)]
+    gap = np.repeat([0.0, 1e-12, -1e-6, 1e-4], 6)
+    starts = np.stack([-0.019 + gap, rng.uniform(0, 0.04, 24)], axis=1)
+    ends = starts + np.stack([rng.uniform(0.0385, 0.0405, 24), rng.uniform(-2e-3, 2e-3, 24)], axis=1)
+    given = {"vertices": np.array(arms) * 1e-3, "radius": 0.006, "friction": 0.3}
+    coarse, fine = (
+        np.stack(
+            [
+                push.pose[-1]
+                for push in run_all([Push(line(a, b, n), **given) for a, b in zip(starts, ends, strict=True)])
+            ]
+        )
+        for n in (1, 64)
+    )
+    np.testing.assert_allclose(coarse, fine, atol=2e-4)
+    assert np.max(np.abs(fine)) > 1e-3
 
 
 def test_free_motion_leaves_the_pose_bit_identical():

@@ -1,5 +1,8 @@
 """Pads against smooth outlines: the points that face them, when they meet, and where a jaw closes."""
 
+import functools
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,29 +28,45 @@ def wavy() -> pj.Curve:
     return pj.Curve.through(np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1))
 
 
+@functools.cache
 def shapes():
-    return {"ellipse": pj.Ellipse(*SEMI, center=(0.002, -0.001)), "curve": wavy(), "butterfly": butterfly().shape}
+    disk, square = pj.Disk(0.02, center=(0.002, -0.001)), pj.Polygon.rectangle(0.03, 0.03)
+    angle = np.pi * np.arange(10) / 5
+    star = np.where(np.arange(10) % 2, 0.009, 0.02)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    smooth = {"ellipse": pj.Ellipse(*SEMI, center=(0.002, -0.001)), "curve": wavy(), "butterfly": butterfly().shape}
+    return smooth | {"disk": disk, "square": square, "star": pj.Polygon(star)}
 
 
-def dense(shape, count=40_000) -> np.ndarray:
-    return np.asarray(shape.boundary(count))
+@functools.cache
+def dense(name: str, count: int = 40_000) -> np.ndarray:
+    return np.asarray(jax.jit(lambda shape: shape.boundary(count))(shapes()[name]))
+
+
+@functools.cache
+def outline_of(name: str):
+    return eqx.filter_jit(lambda shape: shape.outline())(shapes()[name])
+
+
+@eqx.filter_jit
+def facing_all(shape, directions):
+    return jax.vmap(lambda d: shape.outline().facing(Vec2.of(d)))(directions)
 
 
 @pytest.mark.parametrize("name", ["ellipse", "curve", "butterfly", "disk"])
 def test_facing_is_every_place_that_stands_out(name):
     """`facing` finds all local maxima of the height over a direction where a dense outline is convex, and no others."""
-    shape = (shapes() | {"disk": pj.Disk(0.02, center=(0.002, -0.001))})[name]
-    points, found = dense(shape), jax.jit(lambda d: shape.outline().facing(d))
+    points = dense(name)
+    # the outward normal: clockwise from the direction of travel
+    velocity = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
     # the axes of the ellipse and of the butterfly are where their pieces join
-    for angle in (*np.linspace(0.01, 6.2, 12), *(k * np.pi / 2 for k in range(4))):
-        d = np.array([np.cos(angle), np.sin(angle)])
+    angle = np.concatenate([np.linspace(0.01, 6.2, 12), np.arange(4) * np.pi / 2])
+    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    found = jax.tree.map(np.asarray, facing_all(shapes()[name], directions))
+    for k, d in enumerate(directions):
         height = points @ d
-        # the outward normal: clockwise from the direction of travel
-        velocity = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
         outward = velocity[:, 1] * d[0] - velocity[:, 0] * d[1] > 0
         peaks = (height > np.roll(height, 1)) & (height >= np.roll(height, -1)) & outward
-        facing = found(Vec2.of(jnp.asarray(d)))
-        mine = np.stack([facing.point.x, facing.point.y], axis=1)[np.asarray(facing.valid)]
+        mine = np.stack([found.point.x[k], found.point.y[k]], axis=1)[found.valid[k]]
         assert len(np.unique(np.round(mine / 1e-5), axis=0)) >= peaks.sum() > 0
         apart = np.linalg.norm(mine[:, None] - points[peaks][None], axis=-1)
         assert np.all(apart.min(axis=1) < 1e-5)
@@ -55,10 +74,9 @@ def test_facing_is_every_place_that_stands_out(name):
 
 
 def test_derivatives_of_facing():
-    outline = wavy().outline()
-
+    @jax.jit
     def point(angle):
-        facing = outline.facing(Vec2(jnp.cos(angle), jnp.sin(angle)))
+        facing = wavy().outline().facing(Vec2(jnp.cos(angle), jnp.sin(angle)))
         return jnp.stack([jnp.where(facing.valid, facing.point.x, 0.0), jnp.where(facing.valid, facing.point.y, 0.0)])
 
     angle, h = 0.7, 1e-6
@@ -71,10 +89,12 @@ def pad() -> Pad:
     return pj.Hand.parallel_jaw(0.027, 0.010).fingers[0]
 
 
+@eqx.filter_jit
 def depth_of(finger, outline, pose):
     return -pair_of(finger, outline).distance(finger, outline, pose)[0]
 
 
+@eqx.filter_jit
 def candidates(finger, outline, pose, displacement):
     """Return where a pad and an outline may touch, with a pad that moves as a whole."""
     found = pair_of(finger, outline).candidates(finger, outline, pose, lambda _: displacement, jnp.asarray(LENGTH))
@@ -92,10 +112,10 @@ def placed(x, y, turn) -> FingerPose:
     return FingerPose(Vec2(jnp.asarray(x), jnp.asarray(y)), Vec2(jnp.asarray(np.cos(turn)), jnp.asarray(np.sin(turn))))
 
 
-@pytest.mark.parametrize("name", ["ellipse", "butterfly"])
+@pytest.mark.parametrize("name", ["ellipse", pytest.param("butterfly", marks=pytest.mark.slow)])
 def test_meets_where_brute_force_does(name, rng):
-    shape, finger = shapes()[name], pad()
-    outline, points, bounds = shape.outline(), dense(shape, 4000), [np.asarray(b) for b in finger.shape.bounds]
+    finger, points = pad(), dense(name, 4000)
+    outline, bounds = outline_of(name), [np.asarray(b) for b in finger.shape.bounds]
     resting, zero = BodyFrame.at(Vec3(*jnp.zeros(3))), jnp.zeros(())
 
     def met_at(center, angle, path):
@@ -103,7 +123,6 @@ def test_meets_where_brute_force_does(name, rng):
         return time_of_impact((motion,), outline, resting, jnp.asarray(LENGTH))
 
     met = jax.jit(met_at)
-    deep = jax.jit(lambda at: depth_of(finger, outline, at))
     hits = 0
     for _ in range(25):
         turn, aside = rng.uniform(-0.6, 0.6), rng.uniform(-0.03, 0.03)
@@ -117,37 +136,32 @@ def test_meets_where_brute_force_does(name, rng):
         assert start - 0.002 <= first <= start + 0.0125 or (first == 1.0 and start > 0.98)
         touching = placed(*(begin + start * way), turn)
         if start < 1:
-            assert abs(float(deep(touching))) < 1e-9
+            assert abs(float(depth_of(finger, outline, touching))) < 1e-9
     assert hits > 10
 
 
 @pytest.mark.parametrize("name", ["ellipse", "butterfly"])
 def test_places_are_at_their_distance(name):
     """With a pad over the outline, contacts lie on it, at their stated distance from the pad along the normal."""
-    shape, finger = shapes()[name], pad()
+    outline, finger, points = outline_of(name), pad(), dense(name)
     still = Vec2(jnp.zeros(()), jnp.zeros(()))
-    seen = jax.jit(lambda at: candidates(finger, shape.outline(), at, still))
-    deep = jax.jit(lambda at: depth_of(finger, shape.outline(), at))
     for aside, turn in ((0.0, 0.0), (0.004, 0.1), (0.016, -0.2), (0.02, 0.3)):
         at = placed(aside, 0.025, turn)
-        touches = seen(at)
+        touches = jax.tree.map(np.asarray, candidates(finger, outline, at, still))
         near = np.flatnonzero(touches.exists)
         assert near.size
-        points = dense(shape)
         for k in near:
-            point = np.array([float(touches.point.x[k]), float(touches.point.y[k])])
+            point = np.array([touches.point.x[k], touches.point.y[k]])
             assert np.linalg.norm(points - point, axis=1).min() < 1e-5
-            assert np.hypot(float(touches.normal.x[k]), float(touches.normal.y[k])) == pytest.approx(1)
-        assert float(np.min(np.asarray(touches.distance)[near])) == pytest.approx(-float(deep(at)), abs=1e-9)
+            assert np.hypot(touches.normal.x[k], touches.normal.y[k]) == pytest.approx(1)
+        deepest = float(depth_of(finger, outline, at))
+        assert np.min(touches.distance[near]) == pytest.approx(-deepest, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["ellipse", "butterfly", "disk", "square", "star"])
 def test_the_gradient_of_an_overlap_has_length_one(name, rng):
     """The derivative of a maximum must not lose parts where the compiler rounds what it compares in two ways."""
-    angle = np.pi * np.arange(10) / 5
-    star = np.where(np.arange(10) % 2, 0.009, 0.02)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    known = shapes() | {"disk": pj.Disk(0.02), "square": pj.Polygon.rectangle(0.03, 0.03), "star": pj.Polygon(star)}
-    outline = known[name].outline()
+    outline = outline_of(name)
 
     def depth(center, turn):
         pose = FingerPose(Vec2.of(center), Vec2(jnp.cos(turn), jnp.sin(turn)))
