@@ -1,6 +1,7 @@
-"""Sliders as values of command-line options: outlines and supports from text."""
+"""Values of command-line options: outlines, supports and fixtures from text."""
 
 import csv
+import math
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pushjax as pj
 
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
+FIXTURES = "wall@X,Y,ANGLE of its normal, or SHAPE@X,Y,THETA with a shape as in --shape"
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
 NUM_PAIRS = 400  # wrench-twist pairs that a limit surface is fitted to
 NUM_POINTS = 100  # points in place of a continuous pressure, "uniform" or "rim"
@@ -44,6 +46,18 @@ def parse_support(text: str, shape: pj.Shape) -> pj.Support:
         raise ValueError(f"--support: expected {SUPPORTS}; got {text!r}")
     points = [parse_numbers("--support", text, point, ",", 2, SUPPORTS) for point in rest.split(";")]
     return pj.Support.tripod(points) if len(points) == 3 else pj.Support.points(points)
+
+
+def parse_fixture(text: str, friction: float) -> pj.Wall | pj.Fixture:
+    """Return the wall or the fixed body that a value of the option `--fixtures` describes."""
+    kind, _, place = text.rpartition("@")
+    x, y, angle = parse_numbers("--fixtures", text, place, ",", 3, FIXTURES)
+    if kind == "wall":
+        return pj.Wall((x, y), (math.cos(angle), math.sin(angle)), friction=friction)
+    shape = parse_shape(kind, "--fixtures")
+    if isinstance(shape, pj.Ellipse):
+        raise ValueError(f"--fixtures: a body is a disk or a convex polygon; got {text!r}")
+    return pj.Fixture(shape, (x, y, angle), friction=friction)
 
 
 def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSurface:

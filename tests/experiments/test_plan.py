@@ -1,7 +1,6 @@
 """The command that plans pushes: its way points are replayed, and compared with the slider by shapely."""
 
 import csv
-import itertools
 import json
 
 import matplotlib.image
@@ -10,7 +9,7 @@ import pytest
 
 import pushjax as pj
 from pushjax.cli import main as cli
-from pushjax.experiments.plan import experiment
+from pushjax.experiments.plan import Options, experiment
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning import PlanStatus, PushPlan
 from pushjax.planning.between_pushes import transits_between
@@ -26,15 +25,20 @@ ROBUST = ["--goal", "0.03", "0.02", "-0.4", "--symmetry", "2", "--finger", "-0.1
 NOT_CONVEX = ["--goal", "0.04", "0.03", "0.6", "--finger", "-0.1", "0", "--attempts", "1"]
 
 
-def push_through_the_middle(slider, hand, goal, fixtures, options, seed):
-    """A plan that needs no search: a push through the center of a symmetric block, which then only translates."""
+def plan_of(status, path, pose, transits=(), samples=None, success=0.0):
+    """A plan that needs no search."""
+    samples, nothing = pose[None] if samples is None else samples, np.zeros(0)
+    outcomes = Outcomes(samples, np.zeros(len(samples), bool))
+    return PushPlan(status, path, pose, transits, nothing, outcomes, success, 0.0, nothing)
+
+
+def push_through_the_middle(*_, pushes, finger, **__):
+    """Plan a push through the center of a symmetric block, which then only translates."""
     path = np.linspace((-0.06, 0.0), (-0.02, 0.0), 13)[None]
     poses = np.array([(0.0, 0.0, 0.0), (0.03, 0.0, 0.0)])
     samples = poses + np.array([0.0, 1.0])[:, None] * np.linspace(-1e-3, 1e-3, 20)[:, None, None]
-    between = transits_between(BLOCK, RADIUS, options.clearance, path, poses, samples, np.array(options.finger))
-    outcomes = Outcomes(samples, np.zeros(20, bool))
-    nothing = np.zeros(0)
-    yield PushPlan(PlanStatus.FOUND, path, poses, between.transits, nothing, outcomes, 1.0, 0.0, nothing)
+    between = transits_between(BLOCK, RADIUS, float(pushes.clearance), path, poses, samples, np.array(finger))
+    return plan_of(PlanStatus.FOUND, path, poses, between.transits, samples, 1.0)
 
 
 @pytest.fixture(
@@ -53,7 +57,7 @@ def planned(request, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         if options == "without search":
             options = SIMPLE
-            patch.setattr(experiment, "_plans", push_through_the_middle)
+            patch.setattr(experiment, "plan_pushes", push_through_the_middle)
         cli.main(["plan", *options, "--shape", str(folder / "block.csv"), "--out", str(folder)])
     rows = list(csv.DictReader((folder / "way_points.csv").open()))
     points = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
@@ -109,13 +113,12 @@ def test_without_a_transit_there_are_no_way_points(tmp_path, monkeypatch, capsys
     (tmp_path / "way_points.csv").write_text("old")
     notched = 0.04 * np.array([(-1, -1), (1, -1), (1, 1), (0.1, 1), (0.1, 0), (-0.1, 0), (-0.1, 1), (-1, 1)])
 
-    def into_the_notch(slider, hand, goal, fixtures, options, seed):
+    def into_the_notch(*_, pushes, **__):
         path, still = np.array([[(0.0, 0.02), (0.0, 0.0)]]), np.zeros((2, 3))
-        between = transits_between(notched, RADIUS, options.clearance, path, still, still[None])
-        outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
-        yield PushPlan(PlanStatus.NO_TRANSIT, path, still, between.transits, nothing, outcomes, 0.0, 0.0, nothing)
+        between = transits_between(notched, RADIUS, float(pushes.clearance), path, still, still[None])
+        return plan_of(PlanStatus.NO_TRANSIT, path, still, between.transits)
 
-    monkeypatch.setattr(experiment, "_plans", into_the_notch)
+    monkeypatch.setattr(experiment, "plan_pushes", into_the_notch)
     cli.main(["plan", *SIMPLE, "--out", str(tmp_path)])
     assert "no plan: the finger does not get to push 1 (GOAL_BLOCKED)" in capsys.readouterr().out
     assert not (tmp_path / "way_points.csv").exists()
@@ -126,13 +129,11 @@ def test_fixtures_of_a_plan(tmp_path, monkeypatch, capsys):
     """Walls and bodies get to the planner; a finger that would run into one makes no way points."""
     given = []
 
-    def into_the_disk(slider, hand, goal, fixtures, options, seed):
-        given.extend(fixtures)
-        path, still = np.array([[(-0.06, 0.0), (0.0, 0.0)]]), np.zeros((2, 3))
-        outcomes, nothing = Outcomes(still[None], np.zeros(1, bool)), np.zeros(0)
-        yield PushPlan(PlanStatus.HAND_IN_FIXTURE, path, still, (), nothing, outcomes, 0.0, 0.0, nothing)
+    def into_the_disk(_, scene, *__, **___):
+        given[:] = scene.fixtures
+        return plan_of(PlanStatus.HAND_IN_FIXTURE, np.array([[(-0.06, 0.0), (0.0, 0.0)]]), np.zeros((2, 3)))
 
-    monkeypatch.setattr(experiment, "_plans", into_the_disk)
+    monkeypatch.setattr(experiment, "plan_pushes", into_the_disk)
     fixtures = ["wall@0,-0.1,1.5707963267948966", "disk:0.02@0.1,0.05,0", "rectangle:0.1x0.02@0,0.2,0.5"]
     options = ["--fixtures", *fixtures, "--fixture-friction", "0.3"]
     cli.main(["plan", *SIMPLE, *options, "--out", str(tmp_path)])
@@ -162,17 +163,19 @@ def test_fixtures_that_cannot_be(fixture, message, tmp_path, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_attempts_end_with_the_first_that_is_sure_enough():
-    def plans():
-        for status, success in ((2, 0.0), (1, 0.4), (1, 0.7), (0, 0.95), (0, 1.0)):
-            yield PushPlan(PlanStatus(status), None, None, (), None, None, success, 0.0, None)
+def test_attempts_end_with_the_first_that_is_sure_enough(monkeypatch):
+    plans, counted = iter([(2, 0.0), (1, 0.4), (1, 0.7), (0, 0.95), (1, 0.4), (1, 0.7), (2, 0.8)]), []
 
-    counted = []
-    best = experiment._best(plans(), 5, lambda done, total: counted.append((done, total)))
-    assert best.success == 0.95
+    def planned(*_, **__):
+        status, success = next(plans)
+        return plan_of(PlanStatus(status), np.zeros((0, 2, 2)), np.zeros((1, 3)), success=success)
+
+    monkeypatch.setattr(experiment, "plan_pushes", planned)
+    goal = 0.03, 0.0, 0.0
+    found = experiment.run(Options(goal, attempts=5), progress=lambda done, total: counted.append((done, total)))
+    assert found["success"] == 0.95
     assert counted == [(1, 5), (2, 5), (3, 5), (4, 5)]
-    few = itertools.islice(plans(), 3)
-    assert experiment._best(few, 3, lambda done, total: None).success == 0.7
+    assert experiment.run(Options(goal, attempts=3))["success"] == 0.7
 
 
 @pytest.mark.parametrize(
@@ -180,12 +183,12 @@ def test_attempts_end_with_the_first_that_is_sure_enough():
     [
         (["--goal", "0", "0", "90"], "--goal: the angle is in rad"),
         (["--goal", "0", "nan", "0"], "--goal must be finite"),
-        (["--goal", "0", "0", "0", "--pushes", "0"], "--pushes must be at least 1; got 0"),
-        (["--goal", "0", "0", "0", "--friction", "0.3", "0.2"], "--friction must be lowest and highest"),
-        (["--goal", "0", "0", "0", "--dof", "2"], "--dof must be at least 3 for ellipsoid surfaces; got 2"),
-        (["--goal", "0", "0", "0", "--radius", "0"], "--radius must be positive, in m; got 0"),
-        (["--goal", "0", "0", "0", "--speed", "0.1", "-1"], "--speed must be positive; got 0.1 -1"),
-        (["--goal", "0", "0", "0", "--tolerance", "0", "1"], "--tolerance must be positive; got 0 1"),
+        (["--goal", "0", "0", "0", "--pushes", "0"], "--pushes must be a whole number, at least 1; got 0"),
+        (["--goal", "0", "0", "0", "--friction", "0.3", "0.2"], "friction must be (lowest, highest); got (0.3, 0.2)"),
+        (["--goal", "0", "0", "0", "--dof", "2"], "dof must be at least 3"),
+        (["--goal", "0", "0", "0", "--radius", "0"], "--radius must be positive; got 0"),
+        (["--goal", "0", "0", "0", "--speed", "0.1", "-1"], "--speed must be positive; got"),
+        (["--goal", "0", "0", "0", "--tolerance", "0", "1"], "--tolerance must be positive; got"),
         (["--goal", "0", "0", "0", "--success", "2"], "--success must be a probability; got 2"),
         (["--goal", "0", "0", "0", "--shape", "cube:1"], "--shape: expected rectangle:"),
         (["--goal", "0", "0", "0", "--shape", "rectangle:90x60"], "--shape: 90 m across; expected at most 2 m"),

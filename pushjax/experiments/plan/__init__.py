@@ -1,5 +1,5 @@
 """Pushes of a block from pose to pose, for a robot: `experiment` builds on `options` and `picture`."""
 
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+from pushjax.experiments.plan.experiment import run as run
+from pushjax.experiments.plan.experiment import summary as summary
+from pushjax.experiments.plan.options import Options as Options

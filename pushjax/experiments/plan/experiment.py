@@ -7,7 +7,6 @@ one, and zero on its way between pushes.
 
 import csv
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ import numpy as np
 import pushjax as pj
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
-from pushjax.experiments._slider_options import expected_surface, parse_shape, parse_support
-from pushjax.experiments.plan.fixtures import parse_fixtures
+from pushjax.experiments._report import Table
+from pushjax.experiments._slider_options import expected_surface, parse_fixture, parse_shape, parse_support
 from pushjax.experiments.plan.options import Options
 from pushjax.geometry.polygon_numpy import outline_vertices, signed_distances
 from pushjax.geometry.se2_numpy import to_body
@@ -26,7 +25,6 @@ from pushjax.identification.pushes_of_recordings import MAX_SLIDER_SIZE
 from pushjax.planning import FinalPose, Goal, PlanStatus, PushPlan, PushScene, PushSequence, finger_motion, plan_pushes
 from pushjax.planning.between_pushes import FingerMotion
 from pushjax.planning.roadmap import TransitStatus
-from pushjax.simulation.fixtures import Fixtures
 
 WAY_POINTS_FILE = "way_points.csv"
 MAX_PUSH_LENGTH = 2.5  # in units of the limit surface's length
@@ -46,25 +44,51 @@ def run(
         progress: Called with the number of attempts done and their total.
     """
     options.check()
-    shape, hand, fixtures = parse_shape(options.shape), pj.Hand.finger(options.radius), parse_fixtures(options)
-    _check_sizes(shape, options)
-    _check_finger(shape, options)
+    shape, hand = parse_shape(options.shape), pj.Hand.finger(options.radius)
+    fixtures = tuple(parse_fixture(text, options.fixture_friction) for text in options.fixtures)
+    model = pj.FrictionModel(options.dof, options.friction)
+    _check_block(shape, options)
     support = parse_support(options.support, shape)
     degree = {"ellipsoid": 2, "quartic": 4}[options.surface]
     slider = pj.Slider(shape, expected_surface(support, degree, seed))
     length = float(slider.surface.length)
+    longest = MAX_PUSH_LENGTH * length if options.longest is None else options.longest
+    away = math.dist(options.start[:2], options.goal[:2])
+    if away > options.pushes * longest + options.tolerance[0]:
+        raise ValueError(
+            f"--goal is {away:.3g} m away, and --pushes {options.pushes} of at most {longest:.3g} m (--longest) do not "
+            "reach it; are its coordinates in millimeters?"
+        )
+    position, angle = options.tolerance
     goal = Goal(
         np.array(options.goal),
-        position_tolerance=options.tolerance[0],
-        angle_tolerance=options.tolerance[1],
+        position_tolerance=position,
+        angle_tolerance=angle,
         length=length,
         symmetry=options.symmetry,
     )
-    _check_distance(options, length)
-    plan = _best(_plans(slider, hand, goal, fixtures, options, seed), options.attempts, progress)
+    scene = PushScene(slider, hand, model, fixtures)
+    plans: list[PushPlan] = []
+    while len(plans) < options.attempts and not (plans and plans[-1].status == PlanStatus.FOUND):
+        plans.append(
+            plan_pushes(
+                jax.random.fold_in(jax.random.key(seed), len(plans)),
+                scene,
+                np.array(options.start),
+                goal,
+                pushes=PushSequence(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
+                success=options.success,
+                finger=options.finger,
+                # without a search under sampled friction, the plan is the best one under the mean friction
+                **({} if options.robust else {"cost": FinalPose(goal), "search": ()}),
+            )
+        )
+        progress(len(plans), options.attempts)
+    plan = max(plans, key=lambda plan: (plan.status in POSSIBLE, plan.success))
     motion = None
     if plan.status in POSSIBLE and plan.transits:
-        motion = finger_motion(plan.transits, np.asarray(plan.path), free=options.speed[0], push=options.speed[1])
+        free, push = options.speed
+        motion = finger_motion(plan.transits, np.asarray(plan.path), free=free, push=push)
     files, pictures = [], []
     if out is not None:
         from pushjax.experiments.plan.picture import draw
@@ -78,69 +102,18 @@ def run(
     return result_record("plan", settings, **_plan_entries(plan, goal, motion), files=files, pictures=pictures)
 
 
-def _check_sizes(shape: pj.Shape, options: Options) -> None:
-    """Raise ValueError if the block or the finger is so large that it is probably in another unit."""
+def _check_block(shape: pj.Shape, options: Options) -> None:
+    """Raise ValueError if block or finger are probably in another unit, or if the finger overlaps the block."""
     low, high = (np.asarray(corner, float) for corner in shape.bounds)
     for name, size in (("shape", float(np.max(high - low))), ("radius", 2 * options.radius)):
         if size > MAX_SLIDER_SIZE:
             raise ValueError(
                 f"--{name}: {size:g} m across; expected at most {MAX_SLIDER_SIZE:g} m: is it in millimeters?"
             )
-
-
-def _check_finger(shape: pj.Shape, options: Options) -> None:
-    """Raise ValueError if the finger overlaps the block, before anything is compiled."""
-    if options.finger is None:
-        return
-    apart = signed_distances(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
-    if apart < options.radius:
-        raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
-
-
-def _plans(
-    slider: pj.Slider, hand: pj.Hand, goal: Goal, fixtures: Fixtures, options: Options, seed: int
-) -> Iterator[PushPlan]:
-    """Yield the plan of each attempt."""
-    longest = _max_push_length(options, float(slider.surface.length))
-    # Without a search under sampled friction, the plan is the best one under the mean friction.
-    search_options: dict[str, Any] = {} if options.robust else {"cost": FinalPose(goal), "search": ()}
-    for attempt in range(options.attempts):
-        yield plan_pushes(
-            jax.random.fold_in(jax.random.key(seed), attempt),
-            PushScene(slider, hand, pj.FrictionModel(options.dof, options.friction), fixtures),
-            np.array(options.start),
-            goal,
-            pushes=PushSequence(options.pushes, length=longest, steps=STEPS, clearance=options.clearance),
-            success=options.success,
-            finger=options.finger,
-            **search_options,
-        )
-
-
-def _max_push_length(options: Options, length: float) -> float:
-    """Return the greatest allowed length of a push, m, for a limit surface of characteristic length `length`, m."""
-    return MAX_PUSH_LENGTH * length if options.longest is None else options.longest
-
-
-def _check_distance(options: Options, length: float) -> None:
-    """Raise ValueError if the goal is farther away than all pushes together are long."""
-    away, longest = math.dist(options.start[:2], options.goal[:2]), _max_push_length(options, length)
-    if away > options.pushes * longest + options.tolerance[0]:
-        raise ValueError(
-            f"--goal is {away:.3g} m away, and --pushes {options.pushes} of at most {longest:.3g} m (--longest) do not "
-            "reach it; are its coordinates in millimeters?"
-        )
-
-
-def _best(plans: Iterator[PushPlan], attempts: int, progress: ProgressCallback) -> PushPlan:
-    """Return the first plan that is as likely to succeed as asked for, or else the likeliest that can be done."""
-    made: list[PushPlan] = []
-    for plan in plans:
-        made.append(plan)
-        progress(len(made), attempts)
-        if plan.status == PlanStatus.FOUND:
-            break
-    return max(made, key=lambda plan: (plan.status in POSSIBLE, plan.success))
+    if options.finger is not None:
+        apart = signed_distances(outline_vertices(shape), to_body(np.array(options.start), np.array(options.finger)))
+        if apart < options.radius:
+            raise ValueError(f"--finger overlaps the block at its start, by {1e3 * (options.radius - apart):.3g} mm")
 
 
 def _plan_entries(plan: PushPlan, goal: Goal, motion: FingerMotion | None) -> dict[str, Any]:
@@ -177,28 +150,27 @@ def _write_way_points(path: Path, motion: FingerMotion) -> Path:
     return path
 
 
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    spread, status = record["spread"], PlanStatus[record["status"]]
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    status, count, spread = PlanStatus[record["status"]], len(record["path"]), record["spread"]
+    success = f"{record['success']:.1%} of {record['samples']} samples"
     if status == PlanStatus.NO_TRANSIT:
-        blocked = next(
-            k for k, transit in enumerate(record["transits"]) if transit["status"] != TransitStatus.FOUND.name
-        )
-        lines = [f"no plan: the finger does not get to push {blocked + 1} ({record['transits'][blocked]['status']})"]
-    elif status == PlanStatus.HAND_IN_FIXTURE:
-        lines = ["no plan: in the best one that was found the finger runs into a fixture in a push"]
-    elif not len(record["path"]):
+        found = [transit["status"] for transit in record["transits"]]
+        k = next(k for k, each in enumerate(found) if each != TransitStatus.FOUND.name)
+        return [f"no plan: the finger does not get to push {k + 1} ({found[k]})"]
+    if status == PlanStatus.HAND_IN_FIXTURE:
+        return ["no plan: in the best one that was found the finger runs into a fixture in a push"]
+    if not count:
         words = "no push is needed" if status == PlanStatus.FOUND else "no push that helps was found"
-        lines = [f"{words}: {record['success']:.1%} of {record['samples']} samples are at the goal"]
-    else:
-        lines = [
-            f"{len(record['path'])} pushes, which take the robot {record['duration_s']:.0f} s: success in "
-            f"{record['success']:.1%} of {record['samples']} samples of friction",
-            f"  final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, "
-            f"{spread['theta_deg']:.1f} deg",
-        ]
-        if status != PlanStatus.FOUND:
-            asked = f"less than the {record['settings']['success']:.0%} asked for"
-            lines.insert(1, f"  {asked}: try more --attempts, more --pushes, or a smaller range of --friction")
-        lines += [f"wrote {path}, {record['way_points']} points" for path in record["files"]]
-    return "\n".join(lines + [f"drew {path}" for path in record["pictures"]])
+        return [f"{words}: {success} are at the goal"]
+    asked = f"less than the {record['settings']['success']:.0%} asked for"
+    return [
+        f"{count} pushes, which take the robot {record['duration_s']:.0f} s: success in {success} of friction",
+        *(
+            []
+            if status == PlanStatus.FOUND
+            else [f"{asked}: try more --attempts, more --pushes, or a smaller range of --friction"]
+        ),
+        f"final pose: standard deviation {spread['x_mm']:.1f} mm, {spread['y_mm']:.1f} mm, {spread['theta_deg']:.1f}°",
+        *(f"wrote {path}, {record['way_points']} points" for path in record["files"]),
+    ]

@@ -1,16 +1,13 @@
-"""Options of the command that plans pushes.
-
-This module does not import JAX, so that the command line answers at once.
-"""
+"""Options of the command that plans pushes."""
 
 import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from pushjax._internal.checks import check_count, check_finite, check_positive
 from pushjax.experiments._cli_option import cli_option
 
 Pose = tuple[float, float, float]
-FIXTURES = "wall@X,Y,ANGLE of its normal, or SHAPE@X,Y,THETA with a shape as in --shape"
 MAX_ANGLE = 8 * math.pi  # rad; a larger angle is probably in degrees
 
 
@@ -22,11 +19,11 @@ class Options:
     """Pose of the block that is wanted, m and rad."""
     shape: Annotated[str, cli_option("SHAPE")] = "rectangle:0.09x0.06"
     """The block: rectangle:0.09x0.06, disk:0.05 (radius), ellipse:0.06x0.04 (semi-axes), regular:6x0.05 (corners,
-    distance of each), all in m, or a CSV file of vertices. Default: rectangle:0.09x0.06."""
+    distance of each), all in m, or a CSV file of vertices."""
     start: Annotated[Pose, cli_option("X Y THETA")] = (0.0, 0.0, 0.0)
-    """Pose of the block now, m and rad. Default: 0 0 0."""
+    """Pose of the block now, m and rad."""
     tolerance: Annotated[tuple[float, float], cli_option("M RAD")] = (0.005, 0.0873)
-    """Tolerances of the goal: of the position, m, and of the angle, rad. Default: 0.005 0.0873 (5 degrees)."""
+    """Tolerances of the goal: of the position, m, and of the angle, rad."""
     symmetry: int = 1
     """Number of angles in a full turn at which the block looks the same: 2 for a rectangle, 4 for a square."""
     finger: Annotated[tuple[float, float] | None, cli_option("X Y")] = None
@@ -45,11 +42,11 @@ class Options:
     clearance: float = 0.01
     """Distance that the finger keeps from the block between pushes, m."""
     speed: Annotated[tuple[float, float], cli_option("FREE PUSH")] = (0.1, 0.02)
-    """Speeds of the finger, m/s: between pushes, and in pushes. Default: 0.1 0.02."""
+    """Speeds of the finger, m/s: between pushes, and in pushes."""
     friction: Annotated[tuple[float, float], cli_option("LOWEST HIGHEST")] = (0.2, 0.3)
-    """Range of the friction coefficient of the finger; twice the same number if it is known. Default: 0.2 0.3."""
+    """Range of the friction coefficient of the finger; twice the same number if it is known."""
     dof: Annotated[float | None, cli_option("DOF")] = 100.0
-    """Degrees of freedom of the limit surface's noise: the fewer, the more noise. None: no noise. Default: 100."""
+    """Degrees of freedom of the limit surface's noise: the fewer, the more noise. None: no noise."""
     surface: Literal["ellipsoid", "quartic"] = "ellipsoid"
     """Kind of limit surface."""
     support: str = "uniform"
@@ -63,40 +60,16 @@ class Options:
     """Number of searches with different random numbers, until one finds a plan that is sure enough."""
 
     def check(self) -> None:
-        """Raise ValueError for the first invalid option that can be found without JAX."""
+        """Raise ValueError for the first invalid option, before anything is compiled."""
+        given = {name.replace("_", "-"): value for name, value in vars(self).items() if value is not None}
         for name in ("start", "goal", "finger"):
-            value = getattr(self, name)
-            if value is not None and not all(map(math.isfinite, value)):
-                raise ValueError(f"--{name} must be finite; got {_joined(value)}")
-        for name, pose in (("start", self.start), ("goal", self.goal)):
-            if abs(pose[2]) > MAX_ANGLE:
-                raise ValueError(f"--{name}: the angle is in rad, at most {MAX_ANGLE:.1f}; got {pose[2]:g}")
-        for text in self.fixtures:
-            if not text.rpartition("@")[0]:
-                raise ValueError(f"--fixtures: expected {FIXTURES}; got {text!r}")
-        if not 0 <= self.fixture_friction < math.inf:
-            raise ValueError(f"--fixture-friction must not be negative; got {self.fixture_friction:g}")
-        if any(not 0 < each < math.inf for each in self.tolerance):
-            raise ValueError(f"--tolerance must be positive; got {_joined(self.tolerance)}")
-        if any(not 0 < each < math.inf for each in self.speed):
-            raise ValueError(f"--speed must be positive; got {_joined(self.speed)}")
-        for name in ("radius", "clearance", "longest"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise ValueError(f"--{name} must be positive, in m; got {value:g}")
+            check_finite(f"--{name}", given.get(name, 0.0))
+        for name in ("tolerance", "speed", "radius", "clearance", "longest"):
+            check_positive(f"--{name}", given.get(name, 1.0))
         for name in ("pushes", "symmetry", "attempts"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1; got {getattr(self, name)}")
-        low, high = self.friction
-        if not 0 <= low <= high < math.inf:
-            raise ValueError(f"--friction must be lowest and highest, both at least 0; got {low:g} {high:g}")
-        least = 3 if self.surface == "ellipsoid" else 9
-        if self.dof is not None and not least <= self.dof < math.inf:
-            raise ValueError(f"--dof must be at least {least} for {self.surface} surfaces; got {self.dof:g}")
+            check_count(f"--{name}", given[name])
+        for name in ("start", "goal"):
+            if abs(given[name][2]) > MAX_ANGLE:
+                raise ValueError(f"--{name}: the angle is in rad, at most {MAX_ANGLE:.1f}; got {given[name][2]:g}")
         if not 0 <= self.success <= 1:
             raise ValueError(f"--success must be a probability; got {self.success:g}")
-
-
-def _joined(numbers: tuple[float, ...]) -> str:
-    """Return numbers as they are typed on the command line."""
-    return " ".join(f"{number:g}" for number in numbers)
