@@ -47,7 +47,7 @@ class Closest(NamedTuple):
     distance: np.ndarray
     point: np.ndarray
     normal: np.ndarray
-    second: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # the second of the `contact_candidates` of a curve
+    second: tuple[np.ndarray, ...]  # the second of the `contact_candidates` of a curve; empty for an ellipse
 
 
 def _of_outline(shape, points):
@@ -81,12 +81,12 @@ def closest(shapes: list, points: list[np.ndarray] | np.ndarray, dtype=np.float6
     if np.ndim(shapes[0]) == 2:
         found = _of_curves(*wide)
     else:
-        rows = np.pad(wide[0], [(0, 0), (0, 4 - wide[0].shape[1])])
+        rows = np.pad(wide[0], [(0, 0), (0, 4 - len(shapes[0]))])
         found = _of_ellipses(rows[:, :2], rows[:, 2:], wide[1])
     found, every = jax.tree.map(np.asarray, found), []
     for k, own in enumerate(points):
         nearest, *others = (tuple(leaf[k][: len(own)] for leaf in part) for part in found)
-        every.append(Closest(*nearest, others[0] if others else None))
+        every.append(Closest(*nearest, others[0] if others else ()))
     return every
 
 
