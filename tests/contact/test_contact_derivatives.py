@@ -14,7 +14,9 @@ import pushjax as pj
 DIFFERENCE = 1e-5  # against central differences
 # One shape for all, so that each degree needs one program: the problems of a batch, and the contacts of each.
 FEW, SLOTS = 240, 3
-DEGREES = pytest.mark.parametrize("degree", [pytest.param(2, marks=pytest.mark.slow), 4])
+DEGREES = pytest.mark.parametrize(
+    "degree", [pytest.param(2, marks=pytest.mark.slow, id="ellipsoid"), pytest.param(4, id="quartic")]
+)
 
 
 class Given(NamedTuple):

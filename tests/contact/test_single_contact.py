@@ -356,7 +356,7 @@ def scaled(parts, p: Problem) -> np.ndarray:
     return np.concatenate([parts[0] * unit / size, parts[1] / unit, parts[2]], axis=1)
 
 
-@pytest.fixture(scope="module", params=[2, 4], ids=["ellipsoid", "quartic"])
+@pytest.fixture(scope="module", params=[2, 4], ids=["degree 2", "degree 4"])
 def smooth(request) -> tuple[Problem, np.ndarray]:
     """Return equally many moderately conditioned problems of each mode, and their modes.
 
@@ -424,7 +424,7 @@ def test_the_motion_is_continuous_across_sticking_and_its_derivative_jumps():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("smooth", [4], indirect=True, ids=["quartic"])
+@pytest.mark.parametrize("smooth", [4], indirect=True)
 def test_second_derivatives_while_sticking(smooth, rng):
     """The implicit derivative is itself differentiable: compare `jax.hessian` with differences of the gradient."""
     problem, modes = smooth
