@@ -142,7 +142,6 @@ def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Com
         callbacks = {"progress": progress, "say": progress.say, "note": progress.note}
         record = call(**{key: each for key, each in callbacks.items() if key in experiment.run.__annotations__})
     report = experiment.summary(record)
-    report = [report] if isinstance(report, str) else report
     print(as_text(report))
     for picture in record.get("pictures", ()):
         print(f"drew {picture}")

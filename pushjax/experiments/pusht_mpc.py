@@ -19,6 +19,7 @@ from scipy.stats import binomtest
 from pushjax._internal.checks import check_count
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
+from pushjax.experiments._report import Table, table
 from pushjax.planning import PushController, pusht_controller, pusht_observation
 from pushjax.planning.pusht import PIXEL
 from pushjax.tasks.push_t import SIZE
@@ -177,29 +178,31 @@ def _times(episodes: Iterable[list[float]]) -> dict[str, float]:
     return {"mean": times.mean(), "percentile_95": np.percentile(times, 95), "largest": times.max()}
 
 
-def summary(record: dict[str, Any]) -> str:
-    """Return the text that the command prints for a record of `run`."""
-    (low, high), steps, times = record["success_ci95"], record["steps_of_successes"], record["seconds_per_step"]
-    setup, count = record["setup_seconds"], len(record["rows"])
+def summary(record: dict[str, Any]) -> list[str | Table]:
+    """Return the report on a record of `run`."""
+    (low, high), steps = record["success_ci95"], record["steps_of_successes"]
     successes = sum(row["success"] for row in record["rows"])
-    lines = [
-        f"PushT (gym-pusht): success in {successes} of {count} episodes (95 % interval {low:.3f} to {high:.3f})",
-        f"  coverage: largest {record['mean_largest_coverage']:.3f}, final {record['mean_final_coverage']:.3f} (means)",
+    kinds = {"wall": "seconds_per_step", "processor": "processor_seconds_per_step"}
+    times = [{"of": name} | record[key] for name, key in kinds.items()]
+    of_steps = (
+        f"Control steps of successes: median {steps['median']:g}, 95 % within {steps['percentile_95']:.0f}, largest "
+        f"{steps['largest']}."
+        if steps
+        else "No success."
+    )
+    return [
+        f"PushT (gym-pusht): success in {successes} of {len(record['rows'])} episodes (95 % interval {low:.3f} to "
+        f"{high:.3f}), set up in {record['setup_seconds']:.1f} s.",
+        f"Mean coverage: largest {record['mean_largest_coverage']:.3f}, final {record['mean_final_coverage']:.3f}.",
+        of_steps,
+        table(
+            times,
+            ("time per control step", "of"),
+            ("mean / s", "mean", ".3f"),
+            ("95 % within / s", "percentile_95", ".3f"),
+            ("largest / s", "largest", ".3f"),
+        ),
+        "The task's clock gives 0.1 s. The planner reads the exact positions. Published policies that see pixels, by "
+        "the same rule:",
+        table(record["published"], ("policy", "policy"), ("success", "success", ".1%"), ("episodes", "episodes")),
     ]
-    if steps:
-        lines.append(
-            f"  control steps of successes: median {steps['median']:g}, 95 % within {steps['percentile_95']:.0f}, "
-            f"largest {steps['largest']}"
-        )
-    for name, each in (("time", times), ("processor time", record["processor_seconds_per_step"])):
-        mean, most, largest = (1e3 * each[key] for key in ("mean", "percentile_95", "largest"))
-        lines.append(
-            f"  {name} per control step: mean {mean:.0f} ms, 95 % within {most:.0f} ms, largest {largest:.0f} ms"
-        )
-    lines += [
-        "  (the task's clock gives 100 ms)",
-        f"  set up in {setup:.1f} s",
-        "The planner reads the exact positions. Published policies that see pixels, by the same rule:",
-    ]
-    lines += [f"  {each['policy']}: {each['success']:.1%} of {each['episodes']}" for each in record["published"]]
-    return "\n".join(lines)
