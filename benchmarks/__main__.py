@@ -9,7 +9,6 @@ import ast
 import inspect
 import sys
 from collections.abc import Callable
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +18,7 @@ import tyro
 
 from benchmarks import speed
 from pushjax._internal.progress import ProgressCallback, no_progress, progress_bar
+from pushjax.cli.options import Output, parsed
 from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import write_json
 
@@ -51,7 +51,6 @@ MODULES = (
     "pusht",
     "solvers",
 )
-PICTURES = Path("pushjax-out")
 
 
 def timed(
@@ -64,7 +63,7 @@ def timed(
     cores: Annotated[int | None, cli_option("N")] = None,
     peers: bool = False,
     baseline: Annotated[Path | None, cli_option("FILE")] = None,
-    out: Path = PICTURES,
+    out: Path = Output.out,
     progress: ProgressCallback = no_progress,
     keep: Callable[[dict[str, Any]], None] = lambda record: None,
 ) -> dict[str, Any]:
@@ -103,30 +102,6 @@ def _first_line(module: str) -> str:
     return (ast.get_docstring(ast.parse(source)) or "").split("\n")[0].rstrip(".")
 
 
-Given = tuple[Callable[..., dict[str, Any]], Path | None]
-
-
-def options(run: Callable[..., dict[str, Any]]) -> Callable[..., Given]:
-    """Return a function of the options of `run` and of `json`, which returns `run` with them bound, and the file."""
-    signature = inspect.signature(run)
-    # `progress` and `keep` are callbacks, not options: of rows done and their total, and of the record so far.
-    parameters = [
-        each.replace(default=PICTURES) if each.name == "out" else each
-        for each in signature.parameters.values()
-        if each.name not in ("progress", "keep")
-    ]
-    file = Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="File for every figure that is printed.")]
-    parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=file))
-
-    def given(json: Path | None = None, **chosen: Any) -> Given:
-        return partial(run, **chosen), json
-
-    given.__doc__ = run.__doc__
-    given.__annotations__ = {each.name: each.annotation for each in parameters}
-    given.__dict__["__signature__"] = signature.replace(parameters=parameters)
-    return given
-
-
 def main(arguments: list[str]) -> None:
     """Run the command line; bad input ends with one line on standard error and exit status 1."""
     if not arguments:
@@ -138,11 +113,11 @@ def main(arguments: list[str]) -> None:
         module = import_module(f"benchmarks.{arguments[0]}")
         run, program, about = module.run, f"{program} {arguments[0]}", module.__doc__
         arguments = arguments[1:]
-    case, json = tyro.cli(options(run), args=arguments, prog=program, description=about)
+    case, written = parsed(run, arguments, program, about)
 
     def keep(so_far: dict[str, Any]) -> None:
-        if json is not None:
-            write_json(so_far, json)
+        if written.json is not None:
+            write_json(so_far, written.json)
 
     try:
         with progress_bar(f"running {program}") as progress:
