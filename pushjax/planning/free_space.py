@@ -3,7 +3,7 @@
 As long as nothing else touches the slider, a push has the outcome that the library has. So a push is free if slider and
 finger keep a distance from all obstacles at every pose on the way. Other pushes are not considered at all.
 
-The many pushes from one pose are first judged by a grid of the slider's distance from obstacles. The best few of them
+The many pushes from one pose are first checked by a grid of the slider's distance from obstacles. The best few of them
 are then checked exactly.
 """
 

@@ -1,15 +1,15 @@
 """Friction from what is seen: samples of friction, weighted by how well they explain the motions of the slider.
 
-It is a particle filter. Each sample is a limit surface and a coefficient of contact friction, drawn from a
+It is a particle filter. Each sample is a limit surface and a coefficient of contact friction from a
 `FrictionModel`. A motion that is seen, from one pose to another along a path of the hand, is simulated under each
 sample. The likelihood of the pose that is seen after it is Student's distribution about the simulated pose. Its scale
 combines the error of poses and a fraction of the motion, for what no sample can explain: contact points, and friction
 that varies over the table.
 
-A few samples never contain the truth. If each were judged by the whole evidence, soon one would carry all the weight,
-however wrong it is. So the likelihood of all motions together is taken to the largest power, up to one, that leaves a
-least number of effective samples (tempering). There is no resampling. Friction is constant, and samples that are drawn
-later have not been judged by the motions before; with resampling, intervals are far too narrow.
+A few samples never contain the truth. With the whole evidence, soon one would carry all the weight, however wrong it
+is. So the likelihood of all motions together is taken to the largest power, up to one, that leaves a least number of
+effective samples (tempering). There is no resampling. Friction is constant, and later samples would lack the evidence
+of the motions before; with resampling, intervals are far too narrow.
 
 A limit surface and its multiples move a slider alike. So poses say nothing about the scale of the surface.
 
@@ -150,8 +150,8 @@ def _update(
     finite = jnp.all(jnp.isfinite(before)) & jnp.all(jnp.isfinite(after)) & jnp.all(jnp.isfinite(path))
     squared = jnp.where(finite, _squared_errors(settings, belief, before, path, after), jnp.inf)
     # a simulation that failed counts as a motion that is not explained: it must not remove the sample for good
-    judged = jnp.where(jnp.isfinite(squared), squared, LOST**2)
-    evidence = belief.evidence - (STUDENT_DOF + 3) / 2 * jnp.log1p(judged / STUDENT_DOF)
+    bounded = jnp.where(jnp.isfinite(squared), squared, LOST**2)
+    evidence = belief.evidence - (STUDENT_DOF + 3) / 2 * jnp.log1p(bounded / STUDENT_DOF)
     possible = jnp.any(squared < LOST**2) & jnp.any(jnp.isfinite(evidence))
     evidence = jnp.where(possible, evidence, belief.evidence)
     weight = jnp.where(possible, _tempered(jnp.where(possible, evidence, 0.0), settings.effective), belief.weight)

@@ -92,7 +92,7 @@ def plan_pushes(
 ) -> PushPlan:
     """Plan pushes that bring a slider to a goal, as surely as can be under friction that is not known.
 
-    The same arguments give the same bits. All candidates are judged under the same sampled friction.
+    The same arguments give the same bits. All candidates share their sampled friction.
 
     Args:
         key: PRNG key of everything random.
@@ -140,7 +140,7 @@ def plan_pushes(
     found, history = _search(jax.random.fold_in(key, 1), problem, candidates, nominal_search, search)
     unseen = push_problem(jax.random.fold_in(key, 2), scene, start, UNSEEN_SAMPLES, criteria)
     plans = (
-        _judged(parameters, float(least), problem, unseen, goal, success, finger_start)
+        _predicted(parameters, float(least), problem, unseen, goal, success, finger_start)
         for parameters, least in zip(found.parameters, found.cost, strict=True)
     )
     first = next(plans)
@@ -166,7 +166,7 @@ def _search(
     return found, np.concatenate(history)
 
 
-def _judged(
+def _predicted(
     parameters: np.ndarray,
     cost: float,
     problem: PushProblem,
@@ -181,17 +181,11 @@ def _judged(
     path, poses, outcomes = _without_idle(paths[0], poses[0], Outcomes(reached[0], failed[0]))
     good = np.asarray(goal.reached(outcomes.pose)) & ~np.asarray(outcomes.failed)
     transits, has_transits = (), True
-    if problem.scene.has_one_finger:
-        between = transits_between(
-            outline_vertices(problem.scene.slider.shape),
-            float(problem.scene.hand.radius[0]),
-            float(problem.pushes.clearance),
-            path,
-            poses,
-            np.asarray(outcomes.poses),
-            finger,
-            problem.scene.fixtures,
-        )
+    if (scene := problem.scene).has_one_finger:
+        vertices, clearance = outline_vertices(scene.slider.shape), float(problem.pushes.clearance)
+        samples = np.asarray(outcomes.poses)
+        radius = float(scene.hand.radius[0])
+        between = transits_between(vertices, radius, clearance, path, poses, samples, finger, scene.fixtures)
         good, transits = good & ~between.touched, between.transits
         has_transits = between.status == TransitStatus.FOUND
     hits = _hand_in_fixture(problem, path)
@@ -212,25 +206,24 @@ def _without_idle(path: np.ndarray, poses: np.ndarray, outcomes: Outcomes) -> tu
 
 def _hand_in_fixture(problem: PushProblem, path: np.ndarray) -> bool:
     """Return whether a finger runs into a fixture along paths, (pushes, steps + 1, dof)."""
-    if not problem.scene.fixtures:
+    hand, fixtures = problem.scene.hand, problem.scene.fixtures
+    if not fixtures:
         return False
-    centers = np.asarray(problem.scene.hand.poses(jnp.asarray(path)), float)[..., :2]
-    apart = Obstacles.of(problem.scene.fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
-    return bool(np.any(apart < np.asarray(problem.scene.hand.radius)))
+    centers = np.asarray(hand.poses(jnp.asarray(path)), float)[..., :2]
+    apart = Obstacles.of(fixtures).segment_clearance(centers[:, :-1], centers[:, 1:])
+    return bool(np.any(apart < np.asarray(hand.radius)))
 
 
 def _check_poses(problem: PushProblem, goal: Goal) -> None:
     """Raise an error if the slider overlaps a fixture at the start, or at the goal."""
-    if not problem.scene.fixtures:
+    slider, fixtures, length = problem.scene.slider, problem.scene.fixtures, problem.scene.length
+    if not fixtures:
         return
-    length = float(problem.scene.slider.surface.length)
     for name, poses, allowed in (
         ("start", problem.start, MAX_PENETRATION * length),  # a rollout pushes out what overlaps less
         ("goal", goal.pose[None], OVERLAP_TOLERANCE * length),
     ):
-        depth = np.asarray(
-            fixture_overlaps(problem.scene.slider, problem.scene.fixtures, poses.astype(problem.start.dtype))
-        )
+        depth = np.asarray(fixture_overlaps(slider, fixtures, poses.astype(problem.start.dtype)))
         if depth.max() > allowed:
             raise ValueError(
                 f"{name} must be a pose at which the slider overlaps no fixture; got an overlap of "

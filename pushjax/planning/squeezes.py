@@ -15,7 +15,7 @@ The entropy compares every sample i with every sample j, by a Gaussian kernel of
 
 Here d_ij^2 is the squared distance of the positions plus the squared difference of the angles times a length. The
 entropy is zero if all samples are the same, log k for k poses far apart that are equally likely, and at most the
-logarithm of the number of samples. So its exponential is the number of poses that can be told apart.
+logarithm of the number of samples. So its exponential is the number of distinct poses.
 
 References: Goldberg, Orienting polygonal parts without sensors, 1993. Zhou, Paolini, Johnson, Bagnell & Mason, A
 probabilistic planning framework for planar grasping under uncertainty, 2017.

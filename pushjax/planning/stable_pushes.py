@@ -5,7 +5,7 @@ surface and coefficient of friction (`line_contact`). Along a path of such curva
 one body. The shortest one between two poses is a Dubins path (`dubins`). So the final pose does not depend on friction
 at all, over any distance.
 
-A bound from samples holds for the samples. A surface that was not drawn may be more extreme than all that were. The
+A bound from samples holds for the samples. A surface that was not sampled may be more extreme than all that were. The
 margin and the number of samples say how much of this is allowed for.
 
 Reference: Lynch & Mason 1996. Zhou & Mason 2017.
