@@ -98,7 +98,7 @@ def run(
     def figures() -> dict[str, Figure]:
         # with the same key, fewer pushes are the first ones
         shown = {**options, "trajectories": True}
-        drawn = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **shown)
+        drawn: Any = pushes if all_plotted else pj.monte_carlo(key, MAX_PLOTTED, slider, hand, path, **shown)
         title = f"{n} pushes" + ("" if all_plotted else f", {MAX_PLOTTED} drawn")
         cloud = plot.cloud_figure(slider.shape, hand, np.asarray(path), drawn.trajectory, title)
         return {"stochastic_push.png": cloud, "stochastic_push_histograms.png": _histograms(pushes)}
