@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 import pushjax as pj
-from pushjax.planning import CVaR, FinalPose, Goal, Mean, Missed
-from pushjax.planning.costs import HandClearance
+from pushjax.planning import CVaR, FinalPose, Goal, Missed
+from pushjax.planning.costs import HandClearance, Mean
 from pushjax.simulation.fixtures import Fixture, Wall
 
 RNG = np.random.default_rng(0)
