@@ -75,36 +75,35 @@ def run(
     hand = pj.Hand.two_fingers(FINGER_RADIUS)
     path = pj.line((0, 0, np.pi / 2, FINGER_SPACING), (0, TRAVEL, np.pi / 2, FINGER_SPACING), steps)
     starts = start_poses(n, seed)
-    rows, results = [], {}
+    rows, shown = [], {}
     for mu in friction:
+        verdicts = []
         for surface_dof in dof:
             model = pj.FrictionModel(dof=surface_dof, friction=mu)
             # run twice with different samples, to find how many verdicts the sampling alone changes
-            for second_draw in (False, True):
-                key = jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + second_draw)
-                pushes = pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True)
-                results[mu, surface_dof, second_draw] = pushes, converged(pushes)
-            (pushes, has_converged), (_, other_has_converged) = (
-                results[mu, surface_dof, second_draw] for second_draw in (False, True)
+            keys = (jax.random.fold_in(jax.random.key(seed), 2 * len(rows) + again) for again in range(2))
+            pushes, others = (
+                pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True) for key in keys
             )
+            verdicts.append(converged(pushes))
             rows.append(
                 {
                     "friction": mu,
                     "dof": surface_dof,
-                    "converged": float(has_converged.mean()),
+                    "converged": float(verdicts[-1].mean()),
                     "outcomes": pushes.outcomes(),
-                    "changed_by_draw_percent": 100 * float(np.mean(has_converged != other_has_converged)),
+                    "changed_by_draw_percent": 100 * float(np.mean(verdicts[-1] != converged(others))),
                     "seconds": pushes.seconds,
-                    "settled": np.flatnonzero(has_converged),
+                    "settled": np.flatnonzero(verdicts[-1]),
                 }
             )
+            if mu == friction[0]:
+                shown[surface_dof] = pushes, verdicts[-1]
             progress(len(rows), len(friction) * len(dof))
-        with_less_noise, with_more_noise = (results[mu, surface_dof, False][1] for surface_dof in dof)
         for row in rows[-2:]:
-            row["difference_percent"] = 100 * abs(float(with_less_noise.mean() - with_more_noise.mean()))
-            row["changed_by_noise_percent"] = 100 * float(np.mean(with_less_noise != with_more_noise))
-    drawn = {surface_dof: results[friction[0], surface_dof, False] for surface_dof in dof}
-    pictures = saved(out, lambda: {"capture.png": _figure(slider, hand, path, drawn)})
+            row["difference_percent"] = 100 * abs(float(verdicts[0].mean() - verdicts[1].mean()))
+            row["changed_by_noise_percent"] = 100 * float(np.mean(verdicts[0] != verdicts[1]))
+    pictures = saved(out, lambda: {"capture.png": _figure(slider, hand, path, shown)})
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction}
     settings |= {"disk_m": DISK_RADIUS, "finger_m": FINGER_RADIUS, "apart_m": FINGER_SPACING, "travel_m": TRAVEL}
     settings |= {"circle_m": START_RADIUS, "ahead_m": START_DISTANCE, "near_m": CONVERGED_DISTANCE}
@@ -135,11 +134,8 @@ def converged(pushes: pj.MonteCarlo) -> np.ndarray:
 def _figure(slider: pj.Slider, hand: pj.Hand, path: jax.Array, results: dict[float, tuple]) -> Figure:
     """Draw the pushes of the first friction."""
     runs = {
-        f"dof {surface_dof:g}: {has_converged.mean():.1%} of {len(has_converged)} converge": (
-            pushes.trajectory,
-            has_converged,
-        )
-        for surface_dof, (pushes, has_converged) in results.items()
+        f"dof {dof:g}: {verdicts.mean():.1%} of {len(verdicts)} converge": (pushes.trajectory, verdicts)
+        for dof, (pushes, verdicts) in results.items()
     }
     pushes, has_converged = list(results.values())[-1]
     density = _density(pushes.start[has_converged, :2])

@@ -26,13 +26,12 @@ IDENTIFY_STEPS = 25
 TRAINING_SIZE, TEST_SIZE = 128, 304
 # Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. All values were chosen
 # on the surface abs.
-SURFACE_DOF, PRESSURE_CENTER, INSET, HAND_OFFSET, FRAME_OFFSET = 10.0, 0.015, 0.001, 0.002, 0.001
 UNKNOWNS: dict[str, Any] = {
-    "surface_dof": SURFACE_DOF,
-    "pressure_center": PRESSURE_CENTER,
-    "inset": INSET,
-    "hand_offset": HAND_OFFSET,
-    "frame_offset": FRAME_OFFSET,
+    "surface_dof": 10.0,
+    "pressure_center": 0.015,
+    "inset": 0.001,
+    "hand_offset": 0.002,
+    "frame_offset": 0.001,
 }
 
 
