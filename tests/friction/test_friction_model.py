@@ -29,13 +29,6 @@ def quartic():
     return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(0), 400), degree=4)
 
 
-@pytest.fixture(scope="module")
-def tripod():
-    """Return the quartic of three points, which is only just convex."""
-    support = pj.Support.points(np.array([[0.03, 0.0], [-0.02, 0.03], [-0.02, -0.02]]), np.array([1.0, 2.0, 0.3]))
-    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(0), 400), degree=4)
-
-
 around = jax.jit(lambda model, surface: model.around(surface))
 
 
@@ -141,14 +134,6 @@ def test_moments_of_the_ellipsoid(rng):
     assert np.all(np.linalg.eigvalsh(drawn) > 0)
 
 
-@pytest.mark.slow
-def test_a_mean_that_is_only_just_convex(tripod):
-    c, pull, _ = sampled(FrictionModel(dof=20, friction=0.3), tripod)
-    assert np.all(least_curvatures(c[:300]) >= -1e-9)
-    assert np.mean(pull > 0) > 0.02
-    assert np.all(pull <= 1)
-
-
 def test_decomposition_of_a_quartic_on_the_border():
     """x^4 + y^4 + z^4 has many flat places: any further and it is not convex."""
     c = jnp.array([1.0, 1, 1] + [0.0] * 12)
@@ -165,6 +150,7 @@ def test_samples_around_means_on_the_border_are_convex(quartic, dtype):
         coefficients, pull, _ = sampled(FrictionModel(dof=np.float32(20), friction=0.3), mean)
         assert np.all(np.isfinite(coefficients))
         assert np.all(pull <= 1)
+        assert np.mean(pull > 0) > 0.02
         assert np.all(least_curvatures(coefficients[:300]) >= (-1e-9 if dtype == "float64" else -3e-7))
 
 

@@ -216,24 +216,6 @@ def test_starts_at_given_states():
     np.testing.assert_array_equal(observations["hand"], np.tile(rows[2, 3:], (NUM_ENVS, 1)))
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_public_wrapper_counts_the_same_episodes(mode, rng):
-    environments = [
-        RecordVectorStatistics(env)
-        for env in (TaskVectorEnv(Walk(), NUM_ENVS, autoreset_mode=mode), sync_of_walks(mode))
-    ]
-    for env in environments:
-        env.reset(seed=5)
-    for _ in range(20):
-        actions = 0.3 * rng.uniform(-1, 1, (NUM_ENVS, 2))
-        for env in environments:
-            env.step(actions)
-    ours, theirs = environments
-    assert ours.episode_count == theirs.episode_count > 10
-    np.testing.assert_array_equal(ours.length_queue, theirs.length_queue)
-    np.testing.assert_allclose(ours.return_queue, theirs.return_queue)
-
-
 def test_vector_goes_on_from_a_pickle(rng):
     env = TaskVectorEnv(Walk(), NUM_ENVS)
     env.reset(seed=1)
