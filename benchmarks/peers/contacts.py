@@ -37,18 +37,24 @@ class Solved(NamedTuple):
 def solve(coefficients, length, contacts, starts: int = STARTS, seed: int = 0) -> Solved:
     """Solve a batch of contact problems, one after another, each from at most `starts` random starts."""
     # coefficients: of quartics, (n, 15); length: (n,), m; contacts: batched `pj.Contacts`, all active
-    parts = [np.asarray(part, float) for part in (contacts.point, contacts.normal, contacts.displacement)]
-    for scalar in (contacts.friction, contacts.gap):
-        parts.append(np.broadcast_to(np.asarray(scalar, float), parts[0].shape[:2]))
     rng = np.random.default_rng(seed)
-    twist = np.full((len(parts[0]), 3), np.nan)
     busy = time.process_time()
-    for k in range(len(twist)):
-        problem = Problem(np.asarray(coefficients[k], float), float(length[k]), *(part[k] for part in parts))
+    problems = without_units(coefficients, length, contacts)
+    twist = np.full((len(problems), 3), np.nan)
+    for k, problem in enumerate(problems):
         found = problem.root(rng, starts)
         if found is not None:
             twist[k] = found
     return Solved(twist, time.process_time() - busy)
+
+
+def without_units(coefficients, length, contacts) -> list["Problem"]:
+    """Return the problems of a batch, with arguments as in `solve`."""
+    parts = [np.asarray(part, float) for part in (contacts.point, contacts.normal, contacts.displacement)]
+    for scalar in (contacts.friction, contacts.gap):
+        parts.append(np.broadcast_to(np.asarray(scalar, float), parts[0].shape[:2]))
+    each = zip(np.asarray(coefficients, float), np.asarray(length, float), *parts, strict=True)
+    return [Problem(*part) for part in each]
 
 
 class Problem:

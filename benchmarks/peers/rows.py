@@ -1,6 +1,6 @@
 """Benchmark rows of other programs.
 
-Pushes and grasps are by MuJoCo and MJX, fits by cvxpy, contact problems by scipy.
+Pushes and grasps are by MuJoCo and MJX, fits by cvxpy and jaxopt, contact problems by scipy and jaxopt.
 
 MuJoCo and MJX each run at their largest timestep that stays within 0.1 mm of their own converged answer.
 """
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 
 import pushjax as pj
 from benchmarks import cases, grasps, reference_push
-from benchmarks.peers import contacts, coulomb, fits, grasp, mjx, mujoco
+from benchmarks.peers import by_jaxopt, contacts, coulomb, fits, grasp, mjx, mujoco
 from benchmarks.peers.scene import Scene, Settings, engine
 from pushjax import plot
 from pushjax.plot.style import STYLE, curve_styles
@@ -44,6 +44,8 @@ def check(case: Sequence[str]) -> None:
         engine()
     if "fit" in case:
         fits.cvxpy()
+    if {"fit", "solve"} & set(case):
+        by_jaxopt.jaxopt()
 
 
 def rows(case: Sequence[str]) -> list[dict[str, Any]]:
@@ -82,7 +84,7 @@ def _grasps() -> list[dict[str, Any]]:
 
 
 def _fits() -> list[dict[str, Any]]:
-    """Return the rows of cvxpy, with the worst ratios of pushjax's loss to theirs."""
+    """Return the rows of cvxpy and of jaxopt, with the worst ratios of pushjax's loss to theirs."""
     found = []
     for degree, name in ((4, "fit_quartic"), (2, "fit_ellipsoid")):
         wrench, twist, length = (np.asarray(part) for part in cases.pairs("float64", FITS))
@@ -90,14 +92,15 @@ def _fits() -> list[dict[str, Any]]:
         for dtype in ("float32", "float64"):
             work = cases.fit(dtype, FITS, degree)
             ours[dtype] = np.asarray(jax.jit(work.function)(*work.args)[1].loss, float)
-        theirs, each = _repeated(lambda these=(wrench, twist, length, degree): fits.fit(*these), FITS)
-        ratio = {dtype: float((loss / theirs.loss).max()) for dtype, loss in ours.items()}
-        found.append(each | {"of": name, "peer": "cvxpy", "loss_over_theirs": ratio, "clipped": theirs.clipped})
+        for peer, solver in (("cvxpy", fits.fit), ("jaxopt", by_jaxopt.fit)):
+            theirs, each = _repeated(lambda fit=solver, these=(wrench, twist, length, degree): fit(*these), FITS)
+            ratio = {dtype: float((loss / theirs.loss).max()) for dtype, loss in ours.items()}
+            found.append(each | {"of": name, "peer": peer, "loss_over_theirs": ratio, "clipped": theirs.clipped})
     return found
 
 
 def _problems() -> list[dict[str, Any]]:
-    """Return the rows of scipy on problems that have a motion, with the fraction of motions that it finds."""
+    """Return the rows of scipy and jaxopt on problems that have a motion, with the fraction of motions they find."""
     found = []
     for m in range(1, MOST_CONTACTS + 1):
         work = cases.solve("float64", 4 * PROBLEMS, m)
@@ -105,8 +108,9 @@ def _problems() -> list[dict[str, Any]]:
         moving = np.flatnonzero(np.any(np.asarray(jax.jit(work.function)(*work.args)) != 0, axis=1))[:PROBLEMS]
         kept = jax.tree.map(lambda leaf, k=moving: leaf[k], problem)
         these = surface.coefficients[moving], surface.length[moving], kept
-        theirs, each = _repeated(lambda these=these: contacts.solve(*these), len(moving))
-        found.append(each | {"of": f"solve_{m}", "peer": "scipy", "found": float(theirs.found.mean())})
+        for peer, solver in (("scipy", contacts.solve), ("jaxopt", by_jaxopt.solve)):
+            theirs, each = _repeated(lambda solve=solver, these=these: solve(*these), len(moving))
+            found.append(each | {"of": f"solve_{m}", "peer": peer, "found": float(theirs.found.mean())})
     return found
 
 
