@@ -214,7 +214,7 @@ def test_an_interrupted_run_goes_on(logs, converted, monkeypatch, tmp_path):
 
     monkeypatch.setattr(experiment, "METHODS", {"identified": guess})
     monkeypatch.setattr(experiment, "ConditionData", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
-    monkeypatch.setattr(experiment, "_draw", lambda cells, out: [])
+    monkeypatch.setattr(experiment, "saved", lambda out, figures: [])
     choice = {"surface": ("abs",), "object": ("rect1",), "method": ("identified",), "out": tmp_path}
     with pytest.raises(KeyboardInterrupt):
         table1.run(converted, **choice)

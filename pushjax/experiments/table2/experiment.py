@@ -213,7 +213,7 @@ def summary(record: dict[str, Any]) -> list[str | Table]:
     for name, means in record["means"].items():
         cells = [cell for cell in record["cells"] if cell["method"] == name]
         lines = [(model, model, _entry) for model in MODELS]
-        parts.append(by_object(cells, name, *lines, ("no motion", "ellipsoid", _no_motion_entry)))
+        parts.append(by_object(cells, name, *lines, ("no motion", list(MODELS)[-1], _no_motion_entry)))
         parts.append(
             table(
                 [{"model": model} | mean for model, mean in means.items() if mean],
