@@ -158,5 +158,6 @@ def _test_second_contacts(
     # `x` must lie on the outer side of the edge. An edge that it faces only through the material is no contact.
     is_faced = (position >= -tolerance) & (position <= edge.length + tolerance) & (edge.normal.dot(rel) >= -tolerance)
     on_edge = ~is_nearest & ~shares_point & (is_faced | is_wedged)
-    in_vertex_sector = (position <= 0) & (rel.dot(edge.previous) >= 0) & ~reflex_a
+    # At a straight vertex the sector is a line, of which one half lies in the material.
+    in_vertex_sector = (position <= 0) & (rel.dot(edge.previous) >= 0) & (edge.bisector_a.dot(rel) >= 0) & ~reflex_a
     return on_edge, in_vertex_sector & ~is_nearest & ~previous_is_nearest & ~on_edge, from_edge.dot(from_edge)

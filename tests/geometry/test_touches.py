@@ -138,3 +138,22 @@ def test_gradients_of_the_second_touch_are_finite():
     for v, seen, by_point in zip(vertices, touches(list(vertices), list(points)), slope[1], strict=True):
         own = seen.second[0] < seen.first[0] + 0.99 * perimeter(v)
         np.testing.assert_allclose(by_point[own, 0], seen.second[2][own], atol=1e-9)
+
+
+def test_a_vertex_in_a_straight_side_touches_nothing_through_the_material():
+    """A vertex in the middle of each side of a T changes no distance, also at points exactly beyond that vertex."""
+    corners = 1e-3 * np.array([(-60, 0), (60, 0), (60, 30), (15, 30), (15, 120), (-15, 120), (-15, 30), (-60, 30)])
+    middles = (corners + np.roll(corners, -1, axis=0)) / 2
+    divided = Polygon(np.stack([corners, middles], axis=1).reshape(-1, 2))
+    x, y = np.meshgrid(1e-3 * np.linspace(-80, 80, 33), 1e-3 * np.linspace(-20, 150, 35))
+    points = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=1))
+
+    def distances(polygon):
+        def of(point):
+            return jnp.stack([c.distance for c in polygon.outline().contact_candidates(Vec2.of(point))])
+
+        return np.asarray(jax.jit(jax.vmap(of))(points))
+
+    expected = distances(Polygon(corners))
+    outside = expected[:, 0] >= 0
+    np.testing.assert_allclose(distances(divided)[outside], expected[outside], rtol=0, atol=1e-15)
