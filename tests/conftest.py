@@ -42,6 +42,8 @@ LONG = (
     "random_contacts",
     "commands",
     "grasps",
+    "impact",
+    "more_tasks",
     "bench",
     "push_t",
     "fixtures",
@@ -50,7 +52,7 @@ LONG = (
     "identify_logs",
     "identify",
     "friction_model",
-    "derivative_modes",
+    "derivatives",
     "smooth_shapes",
     "table",
     "contact_derivatives",
@@ -66,40 +68,6 @@ if "PUSHJAX_DATA" not in os.environ and BESIDE.is_dir():
     os.environ["PUSHJAX_DATA"] = str(BESIDE)
 
 
-# Notebooks that compile programs of their own, which takes a minute each.
-LONG_NOTEBOOKS = (
-    "02_one_push",
-    "03_several_contacts",
-    "04_stochastic_pushing",
-    "05_identifying_friction",
-    "06_planning",
-    "07_tasks",
-    "08_plans",
-)
-
-SLOW_NOTEBOOK = "01_limit_surfaces"
-# Cases of parametrized tests that are slow, by the test and what their names contain. Faster cases remain.
-SLOW_CASES = {
-    "test_conditions_hold_and_jams_have_no_motion": ("[4]",),
-    "test_derivative_of_the_inverse_map": ("quartic",),
-    "test_derivatives_match_central_differences": ("quartic",),
-    "test_examples_run": ("contact.md", "identification.md"),
-    "test_first_and_second_derivatives_of_the_distance": ("waisted",),
-    "test_forces_at_the_contact_points_are_the_wrench": ("pad, L", "finger, T", "jaw"),
-    "test_frictionless_fingers_jam_where_their_forces_balance_to_rounding": ("float32",),
-    "test_laws_of_a_grasp": ("three fingers",),
-    "test_meets_where_brute_force_does": ("butterfly",),
-    "test_nothing_is_nan_in_degenerate_problems": ("[4]",),
-    "test_one_contact_has_the_same_answer": ("[4]",),
-    "test_random_experiments_draw_and_write_a_page": ("stochastic-push",),
-    "test_random_problems": ("[8-", "[3-2"),
-    "test_recorded_problems": ("[3-", "[4-", "2-ellipsoid"),
-    "test_recorded_pushes": ("ellipsoid",),
-    "test_samples_are_convex_around_their_mean": ("gram-float32",),
-    "test_solvers_agree": ("quartic",),
-}
-
-
 def pytest_collection_modifyitems(items):
     order = {f"test_{name}": place for place, name in enumerate(LONG)}
 
@@ -111,13 +79,10 @@ def pytest_collection_modifyitems(items):
 
 
 class Marks:
-    """Marks tests as long and slow. As a plugin, it sees the notebooks too."""
+    """Marks notebooks as slow. It is a plugin, because a conftest.py sees only its own folder."""
 
     def pytest_itemcollected(self, item):
-        test, _, case = item.name.partition("[")
-        if item.path.stem in LONG_NOTEBOOKS:
-            item.add_marker("long")
-        if item.path.stem == SLOW_NOTEBOOK or any(part in f"[{case}" for part in SLOW_CASES.get(test, ())):
+        if item.path.suffix == ".ipynb":
             item.add_marker("slow")
 
 

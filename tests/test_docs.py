@@ -25,7 +25,13 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SITE = sorted(path for path in DOCS.rglob("*.md"))
 # pages that compile for half a minute to a minute
-LONG_PAGES = ("docs/concepts/pushing.md", "docs/concepts/random-friction.md", "docs/tasks.md")
+SLOW_PAGES = (
+    "docs/concepts/contact.md",
+    "docs/concepts/identification.md",
+    "docs/concepts/pushing.md",
+    "docs/concepts/random-friction.md",
+    "docs/tasks.md",
+)
 PAGES = [*SITE, ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CHANGELOG.md"]
 BLOCK = re.compile(r"^(<!-- not run: [^>]+ -->\n)?```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SHELL = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -283,7 +289,7 @@ def ran(tmp_path_factory):
     @cache
     def run(long: bool) -> dict[str, str]:
         environment = os.environ | {"JAX_ENABLE_X64": "0", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2"}
-        paths = [str(path) for path in with_blocks() if (label(path) in LONG_PAGES) == long]
+        paths = [str(path) for path in with_blocks() if (label(path) in SLOW_PAGES) == long]
         folder = tmp_path_factory.mktemp("pages")
         command = [sys.executable, __file__, *paths]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=1800)
@@ -295,11 +301,11 @@ def ran(tmp_path_factory):
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, marks=[pytest.mark.long] * (label(path) in LONG_PAGES)) for path in with_blocks()],
+    [pytest.param(path, marks=[pytest.mark.slow] * (label(path) in SLOW_PAGES)) for path in with_blocks()],
     ids=label,
 )
 def test_examples_run(path, ran):
-    assert ran(label(path) in LONG_PAGES)[str(path)] == ""
+    assert ran(label(path) in SLOW_PAGES)[str(path)] == ""
 
 
 def run_pages(paths: list[str]) -> None:

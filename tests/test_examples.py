@@ -8,7 +8,7 @@ import jax
 import pytest
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_learn_push_box(capsys, monkeypatch):
     path = Path(__file__).parents[1] / "examples" / "learn_push_box.py"
     spec = importlib.util.spec_from_file_location("learn_push_box", path)

@@ -8,7 +8,7 @@ from pushjax._math.sums import repeated, summed
 
 # The products F_i F_j of a vector's components, and so the entries of a symmetric matrix.
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])  # where the entries of the matrix stand among the six
+FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]], np.int32)  # where the entries of the matrix stand among the six
 
 
 def dot(a: Float[Array, "3 *rest"], b: Float[Array, "3 *rest"]) -> Float[Array, "*rest"]:

@@ -27,7 +27,7 @@ def test_errors_fall_with_the_square_of_the_step():
         reference_push.fewest_steps(by_steps, 1e-9)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_no_slip_where_it_sticks():
     """A sticking tip rolls as the side turns; the slip that is left is the discretization error, nanometers."""
     coarse, fine = (max(rows.slip_um("float64", (0.004, 0.01), steps)) for steps in (50, 200))
@@ -93,7 +93,7 @@ def test_traffic_counts_rounds():
     assert product.flops == pytest.approx(2 * 40 * 40 * 30)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_cases_work():
     """Each case runs, and moves what it should."""
     problems = cases.solve("float64", 16, 2)
@@ -113,7 +113,7 @@ def test_cases_work():
     np.testing.assert_allclose(*poses, rtol=0, atol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_grasps_begin_at_the_touch_and_end_where_the_square_fits():
     poses = grasps.random_poses(jax.random.key(2), 8, "float64")
     square = pj.Polygon.rectangle(reference_push.SIDE, reference_push.SIDE)
@@ -175,7 +175,7 @@ def test_a_jaw_begins_at_the_touch():
     np.testing.assert_allclose(path[:, -1, 3], reference_push.SIDE + grasps.CLEARANCE, atol=1e-12)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_rows_of_fits_and_of_monte_carlo():
     """Cases that are not pushes have rows with the same names."""
     names = None
@@ -194,7 +194,7 @@ def test_rows_of_fits_and_of_monte_carlo():
     assert found["modes"][0]["SEPARATED"] == 0  # the finger touches in every step
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_tiles_change_nothing(monkeypatch):
     monkeypatch.setattr(cases, "TILE", 16)
     work = cases.push("float64", 40)
@@ -280,7 +280,7 @@ def test_every_case_describes_its_options_and_writes_a_record(case, capsys):
     assert "--progress" not in text
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_only_new_shapes_are_compiled():
     """Only new shapes compile; new values of outline, path, friction, or more batches of `monte_carlo` do not."""
     here = reference_push.task("quartic", "float64")
@@ -324,7 +324,7 @@ def test_only_new_shapes_are_compiled():
     assert compiled_by(lambda: many(320), lambda: many(1000)) == 0
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contacts(monkeypatch):
     """Judge two thousand problems of two contacts by the independent solver."""
     monkeypatch.setattr(contacts, "MODELS", {"quartic": 4})

@@ -196,7 +196,7 @@ def test_threads_change_nothing():
     np.testing.assert_array_equal(one.pose, two.pose)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_mjx_converges_with_softened_contacts():
     """With softened contacts MJX converges, and another timestep uses the same compiled program."""
     mjx = pytest.importorskip("benchmarks.peers.mjx")
@@ -244,7 +244,7 @@ AMONG_FIXTURES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["along a wall", pytest.param("around a peg", marks=pytest.mark.long)])
+@pytest.mark.parametrize("name", ["along a wall", pytest.param("around a peg", marks=pytest.mark.slow)])
 def test_pushes_among_fixtures_agree(name):
     """The poses agree to what a quartic and soft contacts allow; without the fixture they are far apart."""
     (geom, fixture), start, travel = AMONG_FIXTURES[name]

@@ -34,7 +34,7 @@ def test_clipped_pairs_are_counted(rng):
 
 
 # The minimum that jaxopt finds for several contacts is mostly not zero.
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solve", "count", "least", "error"), [(contacts.solve, 2, 0.8, 1e-6), (by_jaxopt.solve, 1, 0.5, 1e-2)]
 )

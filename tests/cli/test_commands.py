@@ -118,7 +118,7 @@ def test_table2_from_forces(table):
         assert 0.85 < forces / ideal < 1.15
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_table2_identified(converted, monkeypatch, tmp_path):
     """On two splits with ellipsoids, identification is better than the ideal surface and far better than the paper."""
     from pushjax.experiments.table2 import experiment
@@ -298,7 +298,7 @@ def test_stochastic_push(random_record):
         assert 0 <= row["normality"]["p_value"] <= 1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_capture(random_record):
     _, record = random_record("capture")
     assert list(record["dof"]) == ["200", "10"]
@@ -315,7 +315,7 @@ def test_capture(random_record):
     assert not caught[np.abs(starts[:, 0]) > 0.07].any()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("slider", ["rectangle", "butterfly"])
 def test_grasps_under_uncertainty(random_record, slider):
     _, record = random_record(f"grasp-{slider}")
@@ -331,15 +331,8 @@ def test_grasps_under_uncertainty(random_record, slider):
         assert len(cell["outcome_of_each"]) == len(cell["pose"]) == 40
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "stochastic-push",
-        pytest.param("capture", marks=pytest.mark.long),
-        pytest.param("grasp-rectangle", marks=pytest.mark.long),
-        pytest.param("grasp-butterfly", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stochastic-push", "capture", "grasp-rectangle", "grasp-butterfly"])
 def test_random_experiments_draw_and_write_a_page(random_record, name):
     """The page is a single file that contains its pictures and needs no other file."""
     folder, record = random_record(name)

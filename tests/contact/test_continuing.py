@@ -23,7 +23,7 @@ def solved(problem, solver, displacement, guess):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("contacts", "with_derivatives"), [(2, False), pytest.param(4, True, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("contacts", "with_derivatives"), [(2, False), pytest.param(4, True, marks=pytest.mark.slow)])
 def test_the_same_motion_or_a_second_one(contacts, with_derivatives):
     """Answer and derivative are those of `Exhaustive`, unless the motion is not unique: whatever the guess is."""
     count = 400
@@ -89,7 +89,7 @@ def grasps():
     return final
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_coarse_grasp_goes_on_as_a_fine_one(grasps):
     """In a coarse grasp, the motion that continues is nearer to fine steps than the motion of largest power.
 

@@ -78,7 +78,7 @@ def test_recorded_problems(oracle, kind, count):
 NUMBERS = [
     *((1, 2), (1, 4), (2, 2), (2, 4), (3, 4), (4, 4)),
     *(pytest.param(count, degree, marks=SLOW) for count, degree in ((3, 2), (4, 2), (8, 2), (8, 4))),
-    *(pytest.param(count, degree, marks=pytest.mark.long) for count in (5, 6, 7) for degree in (2, 4)),
+    *(pytest.param(count, degree, marks=pytest.mark.slow) for count in (5, 6, 7) for degree in (2, 4)),
 ]
 
 
@@ -264,7 +264,7 @@ def test_float32():
 
 
 @SLOW
-@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_projected_is_right_where_it_answers(count):
     surface, contacts = problems(count, seed=9, condition=100.0)
     exact = solve_all(surface, contacts)

@@ -423,7 +423,7 @@ def test_the_motion_is_continuous_across_sticking_and_its_derivative_jumps():
     assert np.abs(slope[change - 1]).max() > 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("smooth", [4], indirect=True)
 def test_second_derivatives_while_sticking(smooth, rng):
     """The implicit derivative is itself differentiable: compare `jax.hessian` with differences of the gradient."""

@@ -38,6 +38,7 @@ def test_streams_are_brought_to_the_tips_stamps(tmp_path, suffix):
     np.testing.assert_allclose(push.pose - push.pose[0] + expected[0], expected, atol=1e-6)
     np.testing.assert_allclose(np.cos(push.pose[:, 2] - expected[:, 2]), 1.0, atol=1e-9)
     force = push.force
+    assert force is not None
     assert np.isnan(force[:4]).all()
     np.testing.assert_allclose(force[4:], np.column_stack([2 * time, -1 - time])[4:], atol=1e-6)
 
@@ -122,6 +123,7 @@ def test_a_push_begins_and_ends_where_the_object_is_tracked(tmp_path):
     lost = np.array([-0.3, 0.31, 0.33, 0.5, 0.6, 1.5])
     (push,) = load_recordings(mit_log(tmp_path, tables(body=lost))).pushes
     assert push.tracked.all()
+    assert push.time is not None
     np.testing.assert_allclose(push.time[[0, -1]], [0.325, 0.6], atol=1e-6)
 
 

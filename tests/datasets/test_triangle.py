@@ -65,6 +65,8 @@ def test_text_log_gives_the_curated_pushes(both) -> None:
         assert raw.tracked.sum() == 2
         close(raw.hand, tidy.hand, TIP_TOLERANCE)
         close(raw.time, tidy.time, TIME_TOLERANCE)
+        assert raw.force is not None
+        assert tidy.force is not None
         inside = np.isfinite(raw.force[:, 0]) & np.isfinite(tidy.force[:, 0])  # float32 may move a time past the end
         assert inside.sum() >= len(inside) - 60
         close(raw.force[inside], tidy.force[inside], FORCE_TOLERANCE)
@@ -172,6 +174,8 @@ def test_clean_log_is_read_as_it_was_made(log_file: Path, records: Records) -> N
         # Written with nine digits: force exactly 2 N along the body's x, arm (-0.05 ... , 0) from the center of mass.
         np.testing.assert_allclose(push.wrench, [[2.0, 0.0, 0.0]], atol=1e-7)
         np.testing.assert_allclose(push.twist, [[STEP, 0.0, 0.0]], atol=1e-8)
+        assert push.time is not None
+        assert push.force is not None
         assert push.time[0] == 0
         np.testing.assert_allclose(np.hypot(*push.force[-1]), 2.0, atol=1e-7)
     with pytest.raises(ValueError, match="arrangement must be one of 3pts1"):

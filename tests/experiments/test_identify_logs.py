@@ -437,7 +437,7 @@ def test_bootstrap(few, found, block, surface):
     assert np.all(np.abs(z.mean(axis=0) - found.z) < 2 * laplace)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_noise(few, found, block, surface, tmp_path):
     """Identify the noise of simulated pushes: the result predicts better than the initial guess."""
     slider, hand = pj.Slider(block, surface), pj.Hand.finger(RADIUS)
@@ -474,7 +474,7 @@ def test_noise(few, found, block, surface, tmp_path):
         pj.identify_noise(jax.random.key(2), found, seen, slider, hand, samples=1)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_density(few, found, block, surface):
     """The density of predicted poses is correct, and the noise that maximizes it is near that of the pushes.
 

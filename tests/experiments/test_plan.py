@@ -45,7 +45,7 @@ def push_through_the_middle(*_, pushes, finger, **__):
     scope="module",
     params=[
         ("without search", BLOCK),
-        *(pytest.param(each, marks=pytest.mark.long) for each in ((SIMPLE, BLOCK), (ROBUST, BLOCK), (NOT_CONVEX, L))),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ((SIMPLE, BLOCK), (ROBUST, BLOCK), (NOT_CONVEX, L))),
     ],
     ids=["without search", "simple", "robust", "not convex"],
 )
@@ -88,7 +88,7 @@ def test_the_finger_touches_nothing_between_pushes(planned):
     np.testing.assert_allclose(position[0], record["settings"]["finger"], atol=1e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_way_points_do_what_the_plan_says(planned):
     """A rollout along all of them, transits included, ends where the plan does under the mean friction."""
     _, record, points, corners = planned

@@ -89,7 +89,7 @@ def test_certificate_agrees_with_the_sweep(quartic):
     ("sampler", "dtype"),
     [
         pytest.param("gram", "float32", marks=pytest.mark.slow),
-        pytest.param("gram", "float64", marks=pytest.mark.long),
+        pytest.param("gram", "float64", marks=pytest.mark.slow),
         ("sum_of_squares", "float32"),
         pytest.param("sum_of_squares", "float64", marks=pytest.mark.slow),
     ],

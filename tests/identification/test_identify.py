@@ -186,7 +186,7 @@ def test_noise_and_outliers(pushes, square, expected, real, hand, tmp_path):
     assert abs(share - 0.99) < 4 * np.sqrt(0.99 * 0.01 / 2000)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_float32_where_float64_is_enabled(square, expected, hand):
     """Float32 converges on noisy pushes whose minimum is at a change of mode, or where roundoff hides the descent."""
     slider, single = pj.Slider(square, expected), lambda tree: jax.tree.map(lambda leaf: leaf.astype(jnp.float32), tree)
@@ -201,7 +201,7 @@ def test_float32_where_float64_is_enabled(square, expected, hand):
         assert abs(float(found.friction) - MU) < 0.005
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_conditions_share_the_calibration(square, hand):
     """Two sliders on two tables share one robot, which goes farther than logged, with a finger thinner than stated."""
     rng = np.random.default_rng(5)
@@ -325,7 +325,7 @@ def test_bad_arguments(pushes, square, expected, hand):
         pj.identify(pushes, slider, pj.Hand.two_fingers(0.002))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_contact_at_end_determines_offsets(square, real, expected, hand, tmp_path):
     """The condition that finger and slider touch reveals the offset of the tip and of the frame.
 

@@ -159,7 +159,7 @@ def test_float32_table():
     np.testing.assert_allclose(low.pose, high.pose, atol=2e-6)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_found_again(square, expected, hand):  # noqa: F811
     """An uneven table, the offset of the frame, drift and sides are recovered from pushes simulated with them."""
     rng = np.random.default_rng(5)
@@ -206,7 +206,7 @@ def test_found_again(square, expected, hand):  # noqa: F811
         found.corrected(slider, hand, jnp.asarray(paths[0]))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_overlap_found_again(square, expected, hand):  # noqa: F811
     """For fingers logged to start up to 3 mm inside, the 70 % of that which is measurement error is recovered."""
     rng = np.random.default_rng(6)
@@ -235,7 +235,7 @@ def test_overlap_found_again(square, expected, hand):  # noqa: F811
         pj.identify(wide, slider, two, pj.Unknowns(overlap=0.5))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_saved_with_a_table(square, expected, hand, tmp_path):  # noqa: F811
     starts, paths = planned(np.random.default_rng(7), 5)
     pushes = pj.Pushes(starts, paths, starts)

@@ -169,7 +169,7 @@ def play(made, pose, finger, fixtures, steps=150):
     return Episode(success, len(apart), *np.min(apart, axis=0))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_box_gets_around_fixtures():
     """The same controller and settings: that knows of the fixtures, that does not, and on a table without them."""
     pushes = PushLibrary.build(scene_of(), contacts=120, angles=7)

@@ -233,7 +233,7 @@ def test_bad_options():
             pusht_mpc.run(**{name: bad})
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_pusht(monkeypatch, tmp_path):
     pytest.importorskip("gym_pusht")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -246,7 +246,7 @@ def test_pusht(monkeypatch, tmp_path):
     assert pusht_mpc.play(pusht_mpc.make_plant(), again, 70000).steps == record["rows"][0]["steps"]
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("vertices", [SHORT_L, 0.6 * PLUS], ids=["L", "plus"])
 def test_other_blocks(vertices):
     """The same code and settings for two other blocks; L and plus have reflex corners as the T has."""

@@ -204,7 +204,7 @@ def test_poses_in_fixtures_are_refused(slider, easy):
         plan(finger=(0.0, -0.202))
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_hand_stays_out_of_fixtures(slider, scene, easy, plan):
     shapely = pytest.importorskip("shapely")
     start, after = plan.path[0, :2]

@@ -175,7 +175,7 @@ def test_bad_input():
         Squeezes(0.08, offsets=())
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulated_disk_moves_as_in_closed_form():
     start, jaws = uniform(64), np.array([(0.001, 0, 0.4), (0, 0.002, 1.2)])
     done = squeeze_outcomes(KEY, DISK, HAND, start, jaws, model=KNOWN, squeezes=Squeezes(0.07, closed=0.02))
@@ -186,7 +186,7 @@ def test_a_simulated_disk_moves_as_in_closed_form():
         np.testing.assert_allclose(done.poses[:, k + 1, :2], wanted[:, :2], atol=1e-4)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_simulated_rectangle_is_oriented():
     """With little friction it turns as in closed form, unless it starts near the edge between two outcomes."""
     settings = {"model": pj.FrictionModel(100, (0.02, 0.05)), "squeezes": Squeezes(0.09, closed=0.02)}

@@ -169,7 +169,7 @@ def test_transits_in_random_worlds():
     assert must > 400
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_transits_in_thousands_of_worlds():
     found, must = check_transits(2000, 3)
     print(f"{found} transits; {must} must exist")

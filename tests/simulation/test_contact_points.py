@@ -46,8 +46,8 @@ MARKS = {
     "finger, T": pytest.mark.slow,
     "jaw": pytest.mark.slow,
     "pad, L": pytest.mark.slow,
-    "pad, bean": pytest.mark.long,
-    "rake": pytest.mark.long,
+    "pad, bean": pytest.mark.slow,
+    "rake": pytest.mark.slow,
 }
 
 

@@ -306,8 +306,8 @@ HAND_DIFFERENCE = 1e-5  # for differences over H, where steps rotate the slider 
     ("hand", "opening"),
     [
         pytest.param(Hand.two_fingers(0.005), (0.06, 0.04), marks=pytest.mark.slow),
-        pytest.param(Hand.three_fingers(0.003), (0.05, 0.015), marks=pytest.mark.long),
-        pytest.param(Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03), marks=pytest.mark.long),
+        pytest.param(Hand.three_fingers(0.003), (0.05, 0.015), marks=pytest.mark.slow),
+        pytest.param(Hand.parallel_jaw(0.027, 0.01), (0.06, 0.03), marks=pytest.mark.slow),
     ],
     ids=["two fingers", "three fingers", "jaw"],
 )

@@ -94,7 +94,7 @@ def test_pushes_far_from_fixtures_are_those_without():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.long)])
+@pytest.mark.parametrize("mode", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_by_a_wall_are_those_of_differences(mode):
     """A slider that is pushed flat along a wall and turns on its corner: by place, direction and friction of a wall."""
     path = straight((TOUCH, 0.012), (TOUCH + 0.02, 0.012))
@@ -166,7 +166,7 @@ def many_pushes():
     )
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_monte_carlo_takes_fixtures():
     corners = np.asarray(slider.shape.vertices)
     for x, y, angle in np.asarray(many_pushes().pose):
@@ -174,7 +174,7 @@ def test_monte_carlo_takes_fixtures():
         assert np.min((corners @ turn.T + [x, y])[:, 1]) > -HALF[1] - 1e-4
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_pushes_are_those_of_monte_carlo():
     key = jax.random.fold_in(jax.random.key(0), 3)
     one = pj.random_rollout(key, slider, hand, TOWARD_FLOOR, pose=jnp.zeros(3), model=MODEL, fixtures=(FLOOR,))

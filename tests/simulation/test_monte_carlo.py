@@ -156,7 +156,7 @@ def test_friction_drawn_every_few_steps(whole):
     np.testing.assert_allclose(result.pose[5], pose, atol=1e-7)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_bits_do_not_depend_on_devices(whole, tmp_path):
     each = {devices: start(tmp_path / f"{devices}.npz", devices=devices) for devices in (2, 8)}
     for devices, process in each.items():

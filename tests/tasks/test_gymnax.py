@@ -37,7 +37,7 @@ print("gymnax", version("gymnax"))
 """
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_gymnax_wrappers_run(tmp_path):
     here = Path(sysconfig.get_paths()["purelib"])
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)

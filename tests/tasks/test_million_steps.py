@@ -11,7 +11,7 @@ from pushjax.tasks import PushT
 BATCH, STEPS = 4096, 250
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 4])
 def test_everything_is_finite(degree):
     """Actions anywhere in the workspace, which press the block into walls and corners; automatic resets."""

@@ -117,7 +117,7 @@ def test_starts_are_free_of_overlaps(task):
             assert block.bounds[1] > -0.15
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_friction_and_surface_are_drawn_at_the_reset():
     env = PushTwoFingers()
     _, states = starts(env, env.params(model=pj.FrictionModel(dof=20, friction=(0.1, 0.5))))
@@ -175,7 +175,7 @@ def test_success_can_be_reached(task, episodes):
         assert abs(observations[0, -1, 4] - 1) < 0.01
 
 
-@pytest.mark.long  # those of PushT see the same code
+@pytest.mark.slow  # those of PushT see the same code
 def test_derivatives_are_those_of_differences(episodes):
     """Of the return in the actions, for a push off the center."""
     env, params, _, _ = drawn(PushBox)
@@ -231,7 +231,7 @@ def test_registered():
         assert env.task == task(substeps=1)
 
 
-@pytest.mark.long  # those of PushT see the same code
+@pytest.mark.slow  # those of PushT see the same code
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasiums_checks_and_pictures(task):
     gymnasium = pytest.importorskip("gymnasium", minversion="1.1")
