@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from pushjax.experiments._record import to_builtin
+from pushjax.experiments._record import as_plain
 from pushjax.experiments._report import Table
 
 TEMPLATE = """<!doctype html>
@@ -41,7 +41,7 @@ ABOUT = ("settings", "versions", "machine", "date")
 
 def write_page(record: dict[str, Any], report: Sequence[str | Table], path: Path) -> Path:
     """Write a record, with its report and its pictures, as one HTML page, and return the page's path."""
-    whole = json.loads(json.dumps(record, default=to_builtin))
+    whole = as_plain(record)
     page = TEMPLATE.format(
         title=html.escape(f"pushjax: {record['experiment']}"),
         report="\n".join(

@@ -1,4 +1,4 @@
-"""Records of a command's results, with its settings, the versions and the machine, and their JSON files."""
+"""The record of a run (results, settings, versions, machine), and its JSON file."""
 
 import json
 import math
@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
+import pushjax
 from pushjax._internal.checks import warn
 
 PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "matplotlib")
@@ -19,8 +20,6 @@ PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "matplotlib")
 
 def result_record(experiment: str, settings: dict[str, Any], **figures: Any) -> dict[str, Any]:
     """Return the record of one run: where, when and with which settings it ran, followed by its figures."""
-    import pushjax
-
     return {
         "experiment": experiment,
         "versions": {"python": platform.python_version(), "pushjax": pushjax.__version__}
@@ -45,11 +44,11 @@ def _processor() -> str:
 
 
 def write_json(record: dict[str, Any], path: Path) -> None:
-    """Write a record as JSON, with NumPy and JAX arrays and numbers as lists and Python numbers."""
+    """Write a record, as `as_plain` converts it, to a JSON file."""
     # JSON has no NaN and no infinity: null is written for such a number, and a warning names the field
     path.parent.mkdir(parents=True, exist_ok=True)
-    plain, missing = json.loads(json.dumps(record, default=to_builtin)), []
-    path.write_text(json.dumps(_with_null(plain, "", missing), indent=2, allow_nan=False) + "\n")
+    missing: list[str] = []
+    path.write_text(json.dumps(_with_null(as_plain(record), "", missing), indent=2, allow_nan=False) + "\n")
     if missing:
         others = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         warn(f"{path}: {missing[0]}{others} is not a finite number; it is null there")
@@ -67,7 +66,12 @@ def _with_null(value: Any, name: str, missing: list[str]) -> Any:
     return value
 
 
-def to_builtin(value: Any) -> Any:
+def as_plain(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record whose arrays are lists, whose NumPy and JAX numbers are Python's, and whose paths are text."""
+    return json.loads(json.dumps(record, default=_to_builtin))
+
+
+def _to_builtin(value: Any) -> Any:
     """Convert a value that `json` cannot write by itself: an array, a NumPy or JAX number, or a path."""
     if isinstance(value, (np.ndarray, np.generic, jax.Array)):
         return np.asarray(value).tolist()

@@ -165,7 +165,7 @@ class Identified(eqx.Module):
         normal = jax.random.normal(key, (len(self.z), n), self.z.dtype)
         upper = jnp.linalg.cholesky(self.precision).T
         z = self.z[None] + jax.scipy.linalg.solve_triangular(upper, normal, lower=False).T
-        return jax.vmap(lambda one: self._drop_condition_axis(self.prior.parameters(one)))(z)
+        return self._samples(z)
 
     def interval(self, level: float = 0.9) -> dict[str, tuple[Array, Array]]:
         """Return an interval for each unknown except the surface.
@@ -215,7 +215,7 @@ class Identified(eqx.Module):
         Raises:
             ValueError: If `label` is another label.
         """
-        return uncertainty.profile(self, pushes, slider, hand, label, points=points, reach=reach)
+        return uncertainty.profile(self, pushes, slider, hand, label, points, reach)
 
     def bootstrap(self, key: PRNGKeyArray, pushes: Pushes, slider: Slider, hand: Hand, n: int) -> Parameters:
         """Identify from `n` bootstrap samples of the pushes of each condition, each from this estimate.
@@ -233,7 +233,7 @@ class Identified(eqx.Module):
         Raises:
             ValueError: If all pushes of a condition have weight zero.
         """
-        return uncertainty.bootstrap(key, self, pushes, slider, hand, n)[0]
+        return self._samples(uncertainty.bootstrap(key, self, pushes, slider, hand, n))
 
     def corrected(self, slider: Slider, hand: Hand, path: Array) -> tuple[Slider, Hand, Array]:
         """Return slider, hand and path as they really are, for use in rollouts.
@@ -277,6 +277,10 @@ class Identified(eqx.Module):
         parameters = self.prior.parameters(self.z)
         surfaces, scene = limit_surfaces(self.prior, parameters), Scene(slider.shape, hand, self.prior.origin)
         return self._drop_condition_axis(predict_pushes(parameters, surfaces, scene, pushes.as_conditions()))
+
+    def _samples(self, z: Float[Array, "n size"]) -> Parameters:
+        """Return the parameters of several z."""
+        return jax.vmap(lambda one: self._drop_condition_axis(self.prior.parameters(one)))(z)
 
     def _drop_condition_axis(self, tree: Any) -> Any:
         """Drop the axis of conditions if the pushes had none."""

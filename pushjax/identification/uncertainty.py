@@ -13,7 +13,6 @@ from pushjax._internal.jit import jit
 from pushjax.identification.fit import Rounds, fit
 from pushjax.identification.model import Problem, Scene, limit_surfaces
 from pushjax.identification.pushes import Pushes
-from pushjax.identification.unknowns import Parameters
 from pushjax.simulation.hand import Hand
 from pushjax.simulation.slider import Slider
 
@@ -54,11 +53,10 @@ def profile(
     slider: Slider,
     hand: Hand,
     label: str,
-    *,
-    points: int = POINTS,
-    reach: float = REACH,
+    points: int,
+    reach: float,
 ) -> Profile:
-    """Compute the profile of one number of z; `Identified.profile` describes it."""
+    """Compute the profile of one number of z; see `Identified.profile`."""
     positions = scalar_positions(found)
     if label not in positions:
         raise ValueError(f"label must be one of {', '.join(positions)}; got {label!r}")
@@ -130,8 +128,8 @@ def _profile_side(
 
 def bootstrap(
     key: PRNGKeyArray, found: "Identified", pushes: Pushes, slider: Slider, hand: Hand, n: int
-) -> tuple[Parameters, Float[Array, "n size"]]:
-    """Identify from `n` bootstrap samples of the pushes of each condition; return the estimates and their z."""
+) -> Float[Array, "n size"]:
+    """Return the estimates of z from `n` bootstrap samples of the pushes of each condition."""
     # All samples are fitted at once, each from the estimate of all pushes.
     pushes, problem = _pushes_and_problem(found, pushes, slider, hand)
     weights = np.asarray(pushes.weight)
@@ -141,10 +139,8 @@ def bootstrap(
     if empty.size:
         raise ValueError(f"pushes: condition {empty[0]} has no push with a weight to sample")
     counts = np.stack([[rng.multinomial(row.sum(), row / row.sum()) for row in has_weight] for _ in range(n)])
-    z = _refitted(
-        problem, pushes, found.z, _sigma_by_kind(found), jnp.asarray(counts * weights, found.z.dtype), found.robust
-    )
-    return jax.vmap(lambda one: found._drop_condition_axis(found.prior.parameters(one)))(z), z
+    resampled = jnp.asarray(counts * weights, found.z.dtype)
+    return _refitted(problem, pushes, found.z, _sigma_by_kind(found), resampled, found.robust)
 
 
 @jit

@@ -25,7 +25,7 @@ from pushjax.experiments.identify_logs.report import warning
 from pushjax.identification.noise import Noise, identify_noise
 from pushjax.identification.pushes import Pushes
 from pushjax.identification.pushes_of_recordings import has_wrenches, observed_often_enough, screen
-from pushjax.identification.uncertainty import Profile, profile, scalar_positions
+from pushjax.identification.uncertainty import Profile, scalar_positions
 
 MIN_PUSHES = 3  # pushes; from fewer the size of their errors cannot be told
 LEVEL = 0.9
@@ -134,7 +134,7 @@ def find(
     profiles: list[Profile] = []
     for label in labels:
         say(f"interval of {label}")
-        profiles.append(profile(found, pushes, slider, hand, label))
+        profiles.append(found.profile(pushes, slider, hand, label))
         progress(1 + len(profiles), total)
     noise = None
     if options.noise:
