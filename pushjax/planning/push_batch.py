@@ -1,8 +1,8 @@
-"""Batches of pushes by one compiled program, whatever their number and length.
+"""Simulation of any number of pushes of any length by one compiled program.
 
-A push along a path is simulated in legs of a fixed number of steps, and the pushes in groups of a fixed number. So a
-library of a hundred thousand outcomes and the few pushes that correct a push while it runs share one program, which is
-compiled once.
+Pushes are simulated in groups of a fixed number, and their paths in legs of a fixed number of steps. So a library of a
+hundred thousand outcomes and the few pushes that correct a push while it runs share one program, which is compiled
+once.
 """
 
 import jax
@@ -32,28 +32,25 @@ def simulate_pushes(
     # before the first one that failed or stopped, (pushes,).
     count, steps = len(paths), paths.shape[1] - 1
     dtype = np.dtype(jnp.result_type(float))
-    mu = np.broadcast_to(np.asarray(friction, dtype), (count,))
-    surfaces = _one_surface_each(slider.surface, count)
-    found = np.empty((count, steps + 1, 3), dtype)
-    valid = np.full(count, steps)
-    for first in range(0, count, GROUP):
-        group = slice(first, min(first + GROUP, count))
-        size = group.stop - first
-        padded = np.minimum(np.arange(GROUP), size - 1) + first  # the last push is repeated to fill the group
-        surface = jax.tree.map(lambda leaf, rows=padded: leaf[rows], surfaces)
-        pose = np.asarray(poses, dtype)[padded]
-        found[group, 0] = pose[:size]
+    # The last push is repeated to fill its group. To fill the last leg, the hand rests at the end of its path.
+    rows = np.minimum(np.arange(-(-count // GROUP) * GROUP), count - 1)
+    columns = np.minimum(np.arange(-(-steps // LEG) * LEG + 1), steps)
+    paths = np.asarray(paths, dtype)[rows][:, columns]
+    mu = np.broadcast_to(np.asarray(friction, dtype), (count,))[rows]
+    surfaces = jax.tree.map(lambda leaf: leaf[rows], _one_surface_each(slider.surface, count))
+    found = np.empty((len(rows), len(columns), 3), dtype)
+    found[:, 0] = np.asarray(poses, dtype)[rows]
+    valid_steps = np.full(len(rows), steps)
+    for first in range(0, len(rows), GROUP):
+        group = slice(first, first + GROUP)
+        surface = jax.tree.map(lambda leaf, group=group: leaf[group], surfaces)
         for begin in range(0, steps, LEG):
-            index = np.minimum(np.arange(begin, begin + LEG + 1), steps)  # beyond its end the hand rests
-            leg = np.asarray(paths[padded][:, index], dtype)
-            reached, until = _simulate_group(slider.shape, hand, surface, mu[padded], leg, pose)
-            reached, until = np.array(reached), np.asarray(until)
-            done = min(LEG, steps - begin)
-            found[group, begin + 1 : begin + done + 1] = reached[:size, 1 : done + 1]
-            stopped = until[:size] < done
-            valid[group] = np.where(stopped, np.minimum(valid[group], begin + until[:size]), valid[group])
-            pose = reached[:, -1]
-    return found, valid
+            leg, start = paths[group, begin : begin + LEG + 1], found[group, begin]
+            reached, valid = map(np.asarray, _simulate_group(slider.shape, hand, surface, mu[group], leg, start))
+            found[group, begin + 1 : begin + LEG + 1] = reached[:, 1:]
+            until = np.where(valid < LEG, begin + valid, steps)
+            valid_steps[group] = np.minimum(valid_steps[group], until)
+    return found[:count, : steps + 1], valid_steps[:count]
 
 
 @quick_jit
