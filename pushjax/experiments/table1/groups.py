@@ -1,7 +1,7 @@
 """The groups of pushes of one condition of table 1, and how well a push predicts its own repetition.
 
-A condition is one `Recordings`, in which each push has two samples, a start and an end. What is known of a push has
-these names:
+A condition is one `Recordings`, in which each push has two samples, a start and an end. `Recording.about` has these
+entries:
 
 - "group": "whole" are complete pushes at 10 mm/s. "middle" are the test pushes of these, from 10 to 90 % of their
   duration. "fast" are complete pushes at 20 mm/s.
@@ -17,16 +17,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-import pushjax as pj
 from pushjax.datasets import LogError, Recording, Recordings
 from pushjax.datasets.mit_folder import MIDDLE_PART, SAME_SPEED, in_body, states_at
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.recordings import Floats
-from pushjax.experiments._tables import relative_motions
+from pushjax.datasets.recordings import Floats, wrap_angle
+from pushjax.experiments._tables import deviation_mm, relative_motions
 
 SLOW, FAST = 0.010, 0.020  # m/s
-TRAIN_SHARE = 0.2  # of the paper
-MIN_PUSHES = 10  # smallest number of slow pushes, of which a few are used for training
+TRAIN_SHARE = 0.2  # part of the slow pushes to learn from, as in the paper
+MIN_PUSHES = 10  # slow pushes, at least
 # The rules for pushes whose tracker can be trusted:
 # - At the start, the tip is less than MAX_GAP (m) from the outline, outside or inside.
 # - At the end, it is less than MAX_OVERLAP (m) inside the outline.
@@ -37,46 +36,43 @@ MAX_GAP, MAX_OVERLAP, MAX_AHEAD, MAX_TURN, MIN_PATH = 0.008, 0.006, 0.005, np.de
 
 
 def grouped(log: Recordings, seed: int) -> Recordings:
-    """Return the groups of pushes with all their samples; the training pushes are chosen at random."""
+    """Return the three groups of pushes of a condition, each push cut to two samples; training is chosen at random."""
     slow, fast = (
         [push for push in log.pushes if abs(push.about["speed"] - speed) < SAME_SPEED] for speed in (SLOW, FAST)
     )
     if len(slow) < MIN_PUSHES:
         what = f"{log.object} on {log.surface} at {1e3 * SLOW:g} mm/s"
         raise LogError(log.source, f"expected at least {MIN_PUSHES} usable pushes of {what}, found {len(slow)}")
-    training = np.zeros(len(slow), bool)
     count = int(np.clip(round(TRAIN_SHARE * len(slow)), 1, len(slow) - 1))
-    training[np.random.default_rng(seed).permutation(len(slow))[:count]] = True
-    tested = [push for push, trains in zip(slow, training, strict=True) if not trains]
-    groups = {
-        "whole": _group(log, slow, (0.0, 1.0), training),
-        "middle": _group(log, tested, MIDDLE_PART, np.zeros(len(tested), bool)),
-        "fast": _group(log, fast, (0.0, 1.0), np.zeros(len(fast), bool)),
-    }
-    pushes = (replace(push, about={**push.about, "group": name}) for name, each in groups.items() for push in each)
+    chosen = np.random.default_rng(seed).permutation(len(slow))[:count]
+    slow = [_with(push, training=k in chosen) for k, push in enumerate(slow)]
+    tested = [push for push in slow if not push.about["training"]]
+    fast = [_with(push, training=False) for push in fast]
+    cuts = {"whole": (slow, (0.0, 1.0)), "middle": (tested, MIDDLE_PART), "fast": (fast, (0.0, 1.0))}
+    pushes = (push for name, (each, fractions) in cuts.items() for push in _cut(log, each, fractions, name))
     return replace(log, pushes=tuple(pushes))
 
 
-def _group(
-    log: Recordings, pushes: list[Recording], fractions: tuple[float, float], training: NDArray[np.bool_]
-) -> list[Recording]:
-    """Return pushes from the first to the second fraction of their duration."""
+def _with(push: Recording, **about: object) -> Recording:
+    """Return a push with more entries of `about`."""
+    return replace(push, about={**push.about, **about})
+
+
+def _cut(log: Recordings, pushes: list[Recording], fractions: tuple[float, float], name: str) -> list[Recording]:
+    """Return pushes from the first to the second fraction of their duration, as the group `name`."""
     cut = [_between(push, fractions) for push in pushes]
-    valid = _is_trustworthy(replace(log, pushes=tuple(cut)))
-    return [
-        replace(push, about={**push.about, "training": bool(trains), "valid": bool(trusted)})
-        for push, trains, trusted in zip(cut, training, valid, strict=True)
-    ]
+    valid = _valid(replace(log, pushes=tuple(cut)))
+    return [_with(push, group=name, valid=bool(each)) for push, each in zip(cut, valid, strict=True)]
 
 
 def _between(push: Recording, fractions: tuple[float, float]) -> Recording:
     """Return the states of a push at two fractions of its duration."""
     _, pose, hand = states_at(push, fractions)
-    pose[1, 2] = pose[0, 2] + ((pose[1, 2] - pose[0, 2] + np.pi) % (2 * np.pi) - np.pi)
+    pose[1, 2] = pose[0, 2] + wrap_angle(pose[1, 2] - pose[0, 2])
     return replace(push, hand=hand, pose=pose, force=None, time=None)
 
 
-def _is_trustworthy(pushes: Recordings) -> NDArray[np.bool_]:
+def _valid(pushes: Recordings) -> NDArray[np.bool_]:
     """Return a mask (k,) of pushes whose poses and tips at the ends can be trusted."""
     if not len(pushes):
         return np.zeros(0, bool)
@@ -109,7 +105,6 @@ def tips(pushes: Recordings) -> Floats:
 
 def noise_floor_mm(log: Recordings) -> float | None:
     """Estimate the mean deviation of a push from the mean of its repetitions; None without repetitions."""
-    assert log.length is not None  # known for every object of the data set
     whole, middle, fast = (group(log, name) for name in ("whole", "middle", "fast"))
     rows = _repeat_rows(fast, whole)
     if not len(rows):
@@ -120,9 +115,8 @@ def noise_floor_mm(log: Recordings) -> float | None:
     quick, slow = (
         relative_motions(pushes.start, pushes.end)[each] for pushes, each in zip((fast, whole), rows.T, strict=True)
     )
-    differences = np.asarray(pj.deviation(quick, slow, log.length), float)
-    ratio = _mean_motion(middle, log.length) / _mean_motion(whole, log.length)
-    return float(1e3 * differences.mean() / np.sqrt(2) * ratio)
+    moved_middle, moved_whole = (deviation_mm(each.start, each.end, log.length).mean() for each in (middle, whole))
+    return float(deviation_mm(quick, slow, log.length).mean() / np.sqrt(2) * moved_middle / moved_whole)
 
 
 def _repeat_rows(fast: Recordings, whole: Recordings) -> NDArray[np.int64]:
@@ -142,8 +136,3 @@ def _repeat_rows(fast: Recordings, whole: Recordings) -> NDArray[np.int64]:
             if push.about["valid"] and whole.pushes[nearest].about["valid"]:
                 pairs.append((row, nearest))
     return np.array(pairs, np.int64).reshape(-1, 2)
-
-
-def _mean_motion(pushes: Recordings, length: float) -> float:
-    """Return the mean deviation of the end poses from the start poses, m."""
-    return float(np.mean(np.asarray(pj.deviation(pushes.start, pushes.end, length), float)))
