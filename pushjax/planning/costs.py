@@ -4,11 +4,11 @@ A `Cost` is a function of a `Trajectory`. Costs add up and are multiplied by num
 
     cost = Missed(goal, width=0.5) + 0.001 * FinalPose(goal)
 
-A plan of several pushes is a trajectory with a leading axis of pushes, and every cost takes it as it is. A cost is a
-pure function, and its derivatives are finite wherever those of the trajectory are.
+The trajectory of several pushes in a row has a leading axis of pushes, and every cost takes it as it is. A cost is a
+pure function. Its derivatives are finite wherever those of the trajectory are.
 
-The friction of a push is random, and so is the pose it starts from. For samples of both a cost has as many values, and
-a `Risk` makes one number of them.
+The friction of a push is random, and so is the pose from which it starts. Samples of both give samples of the cost,
+which a `Risk` reduces to one number.
 """
 
 from abc import abstractmethod
@@ -23,7 +23,6 @@ from pushjax._internal.checks import ArrayLike, as_float, checked_array
 from pushjax._internal.xla import smallest
 from pushjax._math.vec import Vec2
 from pushjax.geometry import se2
-from pushjax.geometry.shape import Shape
 from pushjax.planning.goal import Goal
 from pushjax.simulation.fixtures import Fixture, Fixtures, Wall
 from pushjax.simulation.hand import Hand
@@ -66,6 +65,11 @@ class Scaled(Cost):
         return self.factor.astype(value.dtype) * value
 
 
+def _final_pose(push: Trajectory) -> Float[Array, "3"]:
+    """Return the final pose of a push, or of the last of several pushes in a row."""
+    return push.pose.reshape(-1, 3)[-1]
+
+
 class FinalPose(Cost):
     """Squared error of the final pose in units of the goal's tolerances, `Goal.squared_error`.
 
@@ -76,7 +80,7 @@ class FinalPose(Cost):
     goal: Goal
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        return self.goal.squared_error(_poses(push)[-1])
+        return self.goal.squared_error(_final_pose(push))
 
 
 class Missed(Cost):
@@ -98,7 +102,7 @@ class Missed(Cost):
         self.goal, self.width = goal, checked_array("width", width, (), non_negative=True)
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
-        beyond = self.goal.max_error(_poses(push)[-1]) - 1
+        beyond = self.goal.max_error(_final_pose(push)) - 1
         smooth = self.width > 0
         transition = jax.nn.sigmoid(beyond / jnp.where(smooth, self.width, 1.0).astype(beyond.dtype))
         return jnp.where(smooth, transition, jnp.where(beyond > 0, 1.0, 0.0).astype(beyond.dtype))
@@ -107,8 +111,8 @@ class Missed(Cost):
 class HandClearance(Cost):
     """Penalty for a hand of round fingers that comes nearer to walls and fixtures than a distance."""
 
-    # The square of what is missing, as a fraction of the distance, for the finger and the point of the path that are
-    # nearest to a wall or fixture: above one if the hand runs into one.
+    # The cost is ((distance - clearance) / distance)^2, where the clearance is the smallest along the path. So it is
+    # zero from `distance` on, and above one if the hand runs into a wall or fixture.
 
     hand: Hand
     fixtures: Fixtures
@@ -120,37 +124,27 @@ class HandClearance(Cost):
 
     def __call__(self, push: Trajectory) -> Float[Array, ""]:
         centers = self.hand.poses(push.configuration)[..., :2].reshape(-1, len(self.hand.fingers), 2)
-        found = [jnp.asarray(jnp.inf, centers.dtype)]
+        clearances = [jnp.asarray(jnp.inf, centers.dtype)]
         for each in self.fixtures:
             for finger, radius in enumerate(self.hand.radius):
-                found.append(_fixture_distance(each, centers[:, finger]) - radius)
-        return (jnp.maximum(self.distance - smallest(jnp.stack(found)), 0) / self.distance) ** 2
+                clearances.append(_fixture_distance(each, centers[:, finger]) - radius)
+        return (jnp.maximum(self.distance - smallest(jnp.stack(clearances)), 0) / self.distance) ** 2
 
 
 def _fixture_distance(fixture: Wall | Fixture, points: Float[Array, "points 2"]) -> Float[Array, ""]:
     """Return the smallest distance of points from a wall or fixture, m, negative inside."""
     if isinstance(fixture, Wall):
         return smallest((points - fixture.point[None]) @ fixture.normal)
-    return _shape_distance(fixture.shape, se2.transform(se2.inverse(fixture.pose), points))
-
-
-def _shape_distance(shape: Shape, points: Float[Array, "points 2"]) -> Float[Array, ""]:
-    """Return the smallest signed distance of points from a shape, both in its body frame, m."""
-    outline = shape.outline()
+    outline, points = fixture.shape.outline(), se2.transform(se2.inverse(fixture.pose), points)
     return smallest(jax.vmap(lambda point: outline.closest(Vec2.of(point)).distance)(points))
 
 
-def _poses(push: Trajectory) -> Float[Array, "poses 3"]:
-    """Return the poses of a push or of several pushes in a row as one array."""
-    return push.pose.reshape(-1, 3)
-
-
 class Risk(eqx.Module):
-    """A number that says how bad a random cost is, from samples of it."""
+    """Reduces samples of a random cost to one number."""
 
     @abstractmethod
     def __call__(self, costs: Float[Array, "samples"]) -> Float[Array, ""]:
-        """Return the risk of samples of a cost, all of one probability."""
+        """Return the risk from equally probable samples of a cost."""
 
 
 class Mean(Risk):
@@ -163,8 +157,8 @@ class Mean(Risk):
 class CVaR(Risk):
     """Conditional value at risk: the mean of the worst fraction of the samples.
 
-    The fraction need not be a whole number of samples; the last one then counts by a part. A fraction of one gives the
-    mean. A fraction that amounts to one sample or less gives the worst sample.
+    If the fraction is not a whole number of samples, the best of them counts in part. A fraction of one gives the mean.
+    A fraction of one sample or less gives the worst sample.
 
     Args:
         fraction: The fraction, above 0 and at most 1.

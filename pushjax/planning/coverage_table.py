@@ -1,4 +1,4 @@
-"""How much of the goal a slider covers, from a table of poses near the goal."""
+"""Measures of how well a final pose reaches the goal: the protocol, and the part of the goal that the slider covers."""
 
 from typing import Protocol
 
@@ -12,21 +12,21 @@ from pushjax.geometry import se2
 from pushjax.geometry.intersection import intersection_area
 from pushjax.geometry.se2_numpy import to_world
 
-POSITIONS, ANGLES = 29, 27  # points of the table along x and y each, and around
-RANGE = 0.26  # of the table to each side: in units of the slider's length, and rad
+POSITIONS, ANGLES = 29, 27  # of the table: points along x and along y, and angles
+RANGE = 0.26  # half-width of the table, in units of the surface's length along x and y, and in rad
 
 
 class Measure(Protocol):
-    """How good a final pose is."""
+    """Score of final poses: how well they reach the goal."""
 
     @property
     def enough(self) -> float:
-        """Score from which a pose counts as the goal."""
+        """Score above which a slider is at the goal."""
         ...
 
     @property
     def reach(self) -> float:
-        """Largest distance of a pose that counts as the goal, m, in the sense of `pose_features`."""
+        """Upper bound of the distance from the goal at which the score can be `enough`, m, as of `pose_features`."""
         ...
 
     def __call__(self, errors: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ class Measure(Protocol):
 
 
 class CoverageTable:
-    """Area of the intersection of slider and goal, divided by the area of the slider, by linear interpolation."""
+    """Coverage: area of the intersection of slider and goal, divided by the slider's, by interpolation in a table."""
 
     def __init__(
         self,
@@ -45,16 +45,16 @@ class CoverageTable:
         enough: float,  # coverage from which the slider is at the goal
     ):
         self.center, self.length, self.enough = np.asarray(center, float), length, enough
-        side, turn = np.linspace(-RANGE, RANGE, POSITIONS) * length, np.linspace(-RANGE, RANGE, ANGLES)
+        # All lengths are in units of `length`. The axes of the table are the displacement of the center and the turn
+        # about it, because a turn about another point displaces the center too.
+        side, turn = np.linspace(-RANGE, RANGE, POSITIONS), np.linspace(-RANGE, RANGE, ANGLES)
         errors = np.stack(np.meshgrid(side, side, turn, indexing="ij"), axis=-1)
-        # the table has the displacement of the center, so the slider turns about its center
-        around = jnp.asarray((vertices - self.center) / length, jnp.float32)
-        scaled = errors / np.array([length, length, 1.0])
-        self.table = np.asarray(_coverage(around, jnp.asarray(scaled.reshape(-1, 3), jnp.float32)))
+        outline = jnp.asarray((vertices - self.center) / length, jnp.float32)
+        self.table = np.asarray(_coverage(outline, jnp.asarray(errors.reshape(-1, 3), jnp.float32)))
         self.table = self.table.reshape(errors.shape[:3])
-        near = self.table >= enough
-        distance = np.sqrt((errors**2 * np.array([1, 1, length**2])).sum(-1))
-        self.reach = float(distance[near].max(initial=0.0)) + length * 2 * RANGE / (POSITIONS - 1)
+        distance = np.linalg.norm(errors, axis=-1)[self.table >= enough]
+        # between two points of the table the coverage can be enough up to one spacing farther away
+        self.reach = length * float(distance.max(initial=0.0) + side[1] - side[0])
 
     def __call__(self, errors: np.ndarray) -> np.ndarray:
         """Return the coverage at poses relative to the goal, (..., 3); zero outside of the table."""
@@ -70,6 +70,5 @@ class CoverageTable:
 @quick_jit
 def _coverage(vertices, errors):
     """Return the coverage of a polygon by itself, moved by each of the poses (poses, 3)."""
-    area = intersection_area(vertices, vertices)
-    moved = jax.vmap(lambda error: intersection_area(se2.transform(error, vertices), vertices))(errors)
-    return moved / area
+    overlap = jax.vmap(lambda error: intersection_area(se2.transform(error, vertices), vertices))(errors)
+    return overlap / intersection_area(vertices, vertices)
