@@ -28,8 +28,8 @@ from pushjax.simulation.arguments import check_slider_and_hand
 from pushjax.simulation.hand import Hand, RoundFinger
 from pushjax.simulation.slider import Slider
 
-ROBUST = 2.0  # sigma: where the pseudo-Huber loss turns from quadratic to linear
-START_SIGMA = 0.002  # m, initial value if sigma is estimated
+ROBUST = 2.0  # number of sigma at which the pseudo-Huber loss turns from quadratic to linear
+START_SIGMA = 0.002  # m, initial sigma of poses, if it is estimated
 START_DIRECTION_SIGMA = 0.3  # initial sigma of directions of motion
 START_GAP_SIGMA = 0.002  # m, initial sigma of gaps: wide, so that no finger counts as lost too soon
 NUM_FRICTIONS = 9  # candidates for the initial friction
@@ -108,14 +108,13 @@ def identify(
     prior = _prior(unknowns, surface, known_values, _mean_start(pushes))
     problem = Problem(Scene(slider.shape, hand, prior.origin), surface, prior, metric_length, contact_at_end)
     has_pairs = pushes.wrench.shape[-2] > 0
-    # A kind of residual that was not measured has no sigma to estimate.
-    sigma_is_given = jnp.array([sigma is not None, not has_pairs, not contact_at_end])
-    count = 1 if sigma is not None and not (has_pairs or contact_at_end) else SIGMA_ROUNDS
+    # Of poses, directions and gaps. A kind of residual that was not measured has no sigma to estimate.
+    sigma_is_given = (sigma is not None, not has_pairs, not contact_at_end)
     start_sigma = jnp.stack([pose_sigma, *jnp.asarray([START_DIRECTION_SIGMA, START_GAP_SIGMA], dtype)])
     start = _best_start(problem, pushes, start_sigma, robust=robust)
-    frozen, rounds = jnp.zeros(start.shape, bool), Rounds.of(dtype, count)
-    fitted = fit(problem, pushes, start, start_sigma, sigma_is_given, frozen, rounds, robust=robust)
-    # The residuals of poses are divided by the root of the number of poses.
+    frozen, rounds = jnp.zeros(start.shape, bool), Rounds.of(dtype, 1 if all(sigma_is_given) else SIGMA_ROUNDS)
+    fitted = fit(problem, pushes, start, start_sigma, jnp.array(sigma_is_given), frozen, rounds, robust=robust)
+    # `Problem` divides pose residuals by the root of the number of poses, so that the poses of a push count as one.
     final_pose_residual = fitted.residual.poses[..., -3:] * len(pushes.observed_steps) ** 0.5
     per_push = (final_pose_residual, fitted.information)
     residual, information = jax.tree.map(lambda leaf: leaf[0], per_push) if one_condition else per_push

@@ -9,13 +9,11 @@ from jaxtyping import Array, Float
 
 from pushjax._internal.checks import ArrayLike, as_float, check_finite, check_positive, concrete
 
-SIDES = 4  # default number of a slider's sides
-
 
 class _Unknown(NamedTuple):
     """One unknown of identification."""
 
-    size: int  # number of its scalars; 0 if it depends on the problem
+    size: int  # number of its scalars; 0 if that depends on the slider
     unit: str = ""
     kind: str = ""  # "calibration" (of robot and tracker), "table" (its uneven friction), or "" for neither
 
@@ -36,7 +34,7 @@ UNKNOWNS = {
     "friction_drift": _Unknown(1),
     "friction_by_side": _Unknown(0),
 }
-NAMES = tuple(UNKNOWNS)
+NAMES = tuple(UNKNOWNS)  # in the order of their entries in z
 SIZES = {name: each.size for name, each in UNKNOWNS.items()}
 NORMAL_PRIORS = tuple(name for name in NAMES if name not in ("friction", "surface"))
 LENGTHS = tuple(name for name, each in UNKNOWNS.items() if each.unit == "m")
@@ -45,7 +43,7 @@ CALIBRATION, TABLE = (
 )
 
 
-def _optional_array(value: ArrayLike | None) -> Array | None:
+def _prior(value: ArrayLike | None) -> Array | None:
     """Return the prior of an unknown as an array, or None for a parameter that is not estimated."""
     return None if value is None else as_float(value)
 
@@ -94,21 +92,21 @@ class Unknowns(eqx.Module):
             scalar, if `sides` is less than one, if a name in `shared` is unknown, or if everything is None.
     """
 
-    friction: Float[Array, "2"] | None = eqx.field(default=(0.0, 1.0), converter=_optional_array)
-    surface_dof: Float[Array, ""] | None = eqx.field(default=50.0, converter=_optional_array, kw_only=True)
-    pressure_center: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    inset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    overshoot: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    lag_distance: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    hand_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    frame_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    overlap: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    anisotropy: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    log_gradient: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    log_hessian: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    friction_drift: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    friction_by_side: Float[Array, ""] | None = eqx.field(default=None, converter=_optional_array, kw_only=True)
-    sides: int = eqx.field(default=SIDES, static=True, kw_only=True)
+    friction: Float[Array, "2"] | None = eqx.field(default=(0.0, 1.0), converter=_prior)
+    surface_dof: Float[Array, ""] | None = eqx.field(default=50.0, converter=_prior, kw_only=True)
+    pressure_center: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    inset: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    overshoot: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    lag_distance: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    hand_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    frame_offset: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    overlap: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    anisotropy: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    log_gradient: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    log_hessian: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    friction_drift: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    friction_by_side: Float[Array, ""] | None = eqx.field(default=None, converter=_prior, kw_only=True)
+    sides: int = eqx.field(default=4, static=True, kw_only=True)
     shared: tuple[str, ...] = eqx.field(default=None, converter=_shared_names, static=True, kw_only=True)
 
     def __check_init__(self):
@@ -156,8 +154,7 @@ def known_parameters(
             raise ValueError(f"known: {name!r} is not one of {', '.join(NORMAL_PRIORS)}{instead.get(name, '')}")
         if name in unknowns.names:
             raise ValueError(f"known: {name!r} is also estimated; leave it out, or pass unknowns with {name}=None")
-        size = SIZES[name] or unknowns.sides
-        shape = (size,) if name == "friction_by_side" or size > 1 else ()
+        shape = () if SIZES[name] == 1 else (SIZES[name] or unknowns.sides,)
         values[name] = per_condition(f"known[{name!r}]", value, shape, conditions, dtype)
     return values
 

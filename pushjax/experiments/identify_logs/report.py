@@ -1,19 +1,20 @@
 """The report on what was identified, in words and with units."""
 
+import re
 from typing import Any
 
 import numpy as np
 
 from pushjax.experiments._report import Table, table
 
-# The posterior of a number counts as normal if its profile's interval is at most so many times as wide as that of a
-# normal posterior, and the other way round.
+# A posterior counts as normal if the widths of its profile's interval and of the normal one differ at most by this
+# factor.
 NOT_NORMAL = 2.0
-MAX_PROBLEMS = 10  # that are listed
-# There is no warning if the mean deviation of the predicted final poses is less than POOR times the mean motion. There
-# is none either if it is less than the mean motion, and less than NO_BETTER times the mean deviation before the fit.
+MAX_PROBLEMS = 10  # problems that are listed
+# There is a warning unless the mean deviation of the predicted final poses is less than POOR times the mean motion, or
+# is less than both the mean motion and NO_BETTER times the mean deviation before the fit.
 POOR, NO_BETTER = 0.4, 0.9
-# What the unknowns are called in the report; the others keep the name that `pj.Unknowns` gives them.
+# descriptions of the unknowns that the options offer, by label without the number of a condition
 NAMES = {
     "friction": "friction at the contact",
     "inset": "distance by which the outline is smaller than given",
@@ -27,17 +28,6 @@ NAMES = {
     "frame_offset.1": "offset of the object's frame, y in the body frame",
     "frame_offset.2": "rotation of the object's frame",
 }
-
-
-def warning(predicted: dict[str, Any]) -> str | None:
-    """Return a warning if the fit explains next to nothing, because its estimates then mean nothing; else None."""
-    mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
-    if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
-        return None
-    return (
-        f"what was found predicts final poses to {mean:.3g} mm in the mean, of {still:.3g} that the objects moved, and "
-        f"to {before:.3g} before: are units, frames, outline and radius right?"
-    )
 
 
 def summary(record: dict[str, Any]) -> list[str | Table]:
@@ -82,11 +72,22 @@ def summary(record: dict[str, Any]) -> list[str | Table]:
     ]
 
 
+def warning(predicted: dict[str, Any]) -> str | None:
+    """Return a warning if the fit explains next to nothing, because its estimates then mean nothing; else None."""
+    mean, before, still = (predicted[f"{name}_mm"] for name in ("mean", "expected", "no_motion"))
+    if mean < POOR * still or (mean < NO_BETTER * before and mean < still):
+        return None
+    return (
+        f"what was found predicts final poses to {mean:.3g} mm in the mean, of {still:.3g} that the objects moved, and "
+        f"to {before:.3g} before: are units, frames, outline and radius right?"
+    )
+
+
 def _name(row: dict[str, Any]) -> str:
-    """Describe an unknown; with several conditions its label has the number of the condition too."""
+    """Describe an unknown; its label follows if it has the number of a condition."""
     label = row["label"]
-    part = next((f"{text} ({label})" for key, text in NAMES.items() if label.startswith(key)), label)
-    return NAMES.get(label, part)
+    unknown = NAMES[re.sub(r"\[\d+\]", "", label)]
+    return f"{unknown} ({label})" if "[" in label else unknown
 
 
 def _interval(ends: list[float]) -> str:
