@@ -1,9 +1,9 @@
-"""Three ways to predict the pushes that were not learned from.
+"""Three ways to predict the test pushes, which are not used for training.
 
-ideal         The surface of the known support, with the friction found on a grid: the paper's.
-wrench_twist  The surface fitted to the forces measured during the pushes, with the friction found on a grid: the other
-              way of the paper.
-identified    Friction, surface, and how far the hand really went, identified from the final poses alone:
+ideal         A method of the paper. The surface is that of the known support. The friction is found on a grid.
+wrench_twist  The other method of the paper. The surface is fitted to the forces measured during the pushes. The
+              friction is found on a grid.
+identified    Friction, surface, and how far the hand really went are identified from the final poses alone, by
               `pushjax.identification`.
 """
 
@@ -21,16 +21,19 @@ from pushjax.experiments._tables import MODELS, Prediction, deviation_mm, final_
 from pushjax.experiments.table2.conditions import Geometry, outline, recorded
 
 FRICTIONS = np.linspace(0.0, 0.8, 41)
-# Share of the pushes to learn from. A quartic has fifteen coefficients, and a push gives one pair.
+# Share of the pushes that is used for training: the paper's, but half for `wrench_twist`. A push gives one pair of
+# wrench and twist, and a quartic has fifteen coefficients.
 TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
-Part = Callable[[str], AbstractContextManager[None]]  # from a description of the work to the context of doing it
-IDENTIFY_STEPS = 40  # at most: the fit, which takes derivatives, gives the same answer with more
-# Priors: the supports are known to about a millimeter, the robot's condition less well.
-SURFACE_DOF, INSET, OVERSHOOT = 200.0, 0.002, 0.001
+# Largest number of steps per push in the identification, which takes derivatives. More steps give the same answer.
+IDENTIFY_STEPS = 40
+# Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. The supports are known
+# to about a millimeter, the geometry of the robot less well.
+UNKNOWNS = {"surface_dof": 200.0, "inset": 0.002, "overshoot": 0.001}
+Part = Callable[[str], AbstractContextManager[None]]  # from the description of a part of the work to its context
 
 
 class ConditionData(NamedTuple):
-    """One condition as the methods take it."""
+    """One condition as all methods take it."""
 
     log: Recordings  # the pushes as logged, with their forces
     pushes: pj.Pushes  # the same as arrays
@@ -39,60 +42,35 @@ class ConditionData(NamedTuple):
 
 
 def ideal(condition: ConditionData, geometry: Geometry) -> Prediction:
-    """Predict one condition with the known surface and the friction that is best for the training pushes, on a grid.
-
-    Args:
-        condition: The condition.
-        geometry: Where the finger really was.
-    """
-    errors, failed = _deviations_on_grid(condition, condition.surface, geometry)
-    return _choose_friction(np.broadcast_to(errors, (len(condition.train), *errors.shape)), condition.train, failed)
+    """Predict one condition with the surface of the known support, and the best friction on a grid."""
+    grid = _deviations_on_grid(condition, condition.surface, geometry)
+    return _choose_friction([grid] * len(condition.train), condition.train)
 
 
 def wrench_twist(condition: ConditionData, model: str, geometry: Geometry) -> Prediction:
-    """Predict one condition with a surface fitted to measured forces, and the best friction on a grid.
-
-    Args:
-        condition: The condition. The fitted surfaces have the characteristic length of its surface.
-        model: "quartic" or "ellipsoid".
-        geometry: Where the finger really was.
-    """
+    """Predict one condition with a surface fitted to measured forces, and the best friction on a grid."""
     length = condition.surface.length
-    pushes = condition.log.pushes
     wrench, twist = (
-        jnp.asarray(np.concatenate([getattr(push, name) for push in pushes]), length.dtype)
+        jnp.asarray(np.concatenate([getattr(push, name) for push in condition.log.pushes]), length.dtype)
         for name in ("wrench", "twist")
     )
-    errors, failed = [], 0
-    for trains in condition.train:
-        surface = pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model])
-        split_errors, split_failed = _deviations_on_grid(condition, surface, geometry)
-        errors.append(split_errors)
-        failed += int(split_failed.sum())
-    return _choose_friction(np.stack(errors), condition.train, np.asarray(failed))
+    surfaces = (
+        pj.fit_limit_surface(wrench[trains], twist[trains], length, degree=MODELS[model]) for trains in condition.train
+    )
+    grids = [_deviations_on_grid(condition, surface, geometry) for surface in surfaces]
+    return _choose_friction(grids, condition.train)
 
 
 def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Part) -> list[Prediction]:
-    """Predict conditions with what is identified from the final poses of all of them at once.
-
-    The conditions share the robot, whose geometry is not taken as given. The surface of each condition is the mean of
-    its prior.
-
-    Args:
-        conditions: The conditions.
-        geometry: Where the finger is assumed to have been, as the mean of the prior.
-        part: Context in which each split is computed.
-
-    Returns:
-        One prediction per condition.
-    """
+    """Predict conditions with what is identified from the final poses of all of them at once, split by split."""
+    # The conditions share the geometry of the robot. The means of the prior are `geometry` and the known surfaces.
     first = conditions[0]
     fine = pj.Pushes.conditions([condition.pushes for condition in conditions])
     steps = min(fine.path.shape[-2] - 1, IDENTIFY_STEPS)
     pushes = pj.Pushes.conditions([recorded(condition.log, geometry, steps) for condition in conditions])
     surfaces = jax.tree.map(lambda *each: jnp.stack(each), *(condition.surface for condition in conditions))
     slider = pj.Slider(outline(first.log, geometry), surfaces)
-    unknowns = pj.Unknowns((0.0, 1.0), surface_dof=SURFACE_DOF, inset=INSET, overshoot=OVERSHOOT)
+    unknowns = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
     hand, length = pj.Hand.finger(geometry.radius), first.log.length
     counts = [condition.train.shape[1] for condition in conditions]
     errors, friction, failed = [], [], np.zeros(len(conditions), int)
@@ -115,18 +93,16 @@ def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Pa
 def _deviations_on_grid(
     condition: ConditionData, surface: pj.LimitSurface, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return every push's deviation in mm and number of failed steps at every friction, (frictions, pushes)."""
+    """Return the deviation in mm and the number of failed steps of each push at each friction, (frictions, pushes)."""
     log, pushes = condition.log, condition.pushes
-    slider = pj.Slider(outline(log, geometry), surface)
-    hand = pj.Hand.finger(geometry.radius)
+    slider, hand = pj.Slider(outline(log, geometry), surface), pj.Hand.finger(geometry.radius)
     final, failed, _ = final_poses(slider, hand, pushes, jnp.asarray(FRICTIONS, pushes.path.dtype))
     return deviation_mm(final, pushes.end[None], log.length), np.asarray(failed)
 
 
-def _choose_friction(errors: np.ndarray, train: np.ndarray, failed: np.ndarray) -> Prediction:
-    """Choose for each split's errors (frictions, pushes) the friction that is best for its training pushes."""
-    best = [
-        int(np.argmin(split_errors[:, trains].mean(axis=1))) for split_errors, trains in zip(errors, train, strict=True)
-    ]
-    chosen = np.stack([split_errors[row] for split_errors, row in zip(errors, best, strict=True)])
-    return Prediction(chosen, FRICTIONS[best], int(failed.sum()))
+def _choose_friction(grids: Sequence[tuple[np.ndarray, np.ndarray]], train: np.ndarray) -> Prediction:
+    """Choose for each split, from its `_deviations_on_grid`, the friction that is best for its training pushes."""
+    best = [int(np.argmin(errors[:, trains].mean(axis=1))) for (errors, _), trains in zip(grids, train, strict=True)]
+    chosen = [(errors[row], failed[row]) for (errors, failed), row in zip(grids, best, strict=True)]
+    errors, failed = map(np.stack, zip(*chosen, strict=True))
+    return Prediction(errors, FRICTIONS[best], int(failed.sum()))
