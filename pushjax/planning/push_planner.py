@@ -1,10 +1,11 @@
-"""Choice of the next push: one that reaches the goal, else the first of two, else by cost to go.
+"""Choice of the next push of least cost to the goal.
 
-Costs are control steps: the transit around the slider to the start of the push, the push, and what comes after it.
+The cost of a push is a number of control steps: the transit of the finger around the slider to the start of the push,
+the push, and what comes after it. The cheaper of two is chosen:
 
-One push: the outcomes near the relative pose of the goal, by the library's k-d tree.
-Two pushes: the poses that first pushes of least transit, push and cost to go lead to are looked up in the same tree.
-Farther away: the push for which that sum is least.
+- The best last push. The library's k-d tree has the pushes whose outcomes are near the relative pose of the goal.
+- The best first of several pushes. From where each of the first pushes of least estimated cost leads, the same tree has
+  the second pushes that reach the goal. If there are none, it is the push from whose end the cost to go is least.
 """
 
 from copy import copy
@@ -27,23 +28,23 @@ from pushjax.planning.scene import PushScene
 from pushjax.planning.workspace import BoundingBoxTable, Workspace
 from pushjax.simulation.pair import MAX_PENETRATION
 
-CLEARANCE, RUN_UP = 0.08, 0.3  # in units of the surface's length
+CLEARANCE, RUN_UP = 0.08, 0.3  # lengths in units of the surface's length
 CANDIDATES, NEIGHBORS = 1500, 4  # first pushes that are continued by a second one, and second pushes for each
 MAX_COLLISION_CHECKS, COLLISION_BATCH = 480, 24  # choices that are checked, the best first, and how many at a time
 RISK_BATCH = 256  # last pushes whose risk is computed at a time, those that take the fewest steps first
-STRIDE = 4  # of the lengths of first pushes, one in so many is considered
+STRIDE = 4  # of first pushes, every so many lengths of the library are considered
 BETWEEN = 6.0  # control steps between two pushes, for the cost to go
-# A slider outside of the workspace must come back by twice this, or, where no push does that, go no farther out than
-# this; in units of the surface's length.
+# A slider outside of the workspace must come back by twice this. If no push does that, it may go farther out by this.
+# In units of the surface's length.
 OUTSIDE = 0.02
 AROUND = 8.0  # distance from the goal along x and y up to which the cost to go is known, in units of the length
 COVERED = 0.95  # coverage from which a slider is at the goal, if no other measure is given
 MISS_COST = 10.0  # control steps of another push, if the last one misses the goal
-NO_TRANSIT_TIME = 60.0  # control steps that count for a transit between two pushes that is not found
-# With known friction: a last push whose score is less than this part of the way from enough to one is at risk, and
-# costs so many control steps for each unit of score below it.
+NO_TRANSIT_TIME = 60.0  # control steps of a transit between two pushes if none is found
+# With known friction, a last push is safe from the score that is this part of the way from `enough` to one. Below it,
+# each unit of score costs so many control steps.
 SAFE_SCORE, RISK_COST = 0.6, 200.0
-INTERPOLATION_FACTOR = 1.2  # factor of costs to go that are interpolated
+INTERPOLATION_FACTOR = 1.2  # of interpolated costs to go; those of the nearest cell, for a first selection, have none
 STEPS_PER_LENGTH = 20.0  # control steps for each length of distance from the goal, where there is no cost to go
 
 
@@ -109,12 +110,14 @@ class PushPlanner:
         self.table_high = np.minimum(workspace.slider_high - half, around[1])
         self.space = None
         if self.obstacles.any:
-            given = workspace, self.roadmap, library, self.clearance, self.goal, self.table_low, self.table_high
-            self.space = FreeSpace(*given)
+            self.space = FreeSpace(
+                workspace, self.roadmap, library, self.clearance, self.goal, self.table_low, self.table_high
+            )
+        # of each entry of the library: its push, control steps, and where the finger ends, body frame, m
         push, index = library.entries.T
-        self.push, self.travel = push, library.travel[index]
-        self.push_time = speeds.push_time(self.travel)
-        self.ends = (starts[push] + self.travel[:, None] * ahead[push]).astype(np.float32)
+        travel = library.travel[index]
+        self.push, self.push_time = push, speeds.push_time(travel)
+        self.ends = (starts[push] + travel[:, None] * ahead[push]).astype(np.float32)
         self.coarse = np.flatnonzero((index % STRIDE == 0) & self.usable[push])
 
     def reweighted(self, weight: np.ndarray) -> "PushPlanner":
@@ -126,13 +129,13 @@ class PushPlanner:
         Args:
             weight: Weights of the samples, (samples,), which add up to one.
         """
-        self.prepare()  # so that planners share the tables
+        self.prepare()  # so that both planners share the tables
         other = copy(self)
         other._weigh(weight)
         return other
 
     def _weigh(self, weight: np.ndarray | None) -> None:
-        """Set the mean outcomes of pushes by weights of the library's samples."""
+        """Set the weights of the library's samples, and the mean outcomes of pushes."""
         self.weight, self.mean_library = weight, self.library_samples.averaged(weight)
 
     @cached_property
@@ -162,20 +165,21 @@ class PushPlanner:
         return self.roadmap.goals[self.usable][first]
 
     @cached_property
-    def _after_push(self) -> np.ndarray:
+    def _transit_time(self) -> np.ndarray:
         """Control steps of the transit from each place to the start of each push, (places, pushes)."""
         lengths = self.roadmap.between(self._places)
         return np.where(np.isfinite(lengths), self.speeds.free_time(lengths), NO_TRANSIT_TIME).astype(np.float32)
 
     @cached_property
-    def _place(self) -> np.ndarray:
+    def _end_place(self) -> np.ndarray:
         """Index of the place that is nearest to the finger at the end of each entry, (entries,)."""
         finger = to_body(self.mean_library.relative, self.ends)
         return np.asarray(KDTree(self._places).query(finger)[1])
 
     def prepare(self) -> None:
         """Compute all tables, which are else computed when they are first needed."""
-        _ = self.value, self._after_push, self._place, self.indexed_library.tree, self.space and self.space.distances
+        _ = self.value, self._transit_time, self._end_place, self.indexed_library.tree
+        _ = self.space and self.space.distances
 
     def is_at_goal(self, pose: np.ndarray) -> bool:
         """Return whether a slider at `pose`, (3,), world, m and rad, is at the goal by `measure`."""
@@ -218,7 +222,7 @@ class PushPlanner:
         return PlannedPush(best.status, transit, starts[push], end, best.target, best.cost)
 
     def _one_push(self, pose: np.ndarray, transit_time: np.ndarray) -> PushChoice | None:
-        """Return the push that reaches the goal at the least cost: its control steps, and its risk of missing."""
+        """Return the push that reaches the goal at the least cost, which includes its risk of missing."""
         relative = compose(inverse(pose), self.goal)
         near = self.indexed_library.tree.query_ball_point(self.mean_library.features(relative), self.measure.reach)
         entries = np.asarray(near, int)
@@ -244,14 +248,14 @@ class PushPlanner:
         order = order[np.isfinite(spent[order])]
         for begin in range(0, len(order), RISK_BATCH):
             some = order[begin : begin + RISK_BATCH]
-            if self.space is None and spent[some[0]] > cost.min():  # a fixture may forbid the best
+            if self.space is None and spent[some[0]] > cost.min():  # among fixtures, the cheapest may not be free
                 break
             risk, may_reach = self._risk(back[some], entries[some])
             cost[some] = np.where(may_reach | (not must_reach), spent[some] + risk, np.inf)
         return cost
 
     def _risk(self, back: np.ndarray, entries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the risk of missing the goal, in control steps, and whether it may be reached, as `_with_risk`."""
+        """Return the risk of missing the goal, in control steps, and whether it may be reached, (pushes,) each."""
         enough = self.measure.enough
         score = self.measure(compose(back, self.mean_library.relative[entries]))
         if len(self.library_samples.outcomes) == 1:
@@ -298,8 +302,8 @@ class PushPlanner:
             good = outside <= now + allowance
         return entries[good], reached[good]
 
-    def _estimate(self, poses: np.ndarray, quick: bool) -> np.ndarray:
-        """Return the control steps from poses to the goal."""
+    def _estimate(self, poses: np.ndarray, *, quick: bool) -> np.ndarray:
+        """Return the control steps from poses to the goal; `quick` takes them from the nearest cell of the grid."""
         if self.value is not None:
             return self.value.nearest(poses) if quick else INTERPOLATION_FACTOR * self.value(poses)
         goal = self.mean_library.features(self.goal.astype(np.float32))
@@ -310,8 +314,7 @@ class PushPlanner:
         self, pose: np.ndarray, entries: np.ndarray, reached: np.ndarray, spent: np.ndarray
     ) -> PushChoice | None:
         """Return the best of the first pushes that a second one continues to the goal."""
-        goal = self.goal.astype(np.float32)
-        wanted = compose(inverse(reached), np.broadcast_to(goal, reached.shape))
+        wanted = compose(inverse(reached), self.goal.astype(np.float32))
         distance, second = self.indexed_library.nearest(wanted, NEIGHBORS, 0.5 * self.measure.reach)
         first, column = np.nonzero(np.isfinite(distance))
         if not len(first):
@@ -320,7 +323,7 @@ class PushPlanner:
         starts = self.mean_library.starts[self.push[second]].astype(np.float32)
         allowed = self.workspace.allows_finger(to_world(reached[first], starts)) & self.usable[self.push[second]]
         allowed &= self.workspace.allows_finger(to_world(reached[first], self.ends[second]))
-        between = self._after_push[self._place[entries[first]], self.push[second]]
+        between = self._transit_time[self._end_place[entries[first]], self.push[second]]
         total = np.where(allowed, spent[first] + between + self.push_time[second], np.inf)
         total = self._with_risk(total, inverse(wanted[first]), second, must_reach=False)
         k = self._least(total, (np.broadcast_to(pose, wanted[first].shape), entries[first]), (reached[first], second))
@@ -333,11 +336,10 @@ class PushPlanner:
         """Return the index of the least finite cost of a choice whose pushes are all free, or None."""
         # `pushes` are the poses of the slider before each push, (choices, 3), and its entries, (choices,). Only the
         # `MAX_COLLISION_CHECKS` choices of least cost are considered.
-        if self.space is None:
-            best = int(np.argmin(cost))
-            return best if np.isfinite(cost[best]) else None
         order = np.argsort(cost, kind="stable")[:MAX_COLLISION_CHECKS]
         order = order[np.isfinite(cost[order])]
+        if self.space is None:
+            return int(order[0]) if len(order) else None
         for some in np.split(order, range(COLLISION_BATCH, len(order), COLLISION_BATCH)):
             free = [self.space.free(self.mean_library, poses[some], entries[some]) for poses, entries in pushes]
             free = np.all(free, axis=0)
