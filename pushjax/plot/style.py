@@ -4,30 +4,27 @@ from collections.abc import Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
-import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-MM, DEGREES = 1e3, 180 / np.pi  # lengths are drawn in mm, angles in degrees
+MM = 1e3  # lengths are drawn in mm
 # The colors of Okabe & Ito, which color-blind readers can tell apart.
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 # Where a picture shows the start, the middle and the end of a push, they are black, gray and red. These colors differ
 # in lightness, so that a grayscale print keeps them apart.
 BLACK, GRAY, RED = "black", "0.72", "#C1121F"
-# Color, dash and marker of curves beside each other. The colors have nearly one lightness, so in grayscale dash and
-# marker tell the curves apart.
+# Color and dash of the curves of one panel. Most of the colors have nearly one lightness, so in grayscale only the dash
+# distinguishes the curves.
 SERIES = (
-    (BLUE, "-", "o"),
-    (ORANGE, "--", "s"),
-    (GREEN, "-.", "^"),
-    (PURPLE, ":", "D"),
-    ("#56B4E9", (0, (5, 1, 1, 1, 1, 1)), "v"),
-    ("black", (0, (1, 3)), "x"),
+    (BLUE, "-"),
+    (ORANGE, "--"),
+    (GREEN, "-."),
+    (PURPLE, ":"),
+    ("#56B4E9", (0, (5, 1, 1, 1, 1, 1))),
+    ("black", (0, (1, 3))),
 )
 MODEL_ROWS = {"quartic": 0, "ellipsoid": 1}  # index into `SERIES`, the same in every picture
-STYLE_KEYS = ("color", "linestyle", "marker")
-HATCH = "////"  # hatch of the second of two kinds of bars
 
 STYLE: Any = {
     "font.size": 9,
@@ -35,7 +32,7 @@ STYLE: Any = {
     "axes.linewidth": 0.8,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.prop_cycle": cycler(color=[color for color, _, _ in SERIES]),
+    "axes.prop_cycle": cycler(color=[color for color, _ in SERIES]),
     "lines.linewidth": 1.4,
     "hatch.linewidth": 0.6,
     "legend.frameon": False,
@@ -59,18 +56,12 @@ def panel_row(
 
 
 def curve_styles(curves: Mapping[str, Any]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Return for each curve its name, the curve, and its color, dash and marker as arguments of `Axes.plot`."""
+    """Return for each curve its name, the curve, and its color and dash as arguments of `Axes.plot`."""
     if len(curves) > len(SERIES):
-        raise ValueError(f"at most {len(SERIES)} curves can be told apart; got {len(curves)}: {', '.join(curves)}")
+        raise ValueError(f"at most {len(SERIES)} curves can be distinguished; got {len(curves)}: {', '.join(curves)}")
     order = [MODEL_ROWS[name] for name in curves] if MODEL_ROWS.keys() >= curves.keys() else range(len(curves))
-    rows = zip(curves.items(), order, strict=True)
-    return [(name, curve, dict(zip(STYLE_KEYS, SERIES[k], strict=True))) for (name, curve), k in rows]
-
-
-def bars(color: str, hatched: bool = False) -> dict[str, Any]:
-    """Return the look of one kind of bars and of their error bars, as keyword arguments of `Axes.bar`."""
-    hatch = HATCH if hatched else None
-    return {"color": color, "hatch": hatch, "edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
+    looks = [{"color": color, "linestyle": dash} for color, dash in (SERIES[k] for k in order)]
+    return list(zip(curves.keys(), curves.values(), looks, strict=True))
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int) -> None:

@@ -87,7 +87,7 @@ def _draw_cut(
     circle[:, 0], circle[:, vertical] = np.cos(angle), np.sin(angle)
     for name, surface, style in curve_styles(surfaces):
         cut = _on_level_set(surface, circle) / load
-        axes.plot(cut[:, 0], cut[:, vertical], color=style["color"], linestyle=style["linestyle"], label=name)
+        axes.plot(cut[:, 0], cut[:, vertical], label=name, **style)
     near = np.abs(wrench[:, 3 - vertical]) < CUT_DISTANCE
     axes.plot(wrench[near, 0], wrench[near, vertical], ".", color="0.2", ms=3, label="pairs nearby")
     axes.set(xlabel=FORCE_X, ylabel=TORQUE if vertical == 2 else FORCE_Y, aspect="equal")

@@ -1,10 +1,16 @@
 """Pictures of tables."""
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from pushjax.plot.style import BLUE, ORANGE, STYLE, bars
+from pushjax.plot.style import BLUE, ORANGE, STYLE
+
+# The hatch distinguishes the models in grayscale.
+MODELS: dict[str, dict[str, Any]] = {"quartic": {"color": BLUE}, "ellipsoid": {"color": ORANGE, "hatch": "////"}}
+BARS: dict[str, Any] = {"edgecolor": "white", "linewidth": 0, "ecolor": "0.25", "capsize": 2}
 
 
 def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
@@ -20,7 +26,7 @@ def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
         conditions = list(dict.fromkeys((cell["surface"], cell["object"]) for cell in cells))
         figure, axes = plt.subplots(figsize=(width, 3.8), layout="constrained")
         above = axes.get_xaxis_transform()  # x in data, y as a share of the height
-        for k, (model, style) in enumerate((("quartic", bars(BLUE)), ("ellipsoid", bars(ORANGE, True)))):
+        for k, (model, style) in enumerate(MODELS.items()):
             of_model = [cell for cell in cells if cell["model"] == model]
             if not of_model:
                 continue
@@ -34,7 +40,7 @@ def table_figure(cells: list[dict], title: str, width: float = 8.6) -> Figure:
                     axes.text(
                         place, 0.02, cell["missing"], rotation=90, ha="center", transform=above, va="bottom", size=7
                     )
-            axes.bar(x, height, 0.34, yerr=error, label=f"{model}, this run", **style)
+            axes.bar(x, height, 0.34, yerr=error, label=f"{model}, this run", **style, **BARS)
             paper = [np.nan if cell["paper_mm"] is None else cell["paper_mm"] for cell in of_model]
             axes.plot(x, paper, "_", color="black", ms=13, mew=1.8, label="the paper" if k == 0 else None)
         axes.set_xticks(np.arange(len(conditions)), [name for _, name in conditions])

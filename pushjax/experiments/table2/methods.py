@@ -9,7 +9,7 @@ identified    Friction, surface, and how far the hand really went are identified
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ TRAIN_SHARE = {"ideal": 0.4, "wrench_twist": 0.5, "identified": 0.4}
 IDENTIFY_STEPS = 40
 # Priors, as in `pj.Unknowns`: degrees of freedom of the surface, and standard deviations in m. The supports are known
 # to about a millimeter, the geometry of the robot less well.
-UNKNOWNS = {"surface_dof": 200.0, "inset": 0.002, "overshoot": 0.001}
+UNKNOWNS: dict[str, Any] = {"surface_dof": 200.0, "inset": 0.002, "overshoot": 0.001}
 Part = Callable[[str], AbstractContextManager[None]]  # from the description of a part of the work to its context
 
 
