@@ -2,7 +2,7 @@
 
 Shapely judges whether slider and finger stay out of the fixtures.
 
-    python -m pytest -m long -s tests/planning/test_among_fixtures.py
+    python -m pytest -m slow -s tests/planning/test_among_fixtures.py
 
 prints the figures of docs/planning.md.
 """
