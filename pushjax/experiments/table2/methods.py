@@ -73,7 +73,7 @@ def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Pa
     unknowns = pj.Unknowns((0.0, 1.0), **UNKNOWNS)
     hand, length = pj.Hand.finger(geometry.radius), first.log.length
     counts = [condition.train.shape[1] for condition in conditions]
-    errors, friction, failed = [], [], np.zeros(len(conditions), int)
+    errors, friction, failed = [], [], np.zeros(fine.weight.shape, int)
     for split in range(len(first.train)):
         weight = np.zeros(pushes.weight.shape)
         for row, (condition, count) in enumerate(zip(conditions, counts, strict=True)):
@@ -82,10 +82,10 @@ def identified(conditions: Sequence[ConditionData], geometry: Geometry, part: Pa
             found = pj.identify(pushes.weighted(weight), slider, hand, unknowns, length=length)
             predicted = found.predict(fine, slider, hand)
             errors.append(deviation_mm(predicted.pose[..., -1, :], fine.end, length))
-            failed += np.asarray(predicted.failed).sum(axis=(1, 2))
+            failed += np.asarray(predicted.failed).sum(axis=2)
             friction.append(np.asarray(found.friction))
     return [
-        Prediction(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k]))
+        Prediction(np.stack([e[k, :count] for e in errors]), np.stack(friction)[:, k], int(failed[k, :count].sum()))
         for k, count in enumerate(counts)
     ]
 
