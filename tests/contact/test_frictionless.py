@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 from support.slopes import slopes
 
 import pushjax as pj
-from pushjax.contact.frictionless import Frictionless
+from pushjax.contact.frictionless import MAX_MOTION, Frictionless
 
 PROBLEMS = 300
 
@@ -45,9 +45,14 @@ def test_conditions_hold_and_jams_have_no_motion(count):
     twist = np.asarray(motion.twist) * [1, 1, length]
     cosine = np.sum(gradient * twist, 1)[moving] / np.linalg.norm(gradient[moving], axis=1)
     assert np.allclose(cosine, np.linalg.norm(twist[moving], axis=1), rtol=1e-6)
+    # An answer is the smallest motion in the metric of the surface, and its entries sum to less than `MAX_MOTION`. So in
+    # a jam no motion is smaller than the bound below. The variables are the positive and negative parts of its entries.
     for k in np.flatnonzero(status == pj.Status.JAMMED):
-        limits = [(-1e3 * unit[k], 1e3 * unit[k])] * 3
-        found = linprog(np.zeros(3), -rows[k] / [1, 1, length], -needed[k] - 1e-2 * unit[k], bounds=limits)
+        opening = rows[k] / [1, 1, length]
+        conditions = np.concatenate([np.concatenate([-opening, opening], axis=1), np.ones((1, 6))])
+        largest = MAX_MOTION / np.sqrt(3 * np.linalg.cond(matrix[k]))
+        limits = np.append(-needed[k] / unit[k] - 1e-2, largest)
+        found = linprog(np.zeros(6), conditions, limits, bounds=(0, None))
         assert found.status == 2, "a motion exists"
 
 
