@@ -45,8 +45,8 @@ def test_conditions_hold_and_jams_have_no_motion(count):
     twist = np.asarray(motion.twist) * [1, 1, length]
     cosine = np.sum(gradient * twist, 1)[moving] / np.linalg.norm(gradient[moving], axis=1)
     assert np.allclose(cosine, np.linalg.norm(twist[moving], axis=1), rtol=1e-6)
-    # An answer is the smallest motion in the surface's metric, and its entries sum to less than `MAX_MOTION`. So in a jam
-    # no motion is smaller than the bound below. The variables are the positive and negative parts of its entries.
+    # An answer is the smallest motion in the surface's metric, and its entries sum to less than `MAX_MOTION`. So no
+    # motion out of a jam is smaller than `largest`. The variables are the positive and negative parts of its entries.
     for k in np.flatnonzero(status == pj.Status.JAMMED):
         opening = rows[k] / [1, 1, length]
         conditions = np.concatenate([np.concatenate([-opening, opening], axis=1), np.ones((1, 6))])
