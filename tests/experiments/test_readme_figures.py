@@ -1,11 +1,13 @@
 """One figure of each robot's table in the README is computed again, from recorded pushes."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pushjax.experiments import table2
 from pushjax.experiments.table1 import conditions
 from pushjax.experiments.table1.groups import noise_floor_mm
 
@@ -13,8 +15,11 @@ README = (Path(__file__).parents[2] / "README.md").read_text()
 
 
 @pytest.mark.slow
-def test_table_2_from_the_known_support(converted):
-    means = table2.run(converted, method=("ideal",))["means"]["ideal"]
+def test_table_2_from_the_known_support(converted, tmp_path):
+    """The command, in float32, and so with its own random splits."""
+    options = ["--method", "ideal", "--data", str(converted), "--out", str(tmp_path), "--json", "table2.json"]
+    subprocess.run([sys.executable, "-m", "pushjax", "reproduce", "table2", *options], cwd=tmp_path, check=True)
+    means = json.loads((tmp_path / "table2.json").read_text())["means"]["ideal"]
     (row,) = [line for line in README.splitlines() if "from forces (table 2: from the known support)" in line]
     expected = f"| {means['quartic']['mean_mm']:.2f} mm | {means['ellipsoid']['mean_mm']:.2f} mm |"
     assert row.endswith(expected), expected
