@@ -29,6 +29,13 @@ class Column(NamedTuple):
     form: str = ""  # format of the value
 
 
+POSE = (  # the columns of a row's "pose", m and rad
+    Column("x / mm", lambda row: 1e3 * row["pose"][0], ".2f"),
+    Column("y / mm", lambda row: 1e3 * row["pose"][1], ".2f"),
+    Column("angle / °", lambda row: np.degrees(row["pose"][2]), ".2f"),
+)
+
+
 def table(rows: Sequence[dict[str, Any]], *columns: tuple[Any, ...]) -> Table:
     """Return the table of records, from the fields of `Column`; "-" stands for None."""
 

@@ -10,7 +10,7 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax.experiments._record import result_record
-from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._report import POSE, Table, saved, table
 
 SIDE, RADIUS, FRICTION = 0.09, 0.00475, 0.25
 START, END, STEPS = (-0.05, 0.018), (0.0, 0.018), 100
@@ -101,9 +101,7 @@ def summary(record: dict[str, Any]) -> list[str | Table]:
             record["rows"],
             ("surface", "model"),
             ("mean error of twists / °", "fit_angle_deg", ".1f"),
-            ("x / mm", lambda row: 1e3 * row["pose"][0], ".2f"),
-            ("y / mm", lambda row: 1e3 * row["pose"][1], ".2f"),
-            ("angle / °", lambda row: np.degrees(row["pose"][2]), ".2f"),
+            *POSE,
             ("steps", lambda row: ", ".join(f"{count} {mode.lower()}" for mode, count in row["modes"].items())),
         ),
         f"The two end {record['apart_mm']:.2f} mm apart (position, and angle times the radius of gyration).",

@@ -17,7 +17,7 @@ import numpy as np
 import pushjax as pj
 from pushjax import plot
 from pushjax.experiments._record import result_record
-from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._report import POSE, Table, saved, table
 
 WIDTH, HEIGHT = 0.050, 0.035  # m, of the rectangle
 FRICTION = 0.2
@@ -91,9 +91,7 @@ def summary(record: dict[str, Any]) -> list[str | Table]:
             record["rows"],
             ("start that ends", "name"),
             ("outcome", "outcome"),
-            ("x / mm", lambda row: 1e3 * row["pose"][0], ".2f"),
-            ("y / mm", lambda row: 1e3 * row["pose"][1], ".2f"),
-            ("angle / °", lambda row: np.degrees(row["pose"][2]), ".2f"),
+            *POSE,
             ("opening / mm", "opening_mm", ".2f"),
         ),
     ]

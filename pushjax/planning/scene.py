@@ -1,6 +1,6 @@
-"""What is pushed and with what, and samples of its friction, which all candidates of a search share.
+"""The scene of a plan: slider, hand, friction and fixtures; and samples of its friction.
 
-So the costs of candidates differ by the candidates, and not by luck.
+All candidates of a search share the samples, so that their costs differ by the candidates and not by the draw.
 """
 
 import equinox as eqx

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contact_batches import first, flat_push, problems, square
-from support.slopes import slopes
+from slopes import slopes
 
 import pushjax as pj
 

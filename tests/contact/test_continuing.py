@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.slopes import slopes
+from slopes import slopes
 
 import pushjax as pj
 from pushjax.contact.problem import contacts_in_columns, form_and_friction, solve_problem

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from contact_batches import first, flat_push, problems
 from scipy.optimize import linprog
-from support.slopes import slopes
+from slopes import slopes
 
 import pushjax as pj
 from pushjax.contact.frictionless import MAX_MOTION, Frictionless

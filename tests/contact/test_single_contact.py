@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contact_batches import problems
-from support.slopes import slopes
+from slopes import slopes
 
 from pushjax import (
     ContactMode,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from contact_batches import square
-from support.slopes import slopes
+from slopes import slopes
 
 import pushjax as pj
 import pushjax.simulation.rollout as rollout_module

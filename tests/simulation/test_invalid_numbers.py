@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.slopes import slopes
+from slopes import slopes
 
 import pushjax as pj
 

@@ -1,1 +1,0 @@
-"""Programs and problems that many tests share."""
