@@ -43,35 +43,31 @@ def test_streams_are_brought_to_the_tips_stamps(tmp_path, suffix):
     np.testing.assert_allclose(force[4:], np.column_stack([2 * time, -1 - time])[4:], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", MIT_JSONS)
-def test_raw_logs_agree_with_the_curated_arrays(data, converted, tmp_path, name):
-    raw = data / "raw" / "mit_push_full" / name
-    for path in sorted((data / "mit_push_full").glob("*.npz")):
+def test_raw_logs_agree_with_the_curated_arrays(data, converted, tmp_path):
+    archives = {}
+    for path in (data / "mit_push_full").glob("*.npz"):
         with np.load(path) as archive:
-            content = dict(archive)
-        if str(content["source_file"]) == name:
-            break
-    else:
-        pytest.skip(f"no curated archive of {name}")
-    ours, curated = load_recordings(raw), load_recordings(converted / "mit_push_full" / path.name)
-    (push,) = ours.pushes
-    same(push, curated.pushes[0], EXACT)
-    # the name of the original tells the object
-    np.testing.assert_allclose(ours.vertices, content["vertices_body"], atol=2e-7)
-    assert ours.length == pytest.approx(float(content["rho"]), abs=2e-7)
-    assert (ours.tip_radius, ours.surface, ours.object) == (content["tip_radius"], curated.surface, curated.object)
-    # the common window of tip and object, without losing a row
-    time, seen = content["tip_t"], content["object_t"]
-    inside = (time >= seen[0]) & (time <= seen[-1])
-    np.testing.assert_allclose(push.time, time[inside], atol=EXACT)
-    np.testing.assert_allclose(push.hand, content["tip_xy"][inside], atol=EXACT)
-    for column in range(3):
-        expected = np.interp(time[inside], seen, content["object_pose"][:, column])
-        np.testing.assert_allclose(push.pose[:, column], expected, atol=EXACT)
-    copy = write_streams(
-        tmp_path / "log.h5", {key: np.array(rows) for key, rows in json.loads(raw.read_text()).items()}
-    )
-    same(load_recordings(copy).pushes[0], push, 0.0)
+            archives[str(archive["source_file"])] = path.name, dict(archive)
+    for name in MIT_JSONS:
+        raw = data / "raw" / "mit_push_full" / name
+        file, content = archives[name]
+        ours, curated = load_recordings(raw), load_recordings(converted / "mit_push_full" / file)
+        (push,) = ours.pushes
+        same(push, curated.pushes[0], EXACT)
+        # the name of the original tells the object
+        np.testing.assert_allclose(ours.vertices, content["vertices_body"], atol=2e-7)
+        assert ours.length == pytest.approx(float(content["rho"]), abs=2e-7)
+        assert (ours.tip_radius, ours.surface, ours.object) == (content["tip_radius"], curated.surface, curated.object)
+        # the common window of tip and object, without losing a row
+        time, seen = content["tip_t"], content["object_t"]
+        inside = (time >= seen[0]) & (time <= seen[-1])
+        np.testing.assert_allclose(push.time, time[inside], atol=EXACT)
+        np.testing.assert_allclose(push.hand, content["tip_xy"][inside], atol=EXACT)
+        for column in range(3):
+            expected = np.interp(time[inside], seen, content["object_pose"][:, column])
+            np.testing.assert_allclose(push.pose[:, column], expected, atol=EXACT)
+        streams = {key: np.array(rows) for key, rows in json.loads(raw.read_text()).items()}
+        same(load_recordings(write_streams(tmp_path / "log.h5", streams)).pushes[0], push, 0.0)
 
 
 def test_force_on_the_object_does_work_on_it(converted):

@@ -1,6 +1,7 @@
 """Logs of the triangle and one finger: against the curated arrays, where these exist, and damaged synthetic ones."""
 
 import gzip
+import itertools
 import math
 import pickle
 from pathlib import Path
@@ -32,14 +33,14 @@ WRENCH_TOLERANCE = 10 * ANGLE_TOLERANCE
 EXACT = 1e-12
 
 
-@pytest.fixture(scope="module", params=CONDITIONS)
-def both(request, data, converted) -> tuple[Recordings, Recordings]:
-    """Return a log as read from the original text and from the curated arrays."""
-    files = sorted((data / "raw" / "three_point_push").glob(f"{request.param}__*.txt.gz"))
-    archive = converted / "three_point_push" / f"{request.param}.npz"
-    if not files or not archive.exists():
-        pytest.skip(f"no {archive} or its original")
-    return load_triangle_log(files[0]), load_recordings(archive)
+@pytest.fixture(scope="module")
+def logs(data, converted) -> list[tuple[Recordings, Recordings]]:
+    """Return each log as read from the original text and from the curated arrays."""
+    raw, archives = data / "raw" / "three_point_push", converted / "three_point_push"
+    return [
+        (load_triangle_log(next(raw.glob(f"{name}__*.txt.gz"))), load_recordings(archives / f"{name}.npz"))
+        for name in CONDITIONS
+    ]
 
 
 def paired(both) -> list[tuple[Recording, Recording]]:
@@ -55,9 +56,9 @@ def close(found, expected, tolerance: float) -> None:
     np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
 
 
-def test_text_log_gives_the_curated_pushes(both) -> None:
-    assert both[0].problems == both[1].problems == ()
-    for raw, tidy in paired(both):
+def test_text_logs_give_the_curated_pushes(logs) -> None:
+    assert all(log.problems == () for both in logs for log in both)
+    for raw, tidy in itertools.chain.from_iterable(map(paired, logs)):
         close(raw.pose[:, :2], tidy.pose[:, :2], POSITION_TOLERANCE)
         turns = raw.pose[[0, -1], 2] - tidy.pose[[0, -1], 2]
         close(turns - 2 * math.pi * np.round(turns / (2 * math.pi)), 0, ANGLE_TOLERANCE)
@@ -72,29 +73,31 @@ def test_text_log_gives_the_curated_pushes(both) -> None:
         close(raw.force[inside], tidy.force[inside], FORCE_TOLERANCE)
 
 
-def test_text_log_gives_the_curated_pairs(both, data) -> None:
-    raw, tidy = (
-        np.concatenate([np.hstack([one.wrench, one.twist]) for one in each]) for each in zip(*paired(both), strict=True)
-    )
-    close(raw, tidy, WRENCH_TOLERANCE + FORCE_TOLERANCE)
-    assert np.all(np.sum(raw[:, :3] * raw[:, 3:], axis=1) > 0)
-    with np.load(data / "three_point_push" / Path(both[1].source).name) as archive:
-        close(raw[:, :3], archive["wrench_body"], WRENCH_TOLERANCE)
-        close(raw[:, 3:], archive["displacement_body"], 2 * ANGLE_TOLERANCE)
-        # Where the toolbox turns the object the long way round, its pair is completely different.
-        off = np.linalg.norm(raw[:, :3] - archive["wrench_body_toolbox"], axis=1)
-        assert np.all(off[archive["angle_wrap_bug"]] > 0.1)
+def test_text_logs_give_the_curated_pairs(logs, data) -> None:
+    for both in logs:
+        raw, tidy = (
+            np.concatenate([np.hstack([one.wrench, one.twist]) for one in each])
+            for each in zip(*paired(both), strict=True)
+        )
+        close(raw, tidy, WRENCH_TOLERANCE + FORCE_TOLERANCE)
+        assert np.all(np.sum(raw[:, :3] * raw[:, 3:], axis=1) > 0)
+        with np.load(data / "three_point_push" / Path(both[1].source).name) as archive:
+            close(raw[:, :3], archive["wrench_body"], WRENCH_TOLERANCE)
+            close(raw[:, 3:], archive["displacement_body"], 2 * ANGLE_TOLERANCE)
+            # Where the toolbox turns the object the long way round, its pair is completely different.
+            off = np.linalg.norm(raw[:, :3] - archive["wrench_body_toolbox"], axis=1)
+            assert np.all(off[archive["angle_wrap_bug"]] > 0.1)
 
 
-def test_text_log_gives_the_curated_setup(both) -> None:
-    raw, tidy = both
-    close(raw.vertices, tidy.vertices, EXACT)
-    assert (raw.surface, raw.object, raw.tip_radius) == (tidy.surface, tidy.object, tidy.tip_radius)
-    assert raw.length == pytest.approx(tidy.length, abs=EXACT)
-    # The order of the points differs in one arrangement and has no meaning.
-    tables = [np.column_stack([each.support_points, each.support_force]) for each in both]
-    ours, theirs = (table[np.lexsort(table.round(9).T)] for table in tables)
-    close(ours, theirs, EXACT)
+def test_text_logs_give_the_curated_setup(logs) -> None:
+    for raw, tidy in logs:
+        close(raw.vertices, tidy.vertices, EXACT)
+        assert (raw.surface, raw.object, raw.tip_radius) == (tidy.surface, tidy.object, tidy.tip_radius)
+        assert raw.length == pytest.approx(tidy.length, abs=EXACT)
+        # The order of the points differs in one arrangement and has no meaning.
+        tables = [np.column_stack([each.support_points, each.support_force]) for each in (raw, tidy)]
+        ours, theirs = (table[np.lexsort(table.round(9).T)] for table in tables)
+        close(ours, theirs, EXACT)
 
 
 # --- a synthetic log ---

@@ -1,4 +1,4 @@
-"""Original logs of two fingers, against the curated arrays of the same pushes, and damaged ones."""
+"""Logs of two fingers: as they were made, against the curated arrays of the same push, and damaged ones."""
 
 import shutil
 
@@ -6,28 +6,50 @@ import numpy as np
 import pytest
 
 from pushjax.datasets import LogError, load_recordings, load_two_finger_logs
+from pushjax.datasets.recordings import rotation
 from pushjax.datasets.two_finger_logs import make_push
 
 
-@pytest.fixture
-def session(data, tmp_path):
-    """A copy of the two files of one session, in a folder that names the arrangement."""
-    folder = tmp_path / "3pts3"
-    folder.mkdir()
-    for path in (data / "raw/two_finger_push/30_90_30_30_30_90").glob("exp_*"):
-        shutil.copy(path, folder / path.name)
-    return folder
+POSE = "0 0 100 1 0 0 0"
+TURN = np.radians(10)
+CENTER = np.array([52.0, -168.0])  # of the turn, mm, in the frame of the corner, which is at the world's origin
+ACTIONS = ("1", "TwoPointRotation", "75 75 0", "52 -168 0", "-0.7071067811865476 -0.7071067811865476 0", "10 0.5")
 
 
 def files(folder):
-    sensor, actions = next(folder.glob("*_sensor*")), next(folder.glob("*_pushaction*"))
-    sensor.chmod(0o644)
-    actions.chmod(0o644)
-    return sensor, actions
+    return next(folder.glob("*_sensor*")), next(folder.glob("*_pushaction*"))
 
 
-def test_a_push_is_that_of_the_curated_arrays(converted, session):
-    log, curated = load_two_finger_logs(session), load_recordings(converted / "two_finger_push/3pts3.npz")
+@pytest.fixture
+def session(tmp_path):
+    """The two files of a session of one push, in which the object turns with the hand."""
+    folder = tmp_path / "3pts3"
+    folder.mkdir()
+    corner = CENTER - rotation(TURN) @ CENTER
+    after = f"{corner[0]:.9f} {corner[1]:.9f} 100 {np.cos(TURN / 2):.12f} 0 0 {np.sin(TURN / 2):.12f}"
+    samples = ["2", "1e9 0 0", "1000000005 0 0", "1", "1e9 0 0 0 1 0 0 0"]
+    (folder / "exp_1_sensor1.txt").write_text("\n".join(["1", POSE, after, *samples]) + "\n")
+    (folder / "exp_1_pushaction1.txt").write_text("\n".join(ACTIONS))
+    return folder
+
+
+def test_a_push_is_read_as_it_was_made(session):
+    log = load_two_finger_logs(session)
+    assert (log.object, log.surface, len(log), log.problems) == ("3pts3", None, 1, ())
+    (push,) = log.pushes
+    assert push.about["began"] == 1e9
+    start = np.array([75, 75]) + 0.5 * np.sqrt([0.5, 0.5])
+    end = CENTER + rotation(TURN) @ (start - CENTER)
+    np.testing.assert_allclose(1000 * push.hand[[0, -1], :2], [start, end], atol=1e-9)
+    np.testing.assert_allclose(push.hand[[0, -1], 2], [-0.75 * np.pi, -0.75 * np.pi + TURN], atol=1e-9)
+    middle = 1000 * push.pose[[0, -1], :2]
+    np.testing.assert_allclose(middle, [[50, 50], CENTER + rotation(TURN) @ (50 - CENTER)], atol=1e-8)
+    np.testing.assert_allclose(push.pose[[0, -1], 2], [0, TURN], atol=1e-9)
+
+
+def test_a_push_is_that_of_the_curated_arrays(data, converted):
+    log = load_two_finger_logs(data / "raw/two_finger_push/30_90_30_30_30_90")
+    curated = load_recordings(converted / "two_finger_push/3pts3.npz")
     assert (log.object, log.surface, len(log), log.problems) == ("3pts3", None, 1, ())
     (row,) = np.flatnonzero(np.abs(curated.about("began") - log.about("began")[0]) < 1e-3)
     (push,), same = log.pushes, curated.pushes[row]
@@ -116,9 +138,6 @@ def test_a_damaged_session_costs_itself_only(session):
     log = load_two_finger_logs(session)
     assert [problem.line for problem in log.problems] == [2]
     np.testing.assert_array_equal(log.pushes[0].hand, whole.pushes[0].hand)
-
-
-POSE = "0 0 100 1 0 0 0"
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,10 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+import pushjax as pj
 from pushjax.datasets import LogError, Recording, Recordings, load_recordings
-from pushjax.experiments import two_finger
+from pushjax.experiments import _tables, two_finger
 from pushjax.experiments._record import write_json
-from pushjax.experiments.two_finger import predictions, scores
 
 EXACT = 1e-12
 # Upper limit of the experiment's error for each object, as a fraction of the motion.
@@ -39,36 +39,31 @@ def test_stuck_objects_do_not_move_in_the_hand(rng):
     where = hands[..., :2] + np.stack([c * x - s * y, s * x + c * y], axis=-1)
     start, end = np.concatenate([where, hands[..., 2:] + angle[:1, :, None]], axis=-1)
     log = log_of(start, end, hands.swapaxes(0, 1), range(5))
-    np.testing.assert_allclose(scores.stick_deviation(log, end), 0, atol=EXACT)
-    np.testing.assert_allclose(scores.stick_deviation(log, end + np.array([0, 0, 0.1])), 0.007, atol=EXACT)
+    np.testing.assert_allclose(two_finger.stick_deviation(log, end), 0, atol=EXACT)
+    np.testing.assert_allclose(two_finger.stick_deviation(log, end + np.array([0, 0, 0.1])), 0.007, atol=EXACT)
 
 
-@pytest.mark.parametrize("name", OBJECTS)
-def test_real_logs(data, converted, name):
+def test_real_logs(data, converted):
     """The curated measure of sticking equals ours, and paths begin, pass and end where the hand does."""
-    log = load_recordings(converted / "two_finger_push" / f"{name}.npz")
-    with np.load(data / "two_finger_push" / f"{name}.npz") as archive:
-        known = archive["stick_deviation"][archive["valid"].astype(bool)]
-    np.testing.assert_allclose(scores.stick_deviation(log, log.end), known, atol=EXACT)
-    assert log.support_points.shape == (OBJECTS[name], 2)
-    paths = predictions.hand_paths(log, 3)
-    np.testing.assert_array_equal(paths, [push.hand[::40] for push in log.pushes])
-    with pytest.raises(ValueError, match="steps must be at least 1; got 0"):
-        predictions.hand_paths(log, 0)
+    for name, supports in OBJECTS.items():
+        log = load_recordings(converted / "two_finger_push" / f"{name}.npz")
+        with np.load(data / "two_finger_push" / f"{name}.npz") as archive:
+            known = archive["stick_deviation"][archive["valid"].astype(bool)]
+        np.testing.assert_allclose(two_finger.stick_deviation(log, log.end), known, atol=EXACT)
+        assert log.support_points.shape == (supports, 2)
+        np.testing.assert_allclose(pj.Pushes.of(log, 3).path, [push.hand[::40] for push in log.pushes], atol=EXACT)
 
 
 def test_repeats_of_an_action_stay_on_one_side_of_a_split(rng):
-    poses = rng.normal(size=(10, 3))
-    log = log_of(poses, poses, rng.normal(size=(10, 2, 3)), np.arange(10) // 2)
-    errors, action = rng.uniform(size=(2, 3, 10)), log.about("action")
-    tested = predictions.splits(log, errors, rng)
-    assert len(tested.test) == predictions.SPLITS
-    for pushes in tested.test:
-        assert 0 < len(pushes) < 10
-        assert not set(action[pushes]) & set(np.delete(action, pushes))
-    mean = predictions.per_push(errors, tested)
-    seen = np.isfinite(mean)
-    assert np.all(mean[seen] < 1)
+    action = np.arange(10) // 2
+    train = _tables.training_masks(action, two_finger.TRAIN_SHARE, rng)
+    assert train.shape == (_tables.SPLITS, 10)
+    for trains in train:
+        assert 0 < trains.sum() < 10
+        assert not set(action[trains]) & set(action[~trains])
+    errors = rng.uniform(size=train.shape)
+    expected = [np.nan if each.all() else errors[~each, k].mean() for k, each in enumerate(train.T)]
+    np.testing.assert_allclose(_tables.per_push(errors, ~train), expected, rtol=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +72,8 @@ def record(converted, tmp_path_factory):
         pytest.skip("no two_finger_push folder")
     folder = tmp_path_factory.mktemp("two_finger")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predictions, "FRICTIONS", np.linspace(0.2, 0.5, 4))
-        patch.setattr(predictions, "RADII", (0.0, 0.001))
+        patch.setattr(two_finger, "FRICTIONS", np.linspace(0.2, 0.5, 4))
+        patch.setattr(two_finger, "RADII", (0.0, 0.001))
         found = two_finger.run(converted, out=folder, steps=30)
     write_json(found, folder / "record.json")
     return json.loads((folder / "record.json").read_text())
@@ -109,10 +104,11 @@ def test_repeats_bound_what_can_be_predicted(record):
 
 
 def test_draws_and_sums_up(record):
-    (picture,) = record["pictures"]
-    image = matplotlib.image.imread(picture)
-    assert image.shape[0] > 300
-    assert image[..., :3].std() > 0.02  # not blank
+    assert len(record["pictures"]) == 1 + len(OBJECTS)
+    for picture in record["pictures"]:
+        image = matplotlib.image.imread(picture)
+        assert image.shape[0] > 300
+        assert image[..., :3].std() > 0.02  # not blank
     _, table, *_ = two_finger.summary(record)
     assert [row[0] for row in table.rows] == list(OBJECTS)
 
@@ -126,10 +122,8 @@ def test_refuses_another_model(tmp_path):
 
 def test_published_logs_take_the_place_of_an_archive(data, converted, tmp_path):
     """Without an archive, a folder with the name of the arrangement is read, as `pushjax data triangle` leaves it."""
-    from pushjax.experiments.two_finger.experiment import load
-
     session = data / "raw/two_finger_push/30_90_30_30_30_90"
     shutil.copytree(session, tmp_path / "3pts3")
-    log = load(tmp_path, "3pts3")
+    log = two_finger.load(tmp_path, "3pts3")
     assert (len(log), log.object) == (1, "3pts3")
-    assert len(load(converted / "two_finger_push", "3pts3")) > 100
+    assert len(two_finger.load(converted / "two_finger_push", "3pts3")) > 100

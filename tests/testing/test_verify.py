@@ -43,9 +43,16 @@ def recorded_batch(rows: dict[str, Any]) -> ProblemBatch:
     )
 
 
-def chosen(oracle, where) -> dict[str, Any]:
+@pytest.fixture(scope="module")
+def recorded(oracle) -> dict[int, dict[str, Any]]:
+    """Return the recorded problems by the degree of their limit surfaces."""
     with np.load(oracle / "multi_contact.npz") as file:
-        return {name: file[name][where(file)] for name in file.files}
+        rows = dict(file)
+    return {degree: chosen(rows, rows["ls_type"] == (degree == 4)) for degree in (2, 4)}
+
+
+def chosen(rows: dict[str, Any], where) -> dict[str, Any]:
+    return {name: column[where] for name, column in rows.items()}
 
 
 def forces_of(batch: ProblemBatch, twist: np.ndarray, wrench: np.ndarray) -> np.ndarray:
@@ -88,55 +95,45 @@ def with_arms(batch: ProblemBatch, twist, wrench) -> tuple[np.ndarray, np.ndarra
     return twist / arms, wrench * arms
 
 
-@pytest.mark.parametrize("degree", [2, 4])
-def test_recorded_answers_violate_nothing(oracle, degree):
-    rows = chosen(oracle, lambda f: (f["ls_type"] == (degree == 4)) & (f["status_true"] == "moving"))
-    batch = recorded_batch(rows)
-    twist, wrench = with_arms(batch, rows["V_true"], rows["F_true_level1"])
-    force = forces_of(batch, rows["V_true"], rows["F_true_level1"])
-    parts = violations(batch, twist, force, wrench)
-    assert {name: part.max() for name, part in parts._asdict().items() if part.max() > RECORDED} == {}
-    assert (closing(batch) > 0).all()
+def test_recorded_answers_violate_nothing(recorded):
+    for every in recorded.values():
+        rows = chosen(every, every["status_true"] == "moving")
+        batch = recorded_batch(rows)
+        twist, wrench = with_arms(batch, rows["V_true"], rows["F_true_level1"])
+        force = forces_of(batch, rows["V_true"], rows["F_true_level1"])
+        parts = violations(batch, twist, force, wrench)
+        assert {name: part.max() for name, part in parts._asdict().items() if part.max() > RECORDED} == {}
+        assert (closing(batch) > 0).all()
 
 
-@pytest.mark.parametrize("degree", [2, 4])
-def test_recorded_squeeze_power(oracle, degree):
-    rows = chosen(oracle, lambda f: f["ls_type"] == (degree == 4))
-    batch = recorded_batch(rows)
-    found = squeeze_power_enumerated(batch) / rows["max_speed"]
-    np.testing.assert_allclose(found, rows["squeeze_power"], rtol=0, atol=SQUEEZE)
-    some = slice(0, None, 5)
-    np.testing.assert_allclose(
-        squeeze_power(batch.take(some)) / rows["max_speed"][some], rows["squeeze_power"][some], rtol=0, atol=SQUEEZE
-    )
+def test_recorded_squeeze_power(recorded):
+    for rows in recorded.values():
+        batch, speed, power = recorded_batch(rows), rows["max_speed"], rows["squeeze_power"]
+        np.testing.assert_allclose(squeeze_power_enumerated(batch) / speed, power, rtol=0, atol=SQUEEZE)
+        some = slice(0, None, 5)
+        found = squeeze_power(batch.take(some)) / speed[some]
+        np.testing.assert_allclose(found, power[some], rtol=0, atol=SQUEEZE)
 
 
-@pytest.mark.parametrize("degree", [2, 4])
-def test_search_of_recorded_problems(oracle, degree):
+def test_search_of_recorded_problems(recorded):
     """More than 99.5 % of the recorded motions are found; for jams that are not marked as ambiguous, none is."""
-    moving = chosen(
-        oracle, lambda f: np.flatnonzero((f["ls_type"] == (degree == 4)) & (f["status_true"] == "moving"))[::2]
-    )
-    batch = recorded_batch(moving)
-    found = search(batch, 50)
-    assert found.found.mean() > 0.995
-    assert violations(batch, found.twist, found.force, found.wrench).worst()[found.found].max() <= CLEAN
-    one = search(batch, 1, portions=())
-    assert one.found.mean() > 0.85
+    for rows in recorded.values():
+        status = rows["status_true"]
+        batch = recorded_batch(chosen(rows, np.flatnonzero(status == "moving")[::2]))
+        found = search(batch, 50)
+        assert found.found.mean() > 0.995
+        assert violations(batch, found.twist, found.force, found.wrench).worst()[found.found].max() <= CLEAN
+        assert search(batch, 1, portions=()).found.mean() > 0.85
 
-    jams = chosen(
-        oracle,
-        lambda f: np.flatnonzero((f["ls_type"] == (degree == 4)) & (f["status_true"] == "jam") & ~f["ambiguous"])[::4],
-    )
-    assert not search(recorded_batch(jams), 50).found.any()
+        jams = chosen(rows, np.flatnonzero((status == "jam") & ~rows["ambiguous"])[::4])
+        assert not search(recorded_batch(jams), 50).found.any()
 
-    still = chosen(oracle, lambda f: (f["ls_type"] == (degree == 4)) & (f["status_true"] == "receding"))
-    batch = recorded_batch(still)
-    assert (closing(batch) <= 0).all()
-    found = search(batch)
-    assert found.found.all()
-    assert not found.twist.any()
-    assert not found.force.any()
+        batch = recorded_batch(chosen(rows, status == "receding"))
+        assert (closing(batch) <= 0).all()
+        found = search(batch)
+        assert found.found.all()
+        assert not found.twist.any()
+        assert not found.force.any()
 
 
 @pytest.mark.parametrize(("contacts", "degree"), [(4, 4), (3, 2)])
