@@ -25,7 +25,6 @@ from benchmarks.random_pushes import (
     SCENES,
     SHAPES,
     Survey,
-    fixtures_seen_by_slider,
     outline_of,
     rollout,
     seen_by_slider,
@@ -33,7 +32,7 @@ from benchmarks.random_pushes import (
 )
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
-from pushjax.simulation.hand import RoundFinger
+from pushjax.geometry.se2_numpy import to_body
 
 Dtype = Literal["float64", "float32"]
 SHOWN = 6  # wrong, failed and unconfirmed pushes of each row that are printed
@@ -141,9 +140,7 @@ def penetration_depths(survey: Survey) -> np.ndarray:
     shapely.prepare(edge)
     pose = np.asarray(survey.push.pose, float)
     deepest = np.full(pose.shape[:-1], -np.inf)
-    seen = seen_by_slider(survey.hand, pose, np.asarray(survey.push.configuration))
-    radii = [float(finger.radius) if isinstance(finger, RoundFinger) else 0.0 for finger in survey.hand.fingers]
-    for radius, placed in [*zip(radii, seen, strict=True), *fixtures_seen_by_slider(survey.scene, pose)]:
+    for radius, placed in seen_by_slider(survey.hand, survey.scene, pose, np.asarray(survey.push.configuration)):
         if placed.shape[-2] == 1:
             centers = shapely.points(placed[..., 0, :])
             distance = shapely.distance(edge, centers)
@@ -210,8 +207,7 @@ def unconfirmed(survey: Survey) -> list[tuple[int, str]]:
 
 def _turned(steps: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Return the steps (fingers, 2) in the body frame of the slider."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return steps @ np.array([[c, -s], [s, c]])
+    return to_body(pose * [0, 0, 1], steps)
 
 
 def _jams_later(survey: Survey, body: shapely.Polygon, i: int, at: int, reach: float) -> bool:
@@ -276,10 +272,8 @@ class Plate(NamedTuple):
 
 def _placed(survey: Survey, pose: np.ndarray, configuration: np.ndarray) -> list[Disk | Plate]:
     """Return the fingers, and then the fixtures, in the body frame of the slider."""
-    seen = seen_by_slider(survey.hand, pose, configuration)
-    radii = [float(finger.radius) if isinstance(finger, RoundFinger) else 0.0 for finger in survey.hand.fingers]
-    bodies = [*zip(radii, seen, strict=True), *fixtures_seen_by_slider(survey.scene, pose)]
-    return [Disk(where[0], radius) if len(where) == 1 else Plate(shapely.Polygon(where)) for radius, where in bodies]
+    seen = seen_by_slider(survey.hand, survey.scene, pose, configuration)
+    return [Disk(where[0], radius) if len(where) == 1 else Plate(shapely.Polygon(where)) for radius, where in seen]
 
 
 def _jams(body: shapely.Polygon, fingers: list[Disk | Plate], steps: np.ndarray, mu: float, reach: float) -> bool:

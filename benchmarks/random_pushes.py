@@ -1,5 +1,6 @@
 """Random pushes and grasps of many outlines by four hands, free or among fixtures, for the survey `overlaps`."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -8,7 +9,8 @@ import numpy as np
 import shapely
 
 import pushjax as pj
-from pushjax.simulation.hand import Pad, RoundFinger
+from pushjax.geometry.se2_numpy import to_body, to_world
+from pushjax.simulation.hand import Pad
 
 MM = 1e-3
 # Vertices of the polygon that replaces a smooth outline. Its chords are within 0.2 um of the outline.
@@ -55,18 +57,30 @@ SMOOTH = {
 }
 SHAPES = (*POLYGONS, *SMOOTH)
 HANDS = ("one", "two", "three", "jaw")
-# Fixtures around the slider: walls as (point, normal), m; disks as (radius, center) and rectangles as (size, pose).
-SCENES = {
-    "free": (),
-    "wall": (("wall", (0.0, -0.14), (0.0, 1.0)),),
-    "corner": (("wall", (0.0, -0.14), (0.0, 1.0)), ("wall", (0.15, 0.0), (-1.0, 0.0))),
-    "wedge": (("wall", (0.0, -0.14), (0.3, 1.0)), ("wall", (0.15, 0.0), (-1.0, 0.4))),
-    "room": tuple(
-        ("wall", (-0.15 * x, -0.15 * y), (x, y)) for x, y in ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
-    ),
-    "peg": (("disk", 0.02, (0.15, 0.0)),),
-    "pegs": (("disk", 0.02, (0.15, 0.06)), ("disk", 0.02, (0.15, -0.06)), ("disk", 0.03, (-0.12, 0.14))),
-    "block": (("rectangle", (0.06, 0.04), (0.16, 0.01, 0.4)), ("wall", (0.0, -0.14), (0.0, 1.0))),
+Fixtures = tuple[pj.Wall | pj.Fixture, ...]
+
+
+def _walls(mu, *walls: tuple) -> Fixtures:
+    """Return walls, each given by a point (m) and its normal."""
+    return tuple(pj.Wall(point, normal, mu) for point, normal in walls)
+
+
+def _disks(mu, *disks: tuple) -> Fixtures:
+    """Return disks, each given by its radius and center, m."""
+    return tuple(pj.Fixture(pj.Disk(radius), (*center, 0.0), mu) for radius, center in disks)
+
+
+BELOW = (0.0, -0.14), (0.0, 1.0)
+# Fixtures around the slider, as functions of their friction.
+SCENES: dict[str, Callable[..., Fixtures]] = {
+    "free": _walls,
+    "wall": lambda mu: _walls(mu, BELOW),
+    "corner": lambda mu: _walls(mu, BELOW, ((0.15, 0.0), (-1.0, 0.0))),
+    "wedge": lambda mu: _walls(mu, ((0.0, -0.14), (0.3, 1.0)), ((0.15, 0.0), (-1.0, 0.4))),
+    "room": lambda mu: _walls(mu, *(((-0.15 * x, -0.15 * y), (x, y)) for x, y in ((1, 0), (0, 1), (-1, 0), (0, -1)))),
+    "peg": lambda mu: _disks(mu, (0.02, (0.15, 0.0))),
+    "pegs": lambda mu: _disks(mu, (0.02, (0.15, 0.06)), (0.02, (0.15, -0.06)), (0.03, (-0.12, 0.14))),
+    "block": lambda mu: (pj.Fixture(pj.Polygon.rectangle(0.06, 0.04), (0.16, 0.01, 0.4), mu), *_walls(mu, BELOW)),
 }
 FINGER = 8 * MM
 PAD = (50 * MM, 10 * MM)
@@ -152,66 +166,30 @@ def simulate(
     return Survey(hand, slider, path, pose, friction, jax.tree.map(np.asarray, push), scene)
 
 
-def fixtures_of(scene: str, friction) -> tuple[pj.Wall | pj.Fixture, ...]:
-    """Return the fixtures of a scene, all with the same friction."""
-    found = []
-    for kind, first, second in SCENES[scene]:
-        if kind == "wall":
-            found.append(pj.Wall(first, second, friction))
-        elif kind == "disk":
-            found.append(pj.Fixture(pj.Disk(first), (*second, 0.0), friction))
-        else:
-            found.append(pj.Fixture(pj.Polygon.rectangle(*first), second, friction))
-    return tuple(found)
-
-
 # The slider is an argument so that polygons with the same number of vertices share a program in the compilation cache.
 def rollout(slider, hand, path, pose, friction, scene="free") -> pj.Trajectory:
     """Simulate one push."""
-    fixtures = fixtures_of(scene, friction)
-    return pj.rollout(slider, hand, path, pose=pose, friction=friction, fixtures=fixtures)
+    return pj.rollout(slider, hand, path, pose=pose, friction=friction, fixtures=SCENES[scene](friction))
 
 
-def fixtures_seen_by_slider(scene: str, poses: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Return the radius and place of each fixture in the body frame of the slider, at poses (..., 3)."""
-    # A disk has its radius, m, and its center, (..., 1, 2). A rectangle, or a wall as a rectangle of 2 m by 1 m, has
+def seen_by_slider(
+    hand: pj.Hand, scene: str, poses: np.ndarray, configurations: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Return the radius and place of each finger and fixture in the body frame of the slider, at poses (..., 3)."""
+    # A round body has its radius, m, and its center, (..., 1, 2). A pad, or a wall as a rectangle of 2 m by 1 m, has
     # zero and its corners, (..., 4, 2), m.
-    c, s = np.cos(poses[..., None, 2]), np.sin(poses[..., None, 2])
-    found = []
-    for kind, first, second in SCENES[scene]:
-        if kind == "wall":
-            normal = np.asarray(second) / np.linalg.norm(second)
-            along = np.array([normal[1], -normal[0]])
-            points = np.asarray(first) + np.array([along, -along, -along - normal, along - normal])[::-1]
-        elif kind == "disk":
-            points = np.asarray(second)[None]
-        else:
-            half, angle = np.asarray(first) / 2, second[2]
-            turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            points = second[:2] + (half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])) @ turn.T
-        away = points - poses[..., None, :2]
-        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
-        found.append((float(first) if kind == "disk" else 0.0, local))
-    return found
-
-
-def seen_by_slider(hand: pj.Hand, poses: np.ndarray, configurations: np.ndarray) -> list[np.ndarray]:
-    """Return the center of each finger or the corners of a pad, (..., points, 2), m, in the slider's body frame."""
     where = np.asarray(hand.poses(jnp.asarray(configurations)), float)
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    bodies: list[tuple] = [(finger, where[..., k, None, :]) for k, finger in enumerate(hand.fingers)]
+    for fixture in SCENES[scene](0.0):
+        if isinstance(fixture, pj.Wall):
+            nx, ny = normal = np.asarray(fixture.normal, float)
+            pose = np.append(np.asarray(fixture.point, float) - normal / 2, np.arctan2(-nx, ny))
+            bodies.append((Pad(pj.Polygon.rectangle(2.0, 1.0)), pose))
+        else:
+            bodies.append((fixture.body, np.asarray(fixture.pose, float)[None]))
     found = []
-    for k, finger in enumerate(hand.fingers):
-        away = where[..., k, :2] - poses[..., :2]
-        local = np.stack([c * away[..., 0] + s * away[..., 1], c * away[..., 1] - s * away[..., 0]], axis=-1)
-        placed = local[..., None, :]
-        if isinstance(finger, Pad):
-            turn = where[..., k, 2] - poses[..., 2]
-            corners = np.asarray(finger.shape.vertices, float)
-            cs, sn = np.cos(turn)[..., None], np.sin(turn)[..., None]
-            placed = placed + np.stack(
-                [cs * corners[:, 0] - sn * corners[:, 1], sn * corners[:, 0] + cs * corners[:, 1]], axis=-1
-            )
-        elif not isinstance(finger, RoundFinger):
-            raise TypeError(f"not a finger: {finger!r}")
-        found.append(placed)
+    for body, pose in bodies:
+        is_pad = isinstance(body, Pad)
+        points = to_world(pose, np.asarray(body.shape.vertices, float)) if is_pad else pose[..., :2]
+        found.append((0.0 if is_pad else float(body.radius), to_body(poses[..., None, :], points)))
     return found
