@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
 MONOMIALS = "xxxx yyyy zzzz xxxy xxxz xyyy yyyz xzzz yzzz xxyy xxzz yyzz xxyz xyyz xyzz".split()
 PRODUCTS = "xx yy zz xy xz yz".split()
-# The (row, column) of each of the six distinct entries of a symmetric 3 x 3 matrix, in the order of `PRODUCTS`.
-UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def _second_derivatives() -> np.ndarray:

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pushjax.testing.batch import UPPER, ProblemBatch, products
+from pushjax._math.arrays import ENTRIES, FULL
+from pushjax.testing.batch import ProblemBatch, products
 from pushjax.testing.condition_violations import CLEAN, level, violations
 
 # Number of starts that are followed together, so that their numbers stay in the processor's cache.
@@ -13,8 +14,6 @@ CHUNK = 4000
 # |residual|^2 below this factor of its value. DAMPING: range of the initial damping, as powers of ten. RHO_SPREAD:
 # standard deviation of log(rho) between starts. MODE_SHARE: fraction of starts that begin with a guess of the modes.
 MOST_STEPS, STALLED, DAMPING, RHO_SPREAD, MODE_SHARE = 120, 0.97, (-8.0, -2.0), 1.0, 0.8
-# For each entry of a symmetric 3 x 3 matrix, its index in `UPPER`.
-FULL = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
 
 
 class SearchResult(NamedTuple):
@@ -118,7 +117,7 @@ class _Equations:
         rows = np.where(active[..., None, None], batch.rows(), 0.0)
         approach = np.where(active[..., None], batch.approach() / batch.speed()[:, None, None], -1.0)
         rho = np.where(active, np.einsum("nmi,nij,nmj->nm", rows[:, :, 0], mean, rows[:, :, 0]), 1.0)
-        upper = np.stack([table[:, i, j] for i, j in UPPER], axis=1) / size[:, None, None]
+        upper = np.stack([table[:, i, j] for i, j in ENTRIES], axis=1) / size[:, None, None]
         flat = rows.reshape(n, 2 * m, 3)
 
         def per_start(array: np.ndarray) -> np.ndarray:

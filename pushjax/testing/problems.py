@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from pushjax._math.directions import fibonacci_hemisphere
 from pushjax._math.vec import Vec3
 from pushjax.contact.problem import Contacts
 from pushjax.friction.ellipsoid import Ellipsoid
@@ -93,14 +94,9 @@ def random_surface(
 
 def _spectrum(c: Float[Array, "15"]) -> tuple[Array, Array]:
     """Return the smallest and the largest eigenvalue of the Hessian over a sweep of the half sphere."""
-    k = jnp.arange(200) + 0.5
-    height, angle = 1 - k / 200, jnp.pi * (1 + 5**0.5) * k
-    ring = jnp.sqrt(1 - height**2)
-    form = QuarticForm(tuple(c), jnp.ones(()))
-    hessian = jax.vmap(lambda x, y, z: form.hessian(Vec3(x, y, z)).array())(
-        ring * jnp.cos(angle), ring * jnp.sin(angle), height
-    )
-    values = jnp.linalg.eigvalsh(hessian)
+    directions = Vec3.of(jnp.asarray(fibonacci_hemisphere(200).T, c.dtype))
+    hessian = QuarticForm(tuple(c), jnp.ones(())).hessian(directions).array()
+    values = jnp.linalg.eigvalsh(jnp.moveaxis(hessian, -1, 0))
     return jnp.min(values), jnp.max(values)
 
 
