@@ -30,9 +30,10 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon, Rectangle
 import pushjax as pj
 from pushjax import planning, plot
 from pushjax.datasets import Recording, find_data
-from pushjax.experiments import demo, squeeze, stochastic_push
+from pushjax.experiments import demo, squeeze, stochastic_push, table2
+from pushjax.experiments._report import pushes_by_error
 from pushjax.experiments.pusht_mpc import make_plant
-from pushjax.experiments.table2 import conditions
+from pushjax.experiments.tables import ideal_surface
 from pushjax.geometry.se2_numpy import compose, inverse, to_world
 from pushjax.planning.pusht import PIXEL, pusht_pose
 from pushjax.plot.parts import draw_fixtures, placed_outline
@@ -100,11 +101,11 @@ def real() -> Figure:
     data = find_data()
     if data is None:
         raise SystemExit("real: set PUSHJAX_DATA to the folder of real data")
-    log, geometry = conditions.load(data / "three_point_push", *REAL), conditions.GEOMETRIES["measured"]
+    log, geometry = table2.load(data / "three_point_push", *REAL), table2.GEOMETRIES["measured"]
     if log is None or log.length is None:
         raise SystemExit(f"real: {data} has no log of {', '.join(map(str, REAL))}")
-    pushes, block = conditions.recorded(log, geometry, STEPS), conditions.outline(log, geometry)
-    slider = pj.Slider(block, conditions.ideal_surface(log, "quartic", jax.random.key(0)))
+    pushes, block = table2.recorded(log, geometry, STEPS), table2.outline(log, geometry)
+    slider = pj.Slider(block, ideal_surface(log, "quartic", 0))
     hand = pj.Hand.finger(geometry.radius)
 
     def end(start, path):
@@ -112,13 +113,9 @@ def real() -> Figure:
 
     predicted = jax.jit(jax.vmap(end))(pushes.start, pushes.path)
     off = MM * np.asarray(pj.deviation(predicted, pushes.end, log.length))
-    order = np.argsort(off)
-    shown = {}
-    for name, share in SHOWN.items():
-        k = order[round(share * (len(order) - 1))]
-        measured = Recording(k, np.asarray(pushes.path[k]), np.stack([pushes.start[k], pushes.end[k]]))
-        shown[f"{name}: {off[k]:.1f} mm"] = measured, np.asarray(predicted[k])
-    return plot.real_figure(block, shown, hand)
+    ends = np.stack([pushes.start, pushes.end], axis=1)
+    measured = [Recording(k, np.asarray(path), ends[k]) for k, path in enumerate(pushes.path)]
+    return plot.real_figure(block, pushes_by_error(measured, np.asarray(predicted), off, SHOWN), hand)
 
 
 # PushT in gym-pusht

@@ -43,7 +43,7 @@ COMMANDS = {
     "reproduce grasp-rectangle": Command("a jaw closes on a rectangle; 100 s", "grasps", {"slider": "rectangle"}),
     "reproduce grasp-butterfly": Command("a jaw closes on a butterfly; 200 s", "grasps", {"slider": "butterfly"}),
     "reproduce pusht-mpc": Command("PushT of the package gym-pusht, solved by a planner", "pusht_mpc"),
-    "identify": Command("identifies friction, limit surface and calibration from LOG files; 1 min", "identify_logs"),
+    "identify": Command("identifies friction, limit surface and calibration from LOG files; 1 min", "identify"),
     "plan": Command("plans pushes from pose to pose, as way points for a robot; 2 min", "plan"),
 }
 FETCH = "data triangle"
@@ -124,8 +124,8 @@ def parse(name: str, options: list[str]) -> tuple[ModuleType, partial[Any], Comm
 
         matplotlib.use("Agg")  # draws to files, because there may be no screen
         experiment = import_module(f"pushjax.experiments.{COMMANDS[name].module}")
-    about = sys.modules[experiment.run.__module__].__doc__
-    return experiment, *parsed(experiment.run, options, f"pushjax {name}", about, Common, **COMMANDS[name].fixed)
+    fixed = COMMANDS[name].fixed
+    return experiment, *parsed(experiment.run, options, f"pushjax {name}", experiment.__doc__, Common, **fixed)
 
 
 def _compute(title: str, experiment: ModuleType, call: partial[Any], common: Common) -> None:

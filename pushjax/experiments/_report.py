@@ -1,4 +1,4 @@
-"""What experiments share: random start positions, saved pictures, and the text of a report."""
+"""What experiments share: random start positions, the text of a report, and pictures."""
 
 import io
 from collections.abc import Callable, Mapping, Sequence
@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
 from pushjax import plot
+from pushjax.datasets import Recording
+from pushjax.plot.style import BLUE, GRAY
 
 
 class Table(NamedTuple):
@@ -37,10 +40,10 @@ POSE = (  # the columns of a row's "pose", m and rad
 
 
 def table(rows: Sequence[dict[str, Any]], *columns: tuple[Any, ...]) -> Table:
-    """Return the table of records, from the fields of `Column`; "-" stands for None."""
+    """Return the table of records, from the fields of `Column`; "-" stands for None and for no field."""
 
     def text(row: dict[str, Any], column: Column) -> str:
-        value = row[column.value] if isinstance(column.value, str) else column.value(row)
+        value = row.get(column.value) if isinstance(column.value, str) else column.value(row)
         return "-" if value is None else format(value, column.form)
 
     each = [Column(*column) for column in columns]
@@ -68,6 +71,23 @@ def as_text(parts: Sequence[str | Table]) -> str:
 def saved(out: Path | None, figures: Callable[[], Mapping[str, Figure]]) -> list[str]:
     """Draw figures, by the names of their files, into the folder `out`, if there is one, and return their paths."""
     return [] if out is None else [str(plot.save(figure, out / name)) for name, figure in figures().items()]
+
+
+def pushes_by_error(
+    pushes: Sequence[Recording], final: np.ndarray, errors: np.ndarray, shares: Mapping[str, float]
+) -> dict[str, tuple[Recording, np.ndarray]]:
+    """Return the pushes at named shares of the order of their errors (n,), mm, as `plot.real_figure` takes them."""
+    order = np.argsort(errors)
+    chosen = {name: order[round(share * (len(order) - 1))] for name, share in shares.items()}
+    return {f"{name}: {errors[k]:.2f} mm": (pushes[k], final[k]) for name, k in chosen.items()}
+
+
+def distribution_panel(axes: Axes, predicted: np.ndarray, no_motion: np.ndarray) -> None:
+    """Draw the cumulative distributions of the deviations, mm, of the predictions and of the start poses."""
+    axes.ecdf(predicted, color=BLUE, label="predicted")
+    axes.ecdf(no_motion, ls="--", color=GRAY, label="no motion")
+    axes.set(xscale="log", ylim=(0, 1), xlabel="deviation of the final pose / mm", ylabel="share of pushes below")
+    axes.legend(loc="lower right")
 
 
 def uniform_in_circle(rng: np.random.Generator, radius: float, n: int) -> np.ndarray:

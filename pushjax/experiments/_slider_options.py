@@ -1,4 +1,4 @@
-"""Values of command-line options: outlines, supports and fixtures from text."""
+"""Sliders of experiments: limit surfaces of supports, and outlines, supports and fixtures from text of options."""
 
 import csv
 import math
@@ -12,8 +12,14 @@ import pushjax as pj
 SHAPES = "rectangle:0.1x0.05, disk:0.05, ellipse:0.06x0.04 (semi-axes), regular:6x0.05, or a CSV file of vertices"
 FIXTURES = "wall@X,Y,ANGLE of its normal, or SHAPE@X,Y,THETA with a shape as in --shape"
 SUPPORTS = "uniform, rim, or points:0.03,0.04;-0.03,0.04;0,-0.04"
-NUM_PAIRS = 400  # wrench-twist pairs that a limit surface is fitted to
+MODELS = {"quartic": 4, "ellipsoid": 2}  # limit surfaces and their degrees
+PAIRS = 400  # wrench-twist pairs that a limit surface is fitted to
 NUM_POINTS = 100  # points in place of a continuous pressure, "uniform" or "rim"
+
+
+def fitted_surface(support: pj.Support, model: str, seed: int) -> pj.LimitSurface:
+    """Fit a limit surface, a "quartic" or an "ellipsoid", to sampled wrench-twist pairs of a support."""
+    return pj.fit_limit_surface(*support.wrench_twist_pairs(jax.random.key(seed), PAIRS), degree=MODELS[model])
 
 
 def parse_shape(text: str, option: str = "--shape") -> pj.Polygon | pj.Disk | pj.Ellipse:
@@ -58,12 +64,6 @@ def parse_fixture(text: str, friction: float) -> pj.Wall | pj.Fixture:
     if isinstance(shape, pj.Ellipse):
         raise ValueError(f"--fixtures: a body is a disk or a convex polygon; got {text!r}")
     return pj.Fixture(shape, (x, y, angle), friction=friction)
-
-
-def expected_surface(support: pj.Support, degree: int, seed: int) -> pj.LimitSurface:
-    """Fit a quartic (`degree` 4) or else an ellipsoid to sampled wrench-twist pairs of a support."""
-    pairs = support.wrench_twist_pairs(jax.random.key(seed), NUM_PAIRS)
-    return pj.fit_limit_surface(*pairs, degree=4 if degree == 4 else 2)
 
 
 def _vertices(path: Path, option: str) -> np.ndarray:

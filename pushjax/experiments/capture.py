@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import scipy.stats
 from matplotlib.figure import Figure
@@ -26,6 +27,9 @@ from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table, uniform_in_circle
+from pushjax.experiments._slider_options import fitted_surface
+from pushjax.plot.parts import finger_poses
+from pushjax.plot.style import BLACK, BLUE, GRAY, MM, RED, STYLE, legend_below
 
 DISK_RADIUS, FINGER_RADIUS, FINGER_SPACING, TRAVEL = 0.0525, 0.001, 0.1, 0.2625  # m
 START_RADIUS = 0.0788  # m, of the circle of start centers
@@ -34,7 +38,7 @@ N, STEPS = 500, 525
 MAX_DRAWN = 100  # paths in each panel of the picture
 DOFS, FRICTIONS = (200.0, 10.0), (0.25, 0.1, 0.5)  # the picture and the record's own figures are of the first friction
 CONVERGED_DISTANCE = 1e-3  # m
-SUPPORT_POINTS, PAIRS = 150, 400  # of the support, and wrench-twist pairs, for the limit surface
+SUPPORT_POINTS = 150
 GRID_POINTS = 80  # on each axis, for the density of start centers in the picture
 
 
@@ -70,8 +74,7 @@ def run(
     if not friction or len(set(friction)) != len(friction):
         raise ValueError(f"friction must be one or more, each once; got {', '.join(f'{mu:g}' for mu in friction)}")
     disk = pj.Disk(DISK_RADIUS)
-    pairs = pj.Support.uniform(disk, points=SUPPORT_POINTS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
-    slider = pj.Slider(disk, pj.fit_limit_surface(*pairs, degree=2))
+    slider = pj.Slider(disk, fitted_surface(pj.Support.uniform(disk, points=SUPPORT_POINTS), "ellipsoid", seed))
     hand = pj.Hand.two_fingers(FINGER_RADIUS)
     path = pj.line((0, 0, np.pi / 2, FINGER_SPACING), (0, TRAVEL, np.pi / 2, FINGER_SPACING), steps)
     starts = start_poses(n, seed)
@@ -86,11 +89,12 @@ def run(
                 pj.monte_carlo(key, n, slider, hand, path, pose=starts, model=model, trajectories=True) for key in keys
             )
             verdicts.append(converged(pushes))
+            share = float(verdicts[-1].mean())
             rows.append(
                 {
                     "friction": mu,
                     "dof": surface_dof,
-                    "converged": float(verdicts[-1].mean()),
+                    "converged": share,
                     "outcomes": pushes.outcomes(),
                     "changed_by_draw_percent": 100 * float(np.mean(verdicts[-1] != converged(others))),
                     "seconds": pushes.seconds,
@@ -98,12 +102,12 @@ def run(
                 }
             )
             if mu == friction[0]:
-                shown[surface_dof] = pushes, verdicts[-1]
+                shown[f"dof {surface_dof:g}: {share:.1%} of {n} converge"] = pushes.trajectory, verdicts[-1]
             progress(len(rows), len(friction) * len(dof))
         for row in rows[-2:]:
             row["difference_percent"] = 100 * abs(float(verdicts[0].mean() - verdicts[1].mean()))
             row["changed_by_noise_percent"] = 100 * float(np.mean(verdicts[0] != verdicts[1]))
-    pictures = saved(out, lambda: {"capture.png": _figure(slider, hand, path, shown)})
+    pictures = saved(out, lambda: {"capture.png": capture_figure(disk, hand, np.asarray(path), shown)})
     settings = {"seed": seed, "steps": steps, "dof": dof, "friction": friction}
     settings |= {"disk_m": DISK_RADIUS, "finger_m": FINGER_RADIUS, "apart_m": FINGER_SPACING, "travel_m": TRAVEL}
     settings |= {"circle_m": START_RADIUS, "ahead_m": START_DISTANCE, "near_m": CONVERGED_DISTANCE}
@@ -131,26 +135,44 @@ def converged(pushes: pj.MonteCarlo) -> np.ndarray:
     return np.hypot(pushes.pose[:, 0], pushes.pose[:, 1] - resting_y) < CONVERGED_DISTANCE
 
 
-def _figure(slider: pj.Slider, hand: pj.Hand, path: jax.Array, results: dict[float, tuple]) -> Figure:
-    """Draw the pushes of the first friction."""
-    runs = {
-        f"dof {dof:g}: {verdicts.mean():.1%} of {len(verdicts)} converge": (pushes.trajectory, verdicts)
-        for dof, (pushes, verdicts) in results.items()
-    }
-    pushes, has_converged = list(results.values())[-1]
-    density = _density(pushes.start[has_converged, :2])
-    return plot.capture_figure(slider.shape, hand, np.asarray(path), runs, density, max_paths=MAX_DRAWN)
-
-
-def _density(centers: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray] | None:
-    """Estimate the density of start centers (n, 2) over a grid, 1/mm^2; None if there are too few (two or less)."""
-    if len(centers) <= 2:
-        return None
-    x, y = (np.linspace(c - 1.1 * START_RADIUS, c + 1.1 * START_RADIUS, GRID_POINTS) for c in (0.0, START_DISTANCE))
-    grid = np.stack(np.meshgrid(x, y))
-    return (grid[0], grid[1]), scipy.stats.gaussian_kde(centers.T)(grid.reshape(2, -1)).reshape(
-        GRID_POINTS, GRID_POINTS
-    ) / 1e6
+def capture_figure(
+    shape: pj.Shape, hand: pj.Hand, path: np.ndarray, runs: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> Figure:
+    """Draw the paths of each run, red if they converge, and the start positions of the last, with their density."""
+    # a run has the poses (pushes, steps + 1, 3) and the verdicts (pushes,)
+    name, (trajectories, verdicts) = list(runs.items())[-1]
+    inside, outside = trajectories[verdicts, 0, :2], trajectories[~verdicts, 0, :2]
+    with plt.rc_context(STYLE):
+        ratios = [1.0] * len(runs) + [1.45] * (len(inside) > 2)  # fewer points have no density
+        size = 3.6 * sum(ratios), 5.6
+        figure, panels = plt.subplots(
+            1, len(ratios), figsize=size, layout="constrained", width_ratios=ratios, squeeze=False
+        )
+        fingers = finger_poses(hand, path)
+        for axes, (title, (poses, converge)) in zip(panels[0], runs.items(), strict=False):
+            for which, color in ((converge[:MAX_DRAWN], RED), (~converge[:MAX_DRAWN], BLACK)):
+                plot.traces(axes, poses[:MAX_DRAWN][which], color, alpha=0.5)
+                axes.plot(*(MM * poses[:MAX_DRAWN][which, 0, :2].T), ".", color=color, ms=3)
+            plot.hand_at(axes, hand, fingers[0], GRAY, 2.0)
+            plot.hand_at(axes, hand, fingers[-1], BLUE, 2.0)
+            if np.any(converge):
+                plot.outline(axes, shape, poses[np.argmax(converge), -1], BLUE, 1.0)
+            axes.set(title=title, xlabel="x / mm", aspect="equal")
+        panels[0, 0].set_ylabel("y / mm")
+        if len(inside) > 2:
+            x, y = (c + np.linspace(-1.1, 1.1, GRID_POINTS) * START_RADIUS for c in (0.0, START_DISTANCE))
+            grid = np.stack(np.meshgrid(x, y))
+            density = scipy.stats.gaussian_kde(inside.T)(grid.reshape(2, -1)).reshape(grid.shape[1:]) / 1e6  # 1/mm²
+            axes = panels[0, -1]
+            drawn = axes.contourf(*(MM * grid), density, levels=12, cmap="Blues")
+            axes.plot(*(MM * outside).T, ".", color=BLACK, ms=2.5)
+            axes.plot(*(MM * inside).T, ".", color=RED, ms=2.5)
+            axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal", title=f"start positions, {name}")
+            plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)
+        for color, label in ((RED, "end as wanted"), (BLACK, "do not")):
+            panels[0, 0].plot([], [], color=color, label=label)
+        legend_below(figure, panels[0, 0], columns=2)
+        return figure
 
 
 def summary(record: dict[str, Any]) -> list[str | Table]:

@@ -27,13 +27,13 @@ from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._cli_option import cli_option
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table, uniform_in_circle
+from pushjax.experiments._slider_options import PAIRS, fitted_surface
 from pushjax.plot.style import BLACK, BLUE, GRAY, MM, ORANGE, PURPLE, RED, STYLE
 from pushjax.simulation.slider import overlaps
 
 PAD_WIDTH, PAD_THICKNESS = 0.027, 0.010  # m
 OPENING = (0.085, 0.001)  # first and last opening of the jaw, m
 HOLD = 5  # steps for which the closed jaw waits, so that a slider that has slipped out is free at the end
-PAIRS = 400  # wrench-twist pairs that the mean ellipsoid is fitted to
 BINS = 45  # of each histogram in the record
 PICTURE_BINS = 60
 COLORS = {"grasped": RED, "jammed": ORANGE, "free": GRAY, "failed": PURPLE}  # by outcome
@@ -115,10 +115,10 @@ def run(
     open_jaw, shut_jaw = ((0.0, 0.0, 0.0, opening) for opening in OPENING)
     path = jnp.concatenate([pj.line(open_jaw, shut_jaw, steps), jnp.asarray([shut_jaw] * HOLD)])
     model = pj.FrictionModel(dof=dof, friction=friction)
-    slider_by_pressure = {}
-    for name, support in setting.supports.items():
-        pairs = support.wrench_twist_pairs(jax.random.key(seed), PAIRS)
-        slider_by_pressure[name] = pj.Slider(setting.shape, pj.fit_limit_surface(*pairs, degree=2))
+    slider_by_pressure = {
+        name: pj.Slider(setting.shape, fitted_surface(support, "ellipsoid", seed))
+        for name, support in setting.supports.items()
+    }
     starts, resampled = start_poses(next(iter(slider_by_pressure.values())), hand, path[0], setting.circle, count, seed)
     cells, shown = [], {}
     for k, (name, grasped_slider) in enumerate(slider_by_pressure.items()):

@@ -22,6 +22,7 @@ import pushjax as pj
 from pushjax import plot
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._slider_options import fitted_surface
 
 HALF_WIDTH, HALF_OFFSET = 0.030, 0.012  # a and h of the header, m
 CLOSING = 0.001  # displacement of each finger, m
@@ -45,8 +46,8 @@ def threshold() -> float:
 def surfaces(seed: int) -> tuple[pj.Polygon, dict[str, pj.LimitSurface]]:
     """Return the rectangle, and by name an ellipsoid and a quartic that are fitted to uniform pressure."""
     block = pj.Polygon.rectangle(2 * HALF_WIDTH, 0.05)
-    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(seed), 400)
-    return block, {name: pj.fit_limit_surface(*pairs, degree=d) for name, d in (("ellipsoid", 2), ("quartic", 4))}
+    support = pj.Support.uniform(block, points=64)
+    return block, {name: fitted_surface(support, name, seed) for name in ("ellipsoid", "quartic")}
 
 
 def run(seed: int = 0, out: Path | None = None) -> dict[str, Any]:

@@ -18,6 +18,7 @@ import pushjax as pj
 from pushjax import plot
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import POSE, Table, saved, table
+from pushjax.experiments._slider_options import fitted_surface
 
 WIDTH, HEIGHT = 0.050, 0.035  # m, of the rectangle
 FRICTION = 0.2
@@ -47,19 +48,17 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
         gives.
     """
     block = pj.Polygon.rectangle(WIDTH, HEIGHT)
-    pairs = pj.Support.uniform(block, points=64).wrench_twist_pairs(jax.random.key(seed), 400)
-    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    slider = pj.Slider(block, fitted_surface(pj.Support.uniform(block, points=64), "quartic", seed))
     hand = pj.Hand.parallel_jaw(PAD, THICKNESS)
     closing = pj.line((0.0, 0.0, 0.0, OPENING), (0.0, 0.0, 0.0, CLOSED), steps)
     path = jnp.concatenate([closing, jnp.repeat(closing[-1:], HOLD, axis=0)])
     starts = jnp.array([(x, y, np.radians(angle)) for x, y, angle in STARTS.values()])
     simulate = jax.jit(jax.vmap(lambda pose: pj.rollout(slider, hand, path, pose=pose, friction=FRICTION)))
     grasps = simulate(starts)
-    rows, drawn = [], {}
-    for k, (name, start) in enumerate(STARTS.items()):
-        grasp = jax.tree.map(lambda leaf, k=k: leaf[k], grasps)
-        rows.append({"name": name, "start": start, "pose": grasp.pose[-1]} | outcome(grasp))
-        drawn[name] = grasp
+    drawn = {name: jax.tree.map(lambda leaf, k=k: leaf[k], grasps) for k, name in enumerate(STARTS)}
+    rows = [
+        {"name": name, "start": STARTS[name], "pose": grasp.pose[-1]} | outcome(grasp) for name, grasp in drawn.items()
+    ]
     pictures = saved(out, lambda: {"squeeze.png": plot.push_figure(block, hand, drawn, friction=FRICTION)})
     settings = {"seed": seed, "steps": steps, "friction": FRICTION, "slider_m": (WIDTH, HEIGHT)}
     settings |= {"pad_m": (PAD, THICKNESS), "opening_m": (OPENING, CLOSED)}
@@ -69,13 +68,10 @@ def run(seed: int = 0, out: Path | None = None, steps: int = 1500) -> dict[str, 
 def outcome(grasp: pj.Trajectory) -> dict[str, Any]:
     """Classify how one closing ended."""
     status = pj.Status(int(grasp.status[-1]))
-    stop_step = int(grasp.stopped)
     tilt = abs((float(grasp.pose[-1, 2]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-    outcome_in_words = (
-        "failed" if status.failed else "slipped out" if stop_step < 0 else "grasped" if tilt < FLAT else "jammed"
-    )
+    held = "grasped" if tilt < FLAT else "jammed"
     return {
-        "outcome": outcome_in_words,
+        "outcome": "failed" if status.failed else "slipped out" if int(grasp.stopped) < 0 else held,
         "status": status.name,
         "opening_mm": 1e3 * float(grasp.configuration[-1, 3]),
         "tilt_deg": float(np.degrees(tilt)),  # from the nearest multiple of 90 degrees

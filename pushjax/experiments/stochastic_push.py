@@ -24,13 +24,14 @@ from pushjax import plot
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
 from pushjax.experiments._report import Table, saved, table
+from pushjax.experiments._slider_options import PAIRS, fitted_surface
 from pushjax.plot.style import STYLE
 from pushjax.simulation.monte_carlo_result import COORDINATES
 from pushjax.testing.convexity import least_curvatures
 
 SIDE, RADIUS = 0.09, 0.00475  # m
 ALONG, TRAVEL = 0.018, 0.05  # m: distance of the tip from the middle of the side, and its travel
-SUPPORT_POINTS, PAIRS = 64, 400
+SUPPORT_POINTS = 64
 N, STEPS, DOF, FRICTION = 2000, 200, 20.0, (0.15, 0.35)
 HISTOGRAM_BINS, MAX_PLOTTED, MIN_PUSHES = 40, 2000, 20
 SURFACES_AT_ONCE = 2000  # surfaces that are sampled together
@@ -44,8 +45,7 @@ LABELS = {"x": (1e3, "Δx / mm"), "y": (1e3, "Δy / mm"), "theta": (180 / np.pi,
 def push_setup(seed: int, steps: int) -> tuple[pj.Slider, pj.Hand, jax.Array]:
     """Return the square with its quartic, the finger, and the path (steps + 1, 2) of its center, m."""
     block = pj.Polygon.rectangle(SIDE, SIDE)
-    pairs = pj.Support.uniform(block, points=SUPPORT_POINTS).wrench_twist_pairs(jax.random.key(seed), PAIRS)
-    slider = pj.Slider(block, pj.fit_limit_surface(*pairs, degree=4))
+    slider = pj.Slider(block, fitted_surface(pj.Support.uniform(block, points=SUPPORT_POINTS), "quartic", seed))
     start = -SIDE / 2 - RADIUS
     return slider, pj.Hand.finger(RADIUS), pj.line((start, ALONG), (start + TRAVEL, ALONG), steps)
 

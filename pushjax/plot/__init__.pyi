@@ -2,7 +2,6 @@ from .animated_pushes import animate as animate
 from .animated_pushes import animate_cloud as animate_cloud
 from .animation import Animation as Animation
 from .animation import save as save
-from .clouds import capture_figure as capture_figure
 from .clouds import cloud_figure as cloud_figure
 from .contacts import jam_figure as jam_figure
 from .contacts import motion_cone_figure as motion_cone_figure
@@ -17,4 +16,3 @@ from .parts import outline as outline
 from .single_pushes import push_figure as push_figure
 from .single_pushes import real_figure as real_figure
 from .surfaces import limit_surfaces as limit_surfaces
-from .tables import table_figure as table_figure

@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
-from pushjax.plot.style import BLACK, BLUE, MM, ORANGE, RED
+from pushjax.plot.style import BLUE, MM, ORANGE
 
 TICK = 1.6  # mm, length of a pose's tick
 
@@ -74,25 +73,3 @@ def histogram_panel(
         height = np.diff(edges).mean() * counts.sum() / (std * np.sqrt(2 * np.pi))
         axes.plot(x, height * np.exp(-0.5 * ((x - mean) / std) ** 2), color=ORANGE, lw=1.4, label="Gaussian")
     axes.set(xlabel=label, ylabel="count", ylim=(0, None))
-
-
-def density_panel(
-    axes: Axes, grid: tuple[np.ndarray, np.ndarray], density: np.ndarray, inside: np.ndarray, outside: np.ndarray
-) -> Any:
-    """Draw a density over x and y, in mm, with two kinds of points.
-
-    Args:
-        axes: Axes to draw into.
-        grid: (n, n) of x and (n, n) of y, m.
-        density: (n, n), 1/mm².
-        inside: (points, 2), m, the points that the density was made from, in red.
-        outside: (points, 2), m, the other points, in black.
-
-    Returns:
-        The color bar.
-    """
-    drawn = axes.contourf(*(MM * g for g in grid), density, levels=12, cmap="Blues")
-    axes.plot(*(MM * outside).T, ".", color=BLACK, ms=2.5)
-    axes.plot(*(MM * inside).T, ".", color=RED, ms=2.5)
-    axes.set(xlabel="x / mm", ylabel="y / mm", aspect="equal")
-    return plt.colorbar(drawn, ax=axes, label="density / (1/mm²)", shrink=0.8)

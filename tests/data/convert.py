@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pushjax.datasets import LogError, Recording, Recordings
-from pushjax.datasets.recordings import wrap_angle
+from pushjax.datasets.planar import wrap_angle
 from pushjax.datasets.streams import Stream, align_streams
 from pushjax.datasets.triangle import make_push
 from pushjax.datasets.two_finger_logs import make_push as make_two_finger_push
@@ -89,7 +89,7 @@ def two_fingers(path: Path, data: Arrays) -> Recordings:
 
 
 def mit_groups(path: Path, data: Arrays) -> Recordings:
-    """Convert the straight pushes of table 1, in the groups that `pushjax.experiments.table1.groups` describes."""
+    """Convert the straight pushes of table 1, in the groups that `pushjax.experiments._mit_pushes` describes."""
     groups = {"whole": "full", "middle": "eval", "fast": "v20"}
     training = ~np.array(data["full_in_eval"], bool)
     pushes = [

@@ -18,9 +18,8 @@ import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.datasets import LogError, Recordings, load_recordings
 from pushjax.datasets.recordings import Recording
-from pushjax.experiments.identify_logs import Options, findings
-from pushjax.experiments.identify_logs.experiment import conditions
-from pushjax.experiments.identify_logs.report import warning
+from pushjax.experiments._identify_report import described, warning
+from pushjax.experiments.identify import Options, conditions
 from pushjax.identification.pushes_of_recordings import screen
 from pushjax.identification.uncertainty import bootstrap, profile_interval
 
@@ -156,6 +155,7 @@ def test_the_page_has_words_and_units(report):
     assert "expected_mm" in page[page.index('<pre id="record">') :]
 
 
+@pytest.mark.slow
 def test_it_says_what_it_is_doing(report):
     """In a pipe, progress is printed as lines; a bar is for terminals."""
     out, _ = report
@@ -169,6 +169,7 @@ def test_it_says_what_it_is_doing(report):
     assert "pushjax: interval of friction" in lines
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_is_named_and_counted(report):
     _, record = report
     reasons = (
@@ -249,9 +250,9 @@ def test_what_is_no_pushes_is_named(log, block, surface):
 
 
 def test_units_of_what_is_found():
-    assert findings.unit("frame_offset.1") == findings.unit("hand_offset.0") == ("mm", 1e3)
-    assert findings.unit("frame_offset.2") == ("°", 180 / np.pi)
-    assert findings.unit("friction") == ("", 1.0)
+    assert described("frame_offset.1")[1] == described("hand_offset.0")[1] == "mm"
+    assert described("frame_offset.2") == ("rotation of the object's frame", "°")
+    assert described("friction[1]") == ("friction at the contact (friction[1])", "")
 
 
 def test_too_few_pushes(rollouts, tmp_path, capsys):

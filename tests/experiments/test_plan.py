@@ -9,7 +9,8 @@ import pytest
 
 import pushjax as pj
 from pushjax.cli import main as cli
-from pushjax.experiments.plan import Options, experiment
+from pushjax.experiments import plan as experiment
+from pushjax.experiments.plan import Options
 from pushjax.geometry.se2_numpy import to_world
 from pushjax.planning import PlanStatus, PushPlan
 from pushjax.planning.between_pushes import transits_between

@@ -10,11 +10,11 @@ import pytest
 import pushjax as pj
 from pushjax.cli import main as cli
 from pushjax.datasets import LogError, Recording, Recordings
+from pushjax.experiments import _mit_pushes as groups
 from pushjax.experiments import table1
 from pushjax.experiments._cell_cache import CellCache
-from pushjax.experiments._tables import Prediction, deviation_mm
-from pushjax.experiments.table1 import conditions, experiment, groups
-from pushjax.experiments.table1.groups import group, noise_floor_mm
+from pushjax.experiments._mit_pushes import group, noise_floor_mm, outline
+from pushjax.experiments.tables import Prediction, deviation_mm, padded
 
 # Results of the published toolbox: mm, quartic, mean over all test pushes of ten objects, of which the archives contain
 # 70 %.
@@ -85,8 +85,8 @@ def test_repetitions():
 def logs(converted):
     if not (converted / "mit_push").is_dir():
         pytest.skip("no mit_push")
-    each = [(surface, name) for surface in conditions.SURFACES for name in conditions.OBJECTS]
-    return {key: conditions.load(converted, *key) for key in each}
+    each = [(surface, name) for surface in table1.SURFACES for name in table1.OBJECTS]
+    return {key: groups.load(converted, *key) for key in each}
 
 
 def test_real_archives(logs):
@@ -101,11 +101,11 @@ def test_real_archives(logs):
         assert not whole.about("training")[tested].any()
         assert np.all(np.abs(whole.end[:, 2] - whole.start[:, 2]) <= np.pi)
     for surface, expected in TOOLBOX_MM.items():
-        tests = [group(logs[surface, name], "middle") for name in conditions.OBJECTS]
+        tests = [group(logs[surface, name], "middle") for name in table1.OBJECTS]
         means = [
             deviation_mm(test.about("toolbox_quartic"), test.end, test.length).mean()
             for test in tests
-            if test.object not in conditions.NOT_IN_PAPER
+            if test.object not in table1.NOT_IN_PAPER
         ]
         assert np.mean(means) == pytest.approx(expected, abs=0.3)
 
@@ -119,11 +119,11 @@ def test_outlines(logs):
     """
     for name, most in (("ellip1", 2e-5), ("ellip3", 2e-5), ("butter", 3.5e-4), ("hex", 1e-9), ("tri1", 1e-9)):
         log = logs["abs", name]
-        distance = jax.vmap(conditions.outline(log).signed_distance)(log.vertices)
+        distance = jax.vmap(outline(log).signed_distance)(log.vertices)
         assert np.max(np.abs(distance)) < most
-    assert not conditions.outline(logs["abs", "butter"]).convex
+    assert not outline(logs["abs", "butter"]).convex
     for name in ("rect1", "tri2", "hex"):
-        filled = conditions.outline(logs["abs", name])
+        filled = outline(logs["abs", name])
         assert isinstance(filled, pj.Polygon)
         assert filled.convex
         assert filled.vertices.shape == (6, 2)
@@ -134,49 +134,24 @@ def test_outlines(logs):
         )
 
 
-def test_sides(logs):
-    """Pushes are about equally frequent on the sides of an object, or its quadrants; the tip is nearest to its side."""
-    for name, many in (("rect1", 4), ("tri1", 3), ("hex", 6), ("ellip2", 4), ("butter", 4)):
-        log = logs["abs", name]
-        side = conditions.pushed_sides(group(log, "whole"))
-        counts = np.bincount(side, minlength=many)
-        assert len(counts) == many
-        assert counts.min() > len(side) / many / 3
-    rect = group(logs["abs", "rect1"], "whole")
-    side = conditions.pushed_sides(rect)
-    start = rect.start
-    c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
-    away = groups.tips(rect)[:, 0] - start[:, :2]
-    local = np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
-    middle = (rect.vertices + np.roll(rect.vertices, -1, axis=0)) / 2
-    outward = middle / np.linalg.norm(middle, axis=1, keepdims=True)
-    reach = np.max(local @ outward.T - np.sum(middle * outward, axis=1)[None], axis=1)
-    mine = np.sum(local * outward[side], axis=1) - np.sum(middle * outward, axis=1)[side]
-    beside = np.abs(mine - reach) > 1e-3  # a corner, where both sides are equally near
-    assert beside.mean() < 0.05
-    assert np.all(reach[beside] < 0.007)
-
-
 def test_noise_floor(logs):
     """Repetitions agree better than any model predicts, but they do differ."""
-    for name in conditions.OBJECTS:
+    for name in table1.OBJECTS:
         floor = noise_floor_mm(logs["abs", name])
         assert (floor is None) == (name in ("hex", "butter"))
         assert floor is None or 2 < floor < 8
         assert noise_floor_mm(logs["plywood", name]) is None
 
 
-def test_filled_up(logs):
-    log = logs["abs", "tri1"]
-    training, last = groups.training_pushes(log), group(log, "whole").pushes[-1].index
+def test_padding(logs):
+    """The path of the tip is straight, and pushes that only fill an array up have no weight."""
+    training = groups.training_pushes(logs["abs", "tri1"])
     count, tips = len(training), groups.tips(training)
-    pushes = conditions.padded_pushes(training, last, 10, 128)
+    pushes = padded(pj.Pushes.of(training, 10), 128)
     assert pushes.path.shape == (128, 11, 2)
-    assert float(pushes.weight.sum()) == count
-    assert 0 <= float(pushes.age.min()) < 0.2 < 0.8 < float(pushes.age.max()) <= 1
-    np.testing.assert_array_equal(pushes.side[:count], conditions.pushed_sides(training))
-    with pytest.raises(ValueError, match=f"batch must be at least {count}; got 3"):
-        conditions.padded_pushes(training, last, 10, 3)
+    np.testing.assert_array_equal(pushes.weight, np.arange(128) < count)
+    with pytest.raises(ValueError, match="batch must be at least 128; got 3"):
+        padded(pushes, 3)
     np.testing.assert_allclose(pushes.path[:count, -1], tips[:, 1])
     np.testing.assert_allclose(pushes.path[3, 5], tips[3].mean(axis=0))
 
@@ -184,16 +159,16 @@ def test_filled_up(logs):
 @pytest.mark.slow
 def test_experiment(logs, converted, monkeypatch, tmp_path):
     """With ellipsoids for one object, results are as good as the paper's from forces, and no worse with calibration."""
-    monkeypatch.setattr(experiment, "MODELS", {"ellipsoid": 2})
+    monkeypatch.setattr(table1, "MODELS", {"ellipsoid": 2})
     given = ["--surface", "abs", "--object", "rect1", "--steps", "30", "--data", str(converted)]
     cli.main(["reproduce", "table1", *given, "--out", str(tmp_path), "--json", str(tmp_path / "t.json")])
     record = json.loads((tmp_path / "t.json").read_text())
     forces, found = record["cells"]
     assert [cell["method"] for cell in record["cells"]] == ["wrench_twist", "identified"]
     for cell in record["cells"]:
-        assert (cell["tested"], cell["learned"], cell["failed_steps"]) == (196, 82, 0)
+        assert (cell["pushes"], cell["learned"], cell["failed_steps"]) == (196, 82, 0)
         assert cell["no_motion_mm"] == pytest.approx(
-            conditions.PAPER_NO_MOTION_MM["abs"][0] / 0.975, abs=0.4
+            table1.PAPER_NO_MOTION_MM["abs"][0] / 0.975, abs=0.4
         )  # the paper's window was a little shorter
         assert 0 < cell["friction"] < 0.5
         assert cell["noise_floor_mm"] < cell["mean_mm"] < 1.1 * cell["paper_mm"]
@@ -210,11 +185,11 @@ def test_an_interrupted_run_goes_on(logs, converted, monkeypatch, tmp_path):
         calls.append(setting)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return Prediction(np.zeros(196), np.array(0.2), 0)
+        return Prediction(np.zeros((1, 196)), np.array(0.2), 0)
 
-    monkeypatch.setattr(experiment, "METHODS", {"identified": guess})
-    monkeypatch.setattr(experiment, "ConditionData", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
-    monkeypatch.setattr(experiment, "saved", lambda out, figures: [])
+    monkeypatch.setattr(table1, "METHODS", {"identified": guess})
+    monkeypatch.setattr(table1, "ConditionData", type("Nothing", (), {"of": staticmethod(lambda *given: given)}))
+    monkeypatch.setattr(table1, "saved", lambda out, figures: [])
     choice = {"surface": ("abs",), "object": ("rect1",), "method": ("identified",), "out": tmp_path}
     with pytest.raises(KeyboardInterrupt):
         table1.run(converted, **choice)
@@ -248,9 +223,9 @@ def test_bad_choices(arguments, message, capsys, tmp_path):
 def test_files_left_out_are_named(tmp_path, monkeypatch):
     problem = LogError(tmp_path / "a.json", "the tracker jumps")
     log = replace(log_of(recorded(k, 0.01) for k in range(12)), problems=(problem, problem))
-    monkeypatch.setattr(conditions, "load_mit_folder", lambda *given, **options: log)
+    monkeypatch.setattr(groups, "load_mit_folder", lambda *given, **options: log)
     with pytest.warns(UserWarning, match=r"2 files of hex on delrin are left out, the first: .*a\.json.*tracker jumps"):
-        assert len(conditions.load(tmp_path, "delrin", "hex")) == 22
+        assert len(groups.load(tmp_path, "delrin", "hex")) == 22
 
 
 def test_folder_without_the_pushes(tmp_path):

@@ -13,7 +13,7 @@ import pytest
 
 import pushjax as pj
 from pushjax.datasets import LogError, Recording, Recordings, load_recordings
-from pushjax.experiments import _tables, two_finger
+from pushjax.experiments import tables, two_finger
 from pushjax.experiments._record import write_json
 
 EXACT = 1e-12
@@ -56,14 +56,14 @@ def test_real_logs(data, converted):
 
 def test_repeats_of_an_action_stay_on_one_side_of_a_split(rng):
     action = np.arange(10) // 2
-    train = _tables.training_masks(action, two_finger.TRAIN_SHARE, rng)
-    assert train.shape == (_tables.SPLITS, 10)
+    train = tables.training_masks(action, two_finger.TRAIN_SHARE, rng)
+    assert train.shape == (tables.SPLITS, 10)
     for trains in train:
         assert 0 < trains.sum() < 10
         assert not set(action[trains]) & set(action[~trains])
     errors = rng.uniform(size=train.shape)
     expected = [np.nan if each.all() else errors[~each, k].mean() for k, each in enumerate(train.T)]
-    np.testing.assert_allclose(_tables.per_push(errors, ~train), expected, rtol=EXACT)
+    np.testing.assert_allclose(tables.per_push(errors, ~train), expected, rtol=EXACT)
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +103,7 @@ def test_repeats_bound_what_can_be_predicted(record):
         assert 0.8 < repeats["floor_agreement"] <= 1
 
 
+@pytest.mark.slow
 def test_draws_and_sums_up(record):
     assert len(record["pictures"]) == 1 + len(OBJECTS)
     for picture in record["pictures"]:

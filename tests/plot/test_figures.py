@@ -219,29 +219,6 @@ def test_cloud_figure():
     assert [circle.center[0] for circle in axes.patches] == [-40, 0]
 
 
-def test_capture_figure():
-    ways = cloud() + np.linspace(0, 0.02, 40)[:, None, None] * np.array([0, 1, 0])
-    wanted, hand = np.arange(40) % 3 == 0, pj.Hand.two_fingers(RADIUS)
-    path = np.linspace([0, -0.04, 0, 0.08], [0, 0.0, 0, 0.08], 5)
-    x, y = np.meshgrid(np.linspace(-0.01, 0.01, 6), np.linspace(0, 0.02, 6))
-    density = ((x, y), np.exp(-((x / 0.005) ** 2)))
-    runs = {"few": (ways, wanted), "more": (ways, ~wanted)}
-    figure = plot.capture_figure(BLOCK, hand, path, runs, density, max_paths=10)
-    figure.canvas.draw()
-    few, more, heat, bar = figure.axes
-    assert [axes.get_title() for axes in (few, more, heat)] == ["few", "more", "start positions, more"]
-    assert legend(figure) == ["end as wanted", "do not"]
-    assert bar.get_ylabel() == "density / (1/mm²)"
-    for drawn, which in zip(few.collections, (wanted[:10], ~wanted[:10]), strict=False):
-        np.testing.assert_allclose(drawn.get_segments(), MM * ways[:10][which, :, :2])
-    assert len(few.patches) == 4  # two fingers at both ends
-    (outside,) = ends_of(heat, BLACK)
-    np.testing.assert_allclose(outside, MM * ways[wanted, 0, :2])
-    alone = plot.capture_figure(BLOCK, hand, path, {"none": (ways, np.zeros(40, bool))})
-    assert len(alone.axes) == 1
-    assert not ends_of(alone.axes[0], BLUE)  # no slider was caught
-
-
 def test_panels():
     axes = plt.figure().subplots(1, 4)
     poses = np.array([[0.01, 0.02, np.pi / 2], [0.0, 0.0, 0.0]])
@@ -261,25 +238,3 @@ def test_panels():
     plot.traces(axes[3], np.zeros((2, 3, 3)) + np.arange(3)[None, :, None], GREEN)
     np.testing.assert_allclose(axes[3].collections[0].get_segments(), 2 * [MM * np.arange(3)[:, None] * np.ones(2)])
     assert axes[3].get_xlim()[1] >= 2 * MM
-
-
-def cell(name, model, mean, paper):
-    named = {"surface": "abs", "object": name, "model": model}
-    return named | {"mean_mm": mean, "ci95_bootstrap_mm": 0.2, "paper_mm": paper}
-
-
-def test_table_figure():
-    cells = [cell("rect1", "quartic", 5.0, 6.0), cell("tri1", "quartic", 4.0, None)]
-    cells += [cell("rect1", "ellipsoid", 5.5, 6.5), cell("tri1", "ellipsoid", 4.5, 5.5)]
-    figure = plot.table_figure(cells, "Table")
-    (axes,) = figure.axes
-    figure.canvas.draw()
-    assert (axes.get_ylabel(), axes.get_title()) == ("mean deviation / mm", "Table")
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["rect1", "tri1"]
-    assert [text.get_text() for text in axes.texts] == ["abs"]
-    assert sorted(legend(axes)) == ["ellipsoid, this run", "quartic, this run", "the paper"]
-    assert [bar.get_height() for bar in axes.patches] == [5.0, 4.0, 5.5, 4.5]
-    paper = [line.get_ydata() for line in axes.lines if line.get_marker() == "_" and line.get_markersize() == 13]
-    np.testing.assert_array_equal(paper, [[6.0, np.nan], [6.5, 5.5]])
-    hatched = [bar.get_hatch() is not None for bar in axes.patches]
-    assert hatched == [False, False, True, True]  # so that they can be distinguished in grayscale
