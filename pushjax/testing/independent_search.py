@@ -79,12 +79,14 @@ def search(batch: ProblemBatch, starts: int = 50, seed: int = 0, portions: tuple
 def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> SearchResult:
     """Return the first solution of each problem that a number of random starts reaches."""
     n = len(batch)
-    equations = _Equations(batch, np.repeat(np.arange(n), starts), rng)
+    problem = np.repeat(np.arange(n), starts)
+    equations, repeated = _Equations.of(batch).take(problem), batch.take(problem)
+    equations = equations._replace(rho=equations.rho * np.exp(RHO_SPREAD * rng.normal(size=len(problem))))
     y = equations.start(rng)
     y = equations.follow_modes(y, rng)
     y = equations.descend(y, 10 ** rng.uniform(*DAMPING, y.shape[1]))
-    twist, force, wrench = equations.answer(y, batch)
-    is_solution = violations(batch.take(equations.problem), twist, force, wrench).worst() <= CLEAN
+    twist, force, wrench = equations.answer(y, repeated)
+    is_solution = violations(repeated, twist, force, wrench).worst() <= CLEAN
     is_solution = is_solution.reshape(n, starts)
     first = np.arange(n) * starts + is_solution.argmax(axis=1)
     found = np.asarray(is_solution.any(axis=1))
@@ -94,7 +96,7 @@ def _follow(batch: ProblemBatch, starts: int, rng: np.random.Generator) -> Searc
     return SearchResult(found, twist, force, wrench, np.full(n, starts), is_solution.sum(axis=1))
 
 
-class _Equations:
+class _Equations(NamedTuple):
     """The conditions as 2 m equations in the 2 m force components, for B starts at once on the last axis."""
 
     # H is scaled so that its mean Hessian over the sphere has trace 3. Lengths are relative to the problem's speed. The
@@ -107,7 +109,18 @@ class _Equations:
     # The second is for a box whose size depends on f_n (Billups 1995). rho varies at random between starts. It changes
     # where a descent ends that does not end at a solution, and so gives starts that fail together another chance.
 
-    def __init__(self, batch: ProblemBatch, problem: np.ndarray, rng: np.random.Generator):
+    degree: int
+    table: np.ndarray  # (6, q, B), of the Hessian
+    rows: np.ndarray  # (2 m, 3, B)
+    approach: np.ndarray  # (2 m, B)
+    friction: np.ndarray  # (m, B)
+    active: np.ndarray  # (m, B)
+    rho: np.ndarray  # (2 m, B)
+    resisting: np.ndarray  # (2 m, 3, B), maps a twist to forces whose wrench approximately causes it
+
+    @staticmethod
+    def of(batch: ProblemBatch) -> "_Equations":
+        """Return the equations of each problem of the batch."""
         n, m = batch.friction.shape
         active = batch.active
         table = batch.hessian_table()
@@ -119,28 +132,14 @@ class _Equations:
         rho = np.where(active, np.einsum("nmi,nij,nmj->nm", rows[:, :, 0], mean, rows[:, :, 0]), 1.0)
         upper = np.stack([table[:, i, j] for i, j in ENTRIES], axis=1) / size[:, None, None]
         flat = rows.reshape(n, 2 * m, 3)
+        resisting = np.linalg.pinv(np.swapaxes(flat, 1, 2)) @ np.linalg.inv(mean)
+        friction = np.where(active, batch.friction, 0.0)
+        arrays = upper, flat, approach.reshape(n, 2 * m), friction, active, np.repeat(rho, 2, axis=1), resisting
+        return _Equations(batch.degree, *(np.moveaxis(array, 0, -1) for array in arrays))
 
-        def per_start(array: np.ndarray) -> np.ndarray:
-            return np.moveaxis(array, 0, -1)[..., problem]
-
-        self.degree, self.problem = batch.degree, problem
-        self.table = per_start(upper)  # (6, q, B)
-        self.rows = per_start(flat)  # (2 m, 3, B)
-        self.approach = per_start(approach.reshape(n, 2 * m))  # (2 m, B)
-        self.friction = per_start(np.where(active, batch.friction, 0.0))  # (m, B)
-        self.active = per_start(active)  # (m, B)
-        rho_factor = np.exp(RHO_SPREAD * rng.normal(size=len(problem)))
-        self.rho = np.repeat(per_start(rho), 2, axis=0) * rho_factor  # (2 m, B)
-        # Maps a twist to forces whose wrench approximately causes it.
-        self.resisting = np.linalg.pinv(np.swapaxes(flat, 1, 2)) @ np.linalg.inv(mean)
-
-    def take(self, keep: np.ndarray) -> "_Equations":
-        """Return the equations of some of the starts, for `descend`; `keep` is a mask over the last axis."""
-        part = object.__new__(_Equations)
-        part.degree = self.degree
-        for name in ("problem", "table", "rows", "approach", "friction", "active", "rho"):
-            setattr(part, name, getattr(self, name)[..., keep])
-        return part
+    def take(self, index: np.ndarray) -> "_Equations":
+        """Return the equations at indices, or by a mask, of the last axis."""
+        return _Equations(self.degree, *(array[..., index] for array in self[1:]))
 
     def evaluate(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the wrench (3, B), the Hessian of H (3, 3, B) and the twist grad H (3, B)."""
@@ -193,7 +192,7 @@ class _Equations:
         )
 
         # The other half resist a random twist, because on an ill-conditioned surface random forces hardly ever do.
-        resisting_force = np.einsum("bij,jb->ib", self.resisting[self.problem], rng.normal(size=(3, count)))
+        resisting_force = np.einsum("ijb,jb->ib", self.resisting, rng.normal(size=(3, count)))
         resisting_force *= np.where(resisting_force[0::2].sum(axis=0) < 0, -1.0, 1.0)
         force = np.where(rng.random(count) < 0.5, self.in_cone(resisting_force), force)
         return force * self.rho * 10 ** (0.3 * rng.normal(size=count))
@@ -271,14 +270,13 @@ class _Equations:
         """Return twist (B, 3), force (B, m, 2) and wrench (B, 3) in the units of `batch`, with the wrench on H = 1."""
         force = self.in_cone(y / self.rho)
         wrench, _, twist = self.evaluate(force * self.rho)
-        repeated = batch.take(self.problem)
-        size = level(repeated, wrench.T)
+        size = level(batch, wrench.T)
         size = np.where(size > 0, size, 1.0)[:, None]
-        one = np.ones_like(repeated.length)
-        scale = np.stack([one, one, repeated.length], axis=1)
+        one = np.ones_like(batch.length)
+        scale = np.stack([one, one, batch.length], axis=1)
         return (
-            twist.T * repeated.speed()[:, None] / scale,
-            force.T.reshape(*repeated.friction.shape, 2) / size[..., None],
+            twist.T * batch.speed()[:, None] / scale,
+            force.T.reshape(*batch.friction.shape, 2) / size[..., None],
             wrench.T * scale / size,
         )
 
