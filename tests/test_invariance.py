@@ -154,6 +154,8 @@ KINDS = [
     ("curve", "pad"),
 ]
 AMONG = ("rectangle", "finger", "fixtures")
+# The programs of all others together take minutes to compile.
+QUICK = (("rectangle", "finger"), ("rectangle", "jaw"), ("T", "finger"), AMONG)
 
 
 def drawn(kind, seed: int) -> tuple[Scene, np.random.Generator]:
@@ -177,11 +179,13 @@ def drawn(kind, seed: int) -> tuple[Scene, np.random.Generator]:
     return scene, rng
 
 
+def each_of(kinds, quick=QUICK):
+    marked = [pytest.param(kind, id="-".join(kind), marks=[pytest.mark.slow] * (kind not in quick)) for kind in kinds]
+    return pytest.mark.parametrize("kind", marked)
+
+
 def every_kind(test):
-    kinds = [*KINDS, AMONG]
-    return pytest.mark.parametrize("kind", kinds, ids=["-".join(kind) for kind in kinds])(
-        EXAMPLES(given(seed=seeds)(test))
-    )
+    return each_of([*KINDS, AMONG])(EXAMPLES(given(seed=seeds)(test)))
 
 
 @every_kind
@@ -252,7 +256,7 @@ def test_origin_of_the_body_frame(kind, seed):
     same((moved(pose, 1), status), of(scene.push()))
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind[1] in ("pad", "jaw")], ids="-".join)
+@each_of([kind for kind in KINDS if kind[1] in ("pad", "jaw")])
 @EXAMPLES
 @given(seed=seeds)
 def test_origin_of_a_pads_frame(kind, seed):
@@ -328,6 +332,7 @@ def test_rows_split(kind, seed):
 # --- one body or one hand in several forms ---
 
 
+@pytest.mark.slow
 def test_vertices_on_straight_sides_and_a_convex_polygon_declared_not_convex():
     """A pad pushes a rectangle flat, tilted and aside: more vertices on sides, or `convex=False`, change nothing."""
     rng = np.random.default_rng(0)
@@ -347,7 +352,10 @@ def test_vertices_on_straight_sides_and_a_convex_polygon_declared_not_convex():
         same(of(scene.but(shape=lambda v: pj.Polygon(v, convex=False)).push()), wanted)
 
 
-def test_disk_ellipse_and_curve():
+@pytest.mark.parametrize(
+    ("finger", "atol"), [(0.006, 1e-5), pytest.param(PAD, 2e-3, marks=pytest.mark.slow)], ids=["finger", "pad"]
+)
+def test_disk_ellipse_and_curve(finger, atol):
     """A disk, an ellipse with equal axes, and a curve through 64 points of the circle (which is off by 0.2 um).
 
     Where the slider comes over the end of a pad within a step, its turn is exact to a hundredth of that step.
@@ -359,16 +367,16 @@ def test_disk_ellipse_and_curve():
         "ellipse": lambda v: pj.Ellipse(0.02, 0.02),
         "curve": pj.Curve.through,
     }
-    for fingers, atol in (((0.006,), 1e-5), ((PAD,), 2e-3)):
-        for seed in range(4):
-            rng = np.random.default_rng(seed)
-            scene = Scene(points=circle, A=surface(rng), length=0.0142, fingers=fingers)
-            scene = scene.but(path=approach(rng, 0.05, 0.04)[:, None], friction=np.array([0.4]))
-            disk, ellipse, curve = (of(scene.but(shape=shape).push()) for shape in shapes.values())
-            same(ellipse, disk)
-            np.testing.assert_allclose(curve[0], disk[0], atol=atol)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        scene = Scene(points=circle, A=surface(rng), length=0.0142, fingers=(finger,))
+        scene = scene.but(path=approach(rng, 0.05, 0.04)[:, None], friction=np.array([0.4]))
+        disk, ellipse, curve = (of(scene.but(shape=shape).push()) for shape in shapes.values())
+        same(ellipse, disk)
+        np.testing.assert_allclose(curve[0], disk[0], atol=atol)
 
 
+@pytest.mark.slow
 def test_wall_as_a_half_plane_a_box_and_two_boxes():
     """A slider that is pushed onto a wall and along it does not catch on the seam of two boxes.
 
@@ -398,6 +406,7 @@ def test_wall_as_a_half_plane_a_box_and_two_boxes():
             assert box.status[-1] == wall.status[-1]
 
 
+@pytest.mark.slow
 def test_idle_finger_far_away():
     """A second finger that never touches changes nothing, except that steps of hands with two contacts are divided.
 
@@ -416,7 +425,7 @@ def test_idle_finger_far_away():
 # --- how it is computed ---
 
 
-@pytest.mark.parametrize("kind", [("rectangle", "finger"), ("T", "finger")], ids="-".join)
+@each_of([("rectangle", "finger"), ("T", "finger")], quick=QUICK[:1])
 def test_eager_jit_vmap_scan_closed_over_or_given(kind):
     scene, _ = drawn(kind, 3)
     slider, hand, mu = scene.slider(), scene.hand(), jnp.asarray(scene.friction)
@@ -444,7 +453,7 @@ def test_eager_jit_vmap_scan_closed_over_or_given(kind):
     same((np.concatenate([pose[None], poses]), np.asarray(statuses)), wanted)
 
 
-@pytest.mark.parametrize("kind", [("rectangle", "finger"), ("rectangle", "pad"), ("T", "finger")], ids="-".join)
+@each_of([("rectangle", "finger"), ("rectangle", "pad"), ("T", "finger")], quick=QUICK[:1])
 def test_float32_beside_float64(kind):
     """In float32 a push of 45 mm ends within 20 um and 0.5 mrad of float64: seven digits, some lost in each step."""
     for seed in range(4):

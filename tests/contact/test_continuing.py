@@ -151,6 +151,7 @@ def test_a_central_push_without_friction_has_its_derivatives():
     assert np.all(np.isfinite(reverse))
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     """Two fingers push a face at different depths, so that it turns: the curvature of the motion by both."""
     problem = jax.jit(lambda key: random_contacts_problem(key, contacts=2, degree=4))(jax.random.key(11))

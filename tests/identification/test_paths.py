@@ -27,6 +27,7 @@ def test_a_hand_that_only_closes_or_turns_keeps_its_path(column):
     np.testing.assert_allclose(jnp.linalg.norm(in_meters(longer - moves)[-1]), 0.001, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_friction_from_a_jaw_that_closes():
     """Pushes by a jaw that only closes on an askew block determine the friction of its pads."""
     slider = pj.Slider(pj.Polygon.rectangle(0.06, 0.04), pj.Ellipsoid(np.eye(3), length=0.025))

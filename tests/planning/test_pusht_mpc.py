@@ -102,6 +102,7 @@ def test_an_adapting_controller_finds_the_friction_of_the_plant(adapting):
     assert min(found) > 0.4, found
 
 
+@pytest.mark.slow
 def test_weights_choose_among_the_samples_of_a_library(adapting):
     """With all weight on one sample, pushes are chosen as from a library of that sample alone."""
     planner, pose, finger = adapting.planner, np.array([0.38, 0.12, -2.0]), np.array([0.1, 0.4])
@@ -132,9 +133,10 @@ def test_no_control_step_both_corrects_a_push_and_plans_one(rectangle, monkeypat
     assert set(steps) == {(), ("_plan",), ("_corrected",)}
 
 
-def test_a_filter_needs_a_prior(adapting):
+def test_a_filter_needs_a_prior(rectangle):
+    learning = FrictionFilter(scene_of(friction=pj.FrictionModel(20, (0.05, 0.5))), samples=12)
     with pytest.raises(ValueError, match="prior"):
-        PushController(adapting.planner, PositionControl(), prior=adapting.prior)
+        PushController(rectangle.planner, PositionControl(), friction_filter=learning)
 
 
 def test_one_push_where_one_is_enough(rectangle):

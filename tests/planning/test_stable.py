@@ -99,6 +99,7 @@ def test_no_slip_for_any_sampled_friction(slider, contacts, goals):
     assert np.all(np.hypot(WIDTH, HEIGHT) * np.abs(np.exp(1j * miss[..., 2]) - 1) < steps_error(pushes))
 
 
+@pytest.mark.slow
 def test_slip_at_twice_the_curvature(slider, contacts, goals):
     """The bound is not much more careful than it must be: along turns twice as tight some friction makes it slip."""
     tighter = [

@@ -272,7 +272,7 @@ def test_gradients_are_finite_at_and_after_a_jam():
     [
         (pj.Hand.two_fingers(0.003), 0.09),
         pytest.param(pj.Hand.three_fingers(0.003), 0.05, marks=pytest.mark.slow),
-        (pj.Hand.parallel_jaw(0.027, 0.01), 0.08),
+        pytest.param(pj.Hand.parallel_jaw(0.027, 0.01), 0.08, marks=pytest.mark.slow),
     ],
     ids=["two fingers", "three fingers", "jaw"],
 )

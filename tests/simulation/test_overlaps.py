@@ -377,7 +377,8 @@ def test_a_step_that_cannot_be_divided_has_finite_derivatives():
     assert np.all(np.isfinite(jax.jacrev(lambda pose: pushed_too_far(pose).pose[-1])(jnp.array([0.002, 0, 0.01]))))
 
 
-@pytest.mark.parametrize("name", ["disk", pytest.param("bean", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["disk", "bean"])
 def test_hands_of_ones_own_and_smooth_sliders(name):
     """A pad with custom kinematics rotates onto a disk and a curve, which have no corners."""
 
@@ -432,9 +433,10 @@ def test_overlap_is_no_variable():
 
 
 def test_pictures_name_the_step_that_failed():
-    path = pj.line((0, 0, 0, 0.1), (0, 0, 0, 0.05), 32)  # as many steps as other tests of two fingers compile for
+    path, far = pj.line((0, 0, 0, 0.1), (0, 0, 0, 0.05), 32), pj.Fixture(RAIL.shape, (0.0, -1.0, 0.0))
     failing = pushed_too_far((0.002, 0, 0.01), 0.3)
-    fine = pj.rollout(SLIDER, TWO, path, pose=(0.002, 0, 0.1), friction=0.3)
+    # far from the rail, with the program of the other
+    fine = pj.rollout(SLIDER, TWO, path, pose=(0.002, 0, 0.1), friction=0.3, fixtures=(far,))
     figure = plot.push_figure(SLIDER.shape, TWO, {"slippery": failing, "rough": fine})
     titles = [axes.get_title() for axes in figure.axes]
     assert titles == [f"slippery\nNOT_CONVERGED from step {int(failing.first_failure)}", "rough"]
