@@ -18,7 +18,8 @@ import numpy as np
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.datasets.mit_logs import PREFIX, SUFFIXES, PushName, load_mit_log, parse_name
 from pushjax.datasets.mit_shapes import MitShape, mit_shape, nearest_on_outline
-from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect, interpolated, rotation
+from pushjax.datasets.planar import cross, in_body, interpolated, rotation
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect
 
 SAME_SPEED = 1e-5  # m/s; file names have speeds in whole mm/s
 # Fractions of the duration between which wrenches are taken. Before the first, the tip may not touch the object yet.
@@ -176,11 +177,6 @@ def states_at(push: Recording, fractions: Sequence[float] | Floats) -> tuple[Flo
     return times, interpolated(times, push.time, push.pose), interpolated(times, push.time, push.hand)
 
 
-def in_body(pose: Floats, vectors: Floats) -> Floats:
-    """Rotate world vectors (k, 2) into the body frames of k poses (k, 3)."""
-    return np.einsum("kji,kj->ki", rotation(pose[:, 2]), vectors)
-
-
 def _wrench_twist_pairs(push: Recording, body: MitShape) -> Iterator[tuple[Floats, Floats]]:
     """Iterate over the wrenches (3,), N and N m, and displacements (3,), m and rad, of the parts with pressing."""
     assert push.time is not None
@@ -188,7 +184,7 @@ def _wrench_twist_pairs(push: Recording, body: MitShape) -> Iterator[tuple[Float
     tip, force = in_body(push.pose, push.hand - push.pose[:, :2]), in_body(push.pose, push.force)
     distance, contact = nearest_on_outline(body.vertices, tip)
     inward = (contact - tip) / np.where(distance == 0, np.inf, distance)[:, None]
-    torque, along, across = _cross(contact, force), np.sum(inward * force, axis=1), _cross(inward, force)
+    torque, along, across = cross(contact, force), np.sum(inward * force, axis=1), cross(inward, force)
     times, poses, _ = states_at(push, np.linspace(*MIDDLE_PART, 2 * NUM_PARTS + 1))
     row_at = np.searchsorted(push.time, times)
     for part in range(0, 2 * NUM_PARTS, 2):
@@ -205,8 +201,3 @@ def _wrench_twist_pairs(push: Recording, body: MitShape) -> Iterator[tuple[Float
         strong = np.linalg.norm(wrench[:2]) >= MIN_FORCE
         if presses and strong and motion >= MIN_MOTION and wrench @ twist > 0:
             yield wrench, twist
-
-
-def _cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross products (n,) of vectors (n, 2) in the plane."""
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

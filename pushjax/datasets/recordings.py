@@ -207,20 +207,3 @@ def collect(path: Path, results: Iterable[Recording | LogError], **facts: Any) -
 def quoted(text: str) -> str:
     """Quote text for a message, shortened to 40 characters."""
     return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
-def interpolated(time: Floats, known_time: Floats, known: Floats) -> Floats:
-    """Interpolate known values (k, c) linearly at the times (m,); NaN outside the known times (k,)."""
-    columns = [np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in known.T]
-    return np.stack(columns, axis=1)
-
-
-def rotation(theta: Floats | float) -> Floats:
-    """Return the rotation matrices (..., 2, 2) of angles (...) in rad."""
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.stack([np.stack([cos, -sin], axis=-1), np.stack([sin, cos], axis=-1)], axis=-2)
-
-
-def wrap_angle(angle: Floats) -> Floats:
-    """Return the same angle in (-pi, pi], in rad."""
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)

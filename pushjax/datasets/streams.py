@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pushjax.datasets.checks import checked_recording, find_bad_number
-from pushjax.datasets.recordings import Floats, LogError, Recording, interpolated
+from pushjax.datasets.planar import interpolated
+from pushjax.datasets.recordings import Floats, LogError, Recording
 
 # If the object is unseen for longer than this (s), its pose is not interpolated. Good logs have gaps of up to 0.39 s.
 MAX_GAP = 0.5

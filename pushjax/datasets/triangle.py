@@ -16,16 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pushjax.datasets.recordings import (
-    Floats,
-    LogError,
-    Recording,
-    Recordings,
-    collect,
-    interpolated,
-    rotation,
-    wrap_angle,
-)
+from pushjax.datasets.planar import cross, in_body, interpolated, rotation, wrap_angle
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect
 from pushjax.datasets.triangle_text import Record, check_quaternions, read_records
 
 # Calibration of the motion capture: the center of mass in the corner frame, in m (a third of each leg).
@@ -198,11 +190,9 @@ def make_push(
     moved = end - start
     moved[2] = wrap_angle(moved[2])
     between = start + np.linspace(0.0, 1.0, int(keep.sum()))[:, None] * moved
-    body_from_world = rotation(between[:, 2]).swapaxes(1, 2)
     at = np.stack([np.interp(force_time[keep], tip_time, column) for column in tip.T], axis=1)
-    body_force = np.einsum("kij,kj->ki", body_from_world, force[keep])
-    arm = np.einsum("kij,kj->ki", body_from_world, at - between[:, :2])
-    torque = arm[:, 0] * body_force[:, 1] - arm[:, 1] * body_force[:, 0]
+    body_force = in_body(between, force[keep])
+    torque = cross(in_body(between, at - between[:, :2]), body_force)
     return Recording(
         index,
         tip,
@@ -243,8 +233,8 @@ def _edge_distances(pose: Floats, point: Floats) -> Floats:
     edge = np.roll(VERTICES, -1, axis=0) - VERTICES
     # The vertices are in clockwise order, so the outside is to the left of an edge.
     outward = np.stack([-edge[:, 1], edge[:, 0]], axis=1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    in_body = rotation(pose[2]).T @ (point - pose[:2])
-    return np.sum((in_body - VERTICES) * outward, axis=1)
+    local = rotation(pose[2]).T @ (point - pose[:2])
+    return np.sum((local - VERTICES) * outward, axis=1)
 
 
 def object_poses(record: Record) -> tuple[Floats, Floats]:

@@ -18,7 +18,8 @@ import numpy as np
 
 from pushjax.datasets import triangle
 from pushjax.datasets.mit_shapes import nearest_on_outline
-from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect, rotation
+from pushjax.datasets.planar import rotation
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, collect
 from pushjax.datasets.triangle_text import Record, read_records
 
 SPACING = 0.05  # m, between the centers of the fingers

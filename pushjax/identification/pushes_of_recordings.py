@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pushjax._internal.jit import quick_jit
-from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, nothing_usable, rotation
+from pushjax.datasets.planar import cross, in_body, interpolated, rotation
+from pushjax.datasets.recordings import Floats, LogError, Recording, Recordings, nothing_usable
 from pushjax.geometry.shape import Shape
 from pushjax.simulation.hand import Hand, RoundFinger
 
@@ -55,25 +56,25 @@ def screen(recordings: Recordings, shape: Shape, hand: Hand, parts: int = 1) -> 
     size = float(np.max(high - low))
     if not size <= MAX_SLIDER_SIZE:
         raise ValueError(f"shape: {size:g} m across; expected at most {MAX_SLIDER_SIZE:g} m: is it in millimeters?")
-    kept: list[Recording] = []
-    problems: list[LogError] = []
-    for push in recordings.pushes:
-        reason = _implausibility(push, size, shape, hand)
-        if reason is None:
-            kept.append(push)
-        else:
-            problems.append(LogError(recordings.source, reason, push=push.index))
-    sparse = [push for push in kept if not _is_observed_often_enough(push, parts)]
-    if 2 * len(sparse) <= len(kept):
-        for push in sparse:
-            reason = (
-                f"the object was tracked {push.tracked[1:-1].sum()} times on the way; {parts} parts need {parts - 1}"
-            )
-            problems.append(LogError(recordings.source, reason, push=push.index))
-        kept = [push for push in kept if _is_observed_often_enough(push, parts)]
+    pushes = recordings.pushes
+    reasons = [_implausibility(push, size, shape, hand) for push in pushes]
+    sparse = [
+        reason is None and not _is_observed_often_enough(push, parts)
+        for push, reason in zip(pushes, reasons, strict=True)
+    ]
+    if 2 * sum(sparse) <= reasons.count(None):
+        for k in np.flatnonzero(sparse):
+            count = pushes[k].tracked[1:-1].sum()
+            reasons[k] = f"the object was tracked {count} times on the way; {parts} parts need {parts - 1}"
+    kept = tuple(push for push, reason in zip(pushes, reasons, strict=True) if reason is None)
+    problems = tuple(
+        LogError(recordings.source, reason, push=push.index)
+        for push, reason in zip(pushes, reasons, strict=True)
+        if reason is not None
+    )
     if not kept:
         raise nothing_usable(recordings.source, problems)
-    return replace(recordings, pushes=tuple(kept), problems=(*recordings.problems, *problems))
+    return replace(recordings, pushes=kept, problems=(*recordings.problems, *problems))
 
 
 def _implausibility(push: Recording, size: float, shape: Shape, hand: Hand) -> str | None:
@@ -140,7 +141,7 @@ def push_arrays(
         parts = 1
     arcs = [_hand_travel(push) for push in pushes]
     path = [
-        _interpolated_columns(push.hand, arc, np.arange(steps + 1) / steps * arc[-1])
+        interpolated(np.arange(steps + 1) / steps * arc[-1], arc, push.hand)
         for push, arc in zip(pushes, arcs, strict=True)
     ]
     # Parts end at steps of the path, because the prediction has poses only there.
@@ -181,14 +182,9 @@ def _hand_travel(push: Recording) -> Floats:
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(in_meters(push.hand), axis=0), axis=1))])
 
 
-def _interpolated_columns(values: Floats, arc: Floats, query: Floats) -> Floats:
-    """Interpolate each column of `values` (m, c), known at `arc` (m,), at other arc lengths `query` (k,)."""
-    return np.stack([np.interp(query, arc, column) for column in values.T], axis=1)
-
-
 def _slider_poses(push: Recording, arc: Floats, query: Floats) -> Floats:
     """Return the slider's poses (k, 3) at the hand's arc lengths `query` (k,), the first and last being the ends."""
-    pose = _interpolated_columns(push.pose[push.tracked], arc[push.tracked], query)
+    pose = interpolated(query, arc[push.tracked], push.pose[push.tracked])
     # A tracker that lags may show the slider moving after the hand has stopped, at equal arc lengths.
     pose[0], pose[-1] = push.pose[0], push.pose[-1]
     return pose
@@ -203,12 +199,9 @@ def _wrench_motion_pairs(
     """Return the mean wrench and the displacement in each part of each push, body frame; zero where unknown."""
     rows = [np.arange(len(push.hand), dtype=float) for push in pushes]
     all_poses = [
-        _interpolated_columns(push.pose[push.tracked], row[push.tracked], row)
-        for push, row in zip(pushes, rows, strict=True)
+        interpolated(row, row[push.tracked], push.pose[push.tracked]) for push, row in zip(pushes, rows, strict=True)
     ]
-    fingertips = [
-        np.einsum("kji,kj->ki", rotation(q[:, 2]), p.hand - q[:, :2]) for p, q in zip(pushes, all_poses, strict=True)
-    ]
+    fingertips = [in_body(pose, push.hand - pose[:, :2]) for push, pose in zip(pushes, all_poses, strict=True)]
     # all pushes at once: otherwise each number of samples would need its own compiled program
     contacts = np.split(
         np.asarray(_nearest_on_outline(shape, jnp.asarray(np.concatenate(fingertips)))),
@@ -219,7 +212,7 @@ def _wrench_motion_pairs(
     for k, (push, pose, contact) in enumerate(zip(pushes, all_poses, contacts, strict=True)):
         force = np.asarray(push.force)
         measured = np.isfinite(force[:, 0]) & np.isfinite(force[:, 1])
-        body_force = np.einsum("kji,kj->ki", rotation(pose[:, 2]), np.where(measured[:, None], force, 0.0))
+        body_force = in_body(pose, np.where(measured[:, None], force, 0.0))
         magnitude = np.hypot(body_force[:, 0], body_force[:, 1])
         usable = measured & (magnitude >= MIN_FORCE_FRACTION * np.sum(magnitude) / max(int(measured.sum()), 1))
         for part, (before, after) in enumerate(zip(poses[k, :-1], poses[k, 1:], strict=True)):
@@ -227,8 +220,8 @@ def _wrench_motion_pairs(
             translation = rotation((before[2] + after[2]) / 2).T @ (after - before)[:2]
             turn = abs(after[2] - before[2]) * lever
             if in_part.any() and max(np.hypot(*translation), turn) >= MIN_DISPLACEMENT:
-                forces, arms = body_force[in_part], contact[in_part]
-                wrench[k, part] = *forces.mean(axis=0), (arms[:, 0] * forces[:, 1] - arms[:, 1] * forces[:, 0]).mean()
+                forces = body_force[in_part]
+                wrench[k, part] = *forces.mean(axis=0), cross(contact[in_part], forces).mean()
                 twist[k, part] = *translation, after[2] - before[2]
     return {"wrench": wrench, "twist": twist}
 

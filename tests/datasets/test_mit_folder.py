@@ -14,7 +14,7 @@ from pushjax.datasets import LogError, Recording, load_mit_folder, load_recordin
 from pushjax.datasets.mit_folder import find_files, states_at
 from pushjax.datasets.mit_logs import parse_name
 from pushjax.datasets.mit_shapes import MIT_SHAPES, mit_shape, nearest_on_outline
-from pushjax.datasets.recordings import rotation
+from pushjax.datasets.planar import rotation
 
 # The objects move as linear functions of time, whose time stamps have a resolution of 0.2 us: m, rad.
 LINEAR = 1e-7

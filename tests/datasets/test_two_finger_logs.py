@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pushjax.datasets import LogError, load_recordings, load_two_finger_logs
-from pushjax.datasets.recordings import rotation
+from pushjax.datasets.planar import rotation
 from pushjax.datasets.two_finger_logs import make_push
-
 
 POSE = "0 0 100 1 0 0 0"
 TURN = np.radians(10)
