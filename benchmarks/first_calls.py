@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
@@ -27,7 +28,7 @@ import tyro
 from pushjax._internal.progress import ProgressCallback, no_progress
 from pushjax.experiments._record import result_record
 
-STEPS, RUNS, RANDOM_PUSHES = 8, 9, 1000  # STEPS as in `cases.MANY_STEPS`
+RUNS, RANDOM_PUSHES = 9, 1000
 Program = Literal["push", "gradient", "t", "two_fingers", "jaw"]
 Session = Literal["example", "random_l", "identify"]
 COLUMNS = (
@@ -220,16 +221,14 @@ def work(case: str, dtype: str, batch: int) -> tuple:
     import jax
     import jax.numpy as jnp
 
-    from benchmarks import cases, grasps
+    from benchmarks import cases
 
-    if case in ("t", "jaw"):
-        made = {"t": cases.push_t, "jaw": cases.grasp_jaw}[case](dtype, batch)
+    makers = {"t": cases.push_t, "jaw": cases.grasp_jaw, "two_fingers": partial(cases.grasp, steps=cases.MANY_STEPS)}
+    if case in makers:
+        made = makers[case](dtype, batch)
         return made.function, made.args
-    if case == "two_fingers":
-        one, args = cases.each_grasp(grasps.hand(dtype), dtype, batch, STEPS)
-    else:
-        one, args = cases.each_push("quartic", dtype, batch, STEPS)
-    final = jax.vmap(lambda *each: one(*each).pose[-1])
+    one, args = cases.each_push("quartic", dtype, batch, cases.MANY_STEPS)
+    final = cases.final_poses(one, batch)
     if case == "gradient":
         return jax.grad(lambda *args: jnp.sum(final(*args)), argnums=(0, 1, 2)), args
     return final, args

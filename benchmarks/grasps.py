@@ -104,14 +104,10 @@ def _final(here: reference_push.Task, poses: Float[Array, "n 3"], steps: Array) 
     """Return the final poses of grasps, step by step, so that one program does any number of steps."""
 
     def one(pose: Array, first: Array) -> Array:
-        def at(k):
-            opening = opening_at(first, (k / steps).astype(first.dtype))
-            return jnp.zeros(4, first.dtype).at[3].set(opening)
+        def closing(share):
+            return jnp.zeros(4, first.dtype).at[3].set(opening_at(first, share))
 
-        def step(k, pose):
-            return pj.step(here.slider, here.hand, at(k), at(k + 1), pose=pose, friction=FRICTION).pose
-
-        return jax.lax.fori_loop(0, steps, step, pose)
+        return reference_push.stepped(here._replace(pose=pose), closing, steps, FRICTION)
 
     return jax.vmap(one)(poses, touching(poses))
 
@@ -125,6 +121,4 @@ def reference() -> np.ndarray:
 @cache
 def errors(dtype: str) -> dict[int, float]:
     """Return the largest error of the fan, mm, for each number of steps."""
-    length = float(reference_push.square("quartic").surface.length)
-    exact = reference()
-    return {n: float(reference_push.error_mm(final_poses(n, dtype), exact, length).max()) for n in reference_push.STEPS}
+    return reference_push.largest_errors(lambda steps: final_poses(steps, dtype), reference(), "quartic")

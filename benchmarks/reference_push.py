@@ -4,6 +4,7 @@ The tip touches the square at the start and stays on its side, because only step
 answers need a process that allows float64 (`timing.both_dtypes`).
 """
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -85,17 +86,19 @@ def final_poses(model: str, steps: int, dtype: str) -> np.ndarray:
 @jax.jit
 def _final(here: Task, ends: Float[Array, "n 2 2"], steps: Array) -> Array:
     """Return the final poses of pushes, step by step, so that one program does any number of steps."""
+    return jax.vmap(lambda each: stepped(here, lambda share: each[0] + share * (each[1] - each[0]), steps))(ends)
 
-    def one(ends: Array) -> Array:
-        def at(k):
-            return ends[0] + (k / steps).astype(ends.dtype) * (ends[1] - ends[0])
 
-        def step(k, pose):
-            return pj.step(here.slider, here.hand, at(k), at(k + 1), pose=pose, friction=FRICTION).pose
+def stepped(here: Task, configuration: Callable[[Array], Array], steps: Array, friction: float = FRICTION) -> Array:
+    """Return the final pose of a motion whose hand is at `configuration` after a fraction (0 to 1) of its steps."""
 
-        return jax.lax.fori_loop(0, steps, step, here.pose)
+    def at(k):
+        return configuration((k / steps).astype(here.pose.dtype))
 
-    return jax.vmap(one)(ends)
+    def step(k, pose):
+        return pj.step(here.slider, here.hand, at(k), at(k + 1), pose=pose, friction=friction).pose
+
+    return jax.lax.fori_loop(0, steps, step, here.pose)
 
 
 @cache
@@ -113,9 +116,13 @@ def error_mm(pose: np.ndarray, other: np.ndarray, length: float = LENGTH) -> np.
 @cache
 def errors(model: str, dtype: str) -> dict[int, float]:
     """Return the largest error of the fan, mm, for each number of steps."""
+    return largest_errors(lambda steps: final_poses(model, steps, dtype), reference(model), model)
+
+
+def largest_errors(poses: Callable[[int], np.ndarray], exact: np.ndarray, model: str) -> dict[int, float]:
+    """Return the largest error of final poses, mm, for each number of steps."""
     length = float(square(model).surface.length)
-    exact = reference(model)
-    return {steps: float(error_mm(final_poses(model, steps, dtype), exact, length).max()) for steps in STEPS}
+    return {steps: float(error_mm(poses(steps), exact, length).max()) for steps in STEPS}
 
 
 def fewest_steps(by_steps: dict[int, float], allowed_mm: float = ALLOWED_MM) -> int:

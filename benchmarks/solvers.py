@@ -2,25 +2,19 @@
 
 `Exhaustive`, `Projected` and, for a single contact, `ScalarRoot` and `HessianIteration` solve the random problems of
 `pushjax.testing.problems`. Each row has the time per problem, its ratio to that of one contact by `ScalarRoot`, the
-fraction of the problems with a motion for which the solver finds one, and the time to trace and compile. The problems
-of a single contact, without a gap, also give the iterations of `HessianIteration`, and the number of problems in which
-it differs from `ScalarRoot` in the mode.
+fraction of the problems with a motion for which the solver finds one, and the time to trace and compile.
 """
 
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import pushjax as pj
 from benchmarks.timing import alternate, compiled
 from pushjax._internal.progress import ProgressCallback, no_progress
-from pushjax._math.vec import Vec2
-from pushjax.contact.contact_plane import Contact, LimitCurve
-from pushjax.contact.single import solve_single
 from pushjax.experiments._record import result_record
-from pushjax.testing.problems import ContactProblem, random_contact_problem, random_contacts_problem
+from pushjax.testing.problems import random_contacts_problem
 
 SEVERAL = {"Exhaustive": pj.Exhaustive(), "Projected": pj.Projected()}
 ONE = {"ScalarRoot": pj.ScalarRoot(), "HessianIteration": pj.HessianIteration()}
@@ -44,7 +38,7 @@ def run(
         progress: Called with the number of programs compiled and their total.
 
     Returns:
-        The record, with one row for each number of contacts and solver, and `one_contact` of `_one_contact`.
+        The record, with one row for each number of contacts and solver.
     """
     jax.config.update("jax_enable_x64", x64)
     todo = [
@@ -71,32 +65,12 @@ def run(
         row |= {"ratio_to_one": seconds / timings["1 ScalarRoot"].median, "compile_s": program.compile_s}
         rows.append(row | {"found": np.mean(status[exact == pj.Status.MOVING] == pj.Status.MOVING)})
     settings = {"problems": problems, "degree": degree, "dtype": str(drawn[1].contacts.point.dtype)}
-    return result_record("solvers", settings, rows=rows, one_contact=_one_contact(problems, degree))
-
-
-def _one_contact(count: int, degree: int) -> dict[str, Any]:
-    """Return how the two solvers of a single contact differ, and the iterations of `HessianIteration`."""
-    problems = jax.jit(jax.vmap(lambda key: random_contact_problem(key, degree=degree)))(
-        jax.random.split(jax.random.key(degree), count)
-    )
-
-    def solve(problem: ContactProblem) -> tuple[Any, ...]:
-        point, normal, displacement = (Vec2.of(v) for v in (problem.point, problem.normal, problem.displacement))
-        contact = Contact(point, normal, displacement, problem.friction, jnp.zeros_like(problem.friction))
-        form = problem.surface.form()
-        found = [solve_single(form, contact, solver) for solver in ONE.values()]
-        rounds = ONE["HessianIteration"].trace(LimitCurve.of(form, contact), contact.approach())[1]
-        return [each.mode for each in found], [each.status == pj.Status.NOT_CONVERGED for each in found], rounds
-
-    (root, hessian), failed, rounds = jax.jit(jax.vmap(solve))(problems)
-    quantiles = dict(zip(("median", "p99", "worst"), np.quantile(rounds, (0.5, 0.99, 1.0)), strict=True))
-    failures = {name: int(np.sum(each)) for name, each in zip(ONE, failed, strict=True)}
-    return {"rounds": quantiles, "modes_that_differ": int(np.sum(root != hessian)), "not_converged": failures}
+    return result_record("solvers", settings, rows=rows)
 
 
 def summary(record: dict[str, Any]) -> str:
     """Return what the command prints."""
-    settings, one = record["settings"], record["one_contact"]
+    settings = record["settings"]
     lines = [f"degree {settings['degree']}, {settings['problems']} problems each, {settings['dtype']}:"]
     lines.append("contacts solver                us each    x one    found   compile s")
     for row in record["rows"]:
@@ -104,7 +78,4 @@ def summary(record: dict[str, Any]) -> str:
             f"{row['contacts']:8} {row['solver']:18} {row['us_per_problem']:9.3f} {row['ratio_to_one']:8.1f} "
             f"{row['found']:8.2%} {row['compile_s']:11.1f}"
         )
-    rounds = ", ".join(f"{name} {number:.0f}" for name, number in one["rounds"].items())
-    lines.append(f"one contact: iterations of HessianIteration: {rounds}; modes that differ from those of ScalarRoot: ")
-    lines[-1] += f"{one['modes_that_differ']}; not converged: {one['not_converged']}"
     return "\n".join(lines)

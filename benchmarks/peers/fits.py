@@ -10,6 +10,7 @@ For the ellipsoid, its own matrix is positive semidefinite. The program is built
 then solved for each set of pairs.
 """
 
+import math
 import time
 from typing import Any, NamedTuple
 
@@ -108,12 +109,7 @@ def gram(a: np.ndarray, degree: int) -> np.ndarray:
     for index in np.ndindex(*tensor.shape):
         counts = np.bincount(index, minlength=3)
         row = int(np.flatnonzero((monomials(degree) == counts).all(axis=1))[0])
-        orders = 1.0
-        left = degree
-        for count in counts:
-            for k in range(count):
-                orders *= left / (k + 1)
-                left -= 1
+        orders = math.factorial(degree) // math.prod(map(math.factorial, counts.tolist()))
         tensor[index] = a[row] / orders
     return tensor * (2.0 if degree == 2 else 12.0)
 

@@ -1,8 +1,7 @@
 """Pushes by MuJoCo (C): final poses, creep of a sticking tip, the timestep that they need, and their computing time.
 
-One call of `mj_step` with the number of steps computes a whole push in C, without Python between the steps. Each thread
-has its own copy of the model and computes a part of the pushes. `mujoco.rollout` does the same work, and also records
-every state, in the same time.
+One call of `mj_step` with the number of steps computes a whole push in C, without Python between the steps.
+`mujoco.rollout` does the same work, and also records every state, in the same time.
 
 The slider starts at rest on the table, after it has settled; settling is not timed. The final pose is read when the tip
 arrives at its end, before anything coasts.
@@ -11,10 +10,8 @@ The largest sufficient timestep is searched on a grid and then by bisection, so 
 MuJoCo: the search finds 15.4 ms where the grid alone has 14.1 on four supports, and 12.2 where it has 10 on three.
 """
 
-import copy
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,8 +44,7 @@ class Pushed(NamedTuple):
     # Distance that the tip's contact has slid along the slider's side, (n,), m; positive to the left of the inward
     # normal.
     slip: np.ndarray
-    seconds: float  # wall time of the pushes, s, without building and settling
-    processor: float  # CPU time of the pushes, s, summed over threads
+    processor: float  # CPU time of the pushes, s, without building and settling
 
 
 class StepError(NamedTuple):
@@ -76,31 +72,24 @@ def fan(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return starts, starts + scene.travel * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def push(
-    scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray, threads: int = 1
-) -> Pushed:
+def push(scene: Scene, settings: Settings, timestep: float, starts: np.ndarray, ends: np.ndarray) -> Pushed:
     """Push a slider that starts at pose zero, by a tip whose center moves from start to end, both (n, 2), m."""
     starts, ends = np.asarray(starts, float).reshape(-1, 2), np.asarray(ends, float).reshape(-1, 2)
     model = build(scene, settings, timestep)
     settled = settle(model, settings)
     frames = [frame(scene, timestep, *each) for each in zip(starts, ends, strict=True)]
     qpos = np.array([initial(model, settled, *each) for each in zip(frames, starts, strict=True)])
-    shares = [range(k, len(starts), threads) for k in range(threads)]
-    workers = [(copy.copy(model), engine().MjData(model)) for _ in shares]
-    begin, busy = time.perf_counter(), time.process_time()
-    if threads == 1:
-        _run(*workers[0], scene, frames, qpos, shares[0])
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            tasks = [
-                pool.submit(_run, *mine, scene, frames, qpos, share)
-                for mine, share in zip(workers, shares, strict=True)
-            ]
-            for task in tasks:
-                task.result()
-    seconds, processor = time.perf_counter() - begin, time.process_time() - busy
+    data, busy = engine().MjData(model), time.process_time()
+    for here, row in zip(frames, qpos, strict=True):
+        engine().mj_resetData(model, data)
+        model.opt.timestep = here.timestep
+        data.qpos[:] = row
+        data.qvel[0] = -scene.speed  # the slider moves with the conveyor
+        engine().mj_step(model, data, nstep=here.steps)
+        row[:] = data.qpos
+    processor = time.process_time() - busy
     pose = np.array([final_pose(*each) for each in zip(frames, qpos, ends, strict=True)]).reshape(-1, 3)
-    return Pushed(pose, slip(scene, pose, starts, ends), seconds, processor)
+    return Pushed(pose, slip(scene, pose, starts, ends), processor)
 
 
 def settle(model: Any, settings: Settings) -> np.ndarray:
@@ -131,18 +120,6 @@ def initial(model: Any, settled: np.ndarray, frame: Frame, start: np.ndarray) ->
     turn = np.array([np.cos(frame.angle / 2), 0.0, 0.0, np.sin(frame.angle / 2)])
     engine().mju_mulQuat(qpos[3:7], turn, settled[3:7])
     return qpos
-
-
-def _run(model, data, scene: Scene, frames: list[Frame], qpos: np.ndarray, share: range) -> None:
-    """Simulate the pushes `share`, and overwrite their rows of `qpos` with the final positions."""
-    mujoco = engine()
-    for k in share:
-        mujoco.mj_resetData(model, data)
-        model.opt.timestep = frames[k].timestep
-        data.qpos[:] = qpos[k]
-        data.qvel[0] = -scene.speed  # the slider moves with the conveyor
-        mujoco.mj_step(model, data, nstep=frames[k].steps)
-        qpos[k] = data.qpos
 
 
 def final_pose(frame: Frame, qpos: np.ndarray, origin: np.ndarray) -> np.ndarray:

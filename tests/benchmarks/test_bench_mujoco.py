@@ -189,13 +189,6 @@ def test_pushjax_converges_over_the_pushes_of_mujoco():
     assert errors[1] < reference_push.ALLOWED_MM
 
 
-def test_threads_change_nothing():
-    scene = Scene(THREE)
-    starts, ends = fan(scene)
-    one, two = (push(scene, Settings(), 0.01, starts, ends, threads=n) for n in (1, 2))
-    np.testing.assert_array_equal(one.pose, two.pose)
-
-
 @pytest.mark.slow
 def test_mjx_converges_with_softened_contacts():
     """With softened contacts MJX converges, and another timestep uses the same compiled program."""
