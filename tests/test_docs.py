@@ -30,6 +30,7 @@ SLOW_PAGES = (
     "docs/concepts/identification.md",
     "docs/concepts/pushing.md",
     "docs/concepts/random-friction.md",
+    "docs/getting-started.md",
     "docs/tasks.md",
 )
 PAGES = [*SITE, ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CHANGELOG.md"]
